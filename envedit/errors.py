@@ -1,0 +1,35 @@
+"""What can go wrong for a user, and the exit code each kind carries.
+
+Every message is one or two lines: what, where (file, key, row and column), what to do.
+Modules raise these; only ``run.py`` turns them into text on stderr and an exit code.
+"""
+
+
+class EnveditError(ValueError):
+    """Base of every error whose cause a user can mend."""
+
+    exit_code = 5
+
+
+class ConfigError(EnveditError):
+    """The configuration or the command line cannot be understood (exit code 2)."""
+
+    exit_code = 2
+
+
+class InputError(EnveditError):
+    """An image or scene file is missing, damaged or unsuitable, or cannot be written (exit code 3)."""
+
+    exit_code = 3
+
+
+class MachineError(EnveditError):
+    """This machine cannot run the kernels: no usable LLVM (exit code 4)."""
+
+    exit_code = 4
+
+
+class NumericalError(EnveditError):
+    """The optimisation could not proceed: non-finite and not recoverable (exit code 5)."""
+
+    exit_code = 5

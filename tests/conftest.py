@@ -1,0 +1,33 @@
+"""One variant for all tests, and the way to real data.
+
+Real maps, meshes and weights are found through ``ENVEDIT_DATA``; a test that needs them asks for the
+``data`` fixture and is skipped by name where the variable is not set.
+"""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def pytest_configure(config):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder with puresky/, hdri/, meshes/ and weights/."""
+    root = os.environ.get("ENVEDIT_DATA")
+    if not root:
+        pytest.skip("ENVEDIT_DATA is not set: no real maps on this machine")
+    return Path(root)
+
+
+@pytest.fixture
+def rng():
+    """A numpy generator with a fixed seed."""
+    import numpy as np
+
+    return np.random.default_rng(0)

@@ -24,7 +24,7 @@ class InputError(EnveditError):
 
 
 class MachineError(EnveditError):
-    """This machine cannot run the kernels: no usable LLVM (exit code 4)."""
+    """No kernel can run on this machine: no usable LLVM (exit code 4)."""
 
     exit_code = 4
 

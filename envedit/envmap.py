@@ -1,0 +1,85 @@
+"""What the optimiser's parameters are: representations of the part of a map that is edited.
+
+All share one interface, so that the edit loop knows none of them:
+
+* ``encode(image, seed) -> params``: a flat dict name -> tensor that reproduces the image (H, W, 3) as well as the representation can;
+* ``decode(params) -> (H, W, 3)``: linear radiance, finite and not negative, differentiable in the parameters;
+* ``lr``: the learning rate that suits its parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import config, fit
+
+Params = dict[str, "mi.TensorXf"]
+
+
+class Pixels:
+    """Radiance itself, one parameter a texel and channel; the paper's baseline. Negative parameters decode to black."""
+
+    lr = 0.02
+
+    def encode(self, image: np.ndarray, seed: int = 0) -> Params:
+        """Store the image; ``seed`` is not used."""
+        return {"radiance": dr.opaque(mi.TensorXf(np.ascontiguousarray(image, np.float32)))}
+
+    def decode(self, params: Params) -> mi.TensorXf:
+        """Return the stored radiance, clipped below at zero."""
+        return dr.maximum(params["radiance"], 0)
+
+
+class LogPixels:
+    """log(E + 0.01), one parameter a texel and channel; decoded radiance is bounded by float32's range."""
+
+    lr = 0.01
+
+    def encode(self, image: np.ndarray, seed: int = 0) -> Params:
+        """Store the logarithms; ``seed`` is not used."""
+        logs = np.log(np.asarray(image, np.float64) + fit.EPSILON)
+        return {"log_radiance": dr.opaque(mi.TensorXf(logs.astype(np.float32)))}
+
+    def decode(self, params: Params) -> mi.TensorXf:
+        """Return exp(x) - 0.01, not below zero; x is held under 80, beyond which float32 would overflow in a sum."""
+        return dr.maximum(dr.exp(dr.minimum(params["log_radiance"], 80)) - fit.EPSILON, 0)
+
+
+class Siren:
+    """The weights of a SIREN fitted to the image (Eq. 1-3); robust (R-SIREN) when fitted with awp_gamma > 0.
+
+    ``fitted`` tells, after :meth:`encode`, how well the network reproduces the image.
+    """
+
+    lr = 5e-5
+
+    def __init__(self, network: config.Representation, settings: config.Fit, folder: Path | None = None,
+                 progress: Callable[[int, int, float], None] | None = None):
+        self.network, self.settings, self.folder, self.progress = network, settings, folder, progress
+        self.fitted: fit.Fitted | None = None
+        self._shape = None
+
+    def encode(self, image: np.ndarray, seed: int = 0) -> Params:
+        """Fit the network, or take an earlier fit of the same image from disk."""
+        self.fitted = fit.fit(image, self.network, self.settings, seed, folder=self.folder, progress=self.progress)
+        self._shape = image.shape[:2]
+        return {name: dr.opaque(mi.TensorXf(value)) for name, value in self.fitted.params.items()}
+
+    def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:
+        """Evaluate the network at the resolution of the image, or at any other ``shape``."""
+        return fit.evaluate(params, self.fitted.normalisation, shape or self._shape, self.network.omega)
+
+
+def make(settings: config.Config, folder: Path | None = None, progress=None):
+    """Return the representation that a configuration asks for."""
+    kind = settings.representation.kind
+    if kind == "pixels":
+        return Pixels()
+    if kind == "log-pixels":
+        return LogPixels()
+    return Siren(settings.representation, settings.fit, folder, progress)

@@ -1,0 +1,246 @@
+"""Fit a SIREN to an HDR map, robust against changes of its weights (R-SIREN, paper Sec. 4 and 6.1).
+
+The network learns the normalised logarithm of the map (Eq. 1), with a loss in log space and one in radiance (Eq. 4). Under adversarial weight
+perturbation the loss is evaluated at theta + gamma ||theta_l|| / ||d_l|| d_l for every weight matrix l, where d is the direction in which a
+proxy Adam would make the SSIM worse (Eq. 5; Algorithm 1), and the gradient is applied to theta.
+
+``python -m envedit.fit MAP.exr`` fits a map, writes what the network makes of it, and says how good it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import config, losses, metrics, optim, siren
+
+EPSILON = 0.01
+"""Added to radiance inside the logarithm (paper, below Eq. 3)."""
+_RECIPE = 1  # raise when the same settings give another fit
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Eq. 1-3: between radiance E and the network's (0, 1); ``low`` and ``span`` of log(E + 0.01)."""
+
+    low: float
+    span: float
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> Normalisation:
+        """Measure the range of an image; a constant image is put in the middle of a range of one."""
+        logs = np.log(np.asarray(image, np.float64) + EPSILON)
+        low, high = float(logs.min()), float(logs.max())
+        return cls(low, high - low) if high - low > 1e-4 else cls(low - 0.5, 1.0)
+
+    def encode(self, image: np.ndarray) -> np.ndarray:
+        """Map radiance to [0, 1], in float64 (Eq. 1)."""
+        return (np.log(np.asarray(image, np.float64) + EPSILON) - self.low) / self.span
+
+    def decode(self, values):
+        """Map network output in (0, 1) to radiance >= 0 (Eq. 2-3); works on Dr.Jit tensors and arrays."""
+        return dr.exp(values * self.span + self.low) - EPSILON
+
+
+@dataclass
+class Fitted:
+    """A fitted network: weights as numpy arrays, its normalisation, and how well it does."""
+
+    params: dict[str, np.ndarray]
+    normalisation: Normalisation
+    log_psnr: float
+    peak_ratio: float
+    epochs: int
+    seconds: float
+    cached: bool
+
+
+def to_image(values: mi.TensorXf, height: int, width: int) -> mi.TensorXf:
+    """Reorder network output (3, H * W) to an image (H, W, 3), differentiably."""
+    n = height * width
+    i = dr.arange(mi.UInt32, 3 * n)
+    return mi.TensorXf(dr.gather(mi.Float, values.array, (i % 3) * n + i // 3, mode=dr.ReduceMode.Permute), (height, width, 3))
+
+
+def fit(image: np.ndarray, network: config.Representation, settings: config.Fit, seed: int = 0, *,
+        folder: Path | None = None, progress: Callable[[int, int, float], None] | None = None) -> Fitted:
+    """Fit a SIREN to an image.
+
+    Parameters
+    ----------
+    image : ndarray (H, W, 3)
+        Linear radiance, finite and not negative.
+    network : config.Representation
+        Width, depth and frequency.
+    settings : config.Fit
+        The recipe.
+    seed : int
+        Seed of the initial weights.
+    folder : Path, optional
+        Where fits are kept under a hash of image and settings; None: nowhere.
+    progress : callable, optional
+        Called with (epoch, epochs, loss) now and then.
+
+    Returns
+    -------
+    Fitted
+        Read from ``folder`` if the same fit was made before.
+    """
+    image = np.ascontiguousarray(image, np.float32)
+    path = folder / f"{_key(image, network, settings, seed)}.npz" if folder and settings.cache else None
+    if path and (found := _load(path)):
+        return found
+    start = time.perf_counter()
+    normalisation = Normalisation.of(image)
+    params = _train(image, normalisation, network, settings, seed, progress)
+    got = evaluate(params, normalisation, image.shape[:2], network.omega).numpy()
+    fitted = Fitted({k: v.numpy() for k, v in params.items()}, normalisation, metrics.log_psnr(got, image),
+                    metrics.peak_ratio(got, image), settings.epochs, time.perf_counter() - start, False)
+    if path:
+        _store(path, fitted)
+    return fitted
+
+
+def evaluate(params: siren.Params, normalisation: Normalisation, shape: tuple[int, int], omega: float) -> mi.TensorXf:
+    """Evaluate a network as an image of linear radiance (H, W, 3), differentiable in its weights."""
+    y = siren.evaluate(params, siren.coordinates(*shape), omega)
+    return normalisation.decode(to_image(y, *shape))
+
+
+class Objective:
+    """Eq. 4 for one image: value and gradient with respect to the network's output (3, H * W)."""
+
+    def __init__(self, image: np.ndarray, normalisation: Normalisation, settings: config.Fit):
+        self.shape = image.shape[:2]
+        self.normalisation, self.settings = normalisation, settings
+        self.logs = dr.opaque(mi.TensorXf(normalisation.encode(image).astype(np.float32)))
+        self.radiance = dr.opaque(mi.TensorXf(np.ascontiguousarray(image, np.float32)))
+        self.ssim = losses.Ssim(self.logs)
+
+    def gradient(self, y: mi.TensorXf, only_ssim: bool = False):
+        """Return the loss (size-1 array) and its gradient with respect to y."""
+        y = mi.TensorXf(y)
+        dr.enable_grad(y)
+        with dr.isolate_grad():
+            values = to_image(y, *self.shape)
+            if only_ssim:
+                loss = self.ssim(values)
+            else:
+                loss = dr.opaque(mi.Float, 0)
+                if self.settings.log_mse:
+                    loss += self.settings.log_mse * losses.log_mse(values, self.logs)
+                if self.settings.log_ssim:
+                    loss += self.settings.log_ssim * self.ssim(values)
+                if self.settings.hdr:
+                    loss += self.settings.hdr * losses.hdr(self.normalisation.decode(values), self.radiance)
+            dr.backward(loss)
+        return dr.detach(loss), dr.grad(y)
+
+
+class Perturbation:
+    """Adversarial weight perturbation (Eq. 5, Algorithm 1) of the weight matrices.
+
+    The proxy Adam of the paper walks from an offset of zero, so that the direction is not the rounding error of two nearly equal weights.
+    Its learning rate cancels in the normalisation but for Adam's epsilon; its moments live on from epoch to epoch.
+    """
+
+    def __init__(self, params: siren.Params, gamma: float, lr: float):
+        self.gamma, self.names = gamma, siren.weight_names(params)
+        self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
+        self._proxy = optim.Adam(self._zeros, lr)
+        self._direction = None
+
+    def update(self, grads: siren.Params, lr: float) -> None:
+        """Set the direction of ascent from a gradient of the loss that is to be made worse."""
+        self._proxy.params = dict(self._zeros)
+        # A refused (non-finite) gradient leaves the direction at zero: no perturbation in this epoch.
+        self._proxy.step({name: -grads[name] for name in self.names}, lr=lr, check=False)
+        self._direction = self._proxy.params
+
+    def apply(self, params: siren.Params) -> siren.Params:
+        """Return perturbed parameters; a layer without direction or of zero norm stays as it is."""
+        out = dict(params)
+        for name in self.names:
+            d = self._direction[name]
+            length = dr.sqrt(dr.sum(dr.square(params[name].array))) * dr.rcp(dr.sqrt(dr.sum(dr.square(d.array))) + 1e-20)
+            out[name] = params[name] + mi.TensorXf(self.gamma * length * d.array, d.shape)
+        dr.eval(out)
+        return out
+
+
+def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
+    """Learning rate of an epoch under the recipe's schedule."""
+    if settings.schedule == "cosine":
+        return optim.cosine(base, epoch, settings.epochs)
+    if settings.schedule == "warm-restarts":
+        return optim.cosine_warm_restarts(base, epoch, settings.restart_period)
+    return optim.constant(base, epoch)
+
+
+def _train(image, normalisation, network, settings, seed, progress):
+    params = siren.init(seed, network.hidden, network.depth, network.omega)
+    x = dr.opaque(siren.coordinates(*image.shape[:2]))
+    objective = Objective(image, normalisation, settings)
+    adam = optim.Adam(params, settings.lr)
+    perturbation = Perturbation(params, settings.awp_gamma, settings.awp_lr) if settings.awp_gamma > 0 else None
+    for epoch in range(settings.epochs):
+        params = adam.params
+        if perturbation:
+            if epoch % settings.awp_every == 0:
+                y, tape = siren.forward(params, x, network.omega)
+                _, slope = objective.gradient(y, only_ssim=True)
+                # A rate of 0 at the end of a schedule would leave no direction.
+                rate = max(learning_rate(settings, settings.awp_lr, epoch), 0.01 * settings.awp_lr)
+                perturbation.update(siren.backward(params, tape, slope), rate)
+            params = perturbation.apply(params)
+        y, tape = siren.forward(params, x, network.omega)
+        loss, slope = objective.gradient(y)
+        adam.step(siren.backward(params, tape, slope), lr=learning_rate(settings, settings.lr, epoch))
+        if progress and (epoch % 20 == 0 or epoch == settings.epochs - 1):
+            progress(epoch + 1, settings.epochs, float(loss[0]))
+    return adam.params
+
+
+# ---------------------------------------------------------------------- fits on disk
+
+
+def default_folder() -> Path:
+    """Folder in which fits are kept: $XDG_CACHE_HOME/envedit/fits, or ~/.cache/envedit/fits."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "envedit" / "fits"
+
+
+def _key(image, network, settings, seed):
+    what = {"network": [network.hidden, network.depth, network.omega], "seed": seed, "recipe": _RECIPE, "shape": image.shape,
+            **{k: v for k, v in asdict(settings).items() if k != "cache"}}
+    return hashlib.sha256(repr(sorted(what.items())).encode() + image.tobytes()).hexdigest()[:32]
+
+
+def _load(path):
+    try:
+        with np.load(path) as stored:
+            numbers = stored["numbers"]
+            params = {k[2:]: stored[k] for k in stored.files if k.startswith("p/")}
+    except (OSError, ValueError, KeyError, EOFError):
+        return None  # not there, or damaged: fit again
+    low, span, log_psnr, peak, epochs, seconds = numbers
+    return Fitted(params, Normalisation(float(low), float(span)), float(log_psnr), float(peak), int(epochs), float(seconds), True)
+
+
+def _store(path, fitted):
+    numbers = [fitted.normalisation.low, fitted.normalisation.span, fitted.log_psnr, fitted.peak_ratio, fitted.epochs, fitted.seconds]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            np.savez(file, numbers=np.array(numbers, np.float64), **{f"p/{k}": v for k, v in fitted.params.items()})
+        os.replace(file.name, path)
+    except OSError:
+        pass  # a cache that cannot be written costs time, not the result

@@ -1,0 +1,159 @@
+"""Camera paths of a scene, traced once without looking at the environment map.
+
+What a map of any content contributes to a picture is decided by three things found here: the surface points that a pixel sees
+directly and after further bounces (:class:`Vertex`), and the directions in which its paths leave the scene (:class:`Escape`).
+
+Sample positions are a rank-1 lattice (R2, Roberts 2018) shifted at random in every pixel, so that the samples of one pixel are spread
+evenly and the errors of neighbouring pixels are independent. The index is permuted anew for every pair of dimensions, otherwise
+two of them would move together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# 2^32 divided by the plastic number and by its square: integer overflow takes the fractional part.
+_R2 = (0xC13FA9A9, 0x91E10DA5)
+_TO_UNIT = 2.0**-32
+
+
+@dataclass
+class Vertex:
+    """Surface points of one bounce; lane = pixel * paths + path.
+
+    ``bounce`` counts from 1, the point that the camera sees. ``throughput`` is the RGB weight of the path up to the point, before its
+    BSDF; lanes that left the scene have zero throughput.
+    """
+
+    bounce: int
+    si: mi.SurfaceInteraction3f
+    throughput: mi.Color3f
+    active: mi.Bool
+
+
+@dataclass
+class Escape:
+    """Directions in which the paths left the scene after ``bounce`` bounces (0: seen by the camera).
+
+    ``pdf`` is the solid-angle density of the BSDF sample that chose the direction, infinite for camera rays and specular
+    reflection, which no other strategy can sample.
+    """
+
+    bounce: int
+    direction: mi.Vector3f
+    throughput: mi.Color3f
+    pdf: mi.Float
+    active: mi.Bool
+
+
+def lattice(index: mi.UInt32, scramble: mi.UInt32) -> mi.Point2f:
+    """Return point ``index`` of the R2 sequence, shifted by a hash of ``scramble``; in [0, 1)^2."""
+    shift = mi.sample_tea_32(scramble, mi.UInt32(0x9E3779B9))
+    # float(2^32 - 1) * 2^-32 rounds to 1: stay below.
+    limit = 1 - 2.0**-24
+    return mi.Point2f(
+        dr.minimum(mi.Float(index * _R2[0] + shift[0]) * _TO_UNIT, limit),
+        dr.minimum(mi.Float(index * _R2[1] + shift[1]) * _TO_UNIT, limit),
+    )
+
+
+def trace(scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: int) -> Iterator[Vertex | Escape]:
+    """Trace camera paths and yield, bounce by bounce, where they leave the scene and where they hit it.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        Its first sensor is used.
+    pixels : ndarray of uint32
+        Indices row * width + column of the pixels to trace.
+    paths : int
+        Camera paths a pixel.
+    bounces : int
+        Surface points along a path (Mitsuba's ``max_depth`` - 1). With 0 only camera rays are traced.
+    seed : int
+        Seed of every random choice.
+
+    Yields
+    ------
+    Escape, Vertex
+        Escape of bounce 0, vertex of bounce 1, escape of bounce 1, ... escape of bounce ``bounces``.
+    """
+    n = len(pixels) * paths
+    lane = dr.arange(mi.UInt32, n)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(pixels.astype(np.uint32)), lane // paths)
+    path = lane % paths
+    context = mi.BSDFContext()
+
+    def sample(dimension: int) -> mi.Point2f:
+        scramble = mi.sample_tea_32(pixel, mi.UInt32(seed * 1009 + dimension))[0]
+        return lattice(mi.permute_kensler(path, paths, scramble), scramble ^ mi.UInt32(0x5BD1E995))
+
+    ray, weight = _camera_rays(scene.sensors()[0], pixel, sample)
+    throughput = mi.Color3f(mi.unpolarized_spectrum(weight))
+    active = mi.Bool(dr.full(mi.Bool, True, n))
+    pdf = dr.full(mi.Float, dr.inf, n)
+    for bounce in range(bounces + 1):
+        si = scene.ray_intersect(ray, active)
+        dr.eval(si, throughput, pdf, active, ray)
+        yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid())
+        active &= si.is_valid()
+        if bounce == bounces:
+            break
+        yield Vertex(bounce + 1, si, dr.select(active, throughput, 0), mi.Bool(active))
+        bs, value = si.bsdf().sample(context, si, sample(3 * bounce + 3).x, sample(3 * bounce + 4), active)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        throughput = throughput * mi.Color3f(mi.unpolarized_spectrum(si.to_world_mueller(value, -bs.wo, si.wi)))
+        active &= dr.max(throughput) > 0
+        pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
+
+
+def _camera_rays(sensor, pixel, sample):
+    """Rays through the pixels' footprints, distributed as the film's reconstruction filter."""
+    film = sensor.film()
+    size, offset = film.crop_size(), film.crop_offset()
+    column, row = pixel % size.x, pixel // size.x
+    u = sample(0)
+    x, weight_x = _filter_offset(film.rfilter(), u.x, column, size.x)
+    y, weight_y = _filter_offset(film.rfilter(), u.y, row, size.y)
+    position = mi.Point2f((mi.Float(column) + x) / size.x, (mi.Float(row) + y) / size.y)
+    del offset  # positions are relative to the crop window, as the sensor wants them
+    shutter = sample(2)
+    ray, weight = sensor.sample_ray(sensor.shutter_open() + sensor.shutter_open_time() * shutter.x, shutter.y, position, sample(1))
+    return mi.Ray3f(ray), mi.Color3f(mi.unpolarized_spectrum(weight)) * weight_x * weight_y
+
+
+def _filter_offset(rfilter, u, index, size):
+    """Offset in pixels from the pixel's lower corner, drawn from |filter|, and the weight that makes it exact.
+
+    The film normalises by the weights of samples that fell inside it, so the filter is cut at the borders of the image.
+    """
+    radius = rfilter.radius()
+    if rfilter.is_box_filter():
+        return u, mi.Float(1)
+    knots = np.linspace(-radius, radius, 4097)
+    centres = (knots[:-1] + knots[1:]) / 2
+    values = np.array(rfilter.eval(mi.Float(np.abs(centres).astype(np.float32)))).astype(np.float64)
+    cumulative = np.concatenate([[0], np.cumsum(np.abs(values))])
+    signed = np.concatenate([[0], np.cumsum(values)])
+    table, signed_table = mi.Float(cumulative / cumulative[-1]), mi.Float(signed / cumulative[-1])
+    step = 2 * radius / len(values)
+
+    def at(t, x):
+        position = dr.clip((x + radius) / step, 0, len(values))
+        i = dr.minimum(mi.UInt32(position), len(values) - 1)
+        return dr.lerp(dr.gather(mi.Float, t, i), dr.gather(mi.Float, t, i + 1), position - i)
+
+    low, high = -mi.Float(index) - 0.5, mi.Float(size) - 0.5 - mi.Float(index)
+    c0, c1 = at(table, low), at(table, high)
+    target = dr.lerp(c0, c1, u)
+    i = dr.binary_search(0, len(values), lambda k: dr.gather(mi.Float, table, k) < target)
+    i = dr.clip(i, 1, len(values)) - 1
+    a, b = dr.gather(mi.Float, table, i), dr.gather(mi.Float, table, i + 1)
+    x = -radius + (i + dr.clip((target - a) / dr.maximum(b - a, 1e-20), 0, 1)) * step
+    sign = dr.sign(dr.gather(mi.Float, mi.Float(values), i))
+    return x + 0.5, sign * (c1 - c0) / (at(signed_table, high) - at(signed_table, low))

@@ -1,0 +1,52 @@
+"""The paper's renderer: Mitsuba's differentiable path tracer, with fresh samples at every step.
+
+Unbiased, but its noise bends any non-linear loss (docs/architecture.md): it is here as the reference that the paper used, not for speed.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from . import latlong
+from .scene import Scene
+
+AUTO_SPP = 16
+AUTO_DEPTH = 6
+
+
+class PathTracer:
+    """Render a map with path replay backpropagation (Vicini et al. 2021, Mitsuba's ``prb``).
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene; its environment map is replaced at every step.
+    spp : int
+        Samples a pixel, for the picture and again for its gradient.
+    max_depth : int
+        Longest path in segments.
+    seed : int
+        Base seed; every step draws two seeds of its own from it, one for the picture and one for the gradient.
+    """
+
+    def __init__(self, scene: Scene, spp: int | str = "auto", max_depth: int | str = "auto", seed: int = 0):
+        self.scene = scene
+        self.spp = AUTO_SPP if spp == "auto" else spp
+        self.depth = AUTO_DEPTH if max_depth == "auto" else max_depth
+        self.seed = seed
+        self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
+        self._integrator = mi.load_dict({"type": "prb", "max_depth": self.depth, "rr_depth": self.depth + 1})
+        self._index = None
+
+    def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
+        """Render (H, W, 3) linear radiance to (h, w, 3), differentiable in the map."""
+        height, width, _ = envmap.shape
+        if self._index is None:
+            self._index = dr.opaque(mi.UInt32(latlong.halo_index(height, width)))
+        data = dr.gather(mi.Float, envmap.array, self._index)
+        params = self.scene.params
+        params[self.scene.envmap_key] = mi.TensorXf(data, (height, width + 2, 3))
+        params.update()
+        seed = mi.sample_tea_32(2 * step, self.seed)
+        return mi.render(self.scene.mi, params, integrator=self._integrator, spp=self.spp, seed=int(seed[0]), seed_grad=int(seed[1]))

@@ -1,0 +1,171 @@
+"""SIREN: a multi-layer perceptron with sine activations, natively in Dr.Jit.
+
+The network of Sec. 3 and 6.1 of the paper, after Sitzmann et al. 2020: a first sine layer, ``depth`` hidden
+sine layers, a linear layer and a sigmoid::
+
+    h_0 = sin(omega (W_0 x + b_0)),   h_i = sin(omega (W_i h_{i-1} + b_i)),   y = sigmoid(W h_depth + b)
+
+Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out, 1) upwards. Activations are
+(width, N): points are columns, so that a bias gradient is a sum over contiguous memory and every product of
+the reverse pass is one matrix product with a transpose flag, which costs nothing.
+
+The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the price
+of one), and needs two matrix products a layer beside the forward one: that is the least possible.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+Params = dict[str, "mi.TensorXf"]
+
+
+def init(seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inputs: int = 2, outputs: int = 3) -> Params:
+    """Draw the initial weights of a SIREN.
+
+    First layer U(-1/in, 1/in), later ones U(-sqrt(6/in)/omega, sqrt(6/in)/omega) (Sitzmann et al. 2020, Sec. 3.2), biases
+    U(-1/sqrt(in), 1/sqrt(in)) as in the authors' code.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the draw; the same seed gives the same weights on every machine.
+    hidden, depth : int
+        Width, and number of hidden sine layers after the first.
+    omega : float
+        Angular frequency of the sine layers.
+    inputs, outputs : int
+        Size of a coordinate and of a value.
+
+    Returns
+    -------
+    dict
+        ``"i.weight"`` (out, in) and ``"i.bias"`` (out, 1) for i = 0 ... depth + 1.
+    """
+    rng = np.random.default_rng(seed)
+    sizes = [inputs] + [hidden] * (depth + 1) + [outputs]
+    params: Params = {}
+    for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        bound = 1.0 / fan_in if i == 0 else np.sqrt(6.0 / fan_in) / omega
+        bias = 1.0 / np.sqrt(fan_in)
+        params[f"{i}.weight"] = dr.opaque(mi.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)))
+        params[f"{i}.bias"] = dr.opaque(mi.TensorXf(rng.uniform(-bias, bias, (fan_out, 1)).astype(np.float32)))
+    return params
+
+
+def layers(params: Params) -> int:
+    """Count the layers of a parameter dict, the linear one included."""
+    return len(params) // 2
+
+
+def weight_names(params: Params) -> list[str]:
+    """List the weight matrices, first layer first; what adversarial perturbation acts on."""
+    return [f"{i}.weight" for i in range(layers(params))]
+
+
+def coordinates(height: int, width: int) -> mi.TensorXf:
+    """Texel centres as network coordinates (2, H * W), rows (y, x) in (-1, 1), row-major over texels.
+
+    Centres, not corners: the same picture area is covered at every resolution, so that a network fitted at one
+    can be evaluated at another without a shift.
+    """
+    y = (2 * np.arange(height) + 1) / height - 1
+    x = (2 * np.arange(width) + 1) / width - 1
+    grid = np.stack(np.meshgrid(y, x, indexing="ij")).reshape(2, -1)
+    return mi.TensorXf(grid.astype(np.float32))
+
+
+def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, list]:
+    """Evaluate the network.
+
+    Parameters
+    ----------
+    params : dict
+        Weights (see :func:`init`).
+    x : TensorXf
+        Coordinates (inputs, N).
+    omega : float
+        Angular frequency.
+
+    Returns
+    -------
+    y : TensorXf
+        Values (outputs, N) in (0, 1).
+    tape : list
+        Per layer its input and omega * cos, and the output: what :func:`backward` needs.
+    """
+    last = layers(params) - 1
+    tape = []
+    h = x
+    for i in range(last):
+        z = dr.matmul(params[f"{i}.weight"], h) + params[f"{i}.bias"]
+        sine, cosine = dr.sincos(omega * z)
+        slope = omega * cosine
+        dr.eval(sine, slope)
+        tape.append((h, slope))
+        h = sine
+    y = _sigmoid(dr.matmul(params[f"{last}.weight"], h) + params[f"{last}.bias"])
+    tape.append((h, y))
+    return y, tape
+
+
+def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
+    """Pull a gradient of the output back to the parameters.
+
+    Parameters
+    ----------
+    params : dict
+        The weights :func:`forward` was called with.
+    tape : list
+        What it kept.
+    grad : TensorXf
+        Gradient of a scalar with respect to y, (outputs, N).
+
+    Returns
+    -------
+    dict
+        Gradient with respect to every parameter, same names and shapes.
+    """
+    last = layers(params) - 1
+    grads: Params = {}
+    h, y = tape[last]
+    delta = grad * y * (1 - y)
+    for i in range(last, -1, -1):
+        dr.eval(delta)
+        grads[f"{i}.weight"] = dr.matmul(delta, h, Bt=True)
+        grads[f"{i}.bias"] = dr.reshape(type(delta)(dr.sum(delta, axis=1)), (delta.shape[0], 1))
+        if i > 0:
+            slope = tape[i - 1][1]
+            delta = dr.matmul(params[f"{i}.weight"], delta, At=True) * slope
+            h = tape[i - 1][0]
+    # In the order of the parameters: dr.CustomOp.set_grad_in drops, silently, a dict whose keys come in another order.
+    return {name: grads[name] for name in params}
+
+
+def evaluate(params: Params, x: mi.TensorXf, omega: float) -> mi.TensorXf:
+    """Evaluate the network as one differentiable operation: :func:`forward` with :func:`backward` as its adjoint."""
+    return dr.custom(_Siren, params, x, omega)
+
+
+class _Siren(dr.CustomOp):
+    """Glue between the hand-written reverse pass and Dr.Jit's AD graph."""
+
+    def eval(self, params, x, omega):
+        self.params = dict(params)
+        y, self.tape = forward(self.params, x, omega)
+        return y
+
+    def backward(self):
+        self.set_grad_in("params", backward(self.params, self.tape, self.grad_out()))
+        self.tape = None  # activations are the largest memory of a step: let go of them at once
+
+    def name(self):
+        return "siren"
+
+
+def _sigmoid(z):
+    # exp(-|z|) cannot overflow; the two branches meet at 1/2.
+    e = dr.exp(-dr.abs(z))
+    return dr.select(z >= 0, 1, e) / (1 + e)

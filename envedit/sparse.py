@@ -1,0 +1,116 @@
+"""A sparse matrix with colour weights whose product costs what its memory traffic costs.
+
+Rows are grouped in slices of :data:`SLICE` rows of similar length, padded to the longest of the slice and stored
+column by column (sliced ELLPACK, Kreutzer et al. 2014, "SELL-C-sigma"): the lanes of a vector then read neighbouring
+memory. An entry is four floats, (r, g, b, bits of the column index), fetched by one packet load. Each output is summed by
+one lane in a fixed order: the product has no atomics and gives the same bits on every run.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+SLICE = 8
+
+
+class ColourMatrix:
+    """Sparse (rows, columns) matrix of RGB weights: y[i, c] = sum_j w[i, j, c] x[j, c].
+
+    Parameters
+    ----------
+    rows : ndarray of uint32 (nnz,)
+        Row of each entry, in any order.
+    columns : ndarray of uint32 (nnz,)
+        Column of each entry.
+    weights : ndarray of float32 (nnz, 3)
+        Its RGB weight.
+    shape : (int, int)
+        Number of rows and columns.
+    """
+
+    def __init__(self, rows, columns, weights, shape):
+        self.shape = shape
+        self.entries = len(rows)
+        count = np.bincount(rows, minlength=shape[0])
+        by_length = np.argsort(count, kind="stable")[::-1]
+        lane = np.empty(shape[0], np.int64)
+        lane[by_length] = np.arange(shape[0])
+
+        longest = np.zeros(-(-shape[0] // SLICE) * SLICE, np.int64)
+        longest[: shape[0]] = count[by_length]
+        longest = longest.reshape(-1, SLICE).max(axis=1)
+        slice_start = np.concatenate([[0], np.cumsum(longest * SLICE)])
+
+        # Position of every entry within its row, from a stable sort by row.
+        order = np.argsort(rows, kind="stable")
+        first = np.concatenate([[0], np.cumsum(count)[:-1]])
+        sorted_rows = rows[order]
+        within = np.arange(self.entries) - first[sorted_rows]
+        lanes = lane[sorted_rows]
+        position = slice_start[lanes // SLICE] + within * SLICE + lanes % SLICE
+
+        packed = np.zeros((int(slice_start[-1]), 4), np.float32)
+        packed[position, :3] = weights[order]
+        packed[position, 3] = columns[order].astype(np.uint32).view(np.float32)
+        start = (slice_start[lane // SLICE] + lane % SLICE).astype(np.uint32)
+        self.bytes = packed.nbytes
+        self._packed = mi.Float(packed.ravel())
+        self._start = mi.UInt32(start)
+        self._stop = mi.UInt32((start + longest[lane // SLICE] * SLICE).astype(np.uint32))
+        dr.make_opaque(self._packed, self._start, self._stop)
+
+    def apply(self, x: mi.Float) -> mi.Float:
+        """Multiply with a vector of colours.
+
+        Parameters
+        ----------
+        x : Float
+            4 floats per column, (r, g, b, unused), flat: packets are loaded four at a time.
+
+        Returns
+        -------
+        Color3f
+            One colour per row.
+        """
+        return _product(self._packed, x, self._start, self._stop)
+
+
+@dr.syntax
+def _product(packed, x, start, stop):
+    i = mi.UInt32(start)
+    total = mi.Color3f(0)
+    while i < stop:
+        entry = dr.gather(mi.Vector4f, packed, i)
+        value = dr.gather(mi.Vector4f, x, dr.reinterpret_array(mi.UInt32, entry.w))
+        total += mi.Color3f(entry.x * value.x, entry.y * value.y, entry.z * value.z)
+        i += SLICE
+    return total
+
+
+def merge(rows, columns, weights, width):
+    """Sum entries that share row and column.
+
+    Parameters
+    ----------
+    rows, columns : ndarray of integers (n,)
+        Places of the entries.
+    weights : ndarray (n, 3)
+        Their RGB weights.
+    width : int
+        Number of columns.
+
+    Returns
+    -------
+    rows, columns : ndarray of uint32 (m,)
+        Distinct places, ordered by row, then column.
+    weights : ndarray of float32 (m, 3)
+        Sums, accumulated in float64.
+    """
+    key = rows.astype(np.int64) * width + columns
+    order = np.argsort(key)
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]])) if len(key) else np.zeros(0, np.int64)
+    total = np.add.reduceat(weights[order].astype(np.float64), first, axis=0) if len(key) else np.zeros((0, 3))
+    return ((key[first] // width).astype(np.uint32), (key[first] % width).astype(np.uint32), total.astype(np.float32))

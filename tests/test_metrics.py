@@ -1,0 +1,130 @@
+"""Metrics against closed forms and scikit-image's recorded numbers."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from envedit import metrics
+from envedit.errors import ConfigError, InputError
+
+
+def waves(height=40, width=56):
+    """Two images by formula, so that another program can make the same ones."""
+    r, c = np.mgrid[:height, :width]
+    y = np.stack([0.5 + 0.4 * np.sin(0.3 * r + 0.11 * c * k) * np.cos(0.07 * k * c) for k in (1, 2, 3)], -1)
+    return y + 0.1 * np.cos(1.7 * r + 2.3 * c)[..., None], y
+
+
+def sky(rng, height=32, width=64):
+    return (0.2 + rng.random((height, width, 3))).astype(np.float32)
+
+
+def test_psnr_and_mse_of_a_known_error():
+    a = np.zeros((4, 5, 3))
+    assert metrics.mse(a + 0.1, a) == pytest.approx(0.01)
+    assert metrics.psnr(a + 0.1, a) == pytest.approx(20)
+    assert metrics.psnr(a + 0.1, a, data_range=10) == pytest.approx(40)
+    assert metrics.psnr(a + 1e6, a) == pytest.approx(-120)
+
+
+def test_against_scikit_image():
+    """Check against scikit-image 0.26.0 on `waves`: peak_signal_noise_ratio and structural_similarity.
+
+    The latter with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=2``.
+    """
+    x, y = waves()
+    assert metrics.psnr(x, y) == pytest.approx(23.010295007701277, rel=1e-12)
+    assert metrics.ssim(x, y) == pytest.approx(0.7613521445087875, rel=1e-12)
+
+
+def test_compare_states_its_tonemap():
+    a, b = np.full((16, 16, 3), 0.25, np.float32), np.full((16, 16, 3), 3.0, np.float32)
+    result = metrics.compare(a, b)
+    error = (1 - 0.25 ** (1 / 2.2)) ** 2
+    assert result["mse"] == pytest.approx(error) and result["psnr"] == pytest.approx(-10 * math.log10(error))
+    assert result["lpips"] is None and list(result) == ["psnr", "ssim", "mse", "lpips"]
+    assert metrics.compare(a, b, tonemap="linear")["mse"] == pytest.approx(0.75**2)
+    with pytest.raises(ConfigError, match="tonemap"):
+        metrics.compare(a, b, tonemap="gama")
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-30, 65504.0, 1e6, 3e38])
+@pytest.mark.parametrize("shape", [(1, 1, 3), (12, 24, 3)])
+def test_everything_is_finite_or_null(level, shape, rng):
+    a, b = np.full(shape, level, np.float32), rng.random(shape).astype(np.float32)
+    for x, y in ((a, b), (b, a), (a, a)):
+        numbers = [f(x, y) for f in (metrics.log_psnr, metrics.peak_ratio, metrics.mean_luminance_ratio,
+                                     metrics.sun_offset)]  # fmt: skip
+        json.dumps([metrics.compare(x, y), numbers, metrics.high_frequency_energy(x)], allow_nan=False)
+    assert metrics.compare(a, a) == {"psnr": metrics.PSNR_CAP, "ssim": 1.0, "mse": 0.0, "lpips": None}
+
+
+def test_log_psnr_is_normalised_by_the_reference(rng):
+    b = sky(rng)
+    span = math.log((b.max() + 0.01) / (b.min() + 0.01))
+    a = (b + 0.01) * math.exp(0.1 * span) - 0.01  # a tenth of the range brighter everywhere
+    assert metrics.log_psnr(a, b) == pytest.approx(20, abs=1e-4)
+    assert metrics.log_psnr(b, b) == metrics.PSNR_CAP
+    flat = np.ones((2, 2, 3))
+    assert metrics.log_psnr(flat, flat) == metrics.PSNR_CAP and metrics.log_psnr(2 * flat, flat) is None
+
+
+def test_sun_offset_goes_through_the_seam(rng):
+    a, b = sky(rng), sky(rng)
+    a[5, 1], b[8, 61] = 1e4, 2e4
+    assert metrics.peak_position(a) == (5, 1)
+    assert metrics.sun_offset(a, b) == metrics.sun_offset(b, a) == 5  # 3 rows, 4 columns
+    assert metrics.peak_ratio(a, b) == pytest.approx(0.5)
+
+
+def test_peak_is_of_luminance_not_of_a_channel(rng):
+    a = sky(rng)
+    a[3, 3], a[6, 6] = (0, 0, 1000), (0, 200, 0)
+    assert metrics.peak_position(a) == (6, 6)
+
+
+def test_ratios():
+    a = np.zeros((4, 8, 3))
+    b = a + 0.5
+    assert metrics.mean_luminance_ratio(b, 2 * b) == pytest.approx(0.5)
+    assert metrics.peak_ratio(b, a) is None and metrics.mean_luminance_ratio(b, a) is None
+    assert metrics.peak_ratio(a, b) == 0
+
+
+def test_high_frequency_energy_sees_speckle_and_not_gradients(rng):
+    noise = rng.normal(scale=0.1, size=(256, 512, 1))
+    speckle = np.exp(noise) * np.ones(3) - metrics.LOG_EPS
+    # Variance of white noise after the high pass; 131072 texels determine it to about 0.5 %.
+    assert metrics.high_frequency_energy(speckle) == pytest.approx(0.01 * 0.7935, rel=0.03)
+    wave = np.exp(np.sin(2 * np.pi * np.arange(512) / 512))[None, :, None] * np.ones((64, 1, 3))
+    assert metrics.high_frequency_energy(wave) < 1e-6
+    assert metrics.high_frequency_energy(np.roll(speckle, 100, axis=1)) == pytest.approx(
+        metrics.high_frequency_energy(speckle), rel=1e-12)  # fmt: skip
+
+
+PAIRS = ["mse", "psnr", "ssim", "compare", "log_psnr", "sun_offset", "peak_ratio", "mean_luminance_ratio"]
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_unsuitable_images_are_refused(name):
+    function = getattr(metrics, name)
+    a = np.ones((12, 12, 3), np.float32)
+    with pytest.raises(InputError, match=r"differ in shape: \(12, 12, 3\) and \(12, 11, 3\)"):
+        function(a, a[:, :11])
+    with pytest.raises(InputError, match=r"expected an image of shape \(H, W, 3\), got \(12, 12\)"):
+        function(a[..., 0], a[..., 0])
+    for bad in (np.nan, np.inf):
+        b = a.copy()
+        b[7, 2, 1] = bad
+        with pytest.raises(InputError, match="second image: 1 texel.* not finite, .* row 7, column 2"):
+            function(a, b)
+
+
+@pytest.mark.parametrize("function", [metrics.psnr, metrics.ssim])
+@pytest.mark.parametrize("data_range", [0, -1, math.nan])
+def test_data_range_must_be_positive(function, data_range):
+    a = np.ones((12, 12, 3))
+    with pytest.raises(ConfigError, match="data_range must be a positive number"):
+        function(a, a, data_range)

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import config, losses, metrics, optim, siren
+from . import config, losses, metrics, optim, siren, ssim
 
 EPSILON = 0.01
 """Added to radiance inside the logarithm (paper, below Eq. 3)."""
@@ -124,7 +124,7 @@ class Objective:
         self.normalisation, self.settings = normalisation, settings
         self.logs = dr.opaque(mi.TensorXf(normalisation.encode(image).astype(np.float32)))
         self.radiance = dr.opaque(mi.TensorXf(np.ascontiguousarray(image, np.float32)))
-        self.ssim = losses.Ssim(self.logs)
+        self.ssim = ssim.Ssim(self.logs)
 
     def gradient(self, y: mi.TensorXf, only_ssim: bool = False):
         """Return the loss (size-1 array) and its gradient with respect to y."""

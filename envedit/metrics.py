@@ -8,8 +8,9 @@ import math
 
 import numpy as np
 
-from envedit import image as im
 from envedit.errors import ConfigError, InputError
+from envedit.tonemap import luminance
+from envedit.tonemap import tonemap as apply_tonemap
 
 PSNR_CAP = 200.0
 """PSNR of identical images, and the most that is ever reported, in dB: JSON has no infinity."""
@@ -73,7 +74,7 @@ def psnr(a, b, data_range: float = 1.0) -> float:
 
 
 def ssim(a, b, data_range: float = 1.0) -> float:
-    """Compute the mean structural similarity of ``envedit.losses.Ssim``, in double precision.
+    """Compute the mean structural similarity of ``envedit.ssim.Ssim``, in double precision.
 
     Raises
     ------
@@ -84,7 +85,7 @@ def ssim(a, b, data_range: float = 1.0) -> float:
     """
     import mitsuba as mi  # here: the variant, once selected, provides the tensor type
 
-    from envedit.losses import ssim_index
+    from envedit.ssim import ssim_index
 
     a, b = _pair(a, b)
     return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
@@ -105,7 +106,7 @@ def compare(a, b, tonemap: str = "gamma") -> dict:
     ConfigError
         If there is no such tonemap.
     """
-    a, b = (im.tonemap(image, tonemap) for image in _pair(a, b))
+    a, b = (apply_tonemap(image, tonemap) for image in _pair(a, b))
     return {"psnr": psnr(a, b), "ssim": ssim(a, b), "mse": mse(a, b), "lpips": None}
 
 
@@ -143,7 +144,7 @@ def peak_position(image) -> tuple[int, int]:
     InputError
         If the image holds values that are not finite.
     """
-    values = im.luminance(_checked(image, "image"))
+    values = luminance(_checked(image, "image"))
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)
     return int(row), int(column)
 
@@ -177,7 +178,7 @@ def peak_ratio(a, b) -> float | None:
         As `mse`.
     """
     a, b = _pair(a, b)
-    return _ratio(im.luminance(a).max(), im.luminance(b).max())
+    return _ratio(luminance(a).max(), luminance(b).max())
 
 
 def mean_luminance_ratio(a, b) -> float | None:
@@ -191,7 +192,7 @@ def mean_luminance_ratio(a, b) -> float | None:
         As `mse`.
     """
     a, b = _pair(a, b)
-    return _ratio(im.luminance(a).mean(), im.luminance(b).mean())
+    return _ratio(luminance(a).mean(), luminance(b).mean())
 
 
 def high_frequency_energy(image) -> float:
@@ -206,7 +207,7 @@ def high_frequency_energy(image) -> float:
     InputError
         If the image holds values that are not finite.
     """
-    values = _log(im.luminance(_checked(image, "image")))
+    values = _log(luminance(_checked(image, "image")))
     height, width = values.shape
     blurred = sum(
         tap * values[np.clip(np.arange(height) + shift, 0, height - 1)]

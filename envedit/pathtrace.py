@@ -50,3 +50,10 @@ class PathTracer:
         params.update()
         seed = mi.sample_tea_32(2 * step, self.seed)
         return mi.render(self.scene.mi, params, integrator=self._integrator, spp=self.spp, seed=int(seed[0]), seed_grad=int(seed[1]))
+
+    def state(self) -> dict:
+        """Return what a checkpoint must hold: nothing, the seeds follow from the step."""
+        return {}
+
+    def restore(self, state: dict) -> None:
+        """Continue from :meth:`state`."""

@@ -25,29 +25,14 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import latlong
+from . import latlong, stage
 from .errors import ConfigError, InputError, NumericalError
 
 __all__ = ["SHIPPED", "Scene", "load"]
 
-SHIPPED = ("sphere", "mirror", "matte", "statue", "mesh")
+SHIPPED = ("sphere", "mirror", "matte", "statue", "pair", "mesh")
 """Names of the scenes that come with the package."""
 
-# Emitters at infinity that shine from every direction, with the rotation that brings an envmap's zenith (+y)
-# to theirs. Mitsuba's sky models stand upright on z.
-_UPRIGHT_ON_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-_ENVIRONMENTS = {
-    "envmap": np.eye(3),
-    "constant": np.eye(3),
-    "sky": _UPRIGHT_ON_Z,
-    "sunsky": _UPRIGHT_ON_Z,
-    "timed_sunsky": _UPRIGHT_ON_Z,
-}
-_SMOOTH = {"roughconductor": "conductor", "roughplastic": "plastic", "roughdielectric": "dielectric"}
-_SMALLEST_ALPHA = 1e-4  # Mitsuba's own clamp
-_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
-_MESHES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}
-_MOST_WIDTH_PER_HEIGHT = 1.5
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -210,29 +195,29 @@ def load(file, width=None, height=None, parameters=None, base=None) -> Scene:
         if parameters:
             raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
         path, where, folders = None, "scene dict", (base,)
-        state = _told(where, mi.parser.parse_dict, config, file)
+        state = stage.told(where, mi.parser.parse_dict, config, file)
     else:
         path = _find(file)
         where, folders = str(path), (path.parent, base)
         filled = _check_parameters(path, parameters or {})
-        state = _told(where, mi.parser.parse_file, config, str(path), **filled)
-    _told(where, mi.parser.transform_all, config, state)
+        state = stage.told(where, mi.parser.parse_file, config, str(path), **filled)
+    stage.told(where, mi.parser.transform_all, config, state)
 
-    emitter, to_world = _replace_environment(state, where)
+    emitter, to_world = stage.replace_environment(state, where)
     digest = hashlib.sha256(b"envedit scene 1")
-    _set_film(state, where, width, height)
-    _find_files(state, where, folders)
+    stage.set_film(state, where, width, height)
+    stage.find_files(state, where, folders)
     for node in state.nodes:
-        _smooth_limit(state, node)
-        _fit(state, node)
-        _hash_node(digest, node)
+        stage.smooth_limit(state, node)
+        stage.fit_to_stage(state, node)
+        stage.hash_node(digest, node)
     emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
     # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
     for node in state.nodes:
         for name in node.props.keys():  # noqa: SIM118 (no dict)
             node.props.mark_queried(name, False)
 
-    built = _told(where, mi.parser.instantiate, config, state)
+    built = stage.told(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
     if scene.environment() is None or scene.environment().id() != emitter.id():
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
@@ -319,204 +304,7 @@ def _names(path: Path, seen: set) -> tuple[set, set]:
     return used, defaults
 
 
-def _find_files(state, where: str, folders) -> None:
-    """Make every file name absolute; the environment's own bitmap is already gone and need not exist."""
-    for node in state.nodes:
-        if "filename" not in node.props or not isinstance(name := node.props["filename"], str):
-            continue
-        found = [f / name for f in folders if (f / name).is_file()]
-        if not found:
-            kind = str(node.type).rpartition(".")[2].lower()
-            raise InputError(
-                f"{_at(state, node, where)}: the {kind} names a missing file: {name or '(empty)'}\n"
-                f"looked in {' and '.join(dict.fromkeys(map(str, folders)))}"
-            )
-        node.props["filename"] = str(found[0])
-
-
-def _told(where: str, call, *arguments, **filled):
-    """Call the parser, and say in one line what it says in many."""
-    try:
-        return call(*arguments, **filled)
-    except (RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
-        text = re.sub(r"\[[A-Za-z][\w.]*(:\d+)?\] ", "", str(error))
-        text = " ".join(text.split())
-        for prefix in (f"At {where} ", f"Error while loading {where} ", f"While loading {where} ",
-                       f"Parsing of XML file {where} failed: ", f'Parsing of XML file "{where}" failed: ',
-                       'At dictionary node "root": '):  # fmt: skip
-            text = text.replace(prefix, "")
-        raise InputError(f"{where}: {text if len(text) <= 300 else text[:297] + '...'}") from None
-
-
-def _at(state, node, where: str) -> str:
-    return mi.parser.file_location(state, node) if state.files else f"{where}, {node.props.id()}"
-
-
 def _whole(name: str, value, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
         raise ConfigError(f"{name}: came {value!r}, wanted a whole number of at least {low}")
     return int(value)
-
-
-# ----------------------------------------------------------------------------------------------------------
-# Changes to the parsed scene
-
-
-def _replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
-    """Put an ``envmap`` in place of the one environment emitter; return its properties and rotation."""
-    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter]
-    found = [n for n in nodes if n.props.plugin_name() in _ENVIRONMENTS]
-    if len(found) != 1:
-        kinds = ", ".join(n.props.plugin_name() for n in found)
-        what = f"{len(found)} environment emitters ({kinds})" if found else "no environment emitter"
-        raise InputError(f'{where}: {what}; wanted exactly one, such as <emitter type="constant"/>')
-    node, plugin = found[0], found[0].props.plugin_name()
-    matrix = np.eye(4)
-    if plugin != "constant" and "to_world" in node.props:
-        matrix = np.array(node.props["to_world"].matrix, np.float64).reshape(4, 4)
-    rotation = matrix[:3, :3]
-    proper = np.isfinite(rotation).all() and np.linalg.det(rotation) > 0
-    if not proper or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
-        raise InputError(
-            f"{_at(state, node, where)}: to_world of the environment emitter scales, shears or mirrors; "
-            "wanted a rotation (the axis of <rotate> has length 1)"
-        )
-    rotation = rotation @ _ENVIRONMENTS[plugin]
-    matrix = np.eye(4)  # where an environment stands has no meaning: a translation is dropped
-    matrix[:3, :3] = rotation
-    taken = {n.props.id() for n in state.nodes if n is not node}
-    emitter = mi.Properties("envmap")
-    emitter.set_id(next(name for i in range(len(taken) + 1) if (name := f"envmap{i or ''}") not in taken))
-    emitter["to_world"] = mi.ScalarTransform4d(matrix)
-    node.props = emitter
-    return node.props, rotation
-
-
-def _set_film(state, where: str, width: int, height: int) -> None:
-    """Give the first sensor's film the asked size and float32 RGB pixels."""
-    sensors = [n for n in state.nodes if n.type == mi.ObjectType.Sensor]
-    if not sensors:
-        raise InputError(f'{where}: the scene has no sensor; add <sensor type="perspective">')
-    inside = [
-        state.nodes[v.index()]
-        for _, v in sensors[0].props.items()
-        if isinstance(v, mi.Properties.ResolvedReference)
-    ]
-    films = [n for n in inside if n.type == mi.ObjectType.Film]
-    if not films or films[0].props.plugin_name() != "hdrfilm":
-        raise InputError(f'{_at(state, sensors[0], where)}: the sensor needs a <film type="hdrfilm">')
-    film = films[0].props
-    own = [int(film.get("width", 768)), int(film.get("height", 576))]  # Mitsuba's defaults
-    if width or height:
-        if any(str(name).startswith("crop_") for name, _ in film.items()):
-            raise ConfigError(
-                f"scene.width: the film of {where} is cropped; remove the crop or leave width and height"
-            )
-        if not height:
-            height = max(1, round(width * own[1] / own[0]))
-        if not width:
-            width = max(1, round(height * own[0] / own[1]))
-        film["width"], film["height"] = width, height
-    film["pixel_format"], film["component_format"] = "rgb", "float32"
-
-
-def _smooth_limit(state, node) -> None:
-    """Turn a rough BSDF of roughness zero into the smooth one; refuse a negative roughness."""
-    props = node.props
-    if node.type != mi.ObjectType.BSDF or props.plugin_name() not in _SMOOTH:
-        return
-    alphas = [k for k in ("alpha", "alpha_u", "alpha_v") if isinstance(props.get(k, None), float | int)]
-    for key in alphas:
-        if not props[key] >= 0:
-            where = _at(state, node, "scene")
-            raise ConfigError(f"{where}: roughness {key} is {props[key]}, wanted 0 or more")
-    if alphas and all(props[k] <= _SMALLEST_ALPHA for k in alphas):
-        for key in (*alphas, "distribution", "sample_visible"):
-            if key in props:
-                del props[key]
-        props.set_plugin_name(_SMOOTH[props.plugin_name()])
-
-
-def _fit(state, node) -> None:
-    """Set a shape that carries ``fit_height`` on the plane y = 0, centred and scaled; see the module."""
-    props = node.props
-    if node.type != mi.ObjectType.Shape or "fit_height" not in props:
-        return
-    where = _at(state, node, "scene")
-    target, up = float(props["fit_height"]), str(props.get("fit_up", "y")).lower()
-    for key in ("fit_height", "fit_up"):
-        if key in props:
-            del props[key]
-    if not (np.isfinite(target) and target > 0):
-        raise ConfigError(f"{where}: fit_height is {target}, wanted a positive number")
-    if up.removeprefix("-") not in _AXES:
-        raise ConfigError(f"{where}: the up axis is {up!r}, wanted x, y, z, -x, -y or -z")
-    filename = str(props.get("filename", ""))
-    if filename:
-        if (suffix := Path(filename).suffix.lower()) not in _MESHES:
-            raise InputError(f"{filename}: cannot read a mesh of this kind; wanted {', '.join(_MESHES)}")
-        props.set_plugin_name(_MESHES[suffix])
-
-    # First the mesh's own up to +y, then the author's to_world (a turn about y, say), then size and place.
-    transform = np.eye(4)
-    transform[:3, :3] = _upright(up)
-    if "to_world" in props:
-        transform = np.array(props["to_world"].matrix, np.float64).reshape(4, 4) @ transform
-    props["to_world"] = mi.ScalarTransform4d(transform)
-    probe = {k: v for k, v in props.items() if not isinstance(v, mi.Properties.ResolvedReference)}
-    box = _told(where, mi.load_dict, {"type": props.plugin_name(), **probe}).bbox()
-    low, high = (np.array(v, np.float64).ravel() for v in (box.min, box.max))
-    extent = high - low
-    if not (np.isfinite(extent).all() and extent[1] > 0):
-        raise InputError(f"{filename or where}: the mesh has no height along its up axis {up}")
-    scale = min(target / extent[1], _MOST_WIDTH_PER_HEIGHT * target / max(extent[0], extent[2], 1e-30))
-    place = np.eye(4)
-    place[:3, :3] *= scale
-    place[:3, 3] = -scale * np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    props["to_world"] = mi.ScalarTransform4d(place @ transform)
-
-
-def _upright(up: str) -> np.ndarray:
-    """Return the rotation ``(3, 3)`` about a coordinate axis that brings an axis to +y."""
-    a = np.array(_AXES[up.removeprefix("-")], float) * (-1 if up.startswith("-") else 1)
-    y = np.array([0.0, 1, 0])
-    v, c = np.cross(a, y), a @ y
-    if c < -0.5:
-        return np.diag([1.0, -1, -1])
-    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + c)
-
-
-# ----------------------------------------------------------------------------------------------------------
-# Digest
-
-
-def _hash_node(digest, node) -> None:
-    digest.update(f"{node.type}|{node.props.plugin_name()}\n".encode())
-    for key, value in node.props.items():
-        digest.update(f"{key}=".encode())
-        if key == "filename":
-            digest.update(hashlib.sha256(Path(value).read_bytes()).digest())
-        else:
-            _hash_value(digest, value)
-
-
-def _hash_value(digest, value) -> None:
-    if isinstance(value, bool | int | float | str):
-        digest.update(repr(value).encode())
-    elif isinstance(value, mi.Properties.ResolvedReference):
-        digest.update(f"@{value.index()}".encode())
-    elif hasattr(value, "matrix"):
-        digest.update(np.array(value.matrix, np.float64).tobytes())
-    elif hasattr(value, "wavelengths"):
-        digest.update(repr((list(value.wavelengths), list(value.values))).encode())
-    elif isinstance(value, mi.Object) and not isinstance(value, mi.Bitmap):
-        digest.update(type(value).__name__.encode())
-        for key, inner in mi.traverse(value).items():
-            digest.update(key.rpartition(".")[2].encode())
-            _hash_value(digest, inner)
-    else:
-        array = np.array(value)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.tobytes() if array.dtype != object else repr(value).encode())
-    digest.update(b"\n")

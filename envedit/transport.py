@@ -26,11 +26,12 @@ from . import latlong, paths
 from .errors import InputError
 from .sparse import SLICE, ColourMatrix, merge
 
-DEPTH_TOLERANCE = 0.005
+DEPTH_TOLERANCE = 0.002
 MAX_BOUNCES = 8
-COLUMN_TOLERANCE = 0.005
+COLUMN_TOLERANCE = 0.03
 COLUMN_PATHS = (8, 48)
 SHARE_OF_A_LIGHT = 0.01
+RESOLVE_EVERY = 10
 _LANES = 1 << 18
 
 
@@ -129,16 +130,13 @@ class LightTransport:
         Texels that have an exact column.
     """
 
-    def __init__(self, scene, grid, spp, bounces, seed, capacity, entries, offset, choices):
-        rows, columns, weights = entries
+    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices, progress):
         texels, pixels = grid.height * grid.width, scene.height * scene.width
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
-        self.spp, self.bounces, self.seed, self.capacity = spp, bounces, seed, capacity
-        self.forward = ColourMatrix(rows, columns, weights, (pixels, texels))
-        self.reverse = ColourMatrix(columns, rows, weights, (texels, pixels))
-        influence = np.bincount(columns, weights.astype(np.float64).mean(axis=1), minlength=texels)
-        self.influence = influence.reshape(grid.height, grid.width).astype(np.float32)
-        self.choices = choices
+        self.spp, self.bounces, self.capacity, self.refresh, self.choices = spp, bounces, capacity, refresh, choices
+        self.epoch, self._base_seed = 0, seed
+        offset = _other_light(scene)
+        self._record(progress)
         self.columns = np.zeros(0, np.int64)
         self._slot_of = np.full(texels, -1, np.int64)
         self._paths_of = np.zeros(texels, np.int64)
@@ -151,8 +149,42 @@ class LightTransport:
 
     # ------------------------------------------------------------------ building
 
+    @property
+    def seed(self) -> int:
+        """Seed of the present recording."""
+        return self._base_seed + 1_000_003 * self.epoch
+
+    def _record(self, progress=None):
+        """Trace the coarse tier with the seed of the present epoch."""
+        texels, pixels = self.grid.height * self.grid.width, self.shape[0] * self.shape[1]
+        block = max(1, _LANES // self.spp)
+        starts = range(0, pixels, block)
+        parts = []
+        for i, start in enumerate(starts):
+            some = np.arange(start, min(start + block, pixels), dtype=np.uint32)
+            parts.append(_record(self.scene.mi, self.grid, some, self.spp, self.bounces, self.seed))
+            if progress:
+                progress(i + 1, len(starts))
+        rows, columns, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        self.forward = ColourMatrix(rows, columns, weights, (pixels, texels))
+        self.reverse = ColourMatrix(columns, rows, weights, (texels, pixels))
+        influence = np.bincount(columns, weights.astype(np.float64).mean(axis=1), minlength=texels)
+        self.influence = influence.reshape(self.grid.height, self.grid.width).astype(np.float32)
+
+    def _retrace(self, epoch):
+        """Record everything again with other samples: a new, independent estimate of the same T."""
+        self.epoch = epoch
+        self._record()
+        self._retrace_columns()
+
+    def _retrace_columns(self):
+        paths_of = self._paths_of[self.columns]
+        for count in np.unique(paths_of)[::-1]:
+            self._trace_columns(self.columns[paths_of == count], int(count))
+
     @classmethod
-    def build(cls, scene, height: int, width: int, *, spp="auto", max_depth="auto", seed: int = 0, memory_gb=2.0, progress=None):
+    def build(cls, scene, height: int, width: int, *, spp="auto", max_depth="auto", seed: int = 0, memory_gb=2.0,
+              refresh: int = 0, progress=None):
         """Trace T.
 
         Parameters
@@ -170,6 +202,8 @@ class LightTransport:
             Seed of the recording.
         memory_gb : float
             Bound on the memory of T.
+        refresh : int
+            Steps after which :meth:`render` records T afresh; 0: never.
         progress : callable, optional
             Called with (done, total) pixel blocks.
 
@@ -215,15 +249,7 @@ class LightTransport:
         choices.append(f"light transport: {spp} paths a pixel, up to {capacity} exact columns, "
                        f"about {coarse_gb + capacity * 16e-9 * len(pixels):.2g} of {memory_gb:g} GB")
 
-        parts = []
-        block = max(1, _LANES // spp)
-        starts = range(0, len(pixels), block)
-        for i, start in enumerate(starts):
-            parts.append(_record(scene.mi, grid, pixels[start : start + block], spp, bounces, seed))
-            if progress:
-                progress(i + 1, len(starts))
-        entries = tuple(np.concatenate(part) for part in zip(*parts, strict=True))
-        return cls(scene, grid, spp, bounces, seed, capacity, entries, _other_light(scene), choices)
+        return cls(scene, grid, spp, bounces, seed, capacity, refresh, choices, progress)
 
     @property
     def memory_bytes(self) -> int:
@@ -243,9 +269,30 @@ class LightTransport:
         return self._adjoint(image)
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
-        """Render a map: the interface that all renderers share. T does not depend on the step."""
-        del step
+        """Render a map: the interface that all renderers share.
+
+        T does not depend on the step; but now and then it is checked whether the map has grown bright where T is coarse.
+        """
+        if self.refresh and step // self.refresh != self.epoch:
+            self._retrace(step // self.refresh)
+        if step % RESOLVE_EVERY == 0:
+            self.resolve(dr.detach(envmap).numpy())
         return self.apply(envmap)
+
+    def state(self) -> dict:
+        """Return what a checkpoint must hold: which columns are exact, in their order, and how many paths each was traced with."""
+        return {"columns": self.columns, "paths": self._paths_of[self.columns], "epoch": np.int64(self.epoch)}
+
+    def restore(self, state: dict) -> None:
+        """Trace the columns of an earlier :meth:`state`."""
+        if int(state["epoch"]) != self.epoch:
+            self.epoch = int(state["epoch"])
+            self._record()
+        # The same slots as before: the order of a sum is part of its result.
+        self.columns = state["columns"].astype(np.int64)
+        self._slot_of[self.columns] = np.arange(len(self.columns))
+        self._paths_of[self.columns] = state["paths"]
+        self._retrace_columns()
 
     def _check(self, tensor, shape, what):
         if tuple(tensor.shape) != shape:
@@ -357,15 +404,7 @@ class LightTransport:
             dr.eval(place, first_of_pixel)
             for event in paths.trace(self.scene.mi, some, count, self.bounces, self.seed + 7919):
                 if isinstance(event, paths.Escape):
-                    taps, _, jacobian = grid.locate(event.direction)
-                    weight = _bsdf_weight(event.pdf, uniform / jacobian) / mi.Float(per_pixel)
-                    for texel, share in taps:
-                        slot = dr.gather(mi.Int32, traced, texel)
-                        value = event.throughput * (weight * share)
-                        target = place + mi.UInt32(slot) * SLICE
-                        for c in range(3):
-                            dr.scatter_add(self._exact, value[c], target * 4 + c, event.active & (slot >= 0))
-                    dr.eval(self._exact)
+                    self._add_escapes(event, traced, place, uniform, count)
                     continue
                 for texel in texels:
                     row, column = divmod(int(texel), grid.width)
@@ -386,6 +425,25 @@ class LightTransport:
         self._coarse_mask = mi.Float(mask)
         self._count = dr.opaque(mi.UInt32, len(self.columns))
         dr.make_opaque(self._texel_of, self._coarse_mask)
+
+    def _add_escapes(self, event, slot_of, place, uniform, count):
+        """Add paths that left the scene towards the traced texels. Few do; summed on the host, in a fixed order."""
+        taps, _, jacobian = self.grid.locate(event.direction)
+        weight = _bsdf_weight(event.pdf, uniform / jacobian) / count
+        targets, values = [], []
+        for texel, share in taps:
+            slot = dr.gather(mi.Int32, slot_of, texel)
+            keep = dr.compress(event.active & (slot >= 0) & (weight * share > 0))
+            value = dr.gather(mi.Color3f, event.throughput * (weight * share), keep) if len(keep) else None
+            if value is not None:
+                targets.append(dr.gather(mi.UInt32, place + mi.UInt32(slot) * SLICE, keep).numpy())
+                values.append(value.numpy().T)
+        if targets:
+            _, target, value = merge(np.zeros(sum(map(len, targets)), np.uint32), np.concatenate(targets),
+                                     np.concatenate(values), len(self._exact) // 4)
+            for c in range(3):
+                dr.scatter_add(self._exact, mi.Float(value[:, c].copy()), mi.UInt32(target) * 4 + c)
+            dr.eval(self._exact)
 
     def _clear(self, slots):
         """Set the exact columns in ``slots`` to zero."""

@@ -1,31 +1,22 @@
-"""The configuration: defaults, precedence, refusals by name, and the way back to TOML."""
+"""The configuration: defaults, overrides, refusals by name, and the way to TOML and back."""
 
 import dataclasses
 import math
 import string
 import tomllib
 
-import numpy as np
 import pytest
+from helpers import refused
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from envedit import config as cfg
 from envedit.errors import ConfigError
+from envedit.tonemap import TONEMAPS
 
 quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 
-
-def refused(text, *overrides, **kwargs) -> str:
-    with pytest.raises(ConfigError) as info:
-        cfg.loads(text, name="a.toml", overrides=overrides, **kwargs)
-    message = str(info.value)
-    assert info.value.exit_code == 2
-    assert len(message.splitlines()) == 1 and len(message) < 400
-    return message
-
-
-# ---- defaults and presets ----------------------------------------------------------------------------------
+# ---- defaults ----------------------------------------------------------------------------------------------
 
 
 def test_an_empty_file_gives_the_defaults():
@@ -34,33 +25,7 @@ def test_an_empty_file_gives_the_defaults():
     assert config == dataclasses.replace(cfg.Config(), output=config.output)
     assert config.input == cfg.Input(envmap="sunsky", width=256, rows="upper")
     assert config.fit.lr == 2e-3 and config.renderer.spp == "auto" and config.loss.ssim == 1.0
-
-
-def test_standard_is_the_defaults_and_the_presets_are_named():
-    assert cfg.PRESETS["standard"] == {}
-    assert cfg.preset_names() == ("draft", "standard", "paper")
-
-
-@pytest.mark.parametrize("preset", cfg.preset_names())
-def test_every_preset_takes_effect_key_by_key(preset):
-    config = cfg.loads("", preset=preset)
-    assert config.preset == preset
-    for table, keys in cfg.PRESETS[preset].items():
-        for key, value in keys.items():
-            assert getattr(getattr(config, table), key) == value, (table, key)
-
-
-def test_the_paper_preset_is_section_6():
-    paper = cfg.loads("", preset="paper")
-    assert paper.representation == cfg.Representation(kind="siren", hidden=256, depth=6, omega=30)
-    fit = paper.fit
-    assert (fit.epochs, fit.lr, fit.schedule, fit.restart_period) == (1500, 5e-5, "warm-restarts", 100)
-    assert (fit.log_mse, fit.log_ssim, fit.hdr) == (0.85, 0.25, 1e-2)
-    assert (fit.awp_gamma, fit.awp_lr) == (0.01, 1e-4)
-    assert (paper.optimizer.lr, paper.optimizer.iterations) == (5e-6, 400)
-    assert (paper.loss.ssim, paper.loss.dists) == ((1, 1e4), 0.6)
-    assert paper.loss.luminance == paper.loss.l1 == (1e-4, 1e-8)
-    assert (paper.input.width, paper.input.rows, paper.renderer.kind) == (256, "upper", "path")
+    assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
 
 
 def test_every_key_says_what_it_means():
@@ -69,27 +34,13 @@ def test_every_key_says_what_it_means():
     assert "turbidity : float" in cfg.Input.__doc__ and "variant : str" in cfg.Config.__doc__
 
 
-def test_tonemaps_are_those_of_the_image_module():
-    from envedit import image
-
-    assert set(cfg.TONEMAPS) == set(image.TONEMAPS)
-
-
-# ---- precedence --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", TONEMAPS)
+def test_tonemaps_are_those_of_the_image_module(name):
+    config = cfg.from_dict({"output": {"tonemap": name}, "target": {"tonemap": name}})
+    assert config.output.tonemap == config.target.tonemap == name
 
 
-def test_default_then_preset_then_file_then_override():
-    assert cfg.loads("").fit.epochs == 600
-    assert cfg.loads('preset = "draft"').fit.epochs == 150
-    assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7').fit.epochs == 7
-    assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7', overrides=["fit.epochs=8"]).fit.epochs == 8
-    assert cfg.loads("", overrides=["fit.epochs=8", "fit.epochs=9"]).fit.epochs == 9
-
-
-def test_the_preset_argument_beats_override_beats_file():
-    assert cfg.loads('preset = "draft"', overrides=["preset=paper"]).preset == "paper"
-    config = cfg.loads('preset = "draft"', preset="standard", overrides=["preset=paper"])
-    assert config.preset == "standard" and config.fit.epochs == 600
+# ---- overrides ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -118,11 +69,6 @@ def test_an_override_without_key_or_value_is_refused(text):
         cfg.parse_override(text)
 
 
-def test_scene_parameters_are_merged_key_by_key():
-    config = cfg.loads("[scene.parameters]\na = 1\nb = true", overrides=["scene.parameters.a=glossy"])
-    assert config.scene.parameters == {"a": "glossy", "b": True}
-
-
 # ---- refusals ----------------------------------------------------------------------------------------------
 
 
@@ -141,8 +87,9 @@ def test_scene_parameters_are_merged_key_by_key():
         ('[fit]\nschedule = "cosin"', ["fit.schedule: came 'cosin'", "did you mean cosine?"]),
         ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
         ("[target]\nkind = 'image'", ["target.file", "wanted the painted image"]),
-        ("[target]\nkind = 'strokes'", ["target.strokes: came 0 strokes"]),
-        ("[[target.strokes]]\ntype = 'fill'", ["target.strokes: came 1 strokes", 'kind = "envmap"']),
+        ("[target]\nkind = 'strokes'", ["target.kind: came 'strokes'", "comes later"]),
+        ("[[target.strokes]]\ntype = 'fill'", ["target.strokes: came 1 strokes", "comes later"]),
+        ("[target]\nkind = 'imgae'", ["target.kind: came 'imgae'", "did you mean image?"]),
         ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: came [0, 64], wanted rows below 64"]),
         ("[loss]\nssim = 0", ["loss.ssim, loss.image_l1: came 0 for both"]),
         ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["came 0 for all"]),
@@ -159,100 +106,11 @@ def test_a_refusal_says_where_what_and_what_to_do(text, parts):
         assert part in message
 
 
-@pytest.mark.parametrize(
-    "key, values",
-    [
-        ("seed", ["-1", "4294967296", "1.0", "true", '"1"']),
-        ("variant", ['"scalar_rgb"', "1"]),
-        ("input.width", ["2", "3", "257", "256.0", "true", "32768", "[256]"]),
-        ("input.rows", ['"lower"', "[3]", "[5, 3]", "[-1, 3]", "[0, 1.5]", "{a = 1, b = 2}", "3"]),
-        ("input.envmap", ['""', "3", '"a\\u0000"', "1979-05-27"]),
-        ("input.elevation", ["-1", "91"]),
-        ("scene.height", ["-1"]),
-        ("scene.parameters", ["3", "{a = [1]}", "{a = nan}", "{a = {b = 1}}", "{a = 12:30:00}"]),
-        ("target.strokes", ["[1]", "{}", "[{a = inf}]"]),
-        ("representation.hidden", ["0", "-128", "true"]),
-        ("representation.omega", ["0", "-30.0"]),
-        ("fit.epochs", ["-1", "1.5", "nan", '"many"']),
-        ("fit.lr", ["0", "-0.0", "-1e-4", "nan", "inf", "true", '"auto"', "1e-46", "1e39", "[1, 2]"]),
-        ("fit.awp_gamma", ["-0.1", "1.1"]),
-        ("fit.cache", ["1", '"yes"']),
-        ("loss.ssim", ["-1", "[1]", "[0, 1]", "[1, 0]", "[1, -1]", "[1, 2, 3]", '["a", 1]', "nan", "true"]),
-        ("renderer.spp", ["0", '"Auto"', "1.5", "true"]),
-        ("renderer.memory_gb", ["0", "-1", "nan"]),
-        ("output.tonemap", ['"reinhard"', "1"]),
-        ("output.report", ["0"]),
-    ],
-)
-def test_values_out_of_type_or_range_are_refused_by_name(key, values):
-    for value in values:
-        message = refused(".".join(key.split(".")) + f" = {value}")
-        assert message.startswith(f"a.toml: {key}: came ") and ", wanted " in message
-        assert message.count("wanted") == 1
-
-
 def test_an_error_names_the_override_it_came_from():
     assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: came -3, wanted")
     assert "did you mean epochs?" in refused("", "fit.epoch=3")
     assert "wanted a table" in refused("", "fit=3")
     assert "preset: came 'fast'" in refused("", preset="fast")
-
-
-def test_replacing_a_field_is_checked_as_well():
-    with pytest.raises(ConfigError, match=r"fit\.epochs: came -1, wanted an integer from 0"):
-        dataclasses.replace(cfg.Fit(), epochs=-1)
-    with pytest.raises(ConfigError, match=r"fit: came 3, wanted a table"):
-        cfg.Config(fit=3)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        cfg.Fit().epochs = 3
-
-
-def test_numbers_are_normalised():
-    config = cfg.from_dict({"fit": {"lr": np.float32(0.5), "epochs": np.int64(3)}, "loss": {"ssim": [1, 2]}})
-    assert type(config.fit.lr) is float and type(config.fit.epochs) is int
-    assert config.loss.ssim == (1.0, 2.0)
-    assert type(cfg.loads("[fit]\nlr = 1").fit.lr) is float
-
-
-# ---- targets -----------------------------------------------------------------------------------------------
-
-
-def test_a_target_file_means_no_rotation_and_the_last_source_wins():
-    assert cfg.loads("").target.rotate_degrees == 60
-    assert cfg.loads("[target]\nfile = 'b.exr'").target.rotate_degrees == 0
-    turned = cfg.loads("[target]\nfile = 'b.exr'", overrides=["target.rotate_degrees=5"]).target
-    assert turned.file == "" and turned.rotate_degrees == 5
-    other = cfg.loads("[target]\nrotate_degrees = 5", base_dir="/d", overrides=["target.file=b.exr"]).target
-    assert other.file == "/d/b.exr" and other.rotate_degrees == 0
-    painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5").target
-    assert painted.file == "/b.exr"
-
-
-# ---- files and paths ---------------------------------------------------------------------------------------
-
-
-def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
-    folder = tmp_path / "project"
-    folder.mkdir()
-    text = (
-        "[input]\nenvmap = 'maps/sky.exr'\n[scene]\nfile = 'room.xml'\n"
-        "[target]\nkind = 'image'\nfile = '/abs/t.png'\nmask = 'm.png'\n"
-    )
-    (folder / "edit.v2.toml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    monkeypatch.chdir(tmp_path)
-    config = cfg.load("project/edit.v2.toml", overrides=["target.mask=n.png"])
-    assert config.input.envmap == str(folder / "maps/sky.exr")
-    assert config.scene.file == str(folder / "room.xml")
-    assert config.target.file == "/abs/t.png"
-    assert config.target.mask == str(folder / "n.png")
-    assert config.output.dir == str(folder / "edit.v2_out")
-
-
-def test_names_that_are_no_paths_stay():
-    config = cfg.loads("[scene]\nfile = 'mirror'", base_dir="/d")
-    assert config.scene.file == "mirror" and config.input.envmap == "sunsky" and config.target.file == ""
-    config = cfg.loads("[scene]\nfile = './mirror'\n[input]\nenvmap = './sunsky'", base_dir="/d")
-    assert config.scene.file == "/d/mirror" and config.input.envmap == "/d/sunsky"
 
 
 def test_unreadable_files_are_refused(tmp_path):
@@ -284,11 +142,6 @@ words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"
 numbers = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
 rates = st.floats(2.0**-100, 1e6)
 weights = rates | st.just(0.0) | st.tuples(rates, rates).map(list)
-plain = st.recursive(
-    words | numbers | st.booleans() | st.integers(-(2**63), 2**63 - 1),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
-    max_leaves=6,
-)
 
 
 def given_keys(**keys):
@@ -308,17 +161,11 @@ tables = given_keys(
         parameters=st.dictionaries(words, words | numbers | st.booleans() | st.integers(-9, 9), max_size=3),
     ),
     target=given_keys(file=words, mask=words, spp=st.integers(1, 4096))
-    | given_keys(rotate_degrees=st.floats(-360, 360, allow_subnormal=False, width=32))
-    | st.fixed_dictionaries(
-        {
-            "kind": st.just("strokes"),
-            "strokes": st.lists(st.dictionaries(words, plain), min_size=1, max_size=3),
-        }
-    ),
+    | given_keys(rotate_degrees=st.floats(-360, 360, allow_subnormal=False, width=32)),
     loss=given_keys(ssim=rates | st.tuples(rates, rates), luminance=weights, tv=weights),
-    optimizer=given_keys(lr=rates, iterations=st.integers(0, 10**7)),
+    optimizer=given_keys(lr=rates | st.just("auto"), iterations=st.integers(0, 10**7)),
     renderer=given_keys(spp=st.integers(1, 512) | st.just("auto"), memory_gb=rates | st.just("auto")),
-    output=given_keys(dir=words, tonemap=st.sampled_from(cfg.TONEMAPS)),
+    output=given_keys(dir=words, tonemap=st.sampled_from(list(TONEMAPS))),
 )
 
 

@@ -1,3 +1,5 @@
+"""Loading and rendering scenes: against Mitsuba itself, closed forms, and files broken on purpose."""
+
 import importlib.util
 import re
 from pathlib import Path
@@ -5,29 +7,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
 from envedit import latlong, scene
 from envedit.errors import ConfigError, InputError, NumericalError
 
 SCENES = Path(__file__).parent.parent / "scenes"
-
-SENSOR = """<sensor type="perspective"><float name="fov" value="40"/>
-    <transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/>
-    <rfilter type="box"/></film></sensor>"""
-BALL = """<shape type="sphere"><bsdf type="diffuse">
-    <rgb name="reflectance" value="0.2, 0.4, 0.6"/></bsdf></shape>"""
-LIGHT = '<emitter type="constant"/>'
-
-
-def write(folder, *parts, name="test.xml"):
-    path = folder / name
-    path.write_text('<scene version="3.0.0">' + "\n".join(parts) + "</scene>")
-    return path
-
-
-def sky(rng, height=8, width=16):
-    return rng.random((height, width, 3), dtype=np.float32) ** 4 * 3
 
 
 # ---- rendering ---------------------------------------------------------------------------------------------
@@ -37,12 +22,12 @@ def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(
     image = sky(rng)
     turn = '<transform name="to_world"><rotate x="0.48" y="0.8" z="0.36" angle="70"/></transform>'
     missing = f'<emitter type="envmap"><string name="filename" value="not-there.exr"/>{turn}</emitter>'
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, missing))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, missing))
     ours = loaded.render(image, spp=16, seed=3, max_depth=4)
 
     mi.Bitmap(image).write(str(tmp_path / "sky.exr"))
     there = f'<emitter type="envmap"><string name="filename" value="sky.exr"/>{turn}</emitter>'
-    theirs = mi.load_file(str(write(tmp_path, SENSOR, BALL, there, name="theirs.xml")))
+    theirs = mi.load_file(str(write_scene(tmp_path, SENSOR, BALL, there, name="theirs.xml")))
     seed = int(np.random.SeedSequence([3, 0]).generate_state(1)[0])
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
     expected = np.array(mi.render(theirs, integrator=integrator, spp=16, seed=seed))
@@ -55,25 +40,25 @@ def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(
 
 
 def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     picture = loaded.render(np.ones((8, 16, 3)), spp=256)
     np.testing.assert_allclose(picture[0, 0], 1.0, rtol=1e-6)
     np.testing.assert_allclose(picture[5:7, 7:9].mean(axis=(0, 1)), [0.2, 0.4, 0.6], rtol=0.02)
 
 
 def test_resolution_may_change_between_renderings(tmp_path, rng):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     small, large = sky(rng), sky(rng, 32, 64)
     first = loaded.render(small, spp=8)
     other = loaded.render(large, spp=8)
     assert np.array_equal(loaded.render(small, spp=8), first)
-    fresh = scene.load(write(tmp_path, SENSOR, BALL, LIGHT)).render(large, spp=8)
+    fresh = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(large, spp=8)
     assert np.array_equal(other, fresh) and not np.array_equal(other, first)
 
 
 def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
     lamp = '<emitter type="point"><point name="position" x="2" y="3" z="4"/></emitter>'
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT, lamp))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT, lamp))
     dark = loaded.render(np.zeros((8, 16, 3)), spp=64)
     lit = loaded.render(np.ones((8, 16, 3)), spp=256)
     assert dark[0, 0].max() == 0 and dark.max() > 0.01
@@ -83,7 +68,7 @@ def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
 
 
 def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, monkeypatch):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     image = sky(rng)
     whole = loaded.render(image, spp=10)
     calls = []
@@ -104,7 +89,7 @@ def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, mon
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e6])
 def test_extreme_maps_render_in_proportion(tmp_path, value):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     one = loaded.render(np.ones((8, 16, 3)), spp=8)
     many = loaded.render(np.full((8, 16, 3), value), spp=8)
     np.testing.assert_allclose(many, one * np.float32(value), rtol=1e-4)
@@ -112,7 +97,7 @@ def test_extreme_maps_render_in_proportion(tmp_path, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e-3, 1e300])
 def test_a_bad_texel_is_named_and_not_rendered(tmp_path, value):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     image = np.ones((8, 16, 3))
     image[3, 5, 1] = value
     with pytest.raises(NumericalError, match=r"1 texels .* row 3, column 5: \S+ in G"):
@@ -120,7 +105,7 @@ def test_a_bad_texel_is_named_and_not_rendered(tmp_path, value):
 
 
 def test_a_non_finite_rendering_is_refused(tmp_path, monkeypatch):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     picture = np.ones((12, 16, 3))
     picture[2, 7, 0] = np.nan
     monkeypatch.setattr(mi, "render", lambda *a, **k: picture)
@@ -131,49 +116,13 @@ def test_a_non_finite_rendering_is_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize("given", [{"spp": 0}, {"spp": 1.5}, {"seed": -1}, {"max_depth": -2}, {"spp": True}])
 def test_unusable_rendering_settings_are_refused(tmp_path, given):
     with pytest.raises(ConfigError, match=next(iter(given))):
-        scene.load(write(tmp_path, SENSOR, BALL, LIGHT)).render(np.ones((8, 16, 3)), **given)
+        scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(np.ones((8, 16, 3)), **given)
 
 
 @pytest.mark.parametrize("image", [np.ones((8, 16)), np.ones((8, 16, 4)), np.ones((2, 4, 3)), "sky.exr"])
 def test_a_map_of_the_wrong_shape_is_refused(tmp_path, image):
     with pytest.raises(InputError):
-        scene.load(write(tmp_path, SENSOR, BALL, LIGHT)).set_envmap(image)
-
-
-# ---- film, camera, emitter ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "asked, size",
-    [({}, (16, 12)), ({"width": 32}, (32, 24)), ({"height": 6}, (8, 6)), ({"width": 5, "height": 7}, (5, 7))],
-)
-def test_film_size(tmp_path, asked, size):
-    loaded = scene.load(write(tmp_path, SENSOR, BALL, LIGHT), **asked)
-    assert (loaded.width, loaded.height) == size
-    assert loaded.render(np.ones((3, 6, 3)), spp=1).shape == (size[1], size[0], 3)
-
-
-def test_a_cropped_film_keeps_its_crop_and_refuses_a_size(tmp_path):
-    crop = "".join(f'<integer name="crop_{k}" value="{v}"/>' for k, v in
-                   {"width": 4, "height": 3, "offset_x": 1, "offset_y": 2}.items())  # fmt: skip
-    path = write(tmp_path, SENSOR.replace("<rfilter", crop + "<rfilter"), BALL, LIGHT)
-    assert scene.load(path).render(np.ones((3, 6, 3)), spp=1).shape == (3, 4, 3)
-    with pytest.raises(ConfigError, match="cropped"):
-        scene.load(path, width=8)
-
-
-def test_the_environment_keeps_its_up_axis(tmp_path):
-    matrix = '<transform name="to_world"><rotate x="1" angle="-90"/></transform>'
-    upright = scene.load(write(tmp_path, SENSOR, BALL, '<emitter type="sunsky"/>'))
-    np.testing.assert_allclose(upright.to_world @ [0, 1, 0], [0, 0, 1], atol=1e-12)
-    turned = scene.load(write(tmp_path, SENSOR, BALL, f'<emitter type="sunsky">{matrix}</emitter>'))
-    np.testing.assert_allclose(turned.to_world, np.eye(3), atol=1e-7)
-
-
-def test_the_emitters_key_is_free_of_clashes(tmp_path):
-    ball = BALL.replace("<shape", '<shape id="envmap"')
-    loaded = scene.load(write(tmp_path, SENSOR, ball, LIGHT))
-    assert loaded.envmap_key == "envmap1.data" and loaded.envmap_key in loaded.params
+        scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).set_envmap(image)
 
 
 def test_a_dict_scene_is_the_same_as_its_xml(tmp_path, rng):
@@ -189,7 +138,7 @@ def test_a_dict_scene_is_the_same_as_its_xml(tmp_path, rng):
         "light": {"type": "envmap", "filename": "not-there.exr"},
     }
     image = sky(rng)
-    from_xml = scene.load(write(tmp_path, SENSOR, BALL, LIGHT)).render(image, spp=8)
+    from_xml = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(image, spp=8)
     from_dict = scene.load(given)
     assert from_dict.path is None
     np.testing.assert_allclose(from_dict.render(image, spp=8), from_xml, rtol=1e-4, atol=1e-6)
@@ -224,7 +173,7 @@ SCALED = '<emitter type="envmap"><transform name="to_world"><scale x="-1"/></tra
     ],
 )
 def test_a_broken_scene_is_told_in_short(tmp_path, parts, says):
-    path = write(tmp_path, *parts)
+    path = write_scene(tmp_path, *parts)
     with pytest.raises(InputError, match=says) as caught:
         scene.load(path)
     text = str(caught.value)
@@ -234,7 +183,7 @@ def test_a_broken_scene_is_told_in_short(tmp_path, parts, says):
 def test_a_damaged_mesh_is_an_input_error(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\nformat nonsense\n\x00")
     with pytest.raises(InputError, match="a.ply"):
-        scene.load(write(tmp_path, SENSOR, MESH, LIGHT))
+        scene.load(write_scene(tmp_path, SENSOR, MESH, LIGHT))
 
 
 @pytest.mark.parametrize(
@@ -283,46 +232,10 @@ def test_text_where_a_number_belongs_is_told():
 
 def test_names_are_found_in_included_files(tmp_path):
     sized = BALL.replace("<bsdf", '<float name="radius" value="$size"/><bsdf')
-    write(tmp_path, '<default name="size" value="1"/>', sized, name="ball.xml")
-    path = write(tmp_path, SENSOR, '<include filename="ball.xml"/>', LIGHT)
+    write_scene(tmp_path, '<default name="size" value="1"/>', sized, name="ball.xml")
+    path = write_scene(tmp_path, SENSOR, '<include filename="ball.xml"/>', LIGHT)
     box = scene.load(path, parameters={"size": 0.5}).mi.bbox()
     np.testing.assert_allclose(np.array(box.max).ravel(), 0.5, rtol=1e-6)
-
-
-def test_zero_roughness_is_the_mirror(rng):
-    image = sky(rng)
-    smooth = scene.load("sphere", width=16, parameters={"roughness": 0}).render(image, spp=16)
-    assert np.array_equal(smooth, scene.load("mirror", width=16).render(image, spp=16))
-
-
-# ---- digest ------------------------------------------------------------------------------------------------
-
-
-def test_digest_follows_what_the_rendering_depends_on(tmp_path):
-    mesh = '<shape type="obj"><string name="filename" value="tent.obj"/></shape>'
-    tent = tmp_path / "tent.obj"
-    tent.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    digest = scene.load(path := write(tmp_path, SENSOR, mesh, LIGHT)).digest
-    assert re.fullmatch("[0-9a-f]{64}", digest) and scene.load(path).digest == digest
-
-    other = tmp_path / "elsewhere"
-    other.mkdir()
-    (other / "tent.obj").write_bytes(tent.read_bytes())
-    map_ = '<emitter type="envmap"><string name="filename" value="any.exr"/></emitter>'
-    same = [write(other, SENSOR, mesh, LIGHT), write(other, SENSOR, mesh, map_, name="b.xml")]
-    same += [write(other, "<!-- why -->", SENSOR, mesh, LIGHT, name="c.xml")]
-    assert {scene.load(p).digest for p in same} == {digest}
-
-    turn = '<transform name="to_world"><rotate y="1" angle="1e-3"/></transform>'
-    turned = f'<emitter type="envmap">{turn}</emitter>'
-    sensors = [SENSOR.replace('"40"', '"41"'), SENSOR.replace('"box"', '"tent"')]
-    digests = [scene.load(write(tmp_path, s, mesh, LIGHT, name="d.xml")).digest for s in sensors]
-    digests += [scene.load(write(tmp_path, SENSOR, mesh, turned, name="d.xml")).digest]
-    digests += [scene.load(path, width=8).digest]
-    digests += [scene.load("sphere", width=16, parameters={"roughness": r}).digest for r in (0.3, 0.31)]
-    tent.write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
-    digests += [scene.load(path).digest]
-    assert len({digest, *digests}) == 1 + len(digests)
 
 
 # ---- shipped scenes and the statue -------------------------------------------------------------------------
@@ -344,57 +257,6 @@ def test_shipped_scenes_render(name, rng):
     below = np.zeros((8, 16, 3))
     below[5:] = 1
     assert scene.load(name, width=16, parameters=parameters).render(below, spp=16).max() < 1e-2
-
-
-def box_obj(path, size):
-    corners = [[x, y, z] for x in (0, size[0]) for y in (0, size[1]) for z in (0, size[2])]
-    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
-    path.write_text("\n".join([f"v {x} {y} {z}" for x, y, z in corners] + [f"f {f}" for f in faces]))
-    return path
-
-
-@pytest.mark.parametrize(
-    "up, size, expected",
-    [("y", (1, 4, 2), (0.5, 2, 1)), ("z", (1, 2, 4), (0.5, 2, 1)), ("-x", (10, 5, 2.5), (1, 2, 0.5)),
-     ("y", (30, 1, 3), (3, 0.1, 0.3)), ("-y", (1, 1, 1), (2, 2, 2)), ("-z", (1, 2, 1e-3), (1.5, 1.5e-3, 3))],
-)  # fmt: skip
-def test_a_mesh_is_fitted_to_the_stage(tmp_path, up, size, expected):
-    path = box_obj(tmp_path / "box.OBJ", size)
-    loaded = scene.load("mesh", width=8, parameters={"mesh": path.name, "up": up}, base=tmp_path)
-    box = {s.id(): s.bbox() for s in loaded.mi.shapes()}["object"]
-    low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
-    np.testing.assert_allclose(high - low, expected, rtol=1e-4)
-    np.testing.assert_allclose([low[1], *(low + high)[[0, 2]]], 0, atol=1e-5)
-
-
-def test_the_right_end_is_up(tmp_path):
-    # A pyramid's tip is at +z: with up = "z" the mesh's mass lies low, with "-z" it stands on its tip.
-    path = tmp_path / "tip.obj"
-    points = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nv 0 0 2\n"
-    path.write_text(points + "f 1 4 3 2\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
-    means = []
-    for up in ("z", "-z"):
-        loaded = scene.load("mesh", width=8, parameters={"mesh": path, "up": up})
-        means.append(np.array(loaded.params["object.vertex_positions"]).reshape(-1, 3)[:, 1].mean())
-    assert means[0] < 1 < means[1]
-
-
-def test_a_mesh_that_cannot_stand_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no height along its up axis"):
-        scene.load("mesh", parameters={"mesh": box_obj(tmp_path / "flat.obj", (1, 0, 1))})
-    (tmp_path / "a.stl").write_text("solid")
-    with pytest.raises(InputError, match="a.stl: cannot read a mesh of this kind; wanted .ply"):
-        scene.load("mesh", parameters={"mesh": tmp_path / "a.stl"})
-    with pytest.raises(InputError, match="missing file: gone.ply\nlooked in .* and "):
-        scene.load("mesh", parameters={"mesh": "gone.ply"}, base=tmp_path)
-
-
-@pytest.mark.parametrize(
-    "name, up", [("bunny_watertight.ply", "z"), ("spot.obj", "y"), ("horse_quad.obj", "y")]
-)
-def test_real_meshes_load(data, name, up):
-    loaded = scene.load("mesh", width=8, parameters={"mesh": data / "meshes" / name, "up": up})
-    assert loaded.render(np.ones((8, 16, 3)), spp=4).max() < 1.5
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,308 @@
+"""Decoders of OpenEXR, Radiance, PNG and JPEG, behind :func:`envedit.image.read`.
+
+A decoder takes the file's name, its first bytes and the ``info`` of :func:`envedit.image.read`, which it
+fills. Damage is told as ``InputError`` or left to the caller as the library's own exception.
+"""
+
+import os
+import re
+import stat
+
+import numpy as np
+
+from .errors import EnveditError, InputError
+from .files import quiet_libraries
+from .tonemap import srgb_to_linear
+
+MAX_SIDE = 32768
+MAX_TEXELS = 2**27
+"""16384 x 8192 texels: 1.6 GB as float32. A header that declares more is refused before allocation."""
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities of red, green, blue and white (D65), as the OpenEXR attribute orders them."""
+
+
+def head_of(name):
+    """Return the first bytes of a regular file."""
+    try:
+        mode = os.stat(name).st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(f"{name}: is a folder; name an image file")
+        if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
+            raise InputError(f"{name}: is not a regular file; name an image file")
+        with open(name, "rb") as file:
+            head = file.read(1 << 16)
+    except FileNotFoundError:
+        raise InputError(f"{name}: no such file; check the path") from None
+    except (OSError, ValueError) as e:
+        if isinstance(e, EnveditError):
+            raise
+        raise InputError(f"{name}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
+    if not head:
+        raise InputError(f"{name}: the file is empty; export or download it again")
+    return head
+
+
+def check_declared(name, width, height):
+    """Refuse a size before memory is asked for."""
+    if width < 1 or height < 1:
+        raise InputError(f"{name}: the header declares {width} x {height} texels; the file is damaged")
+    if max(width, height) > MAX_SIDE or width * height > MAX_TEXELS:
+        raise InputError(
+            f"{name}: the header declares {width} x {height} texels, more than {MAX_SIDE} on a side or "
+            f"{MAX_TEXELS} in all; the file is damaged, or has to be made smaller"
+        )
+
+
+def damaged(name, reason):
+    """Return the error for a file that starts well and cannot be decoded."""
+    reason = " ".join(str(reason).split())[:160] or "no reason given"
+    return InputError(f"{name}: damaged or truncated ({reason}); export or download it again")
+
+
+# ----------------------------------------------------------------------------------------------------------
+# OpenEXR
+
+
+def _read_exr(name, head, info):
+    import OpenEXR
+
+    try:
+        with quiet_libraries():
+            parts = OpenEXR.File(name, header_only=True).parts
+    except Exception as e:  # the library raises bare RuntimeError for anything
+        raise damaged(name, e) from None
+    windows = [_window(p.header["dataWindow"]) for p in parts]
+    for _, _, width, height in windows:
+        check_declared(name, width, height)
+    if sum(w * h for _, _, w, h in windows) > MAX_TEXELS:  # the library decodes every part
+        raise InputError(
+            f"{name}: its {len(parts)} parts hold more than {MAX_TEXELS} texels; save only colour"
+        )
+    index, names = _choose_channels(name, [p.header for p in parts], info)
+
+    # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
+    try:
+        with quiet_libraries() as said:
+            decoded = OpenEXR.File(name, separate_channels=True)
+            channels = decoded.parts[index].channels if len(decoded.parts) == len(parts) else None
+            planes = None if channels is None else [np.array(channels[c].pixels, np.float32) for c in names]
+    except MemoryError:
+        raise
+    except Exception as e:
+        raise damaged(name, e) from None
+    left, top, width, height = windows[index]
+    # A part that cannot be decoded is dropped with a printed warning, and the others move up.
+    if planes is None or any(p.shape != (height, width) for p in planes):
+        raise damaged(name, said and said[0] or "not all of its parts could be decoded")
+    image = np.stack(planes if len(planes) == 3 else planes * 3, axis=-1)
+    header = parts[index].header
+    _describe(header, info)
+    return _to_display(image, (left, top), _window(header["displayWindow"]), name, info)
+
+
+def _window(box):
+    """Return (left, top, width, height) of an inclusive OpenEXR box."""
+    (x0, y0), (x1, y1) = ([int(c) for c in corner] for corner in box)
+    return x0, y0, x1 - x0 + 1, y1 - y0 + 1
+
+
+def _choose_channels(name, headers, info):
+    """Return the first part with colour and its channel names, three or (luminance) one."""
+    seen = []
+    for index, header in enumerate(headers):
+        if "deep" in str(header.get("type", "")).lower():
+            seen.append("deep data")
+            continue
+        channels = {c.name: c for c in header["channels"]}
+        seen.extend(channels)
+        layers = {}
+        for full in channels:
+            layer, _, short = full.rpartition(".")
+            layers.setdefault(layer, {})[short.upper()] = full
+        # Unnamed channels first, then a layer that calls itself the picture, then the order of the file.
+        colour = [k for k, v in layers.items() if {"R", "G", "B"} <= v.keys()]
+        colour.sort(key=lambda k: (k != "", not re.search("combined|beauty|rgba", k.lower())))
+        if colour:
+            names = [layers[colour[0]][c] for c in "RGB"]
+            if len(colour) > 1:
+                info["warnings"].append(f"{len(colour)} colour layers: '{colour[0] or 'R, G, B'}' was read")
+        else:
+            grey = [v["Y"] for v in layers.values() if "Y" in v and not {"RY", "BY", "X", "Z"} & v.keys()]
+            if not grey:
+                continue
+            names = grey[:1]
+            info["warnings"].append(f"only luminance ('{names[0]}'): read as grey")
+        if any(channels[c].xSampling != 1 or channels[c].ySampling != 1 for c in names):
+            raise InputError(f"{name}: subsampled channels are not supported; save R, G, B in full")
+        return index, names
+    raise InputError(f"{name}: no R, G, B channels (found: {', '.join(seen[:12])}); save it as RGB")
+
+
+def _describe(header, info):
+    """Take over the header's plain attributes, and warn of a colour space or projection we would misread."""
+    info["metadata"] = {k: v for k, v in header.items() if isinstance(v, str | int | float)}
+    primaries = header.get("chromaticities")
+    if primaries is not None and not np.allclose(primaries, REC709, atol=2e-3):
+        info["warnings"].append("its primaries are not Rec.709: values are used as they are, hues may be off")
+    if "CUBE" in str(header.get("envmap", "")):
+        info["warnings"].append("it is marked as a cube map: read as if it were lat-long")
+
+
+def _to_display(image, corner, display, name, info):
+    """Place the data window in the display window; what is not stored is black."""
+    left, top, width, height = display
+    if corner == (left, top) and image.shape[:2] == (height, width):
+        return image
+    check_declared(name, width, height)
+    info["warnings"].append(
+        f"data window {image.shape[1]} x {image.shape[0]} at {corner[0]}, {corner[1]} differs from the "
+        f"display window {width} x {height} at {left}, {top}: cropped, or filled with black"
+    )
+    whole = np.zeros((height, width, 3), np.float32)
+    y, x = corner[1] - top, corner[0] - left
+    y0, x0 = max(y, 0), max(x, 0)
+    y1, x1 = min(y + image.shape[0], height), min(x + image.shape[1], width)
+    if y1 > y0 and x1 > x0:
+        whole[y0:y1, x0:x1] = image[y0 - y : y1 - y, x0 - x : x1 - x]
+    return whole
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Radiance
+
+
+def _read_radiance(name, head, info):
+    end = re.search(rb"\n\r?\n([^\n]*)\n", head)
+    size = end and re.fullmatch(rb"([-+][XY]) +(\d{1,9}) +([-+][XY]) +(\d{1,9})\s*", end[1])
+    if not size:
+        raise damaged(name, "no Radiance resolution line")
+    if (size[1], size[3]) != (b"-Y", b"+X"):
+        raise InputError(f"{name}: rows are stored as '{end[1].decode()}'; save them as '-Y H +X W'")
+    height, width = int(size[2]), int(size[4])
+    check_declared(name, width, height)
+    header = dict(re.findall(r"^(\w+) *= *(.*?)\s*$", head[: end.start()].decode("latin-1"), re.M))
+    info["metadata"] = header
+    if "xyze" in header.get("FORMAT", ""):
+        raise InputError(f"{name}: holds XYZ colours (32-bit_rle_xyze); save it as RGB (32-bit_rle_rgbe)")
+    for key in {"EXPOSURE", "COLORCORR"} & header.keys():
+        if any(float(v) != 1 for v in re.findall(r"[-+.\deE]*\d[-+.\deE]*", header[key])):
+            info["warnings"].append(f"{key}={header[key]} in its header is not undone: values are as stored")
+    with open(name, "rb") as file:
+        file.seek(end.end())
+        # No encoding takes more than 1 + 1/127 bytes for one.
+        data = file.read(height * (4 + 4 * width + 4 * (width // 64 + 2)))
+    if data[:2] == b"\x02\x02" and int.from_bytes(data[2:4], "big") == width:
+        rgbe = _radiance_runs(name, data, height, width)
+    else:
+        rgbe = _radiance_pixels(name, data, height, width)
+    # Ward's format: (R, G, B) 2^(E - 136), and E = 0 is black.
+    scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
+    scale[rgbe[..., 3] == 0] = 0
+    return rgbe[..., :3] * scale[..., None]
+
+
+def _radiance_runs(name, data, height, width):
+    """Decode run-length encoded scanlines: (2, 2, W >> 8, W & 255), then four bands of runs and literals.
+
+    Mitsuba's reader is quicker and overruns its buffer on damaged files, which kills the process.
+    """
+    rows = bytearray()
+    start, at = data[:4], 0
+    for y in range(height):
+        if data[at : at + 4] != start:
+            raise damaged(name, f"scanline {y} of {height} does not begin")
+        at += 4
+        for _ in range(4):
+            goal = len(rows) + width
+            while len(rows) < goal:
+                count = data[at] if at < len(data) else 0
+                if count > 128:
+                    rows += data[at + 1 : at + 2] * (count - 128)
+                    at += 2
+                else:
+                    rows += data[at + 1 : at + 1 + count]
+                    at += 1 + count
+                if count == 0 or at > len(data):
+                    raise damaged(name, f"scanline {y} of {height} breaks off")
+            if len(rows) > goal:
+                raise damaged(name, f"scanline {y} of {height} is too long")
+    return np.frombuffer(rows, np.uint8).reshape(height, 4, width).transpose(0, 2, 1)
+
+
+def _radiance_pixels(name, data, height, width):
+    """Decode flat pixels with the old run lengths: (1, 1, 1, n) repeats the pixel before it n times."""
+    pixels = np.frombuffer(data[: len(data) // 4 * 4], np.uint8).reshape(-1, 4)
+    place = np.arange(len(pixels))
+    marker = (pixels[:, :3] == 1).all(1)
+    source = np.maximum.accumulate(np.where(marker, 0, place))
+    # Markers in a row are the digits of one count, the lowest first: n + 256 n' + ...
+    digit = np.minimum(place - source - 1, 3)
+    count = np.where(marker, pixels[:, 3].astype(np.int64) << 8 * np.maximum(digit, 0), 1)
+    total = np.cumsum(count)
+    if not len(total) or marker[0] or total[-1] < height * width:
+        raise damaged(name, f"holds {total[-1] if len(total) else 0} of {height * width} texels")
+    stop = int(np.searchsorted(total, height * width)) + 1
+    count[stop - 1] -= total[stop - 1] - height * width
+    return pixels[np.repeat(source[:stop], count[:stop])].reshape(height, width, 4)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# PNG and JPEG
+
+
+def _read_ldr(name, head, info):
+    if info["format"] == "png":
+        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
+    else:
+        size = _jpeg_size(name)
+    check_declared(name, *size)
+    image = _bitmap(name)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise damaged(name, f"unexpected samples of type {image.dtype}")
+    info["hdr"] = False
+    depth = 8 * image.dtype.itemsize
+    info["warnings"].append(f"a {depth}-bit {info['format'].upper()} is not HDR: light above 1 is missing")
+    image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
+    values = srgb_to_linear(np.arange(2**depth) / (2**depth - 1)).astype(np.float32)
+    return values[image]
+
+
+def _jpeg_size(name):
+    """Return (width, height) from the frame header, wherever the markers before it end."""
+    with open(name, "rb") as file:
+        file.seek(2)
+        while True:
+            marker = file.read(4)
+            if len(marker) < 4 or marker[0] != 0xFF:
+                raise damaged(name, "no JPEG frame header")
+            if marker[1] == 0xFF:  # padding before a marker
+                file.seek(-3, os.SEEK_CUR)
+                continue
+            if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+                frame = file.read(5)
+                return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
+            file.seek(max(int.from_bytes(marker[2:], "big") - 2, 0), os.SEEK_CUR)
+
+
+def _bitmap(name):
+    """Decode a PNG or JPEG with Mitsuba; returns (H, W, C) as stored."""
+    import mitsuba as mi
+
+    try:
+        with quiet_libraries() as said:
+            pixels = np.array(mi.Bitmap(name))
+    except Exception as e:
+        raise damaged(name, re.sub(r'^(\[\w+\] )?("[^"]*": )?', "", str(e))) from None
+    if re.search("corrupt|premature", said[0] if said else "", re.I):  # libjpeg only prints
+        raise damaged(name, said[0])
+    return pixels if pixels.ndim == 3 else pixels[..., None]
+
+
+FORMATS = (
+    ("exr", b"\x76\x2f\x31\x01", _read_exr),
+    ("hdr", b"#?", _read_radiance),
+    ("png", b"\x89PNG\r\n\x1a\n", _read_ldr),
+    ("jpeg", b"\xff\xd8\xff", _read_ldr),
+)
+"""Kind, first bytes and decoder of every format."""

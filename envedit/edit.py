@@ -1,0 +1,183 @@
+"""The one optimisation loop: find parameters whose map renders to the target (Eq. 10, Sec. 6.2).
+
+The loop knows neither what the parameters mean nor how the picture is made: it decodes, renders, compares, pulls the gradient back, and lets
+Adam step. A step with a non-finite loss or gradient is not taken, is counted, and halves the learning rate.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import config, losses, optim
+from .errors import NumericalError
+from .ssim import Ssim
+
+MOST_BAD_STEPS = 20
+"""Non-finite steps in a row after which the loop gives up."""
+READ_EVERY, READ_SECONDS = 10, 1.0
+"""Losses are read back after so many steps or seconds: every read-back waits for the device."""
+
+
+def to_display(radiance: mi.TensorXf) -> mi.TensorXf:
+    """Map linear radiance to display values, differentiably and with a slope everywhere.
+
+    x^(1/2.2) as the metrics' tonemap, but linear below 1e-3, where the root is too steep, and 1 + log(x) / 2.2 above 1, where a clip would
+    leave a highlight no way back. Continuous with its first derivative at 1.
+    """
+    x = radiance.array
+    low, toe = 1e-3, 1e-3 ** (1 / 2.2)
+    middle = dr.power(dr.clip(x, low, 1), 1 / 2.2)
+    y = dr.select(x < low, x * (toe / low), dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
+    return mi.TensorXf(y, radiance.shape)
+
+
+class Objective:
+    """The weighted sum of Eq. 10 for one target and one original map.
+
+    Parameters
+    ----------
+    weights : config.Loss
+        A number or a (start, end) ramp for every term; terms of weight 0 are not computed.
+    picture : ndarray (h, w, 3)
+        Target, linear radiance.
+    pixel_weight : ndarray (h, w, 1) or None
+        How much each pixel counts.
+    original : ndarray (rows, W, 3)
+        The active rows of the original map.
+    iterations : int
+        Length of the run, over which ramps are walked.
+    """
+
+    def __init__(self, weights: config.Loss, picture, pixel_weight, original, iterations: int):
+        self.iterations = iterations
+        self.ramps = {name: value if isinstance(value, tuple) else (value, value)
+                      for name, value in vars(weights).items() if value and name != "dists"}
+        self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
+        self._weight = None if pixel_weight is None else dr.opaque(mi.TensorXf(np.ascontiguousarray(pixel_weight, np.float32)))
+        self._original = dr.opaque(mi.TensorXf(np.ascontiguousarray(original, np.float32)))
+        self._ssim = Ssim(self._target, self._weight)
+
+    def __call__(self, rendering, crop, step: int):
+        """Return the total and a dict of the weighted terms, size-1 arrays, for a rendering and the active rows of its map."""
+        terms = {}
+        shown = to_display(rendering)
+        for name, (start, end) in self.ramps.items():
+            if name == "ssim":
+                term = self._ssim(shown)
+            elif name == "image_l1":
+                term = losses.image_l1(shown, self._target, self._weight)
+            else:
+                term = losses.LOSSES[name](crop, self._original)
+            terms[name] = term * dr.opaque(mi.Float, optim.ramp(start, end, step, self.iterations))
+        return sum(terms.values()), terms
+
+
+@dataclass
+class State:
+    """Everything a run needs to continue: what a checkpoint holds."""
+
+    step: int = 0
+    bad_steps: int = 0
+    bad_in_a_row: int = 0
+    slowdown: float = 1.0
+    history: list[dict] = field(default_factory=list)
+
+
+def place_rows(original: mi.TensorXf, crop: mi.TensorXf, first: int) -> mi.TensorXf:
+    """Return a copy of a map (H, W, 3) with rows ``first`` ... replaced by ``crop``, differentiable in the crop."""
+    height, width, _ = original.shape
+    if crop.shape[0] == height:
+        return crop
+    n = height * width * 3
+    i = dr.arange(mi.UInt32, n)
+    offset, size = dr.opaque(mi.UInt32, first * width * 3), len(crop.array)
+    inside = (i >= offset) & (i < offset + size)
+    edited = dr.gather(mi.Float, crop.array, i - offset, inside)
+    return mi.TensorXf(dr.select(inside, edited, original.array), original.shape)
+
+
+def optimise(representation, params, renderer, objective: Objective, envmap: np.ndarray, first_row: int, settings: config.Optimizer, *,
+             adam: optim.Adam | None = None, state: State | None = None,
+             after_step: Callable[[State, optim.Adam], None] | None = None) -> tuple[dict, State]:
+    """Run the loop.
+
+    Parameters
+    ----------
+    representation : object
+        ``decode(params)`` gives the active rows (rows, W, 3).
+    params : dict
+        Where to start.
+    renderer : object
+        ``render(envmap, step)``.
+    objective : Objective
+        What to minimise.
+    envmap : ndarray (H, W, 3)
+        The original; rows outside the active ones stay as they are.
+    first_row : int
+        First active row.
+    settings : config.Optimizer
+        Iterations and learning rate.
+    adam, state : optional
+        To continue an earlier run; changed in place.
+    after_step : callable, optional
+        Called with state and optimiser whenever the losses have been read back, and at the end: progress and checkpoints. What it
+        raises ends the run.
+
+    Returns
+    -------
+    params, state
+        Parameters after the last good step.
+
+    Raises
+    ------
+    NumericalError
+        After :data:`MOST_BAD_STEPS` non-finite steps in a row.
+    """
+    lr = representation.lr if settings.lr == "auto" else settings.lr
+    adam = adam or optim.Adam(params, lr)
+    state = state or State()
+    fixed = dr.opaque(mi.TensorXf(np.ascontiguousarray(envmap, np.float32)))
+    waiting, last_read = [], time.perf_counter()
+    while state.step < settings.iterations:
+        start = time.perf_counter()
+        leaves = adam.leaves()
+        with dr.isolate_grad():
+            crop = representation.decode(leaves)
+            rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
+            total, terms = objective(rendering, crop, state.step)
+            dr.backward(total)
+        grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
+        finite = bool(dr.isfinite(total)[0])
+        if finite and adam.step(grads, lr=lr * state.slowdown):
+            state.bad_in_a_row = 0
+        else:
+            state.bad_steps += 1
+            state.bad_in_a_row += 1
+            state.slowdown *= 0.5
+            if state.bad_in_a_row >= MOST_BAD_STEPS:
+                raise NumericalError(
+                    f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not finite; "
+                    "the last good map is kept; lower [optimizer] lr or look at the target for extreme pixels")
+        waiting.append((state.step, dr.detach(total), {k: dr.detach(v) for k, v in terms.items()},
+                        lr * state.slowdown, 1000 * (time.perf_counter() - start)))
+        state.step += 1
+        now = time.perf_counter()
+        if len(waiting) >= READ_EVERY or now - last_read > READ_SECONDS or state.step == settings.iterations:
+            _read_back(waiting, state)
+            last_read = now
+            if after_step:
+                after_step(state, adam)
+    return adam.params, state
+
+
+def _read_back(waiting, state):
+    for step, total, terms, lr, ms in waiting:
+        row = {"iteration": step, "loss": float(total[0]), **{name: float(term[0]) for name, term in terms.items()}}
+        state.history.append({**row, "lr": lr, "step_ms": round(ms, 3)})
+    waiting.clear()

@@ -1,0 +1,288 @@
+"""One run from configuration to result: load, prepare, optimise, judge.
+
+Nothing here prints or writes but the checkpoint; ``run.py`` does, with what this returns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from . import checkpoint, config, edit, envmap, fit, image, metrics, optim, scene, sky, target
+from .errors import NumericalError
+from .pathtrace import PathTracer
+from .transport import LightTransport
+
+JUDGE_SEED = 9_000_011
+"""Seed of the renderings that are judged; the optimiser never sees their samples."""
+
+
+@dataclass
+class Result:
+    """What a run found.
+
+    Attributes
+    ----------
+    envmap : ndarray (H, W, 3)
+        The edited map; rows outside the active ones are the original's, bit for bit.
+    renders, maps : dict
+        ``initial``, ``target``, ``edited``; linear radiance. ``maps["target"]`` is None where it is unknown.
+    metrics : dict
+        As in metrics.json.
+    history : list of dict
+        A row an iteration.
+    notes, warnings : list of str
+        What was chosen automatically; what the user should know.
+    """
+
+    envmap: np.ndarray
+    renders: dict
+    maps: dict
+    metrics: dict
+    history: list
+    notes: list[str]
+    warnings: list[str]
+    influence: np.ndarray | None = None
+
+    @property
+    def render(self) -> np.ndarray:
+        """The rendering under the edited map, by Mitsuba with fresh samples."""
+        return self.renders["edited"]
+
+
+class Interrupted(Exception):
+    """Ctrl-C during the edit, after the checkpoint was written; ``envmap`` is the map so far."""
+
+    def __init__(self, envmap: np.ndarray, step: int):
+        super().__init__(f"interrupted at iteration {step}")
+        self.envmap, self.step = envmap, step
+
+
+class Stopped(NumericalError):
+    """The optimisation could not go on; ``envmap`` is the last good map."""
+
+    def __init__(self, message: str, envmap: np.ndarray):
+        super().__init__(message)
+        self.envmap = envmap
+
+
+@dataclass
+class Watch:
+    """What a run tells while it works: ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one."""
+
+    stage: Callable[[str], None] = lambda text: None
+    progress: Callable[[int, int, str], None] = lambda done, total, text: None
+
+
+@dataclass
+class _Clock:
+    """Wall seconds by name."""
+
+    seconds: dict = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def __call__(self, name):
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
+    """Load the map of a configuration at working width; returns it with warnings."""
+    if settings.envmap == "sunsky":
+        return sky.sunsky(settings.width, settings.azimuth, settings.elevation, settings.turbidity), []
+    picture, info = image.load_envmap(settings.envmap, settings.width, settings.repair)
+    return picture, list(info["warnings"])
+
+
+def active_rows(rows, height: int) -> tuple[int, int]:
+    """First and last row that the edit may change; "upper" is the half above the horizon (paper, Sec. 5.1)."""
+    if rows == "upper":
+        return 0, (height + 1) // 2 - 1
+    return (0, height - 1) if rows == "all" else (rows[0], rows[1])
+
+
+def make_renderer(settings: config.Config, lit: scene.Scene, shape, progress=None):
+    """Build the renderer of a configuration for maps of the given (H, W)."""
+    chosen = settings.renderer
+    if chosen.kind == "path":
+        return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
+    return LightTransport.build(lit, *shape, spp=chosen.spp, max_depth=chosen.max_depth, seed=settings.seed, memory_gb=chosen.memory_gb,
+                                refresh=0 if chosen.refresh == "auto" else chosen.refresh, progress=progress)
+
+
+def run(settings: config.Config, *, folder: Path | None = None, resume: bool = False, base: Path | None = None,
+        watch: Watch | None = None) -> Result:
+    """Carry out an edit.
+
+    Parameters
+    ----------
+    settings : config.Config
+        What to do.
+    folder : Path, optional
+        Where checkpoints are written while the loop runs; None: nowhere.
+    resume : bool
+        Continue from the checkpoint in ``folder`` if there is one.
+    base : Path, optional
+        Folder that file names in scene parameters are relative to.
+    watch : Watch, optional
+        Told of progress.
+
+    Raises
+    ------
+    EnveditError
+        With the exit code of its cause.
+    Interrupted
+        After Ctrl-C during the edit; the checkpoint has been written.
+    Stopped
+        If the optimisation cannot go on.
+    """
+    watch, clock, begun = watch or Watch(), _Clock(), time.perf_counter()
+    warnings: list[str] = []
+    with clock("target_s"):
+        watch.stage("loading")
+        original, found = load_map(settings.input)
+        warnings += found
+        height, width, _ = original.shape
+        first, last = active_rows(settings.input.rows, height)
+        lit = scene.load(settings.scene.file, settings.scene.width, settings.scene.height, dict(settings.scene.parameters), base)
+        watch.stage("rendering the target")
+        wanted = target.make(settings.target, lit, original, settings.seed, settings.input.repair)
+        warnings += wanted.warnings
+        initial = lit.render(original, spp=settings.output.spp, seed=settings.seed + JUDGE_SEED)
+    if settings.loss.dists:
+        warnings.append("loss.dists is off: no backbone weights are given")
+
+    crop = original[first : last + 1]
+    with clock("fit_s"):
+        watch.stage(f"fitting ({settings.representation.kind})")
+        representation = envmap.make(settings, fit.default_folder(),
+                                     lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"))
+        params = representation.encode(crop, settings.seed)
+    with clock("transport_s"):
+        watch.stage("tracing light transport" if settings.renderer.kind == "transport" else "preparing the path tracer")
+        renderer = make_renderer(settings, lit, (height, width), lambda done, total: watch.progress(done, total, ""))
+
+    with clock("edit_s"):
+        watch.stage("editing")
+        decode = _Decoder(representation, original, first)
+        params, state = _optimise(settings, representation, params, renderer, wanted, original, first, crop, folder, resume, decode, watch)
+        edited = decode(params)
+
+    with clock("judge_s"):
+        watch.stage("rendering the result")
+        final = lit.render(edited, spp=settings.output.spp, seed=settings.seed + JUDGE_SEED + 1)
+    seconds = clock.seconds
+    iterations = len(state.history)
+    rows = slice(first, last + 1)
+    tonemap = settings.output.tonemap
+    fitted = getattr(representation, "fitted", None)
+    measured = {
+        "render": metrics.compare(final, wanted.picture, tonemap),
+        "initial": metrics.compare(initial, wanted.picture, tonemap),
+        "envmap": None if wanted.envmap is None else metrics.compare(edited[rows], wanted.envmap[rows], tonemap),
+        "fit": None if fitted is None else {"log_psnr": fitted.log_psnr, "peak_ratio": fitted.peak_ratio, "epochs": fitted.epochs,
+                                            "cached": fitted.cached},
+        "timing": {"import_s": None, **{k: round(seconds[k], 3) for k in ("target_s", "fit_s", "transport_s", "edit_s", "judge_s")},
+                   "report_s": None, "total_s": round(time.perf_counter() - begun, 3),
+                   "per_iteration_ms": float(np.median([row["step_ms"] for row in state.history])) if iterations else None},
+        "iterations": state.step,
+        "non_finite_steps": state.bad_steps,
+        "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
+        "active_rows": [first, last],
+    }
+    if wanted.envmap is not None:
+        measured["sun_offset_texels"] = metrics.sun_offset(edited[rows], wanted.envmap[rows])
+        measured["initial_envmap"] = metrics.compare(original[rows], wanted.envmap[rows], tonemap)
+    notes = [wanted.source, *renderer.choices]
+    return Result(edited, {"initial": initial, "target": wanted.picture, "edited": final},
+                  {"initial": original, "target": wanted.envmap, "edited": edited}, measured, state.history, notes, warnings,
+                  getattr(renderer, "influence", None))
+
+
+_TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
+
+
+class _Decoder:
+    """Parameters to a whole map on the host, refusing what is not finite."""
+
+    def __init__(self, representation, original, first):
+        self.representation, self.original, self.first = representation, original, first
+
+    def __call__(self, params):
+        crop = self.representation.decode(params).numpy()
+        if not np.isfinite(crop).all():
+            row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
+            raise NumericalError(f"the edited map is not finite at row {self.first + row}, column {column}: lower [optimizer] lr")
+        edited = self.original.copy()
+        edited[self.first : self.first + crop.shape[0]] = crop
+        return edited
+
+
+def _optimise(settings, representation, params, renderer, wanted, original, first, crop, folder, resume, decode, watch):
+    objective = edit.Objective(settings.loss, wanted.picture, wanted.weight, crop, settings.optimizer.iterations)
+    lr = representation.lr if settings.optimizer.lr == "auto" else settings.optimizer.lr
+    adam, state = optim.Adam(params, lr), edit.State()
+    what = checkpoint.digest(settings, [original, wanted.picture])
+    if folder and resume and (found := checkpoint.load(folder, what)):
+        state, optimiser, traced = found
+        adam.load_state_dict(optimiser)
+        renderer.restore(traced)
+    saved = time.perf_counter()
+
+    def save(state, adam):
+        if folder:
+            checkpoint.save(folder, what, state, adam.state_dict(), renderer.state())
+
+    with _ctrl_c() as interrupt:
+
+        def after_step(state, adam):
+            nonlocal saved
+            watch.progress(state.step, settings.optimizer.iterations, f"loss {state.history[-1]['loss']:.4g}")
+            if interrupt.is_set():
+                save(state, adam)
+                raise Interrupted(decode(adam.params), state.step)
+            if time.perf_counter() - saved >= settings.optimizer.checkpoint_s:
+                save(state, adam)
+                saved = time.perf_counter()
+
+        try:
+            return edit.optimise(representation, params, renderer, objective, original, first, settings.optimizer,
+                                 adam=adam, state=state, after_step=after_step)
+        except NumericalError as error:
+            raise Stopped(str(error), decode(adam.params)) from error
+
+
+@contextlib.contextmanager
+def _ctrl_c():
+    """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def handle(number, frame):
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def select_variant(settings: config.Config) -> None:
+    """Select the Mitsuba variant of a configuration; the one piece of global state."""
+    mi.set_variant(settings.variant)

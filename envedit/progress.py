@@ -1,0 +1,60 @@
+"""Progress of a long run: a bar on a terminal, plain lines now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from tqdm import tqdm
+
+LINE_SECONDS = 5.0
+
+
+class Progress:
+    """Show stages and how far each has come, on stderr; a context manager.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing.
+    stream : file, optional
+        Where to; a bar if it is a terminal.
+    """
+
+    def __init__(self, quiet: bool = False, stream=None):
+        self.quiet, self.stream = quiet, stream or sys.stderr
+        self._bar = None
+        self._stage, self._begun, self._last_line = "", time.monotonic(), 0.0
+        self._terminal = self.stream.isatty()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self._close()
+
+    def stage(self, text: str) -> None:
+        """Begin a stage."""
+        self._close()
+        self._stage, self._begun, self._last_line = text, time.monotonic(), time.monotonic()
+        if not self.quiet and not self._terminal:
+            print(text, file=self.stream, flush=True)
+
+    def update(self, done: int, total: int, text: str = "") -> None:
+        """Tell that ``done`` of ``total`` parts of the stage are done."""
+        if self.quiet:
+            return
+        if self._terminal:
+            if self._bar is None:
+                self._bar = tqdm(total=total, desc=self._stage, file=self.stream, leave=False, dynamic_ncols=True)
+            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.update(done - self._bar.n)
+        elif time.monotonic() - self._last_line >= LINE_SECONDS:
+            self._last_line = time.monotonic()
+            rate = done / max(self._last_line - self._begun, 1e-9)
+            print(f"{self._stage}: {done}/{total}, {rate:.3g}/s {text}".rstrip(), file=self.stream, flush=True)
+
+    def _close(self):
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None

@@ -1,0 +1,76 @@
+"""Files are written whole or not at all, and libraries are kept quiet."""
+
+import os
+import sys
+
+import pytest
+
+from envedit import files
+from envedit.errors import InputError, NumericalError
+
+
+def test_interrupted_move_leaves_no_partial_file(tmp_path, monkeypatch):
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "replace", full)
+    with pytest.raises(InputError, match=r"metrics.json: cannot be written \(No space left on device\)"):
+        files.write_atomically(tmp_path / "metrics.json", b"{}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_replaced_whole(tmp_path):
+    path = tmp_path / "zażółć.txt"
+    for data in (b"old", b"", b"new" * 100_000):
+        files.write_atomically(path, data)
+        assert path.read_bytes() == data
+    with files.replacing(path, ".txt") as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".txt"
+        temporary.write_bytes(b"newer")
+        assert path.read_bytes() == b"new" * 100_000, "not before the end"
+    assert path.read_bytes() == b"newer" and os.listdir(tmp_path) == [path.name]
+
+
+@pytest.mark.parametrize(
+    "raised, seen, says",
+    [
+        (
+            RuntimeError("Cannot open x.tmp: Too many links."),
+            InputError,
+            r"a: cannot be written \(Too many links\)",
+        ),
+        (ValueError("bad header"), InputError, r"a: cannot be written \(bad header\)"),
+        (NumericalError("texel 3 is NaN"), NumericalError, "^texel 3 is NaN$"),
+        (KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+    ],
+)
+def test_a_failure_keeps_the_old_file(tmp_path, raised, seen, says):
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    with pytest.raises(seen, match=says), files.replacing(path) as temporary:
+        temporary.write_bytes(b"half")
+        raise raised
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a"]
+
+
+def test_a_block_that_writes_nothing_is_told(tmp_path):
+    with pytest.raises(InputError, match="No such file"), files.replacing(tmp_path / "a"):
+        pass
+
+
+@pytest.mark.parametrize("name", ["gone/a", "file/a", "a\0b", "folder"])
+def test_an_impossible_place_is_an_input_error(tmp_path, name):
+    (tmp_path / "file").write_text("not a folder")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        files.write_atomically(tmp_path / name, b"data")
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+def test_libraries_are_heard_and_kept_quiet(capfd):
+    with files.quiet_libraries() as said:
+        os.write(2, b"from C, ")
+        print("from Python")
+    assert said == ["from Python\nfrom C, "] and capfd.readouterr() == ("", "")
+    print("after", file=sys.stderr)
+    assert capfd.readouterr() == ("", "after\n")

@@ -1,0 +1,133 @@
+"""The sparse product against dense numpy."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.sparse import ColourMatrix, merge
+
+
+def dense(rows, columns, weights, shape):
+    """Add up entries in float64, one after the other."""
+    matrix = np.zeros((*shape, 3))
+    for r, c, w in zip(rows, columns, weights, strict=True):
+        matrix[int(r), int(c)] += w.astype(np.float64)
+    return matrix
+
+
+def entries(rng, shape, count):
+    rows = rng.integers(0, shape[0], count).astype(np.uint32)
+    columns = rng.integers(0, shape[1], count).astype(np.uint32)
+    return rows, columns, rng.standard_normal((count, 3)).astype(np.float32)
+
+
+def product(matrix, x):
+    packets = np.zeros((len(x), 4), np.float32)
+    packets[:, :3] = x
+    packets[:, 3] = np.nan  # "unused": must not reach a result
+    return np.array(matrix.apply(mi.Float(packets.ravel()))).T
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (7, 3), (8, 8), (9, 20), (64, 1), (37, 101)])
+def test_product_is_the_dense_one(rng, shape):
+    rows, columns, weights = entries(rng, shape, 4 * shape[0])
+    x = rng.standard_normal((shape[1], 3)).astype(np.float32)
+    result = product(ColourMatrix(rows, columns, weights, shape), x)
+    full = dense(rows, columns, weights, shape)
+    expected = np.einsum("ijc,jc->ic", full, x.astype(np.float64))
+    # Each product and each sum rounds once: (entries of the row + 1) * 2^-24 of the sum of magnitudes.
+    magnitude = np.zeros((shape[0], 3))
+    np.add.at(magnitude, rows.astype(int), np.abs(weights * x[columns.astype(int)]))
+    assert result.shape == expected.shape
+    bound = (np.bincount(rows, minlength=shape[0])[:, None] + 1) * 2.0**-24 * magnitude
+    assert (np.abs(result - expected) <= bound).all()
+
+
+def test_rows_without_entries_give_zero():
+    rows, columns = np.array([5, 5], np.uint32), np.array([0, 1], np.uint32)
+    matrix = ColourMatrix(rows, columns, np.ones((2, 3), np.float32), (11, 2))
+    result = product(matrix, np.full((2, 3), 3, np.float32))
+    np.testing.assert_array_equal(result[5], 6)
+    np.testing.assert_array_equal(np.delete(result, 5, axis=0), 0)
+
+
+@pytest.mark.parametrize("rows", [1, 9])
+def test_matrix_without_entries_gives_zero(rows):
+    nothing = np.zeros(0, np.uint32)
+    matrix = ColourMatrix(nothing, nothing, np.zeros((0, 3), np.float32), (rows, 4))
+    np.testing.assert_array_equal(product(matrix, np.ones((4, 3), np.float32)), np.zeros((rows, 3)))
+    assert matrix.entries == 0
+
+
+def test_one_long_row_does_not_spoil_the_short_ones(rng):
+    rows = np.concatenate([np.full(500, 3), np.arange(20)]).astype(np.uint32)
+    columns = rng.integers(0, 50, len(rows)).astype(np.uint32)
+    weights = rng.random((len(rows), 3), dtype=np.float32)
+    matrix = ColourMatrix(rows, columns, weights, (20, 50))
+    x = rng.random((50, 3), dtype=np.float32)
+    expected = np.einsum("ijc,jc->ic", dense(rows, columns, weights, (20, 50)), x)
+    # All is positive: the relative error of a sum of n terms is at most n * 2^-24, and the longest has 501.
+    np.testing.assert_allclose(product(matrix, x), expected, rtol=502 * 2.0**-24)
+
+
+def test_column_indices_survive_as_bits_of_a_float():
+    # 0x7f80_0001 upwards would be NaNs; real indices are far below, yet beyond 2^24 a float cannot count.
+    index = (1 << 24) + 1
+    zero, column = np.zeros(1, np.uint32), np.array([index], np.uint32)
+    matrix = ColourMatrix(zero, column, np.ones((1, 3), np.float32), (1, index + 1))
+    x = dr.zeros(mi.Float, 4 * (index + 1))
+    dr.scatter(x, mi.Float(1, 2, 3), mi.UInt32(4 * index, 4 * index + 1, 4 * index + 2))
+    np.testing.assert_array_equal(np.array(matrix.apply(x)).ravel(), [1, 2, 3])
+
+
+def test_product_has_the_same_bits_every_time(rng):
+    rows, columns, weights = entries(rng, (300, 40), 5000)
+    x = rng.standard_normal((40, 3)).astype(np.float32)
+    first = product(ColourMatrix(rows, columns, weights, (300, 40)), x)
+    for _ in range(3):
+        np.testing.assert_array_equal(product(ColourMatrix(rows, columns, weights, (300, 40)), x), first)
+
+
+# ---- merge -------------------------------------------------------------------------------------------------
+
+
+def test_merge_adds_entries_of_one_place_and_sorts_them(rng):
+    rows, columns, weights = entries(rng, (6, 5), 400)
+    r, c, w = merge(rows, columns, weights, 5)
+    key = r.astype(np.int64) * 5 + c
+    assert (np.diff(key) > 0).all()  # distinct, ordered by row, then column
+    # One rounding to float32 after a float64 sum.
+    expected = dense(rows, columns, weights, (6, 5))[r, c]
+    np.testing.assert_allclose(w, expected, rtol=2.0**-23, atol=1e-12)
+    assert (r.dtype, c.dtype, w.dtype) == (np.uint32, np.uint32, np.float32)
+
+
+def test_merge_does_not_care_for_the_order_of_its_entries(rng):
+    rows, columns, weights = entries(rng, (20, 30), 3000)
+    a = merge(rows, columns, weights, 30)
+    shuffle = rng.permutation(len(rows))
+    b = merge(rows[shuffle], columns[shuffle], weights[shuffle], 30)
+    np.testing.assert_array_equal(a[0], b[0])
+    np.testing.assert_array_equal(a[1], b[1])
+    # float64 sums of some five numbers of order 1 differ by 1e-15; float32 may round that to its next number.
+    np.testing.assert_allclose(a[2], b[2], rtol=2.0**-23, atol=1e-14)
+
+
+def test_merge_keeps_a_small_light_beside_a_large_one():
+    # 1e8 + 1 in float32 is 1e8: sums are accumulated in float64.
+    zero = np.zeros(4, np.uint32)
+    weights = np.array([[1e8], [1.0], [-1e8], [1.0]], np.float32).repeat(3, axis=1)
+    np.testing.assert_array_equal(merge(zero, zero, weights, 1)[2], [[2, 2, 2]])
+
+
+def test_merge_of_nothing_is_nothing():
+    r, c, w = merge(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((0, 3), np.float32), 7)
+    assert r.shape == c.shape == (0,) and w.shape == (0, 3)
+
+
+def test_merge_knows_places_beyond_32_bits():
+    rows, columns = np.array([200_000, 200_000, 0], np.uint32), np.array([99_999, 99_999, 1], np.uint32)
+    r, c, w = merge(rows, columns, np.ones((3, 3), np.float32), 100_000)
+    np.testing.assert_array_equal(np.stack([r, c]), [[0, 200_000], [1, 99_999]])
+    np.testing.assert_array_equal(w[:, 0], [1, 2])

@@ -1,0 +1,524 @@
+"""Light transport against Mitsuba's path tracer, against integrals, and against itself."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_paths import LEVEL, disagreement
+
+from envedit import latlong, scene
+from envedit.errors import InputError
+from envedit.transport import LightTransport
+
+DEPTH = 4  # of every path, here and in the reference: both leave out the same light
+SEEDS = 8
+HEIGHT, WIDTH = 16, 32
+T = mi.ScalarTransform4d
+
+
+# ---- scenes ------------------------------------------------------------------------------------------------
+
+
+def colour(*rgb):
+    return {"type": "rgb", "value": list(rgb)}
+
+
+def ball(bsdf, x=0.0, radius=1.0):
+    return {"type": "sphere", "center": [x, radius, 0], "radius": radius, "bsdf": bsdf}
+
+
+def stage(*shapes, light=None, film=None, origin=(0, 3.6, 7.4), up=(0, 1, 0)):
+    """Objects on a grey plane; the camera of the shipped scenes."""
+    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}} | (film or {})
+    to_world = T().look_at(origin=list(origin), target=[0, 0.85, 0], up=list(up))
+    plane = {
+        "type": "rectangle",
+        "to_world": T().rotate([1, 0, 0], -90).scale(100),
+        "bsdf": {"type": "diffuse", "reflectance": colour(0.5, 0.5, 0.5)},
+    }
+    return {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 28, "to_world": to_world, "film": film},
+        "sky": light or {"type": "constant"},
+        "plane": plane,
+        **{f"object{i}": shape for i, shape in enumerate(shapes)},
+    }
+
+
+METAL = {"type": "roughconductor", "material": "Al", "alpha": 0.3}
+WHITE = {"type": "diffuse", "reflectance": colour(0.8, 0.8, 0.8)}
+PRINCIPLED = {
+    "type": "principled",
+    "base_color": colour(0.7, 0.3, 0.1),
+    "metallic": 0.3,
+    "roughness": 0.4,
+    "clearcoat": 0.8,
+    "sheen": 0.5,
+}
+WALL = {
+    "type": "cube",
+    "to_world": T().translate([-1.6, 1, 0]).scale([0.1, 1, 1]),
+    "bsdf": {"type": "diffuse", "reflectance": colour(0.9, 0.1, 0.05)},
+}
+LAMP = {
+    "type": "sphere",
+    "center": [1.6, 2.2, 0.5],
+    "radius": 0.3,
+    "emitter": {"type": "area", "radiance": colour(2, 1, 4)},
+}
+TURNED = {
+    "type": "envmap",
+    "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32)),
+    "to_world": T().rotate([0.48, 0.8, 0.36], 70),
+}
+CROP = {"width": 48, "height": 40, "crop_offset_x": 12, "crop_offset_y": 6, "crop_width": 24, "crop_height": 20}
+SCENES = {
+    "sphere": "sphere",
+    "mirror": "mirror",
+    "matte": "matte",
+    "statue": "statue",
+    "glass": stage(ball({"type": "dielectric"})),
+    "plastic and principled": stage(ball({"type": "plastic"}, -0.9, 0.8), ball(PRINCIPLED, 0.9, 0.8)),
+    "red wall and a lamp": stage(ball(WHITE), WALL, LAMP),
+    "turned and cropped": stage(ball(METAL), light=TURNED, film=CROP),
+    "mitchell filter": stage(ball(WHITE), film={"rfilter": {"type": "mitchell"}}),
+}
+
+
+def load(name):
+    return scene.load(SCENES[name], *((24, 24) if isinstance(SCENES[name], str) else ()))
+
+
+def sun(row, column):
+    """One texel of 1e5 in a grey sky."""
+    image = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    image[row, column] = 1e5
+    return image
+
+
+def noise(seed=0, height=HEIGHT, width=WIDTH):
+    return np.random.default_rng(seed).random((height, width, 3), dtype=np.float32) ** 2 * 3
+
+
+def build(s, height=HEIGHT, width=WIDTH, **options):
+    return LightTransport.build(s, height, width, **{"spp": 64, "max_depth": DEPTH, "memory_gb": 0.5} | options)
+
+
+def picture(transport, image):
+    return transport.apply(mi.TensorXf(image)).numpy()
+
+
+def references(s, image, spp=256, depth=DEPTH):
+    return np.stack([s.render(image, spp=spp, seed=100 + k, max_depth=depth) for k in range(SEEDS)])
+
+
+# ---- Mitsuba's pictures ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_pictures_are_those_of_mitsuba(name):
+    s = load(name)
+    transports = [build(s, seed=seed) for seed in range(SEEDS)]
+    wrong = {}
+
+    def compare(what, image, sizes=(1, 4, 0)):
+        ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image)
+        if text := disagreement(ours, theirs, sizes):
+            wrong[what] = text
+        return ours, theirs
+
+    # The coarse tier alone.
+    compare("grey", np.full((HEIGHT, WIDTH, 3), 0.7, np.float32))
+    _, theirs = compare("noise", noise())
+    moved = np.stack([picture(t, np.roll(noise(), 1, axis=1)) for t in transports])
+    assert disagreement(moved, theirs) != "", "the comparison does not see a sky moved by one texel"
+
+    # Both tiers.
+    for what, row, column in (("sun at the horizon", HEIGHT // 2 - 1, 9), ("sun at the seam", 4, 0)):
+        assert all(t.resolve(sun(row, column)) >= 1 for t in transports)
+        assert row * WIDTH + column in transports[0].columns
+        # Paths that meet a mirror or glass before the sun are rare and carry much: single pixels are not normal.
+        caustics = (8, 0) if name in ("mirror", "glass", "plastic and principled") else (1, 4, 0)
+        ours, theirs = compare(what, sun(row, column), caustics)
+        if caustics[0] == 1:
+            moved = np.roll(sun(row, column), 1, axis=1)
+            assert [t.resolve(moved) for t in transports]
+            assert disagreement(np.stack([picture(t, moved) for t in transports]), theirs) != ""
+    # Mitsuba hardly samples the row at the pole (its table has sin(0) there): only averages are normal.
+    assert all(t.resolve(sun(0, 5)) >= 1 for t in transports)
+    compare("sun at the pole", sun(0, 5), sizes=(8, 0))
+    # The columns that are there now do not spoil other maps.
+    compare("noise through both tiers", noise())
+    assert not wrong, wrong
+
+
+def test_comparison_sees_one_percent():
+    s = load("matte")
+    ours = np.stack([picture(build(s, seed=seed), noise()) for seed in range(SEEDS)])
+    assert disagreement(1.01 * ours, references(s, noise())) != ""
+
+
+@pytest.mark.parametrize("name", ["sphere", "red wall and a lamp"])
+def test_exact_columns_of_the_whole_map_give_the_picture(name):
+    s, image = load(name), noise(1, 6, 12)
+    transports = [build(s, 6, 12, seed=seed) for seed in range(SEEDS)]
+    for t in transports:
+        t.resolve(image, tolerance=0)
+        # What cannot matter needs no column, and the last one alone has no variance.
+        assert len(t.columns) >= np.count_nonzero(t.influence) - 1
+    ours = np.stack([picture(t, image) for t in transports])
+    assert disagreement(ours, references(s, image)) == ""
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_depth_means_what_it_means_to_mitsuba(depth):
+    film = {"width": 24, "height": 24}
+    # Low and level, so that the sky is in view; the lamp's own light is cut at the same depth.
+    s = scene.load(stage(ball(WHITE), WALL, LAMP, film=film, origin=(0, 1.2, 7)))
+    transports = [build(s, max_depth=depth, seed=seed) for seed in range(SEEDS)]
+    for image in (noise(), np.zeros((HEIGHT, WIDTH, 3), np.float32)):
+        ours = np.stack([picture(t, image) for t in transports])
+        # The lamp's picture may be shared between the transports, so it must not be the noisier one: few samples.
+        assert disagreement(ours, references(s, image, spp=32, depth=depth)) == ""
+
+
+# ---- integrals ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row, column", [(0, 3), (1, 0), (4, WIDTH - 1), (7, 20), (8, 11)])
+def test_plane_under_one_texel_receives_its_irradiance(row, column):
+    # I = albedo / pi * integral of cos(theta) times the texel's tent over the upper hemisphere.
+    image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    image[row, column] = (1e5, 2e5, 3e5)
+    v = (np.arange(3000) + 0.5) / 6000  # midpoints; the error is of the order of the step squared
+    phi = 2 * np.pi * (np.arange(640) + 0.5) / 640
+    theta = np.pi * v[:, None]
+    d = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi, -np.sin(theta) * np.cos(phi)], axis=-1)
+    measure = np.cos(theta) * np.sin(theta) * (np.pi / 6000) * (2 * np.pi / 640)
+    expected = 0.5 / np.pi * (latlong.lookup(image.astype(np.float64), d) * measure[..., None]).sum(axis=(0, 1))
+
+    s = scene.load(stage(film={"width": 8, "height": 8}, origin=(0, 5, 0), up=(0, 0, -1)))
+    ours = []
+    for seed in range(SEEDS):
+        t = build(s, max_depth=2, seed=seed)
+        assert t.resolve(image) == 1
+        ours.append(picture(t, image))
+    ours = np.stack(ours)
+    assert disagreement(ours, np.broadcast_to(expected, ours.shape), sizes=(4, 0)) == ""
+    assert disagreement(1.01 * ours, np.broadcast_to(expected, ours.shape), sizes=(0,)) != ""
+
+
+def test_automatic_depth_is_that_of_the_scene():
+    plane = scene.load(stage(film={"width": 8, "height": 8}, origin=(0, 5, 0), up=(0, 0, -1)))
+    t = build(plane, max_depth="auto", spp=16)
+    assert t.bounces == 1  # an open plane does not light itself
+    assert any("path depth 2" in text for text in t.choices)
+    assert build(load("red wall and a lamp"), max_depth="auto", spp=16).bounces >= 3
+    assert build(plane, max_depth=5, spp=16).bounces == 4
+
+
+def test_texels_below_the_ground_have_no_influence(lit):
+    # The plane ends 1.2 degrees below the horizon; the tent of row 9 begins 6 degrees below it.
+    assert (lit.influence[9:] == 0).all() and (lit.influence[1:7] > 0).all()
+    gradient = lit.adjoint(mi.TensorXf(np.ones((*lit.shape, 3), np.float32))).numpy()
+    assert (gradient[9:] == 0).all()
+
+
+def test_influence_is_what_a_texel_adds_to_the_picture():
+    t = build(load("matte"), 6, 12)
+    ones = mi.TensorXf(np.ones((*t.shape, 3), np.float32))
+    # Sums of some thousand positive numbers in float32.
+    np.testing.assert_allclose(t.influence, t.adjoint(ones).numpy().mean(axis=2), rtol=1e-4)
+
+
+# ---- a linear operation and its adjoint --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lamp_scene():
+    return scene.load(stage(ball(METAL), WALL, LAMP, film={"width": 23, "height": 17}))
+
+
+@pytest.fixture(scope="module")
+def lit(lamp_scene):
+    """Transport without columns, for a scene with a lamp, on an odd number of pixels."""
+    return build(lamp_scene, spp=32)
+
+
+@pytest.fixture(scope="module")
+def resolved(lamp_scene):
+    """The same with exact columns."""
+    t = build(lamp_scene, spp=32)
+    assert t.resolve(sun(4, 0)) >= 1 and t.resolve(sun(7, 9)) >= 1
+    assert t.resolve(noise(), limit=20) >= 1
+    return t
+
+
+@pytest.fixture(params=["coarse", "with columns"])
+def transport(request):
+    return request.getfixturevalue("lit" if request.param == "coarse" else "resolved")
+
+
+def black():
+    return np.zeros((HEIGHT, WIDTH, 3), np.float32)
+
+
+def dot(a, b):
+    return (np.asarray(a, np.float64) * np.asarray(b, np.float64)).sum()
+
+
+def test_adjoint_is_the_transpose(transport, rng):
+    offset = picture(transport, black()).astype(np.float64)
+    for _ in range(3):
+        x = rng.random((HEIGHT, WIDTH, 3), dtype=np.float32)
+        y = rng.random((*transport.shape, 3), dtype=np.float32)
+        forward = dot(picture(transport, x) - offset, y)
+        backward = dot(x, transport.adjoint(mi.TensorXf(y)).numpy())
+        # All terms are positive: float32 sums of some hundred terms have errors of some 1e-6.
+        assert abs(forward - backward) <= 1e-5 * forward
+        # Each channel on its own; a mixture of channels would not be seen in the sum.
+        only = np.zeros_like(y)
+        only[..., 1] = y[..., 1]
+        pulled = transport.adjoint(mi.TensorXf(only)).numpy()
+        assert (pulled[..., [0, 2]] == 0).all()
+        assert abs(dot(picture(transport, x)[..., 1] - offset[..., 1], y[..., 1]) - dot(x, pulled)) <= 1e-5 * forward
+
+
+def test_reverse_mode_gives_the_adjoint(transport, rng):
+    y = mi.TensorXf(rng.standard_normal((*transport.shape, 3)).astype(np.float32))
+    x = mi.TensorXf(rng.random((HEIGHT, WIDTH, 3), dtype=np.float32))
+    dr.enable_grad(x)
+    dr.backward(dr.sum(transport.apply(x) * y, axis=None))
+    np.testing.assert_array_equal(dr.grad(x).numpy(), transport.adjoint(y).numpy())
+
+
+def test_forward_mode_gives_the_product_without_the_lamp(transport, rng):
+    x, v = (rng.random((HEIGHT, WIDTH, 3), dtype=np.float32) for _ in range(2))
+    variable = mi.TensorXf(x)
+    dr.enable_grad(variable)
+    dr.set_grad(variable, mi.TensorXf(v))
+    image = transport.apply(variable)
+    tangent = dr.forward_to(image).numpy()
+    difference = picture(transport, v) - picture(transport, black())
+    # The difference cancels digits where the lamp is bright.
+    np.testing.assert_allclose(tangent, difference, rtol=1e-5, atol=1e-5 * picture(transport, v).max())
+    # A lamp that crept in would add its own light.
+    assert picture(transport, black()).max() > 100 * np.abs(tangent - difference).max()
+
+
+def test_finite_differences_of_a_nonlinear_loss(transport, rng):
+    x, v = (rng.random((HEIGHT, WIDTH, 3), dtype=np.float32) + 0.1 for _ in range(2))
+    variable = mi.TensorXf(x)
+    dr.enable_grad(variable)
+    dr.backward(dr.sum(dr.log(transport.apply(variable)), axis=None))
+    slope = dot(dr.grad(variable).numpy(), v)
+
+    def loss(step):
+        return np.log(picture(transport, (x + step * v).astype(np.float32)).astype(np.float64)).sum()
+
+    # Central difference: error ~ step^2 = 1e-4 of the slope, and 1e-6 / step = 1e-4 from rounding.
+    assert slope == pytest.approx((loss(1e-2) - loss(-1e-2)) / 2e-2, rel=1e-3)
+
+
+def test_rendering_is_linear(transport, rng):
+    a, b = (rng.random((HEIGHT, WIDTH, 3), dtype=np.float32) for _ in range(2))
+    offset = picture(transport, black())
+    together = picture(transport, 2 * a + 3 * b) - offset
+    apart = 2 * (picture(transport, a) - offset) + 3 * (picture(transport, b) - offset)
+    # Rounding of float32 sums, at the size of what was subtracted.
+    np.testing.assert_allclose(together, apart, rtol=1e-5, atol=1e-5 * picture(transport, a).max())
+
+
+@pytest.mark.parametrize("scale", [1e-30, 65504.0, 1e6, 1e30])
+def test_scale_of_the_map_is_the_scale_of_the_picture(scale):
+    t = build(load("matte"), 6, 12, spp=16)
+    image = noise(2, 6, 12)
+    scaled = (image * np.float32(scale)).astype(np.float32)
+    t.resolve(scaled)
+    np.testing.assert_allclose(picture(t, scaled) / scale, picture(t, image), rtol=2e-5)  # order of sums is the same
+
+
+def test_black_map_needs_no_columns_and_shows_the_lamp(lamp_scene, lit):
+    assert lit.resolve(black()) == 0
+    lamp = picture(lit, black())
+    assert lamp.max() > 1 and np.isfinite(lamp).all()
+    t = build(load("matte"), 6, 12, spp=16)
+    np.testing.assert_array_equal(picture(t, np.zeros((6, 12, 3), np.float32)), 0)
+
+
+def test_non_finite_texel_is_not_hidden():
+    t = build(load("matte"), 6, 12, spp=16)
+    image = np.ones((6, 12, 3), np.float32)
+    for value in (np.nan, np.inf):
+        image[1, 4] = value
+        assert not np.isfinite(picture(t, image)).all()
+
+
+# ---- columns -----------------------------------------------------------------------------------------------
+
+
+def test_texels_that_deserve_it_get_columns(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    assert t.resolve(np.ones((HEIGHT, WIDTH, 3), np.float32)) == 0  # a grey sky has no error
+    image = sun(4, 0)
+    image[12, 3] = 1e6  # below the ground: bright, but of no consequence
+    assert t.resolve(image) == 1
+    np.testing.assert_array_equal(t.columns, [4 * WIDTH])
+    assert t.resolve(image) == 0  # exact for good
+    many = t.bright_texels(noise(), tolerance=0.001)
+    radiance = noise().reshape(-1, 3).max(axis=1)[many]
+    assert len(many) > len(t.bright_texels(noise(), tolerance=0.01))
+    assert (np.diff(radiance) <= 0).all()  # brightest first
+
+
+def test_limit_bounds_the_new_columns(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    image = noise()
+    image[4, :3] = 1e4  # lights and mere bright texels are traced differently, and bounded together
+    assert t.resolve(image, tolerance=0, limit=2) == 2
+    assert len(t.columns) == 2
+
+
+def test_capacity_is_never_exceeded(lamp_scene):
+    pixels = lamp_scene.width * lamp_scene.height
+    coarse = pixels * 32 * 1.5 * 32 / 1e9
+    t = build(lamp_scene, spp=32, memory_gb=coarse + 5.5 * 16 * pixels / 1e9)
+    assert t.capacity == 5
+    t.resolve(noise(), tolerance=0)
+    assert len(t.columns) == 5 and len(set(t.columns)) == 5
+    assert t.resolve(noise(1), tolerance=0) == 0
+    assert np.isfinite(picture(t, noise())).all()
+    none = build(lamp_scene, spp=32, memory_gb=coarse * 1.0001)
+    assert none.capacity == 0 and none.resolve(sun(4, 0)) == 0
+    gradient = none.adjoint(mi.TensorXf(np.ones((*none.shape, 3), np.float32))).numpy()
+    assert np.isfinite(picture(none, sun(4, 0))).all() and np.isfinite(gradient).all()
+
+
+def test_same_seed_gives_the_same_bytes(lamp_scene):
+    def run(seed):
+        t = build(lamp_scene, spp=32, seed=seed)
+        before = picture(t, noise())
+        t.resolve(sun(7, 9))
+        t.resolve(noise(), limit=5)
+        after = picture(t, sun(7, 9))
+        return before, after, t.adjoint(mi.TensorXf(before)).numpy(), t.influence
+
+    first, again, other = run(3), run(3), run(4)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(first, other, strict=True):
+        assert (a != b).any()
+
+
+def test_every_seed_of_a_configuration_works(lamp_scene):
+    for seed in (2**31 - 1, 2**32 - 1):
+        t = build(lamp_scene, spp=4, seed=seed)
+        t.resolve(sun(7, 9))
+        assert np.isfinite(picture(t, noise())).all()
+
+
+def test_state_brings_back_the_same_bytes(lamp_scene):
+    t = build(lamp_scene, spp=32, refresh=4)
+    image = mi.TensorXf(sun(7, 9))
+    for step in (0, 5):  # the second in the next epoch: everything was traced afresh
+        drawn = t.render(image, step).numpy()
+    t.resolve(noise(), limit=5)
+    after = picture(t, noise())
+    copy = build(lamp_scene, spp=32, refresh=4)
+    copy.restore({key: np.array(value) for key, value in t.state().items()})
+    np.testing.assert_array_equal(picture(copy, noise()), after)
+    np.testing.assert_array_equal(copy.columns, t.columns)
+    np.testing.assert_array_equal(copy.render(image, 5).numpy(), t.render(image, 5).numpy())
+    assert (drawn != build(lamp_scene, spp=32).render(image, 5).numpy()).any()
+
+
+def test_refreshed_transport_is_another_estimate_of_the_same(lamp_scene):
+    t = build(lamp_scene, spp=32, refresh=1)
+    # Seeds far apart and many: a refreshed run visits hundreds of epochs.
+    ours = np.stack([t.render(mi.TensorXf(sun(7, 9)), step).numpy() for step in range(0, 80, 10)])
+    assert t.epoch == 70
+    theirs = references(lamp_scene, sun(7, 9))
+    assert disagreement(ours, theirs) == ""
+    assert (ours[0] != ours[1]).any()
+
+
+# ---- compiled once -----------------------------------------------------------------------------------------
+
+
+def compiled(call):
+    """Count the kernels that were not in memory yet: compiled, or fetched from the disk."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        call()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    return len(kernels), sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
+
+
+def test_nothing_is_compiled_after_the_first_steps(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    x, y = mi.TensorXf(noise()), mi.TensorXf(np.ones((*t.shape, 3), np.float32))
+
+    def step():
+        image = mi.TensorXf(x)
+        dr.enable_grad(image)
+        loss = dr.sum(t.apply(image) * y, axis=None)
+        dr.backward(loss)
+        dr.eval(dr.grad(image), t.adjoint(y))
+
+    for texel in ((4, 0), (7, 9), (2, 2)):
+        t.resolve(sun(*texel))
+        step()
+    assert compiled(step)[0] >= 2 and compiled(step)[1] == 0
+    # More columns: neither they nor the products that use them need another kernel.
+    assert compiled(lambda: t.resolve(sun(3, 20)))[1] == 0
+    assert compiled(step)[1] == 0
+
+
+def test_another_seed_needs_no_other_kernel(lamp_scene):
+    # Else every refresh, and every run of a series, would pay seconds of compilation.
+    build(lamp_scene, spp=32, seed=11).resolve(sun(7, 9))
+    count, fresh = compiled(lambda: build(lamp_scene, spp=32, seed=12).resolve(sun(3, 20)))
+    assert count > 10 and fresh == 0
+
+
+# ---- refusals ----------------------------------------------------------------------------------------------
+
+
+def test_wrong_shapes_are_refused(lit):
+    for shape in ((HEIGHT, WIDTH + 2, 3), (WIDTH, HEIGHT, 3), (HEIGHT, WIDTH, 4), (HEIGHT * WIDTH, 3)):
+        with pytest.raises(ValueError, match=r"map must have shape \(16, 32, 3\), got \("):
+            lit.apply(dr.ones(mi.TensorXf, shape))
+    with pytest.raises(ValueError, match=r"picture must have shape \(17, 23, 3\), got \(23, 17, 3\)"):
+        lit.adjoint(dr.ones(mi.TensorXf, (23, 17, 3)))
+
+
+def test_too_little_memory_is_told_with_what_to_do(lamp_scene):
+    with pytest.raises(InputError, match=r"needs .* GB for 23x17 pixels at 4096 samples.*0.01.*memory_gb.*spp"):
+        build(lamp_scene, spp=4096, memory_gb=0.01)
+    # Left to itself it takes fewer samples.
+    t = build(lamp_scene, spp="auto", memory_gb=0.002)
+    assert t.spp < 256 and t.memory_bytes < 0.003e9
+
+
+@pytest.mark.parametrize("depth", ["auto", DEPTH])
+def test_closed_room_is_refused(depth):
+    room = {"type": "sphere", "radius": 50.0, "flip_normals": True, "bsdf": WHITE}
+    with pytest.raises(InputError, match="no pixel receives light from the environment"):
+        build(scene.load(stage(room)), max_depth=depth)
+
+
+@pytest.mark.parametrize("depth", [1, 0, -1])
+def test_depth_at_which_the_sky_lights_nothing_is_refused(depth):
+    # The camera of the matte scene sees ground and ball only: a black picture would be the silent result.
+    with pytest.raises(ValueError, match=r"depth|light"):
+        build(load("matte"), max_depth=depth)
+
+
+@pytest.mark.parametrize("spp", [0, -4])
+def test_no_samples_are_refused(lamp_scene, spp):
+    with pytest.raises(ValueError, match="spp"):
+        build(lamp_scene, spp=spp)
+
+
+def test_level_of_the_comparisons_is_strict():
+    assert LEVEL <= 1e-4  # some hundred comparisons are made: less than one false alarm in a hundred suites

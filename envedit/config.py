@@ -101,7 +101,7 @@ class Target(Table):
     mask: str = _key("", string, "image that is white where the target counts; empty: everywhere")
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image was painted")
     strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes, which comes later: list of tables")
-    spp: int = _key(1024, integer(1, 1 << 20), "samples a pixel of the target's rendering")
+    spp: int = _key(2048, integer(1, 1 << 20), "samples a pixel of the target's rendering")
 
     def _check_together(self) -> None:
         if self.kind == "envmap" and self.file:
@@ -128,7 +128,7 @@ class Representation(Table):
 class Fit(Table):
     """Fit of the SIREN to the input map (paper, Sec. 4 and 6.1)."""
 
-    epochs: int = _key(600, integer(0, 10**7), "full passes over the active texels")
+    epochs: int = _key(400, integer(0, 10**7), "full passes over the active texels")
     lr: float = _key(2e-3, number(0, positive=True), "initial learning rate of Adam")
     schedule: str = _key(
         "cosine", choice("cosine", "warm-restarts", "constant"), "course of both learning rates"
@@ -156,7 +156,7 @@ class Loss(Table):
     l1: Ramp = _key(0.0, weight, "sum of the map's radiance (Eq. 9)")
     dists: Ramp = _key(0.0, weight, "DISTS of map and original")
     tv: Ramp = _key(0.0, weight, "total variation of the map")
-    image_l1: Ramp = _key(0.0, weight, "mean absolute difference of rendering and target")
+    image_l1: Ramp = _key(1.0, weight, "mean absolute difference of rendering and target")
 
     def _check_together(self) -> None:
         if not self.ssim and not self.image_l1:
@@ -170,6 +170,9 @@ class Optimizer(Table):
     iterations: int = _key(400, integer(0, 10**7), "steps of the edit")
     lr: float | str = _key(
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
+    )
+    schedule: str = _key(
+        "cosine", choice("cosine", "constant"), "course of the learning rate; cosine: to 0 at the end of the run"
     )
     checkpoint_s: float = _key(10.0, number(0), "seconds between checkpoints; 0: after every step")
 
@@ -195,7 +198,7 @@ class Output(Table):
 
     dir: str = _key("", string, "folder of the results; empty: <config stem>_out beside the file")
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap of previews and metrics")
-    spp: int = _key(1024, integer(1, 1 << 20), "samples a pixel of the judged renderings")
+    spp: int = _key(2048, integer(1, 1 << 20), "samples a pixel of the judged renderings")
     report: bool = _key(True, boolean, "write preview.png and report.html")
 
 

@@ -154,7 +154,9 @@ def optimise(representation, params, renderer, objective: Objective, envmap: np.
             dr.backward(total)
         grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
         finite = bool(dr.isfinite(total)[0])
-        if finite and adam.step(grads, lr=lr * state.slowdown):
+        rate = optim.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr
+        rate *= state.slowdown
+        if finite and adam.step(grads, lr=rate):
             state.bad_in_a_row = 0
         else:
             state.bad_steps += 1
@@ -165,7 +167,7 @@ def optimise(representation, params, renderer, objective: Objective, envmap: np.
                     f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not finite; "
                     "the last good map is kept; lower [optimizer] lr or look at the target for extreme pixels")
         waiting.append((state.step, dr.detach(total), {k: dr.detach(v) for k, v in terms.items()},
-                        lr * state.slowdown, 1000 * (time.perf_counter() - start)))
+                        rate, 1000 * (time.perf_counter() - start)))
         state.step += 1
         now = time.perf_counter()
         if len(waiting) >= READ_EVERY or now - last_read > READ_SECONDS or state.step == settings.iterations:

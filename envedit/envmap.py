@@ -56,7 +56,7 @@ class Siren:
     ``fitted`` tells, after :meth:`encode`, how well the network reproduces the image.
     """
 
-    lr = 5e-5
+    lr = 1e-4
 
     def __init__(self, network: config.Representation, settings: config.Fit, folder: Path | None = None,
                  progress: Callable[[int, int, float], None] | None = None):

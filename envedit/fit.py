@@ -25,7 +25,7 @@ from . import config, losses, metrics, optim, siren, ssim
 
 EPSILON = 0.01
 """Added to radiance inside the logarithm (paper, below Eq. 3)."""
-_RECIPE = 1  # raise when the same settings give another fit
+_RECIPE = 2  # raise when the same settings give another fit
 
 
 @dataclass(frozen=True)
@@ -149,22 +149,22 @@ class Objective:
 class Perturbation:
     """Adversarial weight perturbation (Eq. 5, Algorithm 1) of the weight matrices.
 
-    The proxy Adam of the paper walks from an offset of zero, so that the direction is not the rounding error of two nearly equal weights.
-    Its learning rate cancels in the normalisation but for Adam's epsilon; its moments live on from epoch to epoch.
+    The proxy Adam of the paper takes one step from an offset of zero, so that the direction is not the rounding error of two nearly equal
+    weights. Its learning rate cancels in the normalisation but for Adam's epsilon. It is made anew every time (Algorithm 1 shows no state): with
+    moments that live on, the fit of kloofendal_48d at 128x32 ended at 34.8 instead of 40.1 dB and was less robust.
     """
 
-    def __init__(self, params: siren.Params, gamma: float, lr: float):
+    def __init__(self, params: siren.Params, gamma: float):
         self.gamma, self.names = gamma, siren.weight_names(params)
         self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
-        self._proxy = optim.Adam(self._zeros, lr)
         self._direction = None
 
     def update(self, grads: siren.Params, lr: float) -> None:
         """Set the direction of ascent from a gradient of the loss that is to be made worse."""
-        self._proxy.params = dict(self._zeros)
+        proxy = optim.Adam(self._zeros, lr)
         # A refused (non-finite) gradient leaves the direction at zero: no perturbation in this epoch.
-        self._proxy.step({name: -grads[name] for name in self.names}, lr=lr, check=False)
-        self._direction = self._proxy.params
+        proxy.step({name: -grads[name] for name in self.names})
+        self._direction = proxy.params
 
     def apply(self, params: siren.Params) -> siren.Params:
         """Return perturbed parameters; a layer without direction or of zero norm stays as it is."""
@@ -191,7 +191,7 @@ def _train(image, normalisation, network, settings, seed, progress):
     x = dr.opaque(siren.coordinates(*image.shape[:2]))
     objective = Objective(image, normalisation, settings)
     adam = optim.Adam(params, settings.lr)
-    perturbation = Perturbation(params, settings.awp_gamma, settings.awp_lr) if settings.awp_gamma > 0 else None
+    perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
     for epoch in range(settings.epochs):
         params = adam.params
         if perturbation:
@@ -244,3 +244,59 @@ def _store(path, fitted):
         os.replace(file.name, path)
     except OSError:
         pass  # a cache that cannot be written costs time, not the result
+
+
+# ---------------------------------------------------------------------- command line
+
+
+def main(argv: list[str] | None = None) -> int:
+    """``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set fit.epochs=100]``: only the representation; returns the exit code."""
+    import argparse
+    import sys
+
+    from . import doctor, image, manifest, preview
+    from .errors import EnveditError
+    from .pipeline import active_rows, load_map
+    from .progress import Progress
+
+    parser = argparse.ArgumentParser(prog="python -m envedit.fit", description="Fit a SIREN to an HDR environment map.")
+    parser.add_argument("map", metavar="MAP", help="EXR, Radiance HDR, or sunsky")
+    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: MAP_fit beside the map)")
+    parser.add_argument("--preset", choices=config.preset_names())
+    parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
+    arguments = parser.parse_args(argv)
+    try:
+        settings = config.loads("", Path.cwd(), "command line", arguments.preset, [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides])
+        doctor.ensure(settings.variant)
+        mi.set_variant(settings.variant)
+        original, warnings = load_map(settings.input)
+        first, last = active_rows(settings.input.rows, original.shape[0])
+        crop = original[first : last + 1]
+        folder = Path(arguments.out or Path(arguments.map).with_suffix("").name + "_fit")
+        folder.mkdir(parents=True, exist_ok=True)
+        with Progress() as progress:
+            progress.stage(f"fitting {arguments.map}")
+            fitted = fit(crop, settings.representation, settings.fit, settings.seed, folder=default_folder(),
+                         progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"))
+        params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
+        got = evaluate(params, fitted.normalisation, crop.shape[:2], settings.representation.omega).numpy()
+        image.write_exr(folder / "fitted.exr", got, {"source": arguments.map, "rows": f"{first} to {last}"})
+        preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
+        numbers = {"log_psnr": fitted.log_psnr, "peak_ratio": fitted.peak_ratio, "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
+                   "epochs": fitted.epochs, "seconds": round(fitted.seconds, 2), "cached": fitted.cached}
+        manifest.write_metrics(folder / "fit.json", numbers)
+        for line in warnings:
+            print(f"envedit: warning: {line}", file=sys.stderr)
+        print(f"log-PSNR {fitted.log_psnr:.1f} dB, peak ratio {fitted.peak_ratio:.2f}, {fitted.seconds:.1f} s"
+              f"{' (kept from an earlier run)' if fitted.cached else ''}; results in {folder}")
+        return 0
+    except EnveditError as error:
+        print(f"envedit: {error}", file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        print(f"envedit: {error.filename}: cannot be written ({error.strerror}): give another folder with --out", file=sys.stderr)
+        return 3
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

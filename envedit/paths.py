@@ -90,7 +90,7 @@ def trace(scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: i
     context = mi.BSDFContext()
 
     def sample(dimension: int) -> mi.Point2f:
-        scramble = mi.sample_tea_32(pixel, mi.UInt32(seed * 1009 + dimension))[0]
+        scramble = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, (seed * 1009 + dimension) & 0xFFFFFFFF))[0]
         return lattice(mi.permute_kensler(path, paths, scramble), scramble ^ mi.UInt32(0x5BD1E995))
 
     ray, weight = _camera_rays(scene.sensors()[0], pixel, sample)
@@ -108,7 +108,7 @@ def trace(scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: i
         bs, value = si.bsdf().sample(context, si, sample(3 * bounce + 3).x, sample(3 * bounce + 4), active)
         ray = si.spawn_ray(si.to_world(bs.wo))
         throughput = throughput * mi.Color3f(mi.unpolarized_spectrum(si.to_world_mueller(value, -bs.wo, si.wi)))
-        active &= dr.max(throughput) > 0
+        active &= dr.max(dr.abs(throughput)) > 0
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
 
 
@@ -118,8 +118,8 @@ def _camera_rays(sensor, pixel, sample):
     size, offset = film.crop_size(), film.crop_offset()
     column, row = pixel % size.x, pixel // size.x
     u = sample(0)
-    x, weight_x = _filter_offset(film.rfilter(), u.x, column, size.x)
-    y, weight_y = _filter_offset(film.rfilter(), u.y, row, size.y)
+    x, weight_x = _filter_offset(film.rfilter(), u.x, column, size.x, film.sample_border())
+    y, weight_y = _filter_offset(film.rfilter(), u.y, row, size.y, film.sample_border())
     position = mi.Point2f((mi.Float(column) + x) / size.x, (mi.Float(row) + y) / size.y)
     del offset  # positions are relative to the crop window, as the sensor wants them
     shutter = sample(2)
@@ -127,10 +127,11 @@ def _camera_rays(sensor, pixel, sample):
     return mi.Ray3f(ray), mi.Color3f(mi.unpolarized_spectrum(weight)) * weight_x * weight_y
 
 
-def _filter_offset(rfilter, u, index, size):
+def _filter_offset(rfilter, u, index, size, border):
     """Offset in pixels from the pixel's lower corner, drawn from |filter|, and the weight that makes it exact.
 
-    The film normalises by the weights of samples that fell inside it, so the filter is cut at the borders of the image.
+    The film normalises by the weights of samples that fell inside it, so the filter is cut at the borders of the image,
+    unless it samples a ``border`` around it.
     """
     radius = rfilter.radius()
     if rfilter.is_box_filter():
@@ -149,6 +150,8 @@ def _filter_offset(rfilter, u, index, size):
         return dr.lerp(dr.gather(mi.Float, t, i), dr.gather(mi.Float, t, i + 1), position - i)
 
     low, high = -mi.Float(index) - 0.5, mi.Float(size) - 0.5 - mi.Float(index)
+    if border:
+        low, high = mi.Float(-radius), mi.Float(radius)
     c0, c1 = at(table, low), at(table, high)
     target = dr.lerp(c0, c1, u)
     i = dr.binary_search(0, len(values), lambda k: dr.gather(mi.Float, table, k) < target)

@@ -15,6 +15,8 @@ With scene and camera fixed a rendering is I = T E + I_0: linear in the map E, p
 scene has lamps besides its environment, which stay as they are.
 """
 
+from __future__ import annotations
+
 import difflib
 import hashlib
 import os

@@ -22,11 +22,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "input": {"width": 128},
         "scene": {"width": 96},
-        "target": {"spp": 256},
+        "target": {"spp": 1024},
         "representation": {"hidden": 64},
         "fit": {"epochs": 150},
         "optimizer": {"iterations": 150},
-        "output": {"spp": 256},
+        "output": {"spp": 1024},
     },
     "standard": {},
     "paper": {
@@ -41,7 +41,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "ssim": (1.0, 1e4), "luminance": (1e-4, 1e-8), "l1": (1e-4, 1e-8), "dists": 0.6,
             "tv": 0.0, "image_l1": 0.0,
         },
-        "optimizer": {"iterations": 400, "lr": 5e-6},
+        "optimizer": {"iterations": 400, "lr": 5e-6, "schedule": "constant"},
         "renderer": {"kind": "path", "spp": 16, "refresh": 1},
     },
 }  # fmt: skip

@@ -33,33 +33,36 @@ class ColourMatrix:
     def __init__(self, rows, columns, weights, shape):
         self.shape = shape
         self.entries = len(rows)
-        count = np.bincount(rows, minlength=shape[0])
+        slices = -(-shape[0] // SLICE)
+        count = np.bincount(rows, minlength=slices * SLICE)
         by_length = np.argsort(count, kind="stable")[::-1]
-        lane = np.empty(shape[0], np.int64)
-        lane[by_length] = np.arange(shape[0])
-
-        longest = np.zeros(-(-shape[0] // SLICE) * SLICE, np.int64)
-        longest[: shape[0]] = count[by_length]
-        longest = longest.reshape(-1, SLICE).max(axis=1)
+        # The work is cut into few blocks of consecutive lanes, one or more a thread: dealing the slices out by length balances them.
+        dealt = by_length.reshape(slices, SLICE)
+        dealt = np.concatenate([dealt[0::4], dealt[2::4], dealt[1::4], dealt[3::4]])
+        lane = np.empty(slices * SLICE, np.int64)
+        lane[dealt.ravel()] = np.arange(slices * SLICE)
+        longest = count[dealt].max(axis=1)
         slice_start = np.concatenate([[0], np.cumsum(longest * SLICE)])
 
         # Position of every entry within its row, from a stable sort by row.
         order = np.argsort(rows, kind="stable")
-        first = np.concatenate([[0], np.cumsum(count)[:-1]])
         sorted_rows = rows[order]
+        first = np.concatenate([[0], np.cumsum(count)[:-1]])
         within = np.arange(self.entries) - first[sorted_rows]
         lanes = lane[sorted_rows]
         position = slice_start[lanes // SLICE] + within * SLICE + lanes % SLICE
 
-        packed = np.zeros((int(slice_start[-1]), 4), np.float32)
+        packed = np.zeros((max(int(slice_start[-1]), 1), 4), np.float32)
         packed[position, :3] = weights[order]
         packed[position, 3] = columns[order].astype(np.uint32).view(np.float32)
-        start = (slice_start[lane // SLICE] + lane % SLICE).astype(np.uint32)
         self.bytes = packed.nbytes
+        every = np.arange(slices * SLICE)
+        start = slice_start[every // SLICE] + every % SLICE
         self._packed = mi.Float(packed.ravel())
-        self._start = mi.UInt32(start)
-        self._stop = mi.UInt32((start + longest[lane // SLICE] * SLICE).astype(np.uint32))
-        dr.make_opaque(self._packed, self._start, self._stop)
+        self._start = mi.UInt32(start.astype(np.uint32))
+        self._stop = mi.UInt32((start + longest[every // SLICE] * SLICE).astype(np.uint32))
+        self._lane = mi.UInt32(lane[: shape[0]].astype(np.uint32))
+        dr.make_opaque(self._packed, self._start, self._stop, self._lane)
 
     def apply(self, x: mi.Float) -> mi.Float:
         """Multiply with a vector of colours.
@@ -74,7 +77,9 @@ class ColourMatrix:
         Color3f
             One colour per row.
         """
-        return _product(self._packed, x, self._start, self._stop)
+        y = _product(self._packed, x, self._start, self._stop)
+        dr.eval(y)
+        return dr.gather(mi.Color3f, y, self._lane)
 
 
 @dr.syntax

@@ -4,6 +4,8 @@ Each function takes the parser's ``state`` or one of its ``nodes`` and changes i
 errors call the scene. What is changed and why is told in :mod:`envedit.scene`.
 """
 
+from __future__ import annotations
+
 import hashlib
 import re
 from pathlib import Path

@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong, paths
-from .errors import InputError
+from .errors import ConfigError, InputError
 from .sparse import SLICE, ColourMatrix, merge
 
 DEPTH_TOLERANCE = 0.002
@@ -135,7 +135,7 @@ class LightTransport:
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
         self.spp, self.bounces, self.capacity, self.refresh, self.choices = spp, bounces, capacity, refresh, choices
         self.epoch, self._base_seed = 0, seed
-        offset = _other_light(scene)
+        offset = _other_light(scene, bounces + 1, seed)
         self._record(progress)
         self.columns = np.zeros(0, np.int64)
         self._slot_of = np.full(texels, -1, np.int64)
@@ -213,6 +213,9 @@ class LightTransport:
             No pixel receives light from the environment, or T does not fit into ``memory_gb``.
         """
         memory_gb = 2.0 if memory_gb == "auto" else float(memory_gb)
+        for name, value in (("spp", spp), ("max_depth", max_depth)):
+            if value != "auto" and not value >= 1:
+                raise ConfigError(f"renderer.{name}: came {value}, wanted a whole number of at least 1, or auto")
         choices = []
         pixels = np.arange(scene.width * scene.height, dtype=np.uint32)
         sphere = latlong.solid_angles(height, width)
@@ -222,8 +225,10 @@ class LightTransport:
         some = pixels.reshape(scene.height, scene.width)[::stride, ::stride].ravel()
         rows_light, bounce_light = _pilot(scene, pilot_grid, some, seed)
         total = bounce_light.sum()
-        if not total > 0:
-            raise InputError(f"{scene.path}: no pixel receives light from the environment: check the camera and that the scene is open")
+        within = "" if max_depth == "auto" else f" within path depth {max_depth}"
+        if not (total if max_depth == "auto" else bounce_light[:max_depth].sum()) > 0:
+            raise InputError(f"{scene.path or 'scene dict'}: no pixel receives light from the environment{within}: "
+                             "check the camera and that the scene is open")
         if max_depth == "auto":
             left = 1 - np.cumsum(bounce_light) / total
             bounces = int(np.argmax(left <= DEPTH_TOLERANCE)) if (left <= DEPTH_TOLERANCE).any() else MAX_BOUNCES
@@ -348,7 +353,7 @@ class LightTransport:
             new = texels[self._paths_of[texels] < count]
             known = new[self._slot_of[new] >= 0]
             fresh = new[self._slot_of[new] < 0][: self.capacity - len(self.columns)]
-            todo = np.concatenate([known, fresh])[: limit]
+            todo = np.concatenate([known, fresh])[: None if limit is None else limit - traced]
             if len(todo):
                 self._trace_columns(todo, count)
                 traced += len(todo)
@@ -361,7 +366,8 @@ class LightTransport:
     def bright_texels(self, envmap: np.ndarray, tolerance: float = COLUMN_TOLERANCE) -> np.ndarray:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
         omega = np.repeat(latlong.solid_angles(self.grid.height, self.grid.width), self.grid.width)
-        seen = self.influence.ravel() > 0
+        # A texel that no sample has met may matter as much as its row: rows are told by many samples.
+        seen = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
         radiance = envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen
         omega = omega * seen
         total, span = (radiance * omega).sum(), omega.sum()
@@ -408,7 +414,7 @@ class LightTransport:
                     continue
                 for texel in texels:
                     row, column = divmod(int(texel), grid.width)
-                    scramble = mi.sample_tea_32(pixel, mi.UInt32(dr.opaque(mi.UInt32, int(texel)) + self.seed * 31 + event.bounce))[0]
+                    scramble = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, (int(texel) + self.seed * 31 + event.bounce) & 0xFFFFFFFF))[0]
                     u = paths.lattice(path, scramble)
                     direction, jacobian = grid.direction(dr.opaque(mi.UInt32, row), dr.opaque(mi.UInt32, column), u)
                     value = _connect(self.scene.mi, event, direction, jacobian, uniform / jacobian)
@@ -433,11 +439,13 @@ class LightTransport:
         targets, values = [], []
         for texel, share in taps:
             slot = dr.gather(mi.Int32, slot_of, texel)
-            keep = dr.compress(event.active & (slot >= 0) & (weight * share > 0))
-            value = dr.gather(mi.Color3f, event.throughput * (weight * share), keep) if len(keep) else None
-            if value is not None:
-                targets.append(dr.gather(mi.UInt32, place + mi.UInt32(slot) * SLICE, keep).numpy())
-                values.append(value.numpy().T)
+            value, target = event.throughput * (weight * share), place + mi.UInt32(slot) * SLICE
+            wanted = event.active & (slot >= 0) & (weight * share > 0)
+            dr.eval(value, target, wanted)  # else what is left to compute, and so the kernel, depends on who was hit
+            keep = dr.compress(wanted)
+            if len(keep):
+                targets.append(dr.gather(mi.UInt32, target, keep).numpy())
+                values.append(dr.gather(mi.Color3f, value, keep).numpy().T)
         if targets:
             _, target, value = merge(np.zeros(sum(map(len, targets)), np.uint32), np.concatenate(targets),
                                      np.concatenate(values), len(self._exact) // 4)
@@ -509,7 +517,7 @@ def _contributions(scene, grid, pixels, spp, bounces, seed):
     lane = dr.arange(mi.UInt32, len(pixels) * spp)
     pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), lane // spp)
     for event in paths.trace(scene, pixels, spp, bounces, seed):
-        scramble = mi.sample_tea_32(pixel, mi.UInt32(seed * 131 + event.bounce))[0]
+        scramble = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, (seed * 1009 + 512 + event.bounce) & 0xFFFFFFFF))[0]
         u = paths.lattice(mi.permute_kensler(lane % spp, spp, scramble), scramble)
         if isinstance(event, paths.Escape):
             texel, row, jacobian = grid.locate_one(event.direction, u)
@@ -526,7 +534,7 @@ def _record(scene, grid, pixels, spp, bounces, seed):
     """Trace one block of pixels; returns merged rows, columns, weights as numpy arrays."""
     rows, columns, weights = [], [], []
     for _, pixel, texel, value in _contributions(scene, grid, pixels, spp, bounces, seed):
-        peak = dr.max(value)
+        peak = dr.max(dr.abs(value))
         keep = dr.compress((peak > 0) & dr.isfinite(peak))
         if len(keep) == 0:
             continue
@@ -542,12 +550,10 @@ def _pilot(scene, grid, pixels, seed):
     """Light by map row (H,) and by bounce, under a white sky, from a few samples of some pixels."""
     by_row, by_bounce = np.zeros(grid.height), np.zeros(MAX_BOUNCES + 1)
     for bounce, _, texel, value in _contributions(scene.mi, grid, pixels, 16, MAX_BOUNCES, seed + 104729):
-        amount = dr.mean(value)
-        amount = dr.select(dr.isfinite(amount), amount, 0)
-        row = dr.zeros(mi.Float, grid.height)
-        dr.scatter_add(row, amount, texel // grid.width)
-        by_row += row.numpy()
-        by_bounce[bounce] += dr.sum(amount)[0]
+        # Summed on the host: atomics would give other bits, and so other samples, on every run.
+        amount = np.nan_to_num(dr.mean(value).numpy().astype(np.float64), nan=0, posinf=0, neginf=0)
+        by_row += np.bincount(texel.numpy() // grid.width, amount, minlength=grid.height)
+        by_bounce[bounce] += amount.sum()
     return by_row, by_bounce
 
 
@@ -555,11 +561,11 @@ def _coarse_gb(pixels, spp):
     return pixels * spp * 1.5 * 32 / 1e9
 
 
-def _other_light(scene):
+def _other_light(scene, max_depth, seed):
     """Picture (h, w, 3) of all light that does not come from the environment, or None where there is none."""
     if len(scene.mi.emitters()) <= 1:
         return None
-    return scene.render(np.zeros((4, 8, 3), np.float32), spp=1024, seed=0)
+    return scene.render(np.zeros((4, 8, 3), np.float32), spp=1024, seed=seed, max_depth=max_depth)
 
 
 # ---------------------------------------------------------------------- kernels
@@ -591,20 +597,34 @@ def _exact_product(exact, packets, texel_of, count, pixels, capacity):
     return total
 
 
-@dr.syntax
+_SEGMENTS = 16
+
+
 def _exact_adjoint(exact, packets, count, pixels, capacity):
-    segments = 16
-    lane = dr.arange(mi.UInt32, capacity * segments)
-    slot, segment = lane // segments, lane % segments
-    each = -(-(-(-pixels // segments)) // SLICE) * SLICE
+    """Sum of column * picture over pixels, for every column; pixels are split into segments to occupy every core."""
+    part = _exact_adjoint_parts(exact, packets, count, pixels, capacity)
+    dr.eval(part)
+    slot, total = dr.arange(mi.UInt32, capacity), mi.Color3f(0)
+    for segment in range(_SEGMENTS):
+        total += dr.gather(mi.Color3f, part, slot + dr.opaque(mi.UInt32, segment * capacity))
+    return total
+
+
+@dr.syntax
+def _exact_adjoint_parts(exact, packets, count, pixels, capacity):
+    # Neighbouring lanes are neighbouring columns: their weights for a pixel lie 8 packets apart and share cache lines with the next 7 pixels.
+    lane = dr.arange(mi.UInt32, capacity * _SEGMENTS)
+    size = dr.opaque(mi.UInt32, capacity)
+    slot, segment = lane % size, lane // size
+    each = -(-(-(-pixels // _SEGMENTS)) // SLICE) * SLICE
     pixel = segment * dr.opaque(mi.UInt32, each)
     stop = dr.minimum(pixel + dr.opaque(mi.UInt32, each), dr.opaque(mi.UInt32, pixels))
     stop = dr.select(slot < count, stop, 0)
-    stride = dr.opaque(mi.UInt32, capacity * SLICE)
+    stride = size * SLICE
     total = mi.Color3f(0)
     while pixel < stop:
         weight = dr.gather(mi.Vector4f, exact, (pixel // SLICE) * stride + slot * SLICE + pixel % SLICE)
         value = dr.gather(mi.Vector4f, packets, pixel)
         total += mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z)
         pixel += 1
-    return mi.Color3f(dr.block_sum(total.x, segments), dr.block_sum(total.y, segments), dr.block_sum(total.z, segments))
+    return total

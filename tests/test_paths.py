@@ -9,15 +9,15 @@ from envedit import latlong, paths, scene
 
 # ---- statistics (also used by the tests of the renderers) --------------------------------------------------
 #
-# Two renderers agree if the differences of their independent pictures, seed by seed, have mean zero. Student's t
-# of a pixel needs normal noise, which a pixel that a firefly visits does not have; blocks of pixels and the whole
-# picture have.
+# Two renderers agree if the differences of independent pictures, seed by seed, have mean zero. The t of
+# Student needs normal noise, which a pixel that a firefly visits does not have, but blocks of pixels and the
+# whole picture have.
 
 LEVEL = 1e-4  # chance of a false alarm in one comparison; some hundred are made in all
 
 
 def student(t, freedom: int):
-    """Return the two-sided tail probability of Student's t = sqrt(f) tan(a), whose density is ~ cos(a)^(f - 1)."""
+    """Return the two-sided tail probability of Student's t; with t = sqrt(f) tan(a), a ~ cos(a)^(f - 1)."""
     angle = np.linspace(0, np.pi / 2, 20001)
     density = np.cos(angle) ** (freedom - 1)
     tail = np.cumsum((density + np.append(density[1:], 0))[::-1])[::-1]
@@ -230,6 +230,7 @@ FILMS = {
     "lanczos": {"rfilter": {"type": "lanczos"}},
     "cropped box": CROP,
     "cropped gaussian": CROP | {"rfilter": {"type": "gaussian"}},
+    "sampled border": {"rfilter": {"type": "gaussian"}, "sample_border": True},
     "one row": {"width": 40, "height": 1, "rfilter": {"type": "gaussian"}},
 }
 

@@ -46,10 +46,9 @@ def gradients(matte, sky, weights):
 def adjoints(matte, weights):
     """The same by light transport, one for every seed."""
     y = mi.TensorXf(weights)
-    build = LightTransport.build
-    return np.stack(
-        [build(matte, HEIGHT, WIDTH, spp=64, max_depth=DEPTH, seed=k).adjoint(y).numpy() for k in range(STEPS)]
-    )
+    options = {"spp": 64, "max_depth": DEPTH, "memory_gb": 0.5}
+    transports = [LightTransport.build(matte, HEIGHT, WIDTH, seed=k, **options) for k in range(STEPS)]
+    return np.stack([t.adjoint(y).numpy() for t in transports])
 
 
 def test_gradient_is_the_adjoint_of_light_transport(gradients, adjoints):

@@ -1,7 +1,8 @@
 """A run's state on disk, so that a killed run resumes to the same result.
 
-One ``checkpoint.npz``: the optimiser's parameters and moments, the loop's counters and history, the exact columns that the light transport had
-traced, and a digest of what the run was asked to do. It is written to a temporary name and renamed: a file that is there is whole.
+One ``checkpoint.npz``: the optimiser's parameters and moments, the loop's counters and history, the exact
+columns that the light transport had traced, and a digest of what the run was asked to do. It is written to a
+temporary name and renamed: a file that is there is whole.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ NAME = "checkpoint.npz"
 
 
 def digest(settings: config.Config, inputs: list[np.ndarray]) -> str:
-    """Hash what decides the result of a run: its configuration without the output folder, and the pixels that went in."""
+    """Hash what decides a run's result: its configuration without the output folder, and the pixels."""
     text = "\n".join(line for line in config.to_toml(settings).splitlines() if not line.startswith("dir ="))
     sha = hashlib.sha256(text.encode())
     for array in inputs:
@@ -33,7 +34,9 @@ def digest(settings: config.Config, inputs: list[np.ndarray]) -> str:
 
 def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict) -> None:
     """Write ``checkpoint.npz`` into a folder."""
-    arrays = {f"optimiser/{k}": v for k, v in optimiser.items()} | {f"renderer/{k}": v for k, v in renderer.items()}
+    arrays = {f"optimiser/{k}": v for k, v in optimiser.items()} | {
+        f"renderer/{k}": v for k, v in renderer.items()
+    }
     text = json.dumps({"digest": what, "state": asdict(state)})
     with replacing(folder / NAME) as temporary, open(temporary, "wb") as file:
         np.savez(file, meta=np.frombuffer(text.encode(), np.uint8), **arrays)
@@ -51,15 +54,25 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict] | None:
     if not path.exists():
         return None
     try:
-        with np.load(path) as stored:
+        # Opened here: np.load leaves a file open that is no archive.
+        with open(path, "rb") as file, np.load(file) as stored:
             meta = json.loads(stored["meta"].tobytes())
-            parts = {part: {k.removeprefix(f"{part}/"): stored[k] for k in stored.files if k.startswith(f"{part}/")}
-                     for part in ("optimiser", "renderer")}
-        state = State(**meta["state"])
+            parts = {
+                part: {
+                    k.removeprefix(f"{part}/"): stored[k] for k in stored.files if k.startswith(f"{part}/")
+                }
+                for part in ("optimiser", "renderer")
+            }
+        state, found = State(**meta["state"]), meta["digest"]
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: the checkpoint cannot be read ({error}): delete it, or run without --resume") from error
-    if meta["digest"] != what:
-        raise InputError(f"{path}: belongs to another configuration or other input files: run without --resume to start afresh")
+        raise InputError(
+            f"{path}: the checkpoint cannot be read ({error}): delete it, or run without --resume"
+        ) from error
+    if found != what:
+        raise InputError(
+            f"{path}: belongs to another configuration or other input files: "
+            "run without --resume to start afresh"
+        )
     return state, parts["optimiser"], parts["renderer"]
 
 

@@ -79,7 +79,9 @@ class Input(Table):
 class Scene(Table):
     """What the map lights."""
 
-    file: str = _key("sphere", string, "Mitsuba XML, or one shipped: sphere, mirror, matte, statue, pair, mesh")
+    file: str = _key(
+        "sphere", string, "Mitsuba XML, or one shipped: sphere, mirror, matte, statue, pair, mesh"
+    )
     width: int = _key(128, integer(4, MOST_DIM), "width of the rendering while editing, pixels")
     height: int = _key(0, integer(0, MOST_DIM), "height of the rendering, pixels; 0: by the scene's aspect")
     parameters: dict[str, str | float | bool] = _key({}, parameter_table, "values for the scene's <default>s")
@@ -157,10 +159,11 @@ class Loss(Table):
     dists: Ramp = _key(0.0, weight, "DISTS of map and original")
     tv: Ramp = _key(0.0, weight, "total variation of the map")
     image_l1: Ramp = _key(1.0, weight, "mean absolute difference of rendering and target")
+    image_l2: Ramp = _key((1.0, 100.0), weight, "mean squared difference of rendering and target")
 
     def _check_together(self) -> None:
-        if not self.ssim and not self.image_l1:
-            raise ConfigError("loss.ssim, loss.image_l1: came 0 for both, wanted one above 0")
+        if not self.ssim and not self.image_l1 and not self.image_l2:
+            raise ConfigError("loss.ssim, loss.image_l1, loss.image_l2: came 0 for all, wanted one above 0")
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,9 @@ class Optimizer(Table):
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
     )
     schedule: str = _key(
-        "cosine", choice("cosine", "constant"), "course of the learning rate; cosine: to 0 at the end of the run"
+        "cosine",
+        choice("cosine", "constant"),
+        "course of the learning rate; cosine: to 0 at the end of the run",
     )
     checkpoint_s: float = _key(10.0, number(0), "seconds between checkpoints; 0: after every step")
 

@@ -28,7 +28,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from .errors import MachineError
+from .errors import InputError, MachineError
+from .files import write_atomically
 
 __all__ = ["Diagnosis", "check", "ensure", "main"]
 
@@ -129,12 +130,9 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
         raise MachineError("\n".join(diagnosis.lines))
     # A stamp of None (no library file is seen on this system) would never prove a change: then probe again.
     if (stamp := _stamp(diagnosis.versions.get("llvm_path"))) or not variant.startswith("llvm"):
-        with contextlib.suppress(OSError, RuntimeError):
+        with contextlib.suppress(OSError, RuntimeError, InputError):
             memory.parent.mkdir(parents=True, exist_ok=True)
-            # Written beside and renamed: a second process never reads half a file.
-            draft = memory.with_suffix(f".{os.getpid()}")
-            draft.write_text(json.dumps({"ok": True, "library": stamp or [None]}))
-            draft.replace(memory)
+            write_atomically(memory, json.dumps({"ok": True, "library": stamp or [None]}).encode())
 
 
 def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple[str, str]:

@@ -1,7 +1,8 @@
 """The one optimisation loop: find parameters whose map renders to the target (Eq. 10, Sec. 6.2).
 
-The loop knows neither what the parameters mean nor how the picture is made: it decodes, renders, compares, pulls the gradient back, and lets
-Adam step. A step with a non-finite loss or gradient is not taken, is counted, and halves the learning rate.
+The loop knows neither what the parameters mean nor how the picture is made: it decodes, renders, compares,
+pulls the gradient back, and lets Adam step. A step with a non-finite loss or gradient is not taken, is
+counted, and halves the learning rate.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ READ_EVERY, READ_SECONDS = 10, 1.0
 def to_display(radiance: mi.TensorXf) -> mi.TensorXf:
     """Map linear radiance to display values, differentiably and with a slope everywhere.
 
-    x^(1/2.2) as the metrics' tonemap, but linear below 1e-3, where the root is too steep, and 1 + log(x) / 2.2 above 1, where a clip would
-    leave a highlight no way back. Continuous with its first derivative at 1.
+    x^(1/2.2) as the metrics' tonemap, but linear below 1e-3, where the root is too steep, and
+    1 + log(x) / 2.2 above 1, where a clip would leave a highlight no way back. Continuous with its first
+    derivative at 1.
     """
     x = radiance.array
     low, toe = 1e-3, 1e-3 ** (1 / 2.2)
     middle = dr.power(dr.clip(x, low, 1), 1 / 2.2)
-    y = dr.select(x < low, x * (toe / low), dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
+    y = dr.select(x <= low, x * (toe / low), dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
     return mi.TensorXf(y, radiance.shape)
 
 
@@ -56,22 +58,37 @@ class Objective:
 
     def __init__(self, weights: config.Loss, picture, pixel_weight, original, iterations: int):
         self.iterations = iterations
-        self.ramps = {name: value if isinstance(value, tuple) else (value, value)
-                      for name, value in vars(weights).items() if value and name != "dists"}
+        self.ramps = {
+            name: value if isinstance(value, tuple) else (value, value)
+            for name, value in vars(weights).items()
+            if value and name != "dists"
+        }
         self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
-        self._weight = None if pixel_weight is None else dr.opaque(mi.TensorXf(np.ascontiguousarray(pixel_weight, np.float32)))
+        self._weight = (
+            None
+            if pixel_weight is None
+            else dr.opaque(mi.TensorXf(np.ascontiguousarray(pixel_weight, np.float32)))
+        )
         self._original = dr.opaque(mi.TensorXf(np.ascontiguousarray(original, np.float32)))
         self._ssim = Ssim(self._target, self._weight)
 
     def __call__(self, rendering, crop, step: int):
-        """Return the total and a dict of the weighted terms, size-1 arrays, for a rendering and the active rows of its map."""
+        """Weigh a rendering and the active rows of its map.
+
+        Returns
+        -------
+        total : Float
+            The weighted sum, a size-1 array.
+        terms : dict
+            Its weighted terms by name, size-1 arrays.
+        """
         terms = {}
         shown = to_display(rendering)
         for name, (start, end) in self.ramps.items():
             if name == "ssim":
                 term = self._ssim(shown)
-            elif name == "image_l1":
-                term = losses.image_l1(shown, self._target, self._weight)
+            elif name in ("image_l1", "image_l2"):
+                term = losses.LOSSES[name](shown, self._target, self._weight)
             else:
                 term = losses.LOSSES[name](crop, self._original)
             terms[name] = term * dr.opaque(mi.Float, optim.ramp(start, end, step, self.iterations))
@@ -90,21 +107,47 @@ class State:
 
 
 def place_rows(original: mi.TensorXf, crop: mi.TensorXf, first: int) -> mi.TensorXf:
-    """Return a copy of a map (H, W, 3) with rows ``first`` ... replaced by ``crop``, differentiable in the crop."""
-    height, width, _ = original.shape
-    if crop.shape[0] == height:
+    """Replace rows ``first`` ... of a map (H, W, 3) by ``crop``, differentiably in the crop."""
+    if crop.shape[0] == original.shape[0]:
         return crop
-    n = height * width * 3
-    i = dr.arange(mi.UInt32, n)
-    offset, size = dr.opaque(mi.UInt32, first * width * 3), len(crop.array)
-    inside = (i >= offset) & (i < offset + size)
-    edited = dr.gather(mi.Float, crop.array, i - offset, inside)
-    return mi.TensorXf(dr.select(inside, edited, original.array), original.shape)
+    return dr.custom(_PlaceRows, crop, dr.detach(original), first * original.shape[1] * 3)
 
 
-def optimise(representation, params, renderer, objective: Objective, envmap: np.ndarray, first_row: int, settings: config.Optimizer, *,
-             adam: optim.Adam | None = None, state: State | None = None,
-             after_step: Callable[[State, optim.Adam], None] | None = None) -> tuple[dict, State]:
+class _PlaceRows(dr.CustomOp):
+    """The gradient of the crop is a slice.
+
+    Written out, because the adjoint of ``dr.gather`` adds with atomics, which drop NaN on LLVM: a bad step
+    would look good.
+    """
+
+    def eval(self, crop, original, start):
+        self.start, self.shape = dr.opaque(mi.UInt32, start), crop.shape
+        i = dr.arange(mi.UInt32, len(original.array))
+        inside = (i >= self.start) & (i < self.start + len(crop.array))
+        edited = dr.gather(mi.Float, crop.array, i - self.start, inside)
+        return mi.TensorXf(dr.select(inside, edited, original.array), original.shape)
+
+    def backward(self):
+        index = dr.arange(mi.UInt32, self.shape[0] * self.shape[1] * 3) + self.start
+        self.set_grad_in("crop", mi.TensorXf(dr.gather(mi.Float, self.grad_out().array, index), self.shape))
+
+    def name(self):
+        return "place rows"
+
+
+def optimise(
+    representation,
+    params,
+    renderer,
+    objective: Objective,
+    envmap: np.ndarray,
+    first_row: int,
+    settings: config.Optimizer,
+    *,
+    adam: optim.Adam | None = None,
+    state: State | None = None,
+    after_step: Callable[[State, optim.Adam], None] | None = None,
+) -> tuple[dict, State]:
     """Run the loop.
 
     Parameters
@@ -126,8 +169,8 @@ def optimise(representation, params, renderer, objective: Objective, envmap: np.
     adam, state : optional
         To continue an earlier run; changed in place.
     after_step : callable, optional
-        Called with state and optimiser whenever the losses have been read back, and at the end: progress and checkpoints. What it
-        raises ends the run.
+        Called with state and optimiser whenever the losses have been read back, and at the end: progress and
+        checkpoints. What it raises ends the run.
 
     Returns
     -------
@@ -164,10 +207,19 @@ def optimise(representation, params, renderer, objective: Objective, envmap: np.
             state.slowdown *= 0.5
             if state.bad_in_a_row >= MOST_BAD_STEPS:
                 raise NumericalError(
-                    f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not finite; "
-                    "the last good map is kept; lower [optimizer] lr or look at the target for extreme pixels")
-        waiting.append((state.step, dr.detach(total), {k: dr.detach(v) for k, v in terms.items()},
-                        rate, 1000 * (time.perf_counter() - start)))
+                    f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not "
+                    "finite; the last good map is kept; lower [optimizer] lr or look at the target for "
+                    "extreme pixels"
+                )
+        waiting.append(
+            (
+                state.step,
+                dr.detach(total),
+                {k: dr.detach(v) for k, v in terms.items()},
+                rate,
+                1000 * (time.perf_counter() - start),
+            )
+        )
         state.step += 1
         now = time.perf_counter()
         if len(waiting) >= READ_EVERY or now - last_read > READ_SECONDS or state.step == settings.iterations:
@@ -180,6 +232,10 @@ def optimise(representation, params, renderer, objective: Objective, envmap: np.
 
 def _read_back(waiting, state):
     for step, total, terms, lr, ms in waiting:
-        row = {"iteration": step, "loss": float(total[0]), **{name: float(term[0]) for name, term in terms.items()}}
+        row = {
+            "iteration": step,
+            "loss": float(total[0]),
+            **{name: float(term[0]) for name, term in terms.items()},
+        }
         state.history.append({**row, "lr": lr, "step_ms": round(ms, 3)})
     waiting.clear()

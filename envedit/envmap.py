@@ -2,7 +2,8 @@
 
 All share one interface, so that the edit loop knows none of them:
 
-* ``encode(image, seed) -> params``: a flat dict name -> tensor that reproduces the image (H, W, 3) as well as the representation can;
+* ``encode(image, seed) -> params``: a flat dict name -> tensor that reproduces the image (H, W, 3) as well
+  as the representation can;
 * ``decode(params) -> (H, W, 3)``: linear radiance, finite and not negative, differentiable in the parameters;
 * ``lr``: the learning rate that suits its parameters.
 """
@@ -21,8 +22,16 @@ from . import config, fit
 Params = dict[str, "mi.TensorXf"]
 
 
+def _not_negative(radiance):
+    """Clip below at zero, but keep the slope: with that of the clip a texel that is black stays black for good."""
+    return dr.replace_grad(dr.maximum(radiance, 0), radiance)
+
+
 class Pixels:
-    """Radiance itself, one parameter a texel and channel; the paper's baseline. Negative parameters decode to black."""
+    """Radiance itself, one parameter a texel and channel; the paper's baseline.
+
+    Negative parameters decode to black.
+    """
 
     lr = 0.02
 
@@ -32,7 +41,7 @@ class Pixels:
 
     def decode(self, params: Params) -> mi.TensorXf:
         """Return the stored radiance, clipped below at zero."""
-        return dr.maximum(params["radiance"], 0)
+        return _not_negative(params["radiance"])
 
 
 class LogPixels:
@@ -46,8 +55,8 @@ class LogPixels:
         return {"log_radiance": dr.opaque(mi.TensorXf(logs.astype(np.float32)))}
 
     def decode(self, params: Params) -> mi.TensorXf:
-        """Return exp(x) - 0.01, not below zero; x is held under 80, beyond which float32 would overflow in a sum."""
-        return dr.maximum(dr.exp(dr.minimum(params["log_radiance"], 80)) - fit.EPSILON, 0)
+        """Return exp(x) - 0.01, not below zero; x is held under 80, as float32 would overflow in a sum."""
+        return _not_negative(dr.exp(dr.minimum(params["log_radiance"], 80)) - fit.EPSILON)
 
 
 class Siren:
@@ -58,15 +67,22 @@ class Siren:
 
     lr = 1e-4
 
-    def __init__(self, network: config.Representation, settings: config.Fit, folder: Path | None = None,
-                 progress: Callable[[int, int, float], None] | None = None):
+    def __init__(
+        self,
+        network: config.Representation,
+        settings: config.Fit,
+        folder: Path | None = None,
+        progress: Callable[[int, int, float], None] | None = None,
+    ):
         self.network, self.settings, self.folder, self.progress = network, settings, folder, progress
         self.fitted: fit.Fitted | None = None
         self._shape = None
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Fit the network, or take an earlier fit of the same image from disk."""
-        self.fitted = fit.fit(image, self.network, self.settings, seed, folder=self.folder, progress=self.progress)
+        self.fitted = fit.fit(
+            image, self.network, self.settings, seed, folder=self.folder, progress=self.progress
+        )
         self._shape = image.shape[:2]
         return {name: dr.opaque(mi.TensorXf(value)) for name, value in self.fitted.params.items()}
 

@@ -1,8 +1,9 @@
 """Fit a SIREN to an HDR map, robust against changes of its weights (R-SIREN, paper Sec. 4 and 6.1).
 
-The network learns the normalised logarithm of the map (Eq. 1), with a loss in log space and one in radiance (Eq. 4). Under adversarial weight
-perturbation the loss is evaluated at theta + gamma ||theta_l|| / ||d_l|| d_l for every weight matrix l, where d is the direction in which a
-proxy Adam would make the SSIM worse (Eq. 5; Algorithm 1), and the gradient is applied to theta.
+The network learns the normalised logarithm of the map (Eq. 1), with a loss in log space and one in radiance
+(Eq. 4). Under adversarial weight perturbation the loss is evaluated at theta + gamma ||theta_l|| / ||d_l||
+d_l for every weight matrix l, where d is the direction in which a proxy Adam would make the SSIM worse (Eq.
+5; Algorithm 1), and the gradient is applied to theta.
 
 ``python -m envedit.fit MAP.exr`` fits a map, writes what the network makes of it, and says how good it is.
 """
@@ -11,8 +12,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,10 +23,12 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, losses, metrics, optim, siren, ssim
+from .errors import InputError
+from .files import replacing
 
 EPSILON = 0.01
 """Added to radiance inside the logarithm (paper, below Eq. 3)."""
-_RECIPE = 2  # raise when the same settings give another fit
+_RECIPE = 3  # raise when the same settings give another fit
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,10 @@ class Normalisation:
         return (np.log(np.asarray(image, np.float64) + EPSILON) - self.low) / self.span
 
     def decode(self, values):
-        """Map network output in (0, 1) to radiance >= 0 (Eq. 2-3); works on Dr.Jit tensors and arrays."""
-        return dr.exp(values * self.span + self.low) - EPSILON
+        """Map network output in (0, 1) to radiance >= 0, finite (Eq. 2-3); works on Dr.Jit tensors and arrays."""
+        # dr.exp is infinite from 88.38 on. Below 0, where a flat or black map can lead, the slope is kept.
+        radiance = dr.exp(dr.minimum(values * self.span + self.low, 88)) - EPSILON
+        return dr.replace_grad(dr.maximum(radiance, 0), radiance)
 
 
 @dataclass
@@ -57,8 +62,8 @@ class Fitted:
 
     params: dict[str, np.ndarray]
     normalisation: Normalisation
-    log_psnr: float
-    peak_ratio: float
+    log_psnr: float | None
+    peak_ratio: float | None
     epochs: int
     seconds: float
     cached: bool
@@ -68,11 +73,21 @@ def to_image(values: mi.TensorXf, height: int, width: int) -> mi.TensorXf:
     """Reorder network output (3, H * W) to an image (H, W, 3), differentiably."""
     n = height * width
     i = dr.arange(mi.UInt32, 3 * n)
-    return mi.TensorXf(dr.gather(mi.Float, values.array, (i % 3) * n + i // 3, mode=dr.ReduceMode.Permute), (height, width, 3))
+    return mi.TensorXf(
+        dr.gather(mi.Float, values.array, (i % 3) * n + i // 3, mode=dr.ReduceMode.Permute),
+        (height, width, 3),
+    )
 
 
-def fit(image: np.ndarray, network: config.Representation, settings: config.Fit, seed: int = 0, *,
-        folder: Path | None = None, progress: Callable[[int, int, float], None] | None = None) -> Fitted:
+def fit(
+    image: np.ndarray,
+    network: config.Representation,
+    settings: config.Fit,
+    seed: int = 0,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> Fitted:
     """Fit a SIREN to an image.
 
     Parameters
@@ -103,14 +118,23 @@ def fit(image: np.ndarray, network: config.Representation, settings: config.Fit,
     normalisation = Normalisation.of(image)
     params = _train(image, normalisation, network, settings, seed, progress)
     got = evaluate(params, normalisation, image.shape[:2], network.omega).numpy()
-    fitted = Fitted({k: v.numpy() for k, v in params.items()}, normalisation, metrics.log_psnr(got, image),
-                    metrics.peak_ratio(got, image), settings.epochs, time.perf_counter() - start, False)
+    fitted = Fitted(
+        {k: v.numpy() for k, v in params.items()},
+        normalisation,
+        metrics.log_psnr(got, image),
+        metrics.peak_ratio(got, image),
+        settings.epochs,
+        time.perf_counter() - start,
+        False,
+    )
     if path:
         _store(path, fitted)
     return fitted
 
 
-def evaluate(params: siren.Params, normalisation: Normalisation, shape: tuple[int, int], omega: float) -> mi.TensorXf:
+def evaluate(
+    params: siren.Params, normalisation: Normalisation, shape: tuple[int, int], omega: float
+) -> mi.TensorXf:
     """Evaluate a network as an image of linear radiance (H, W, 3), differentiable in its weights."""
     y = siren.evaluate(params, siren.coordinates(*shape), omega)
     return normalisation.decode(to_image(y, *shape))
@@ -149,9 +173,10 @@ class Objective:
 class Perturbation:
     """Adversarial weight perturbation (Eq. 5, Algorithm 1) of the weight matrices.
 
-    The proxy Adam of the paper takes one step from an offset of zero, so that the direction is not the rounding error of two nearly equal
-    weights. Its learning rate cancels in the normalisation but for Adam's epsilon. It is made anew every time (Algorithm 1 shows no state): with
-    moments that live on, the fit of kloofendal_48d at 128x32 ended at 34.8 instead of 40.1 dB and was less robust.
+    The proxy Adam of the paper takes one step from an offset of zero, so that the direction is not the
+    rounding error of two nearly equal weights. Its learning rate cancels in the normalisation but for Adam's
+    epsilon. It is made anew every time (Algorithm 1 shows no state): with moments that live on, the fit of
+    kloofendal_48d at 128x32 ended at 34.8 instead of 40.1 dB and was less robust.
     """
 
     def __init__(self, params: siren.Params, gamma: float):
@@ -171,7 +196,9 @@ class Perturbation:
         out = dict(params)
         for name in self.names:
             d = self._direction[name]
-            length = dr.sqrt(dr.sum(dr.square(params[name].array))) * dr.rcp(dr.sqrt(dr.sum(dr.square(d.array))) + 1e-20)
+            length = dr.sqrt(dr.sum(dr.square(params[name].array))) * dr.rcp(
+                dr.sqrt(dr.sum(dr.square(d.array))) + 1e-20
+            )
             out[name] = params[name] + mi.TensorXf(self.gamma * length * d.array, d.shape)
         dr.eval(out)
         return out
@@ -219,30 +246,44 @@ def default_folder() -> Path:
 
 
 def _key(image, network, settings, seed):
-    what = {"network": [network.hidden, network.depth, network.omega], "seed": seed, "recipe": _RECIPE, "shape": image.shape,
-            **{k: v for k, v in asdict(settings).items() if k != "cache"}}
+    what = {
+        "network": [network.hidden, network.depth, network.omega],
+        "seed": seed,
+        "recipe": _RECIPE,
+        "shape": image.shape,
+        **{k: v for k, v in asdict(settings).items() if k != "cache"},
+    }
     return hashlib.sha256(repr(sorted(what.items())).encode() + image.tobytes()).hexdigest()[:32]
 
 
 def _load(path):
     try:
-        with np.load(path) as stored:
-            numbers = stored["numbers"]
+        # Opened here: np.load leaves a file open that is no archive.
+        with open(path, "rb") as file, np.load(file) as stored:
+            low, span, log_psnr, peak, epochs, seconds = stored["numbers"].tolist()
             params = {k[2:]: stored[k] for k in stored.files if k.startswith("p/")}
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None  # not there, or damaged: fit again
-    low, span, log_psnr, peak, epochs, seconds = numbers
-    return Fitted(params, Normalisation(float(low), float(span)), float(log_psnr), float(peak), int(epochs), float(seconds), True)
+    # None is stored as NaN.
+    log_psnr, peak = (None if np.isnan(number) else number for number in (log_psnr, peak))
+    return Fitted(params, Normalisation(low, span), log_psnr, peak, int(epochs), seconds, True)
 
 
 def _store(path, fitted):
-    numbers = [fitted.normalisation.low, fitted.normalisation.span, fitted.log_psnr, fitted.peak_ratio, fitted.epochs, fitted.seconds]
+    numbers = [
+        fitted.normalisation.low,
+        fitted.normalisation.span,
+        fitted.log_psnr,
+        fitted.peak_ratio,
+        fitted.epochs,
+        fitted.seconds,
+    ]
+    weights = {f"p/{name}": value for name, value in fitted.params.items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-            np.savez(file, numbers=np.array(numbers, np.float64), **{f"p/{k}": v for k, v in fitted.params.items()})
-        os.replace(file.name, path)
-    except OSError:
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            np.savez(file, numbers=np.array(numbers, np.float64), **weights)
+    except (OSError, InputError):
         pass  # a cache that cannot be written costs time, not the result
 
 
@@ -250,7 +291,10 @@ def _store(path, fitted):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set fit.epochs=100]``: only the representation; returns the exit code."""
+    """Fit a map and judge the fit, nothing else; returns the exit code.
+
+    ``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set fit.epochs=100]``
+    """
     import argparse
     import sys
 
@@ -259,14 +303,24 @@ def main(argv: list[str] | None = None) -> int:
     from .pipeline import active_rows, load_map
     from .progress import Progress
 
-    parser = argparse.ArgumentParser(prog="python -m envedit.fit", description="Fit a SIREN to an HDR environment map.")
+    parser = argparse.ArgumentParser(
+        prog="python -m envedit.fit", description="Fit a SIREN to an HDR environment map."
+    )
     parser.add_argument("map", metavar="MAP", help="EXR, Radiance HDR, or sunsky")
-    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: MAP_fit beside the map)")
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for the results (default: MAP_fit beside the map)"
+    )
     parser.add_argument("--preset", choices=config.preset_names())
     parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
     arguments = parser.parse_args(argv)
     try:
-        settings = config.loads("", Path.cwd(), "command line", arguments.preset, [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides])
+        settings = config.loads(
+            "",
+            Path.cwd(),
+            "command line",
+            arguments.preset,
+            [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides],
+        )
         doctor.ensure(settings.variant)
         mi.set_variant(settings.variant)
         original, warnings = load_map(settings.input)
@@ -276,25 +330,40 @@ def main(argv: list[str] | None = None) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         with Progress() as progress:
             progress.stage(f"fitting {arguments.map}")
-            fitted = fit(crop, settings.representation, settings.fit, settings.seed, folder=default_folder(),
-                         progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"))
+            fitted = fit(
+                crop,
+                settings.representation,
+                settings.fit,
+                settings.seed,
+                folder=default_folder(),
+                progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
+            )
         params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
         got = evaluate(params, fitted.normalisation, crop.shape[:2], settings.representation.omega).numpy()
         image.write_exr(folder / "fitted.exr", got, {"source": arguments.map, "rows": f"{first} to {last}"})
         preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
-        numbers = {"log_psnr": fitted.log_psnr, "peak_ratio": fitted.peak_ratio, "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
-                   "epochs": fitted.epochs, "seconds": round(fitted.seconds, 2), "cached": fitted.cached}
+        numbers = {
+            "log_psnr": fitted.log_psnr,
+            "peak_ratio": fitted.peak_ratio,
+            "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
+            "epochs": fitted.epochs,
+            "seconds": round(fitted.seconds, 2),
+            "cached": fitted.cached,
+        }
         manifest.write_metrics(folder / "fit.json", numbers)
         for line in warnings:
             print(f"envedit: warning: {line}", file=sys.stderr)
-        print(f"log-PSNR {fitted.log_psnr:.1f} dB, peak ratio {fitted.peak_ratio:.2f}, {fitted.seconds:.1f} s"
-              f"{' (kept from an earlier run)' if fitted.cached else ''}; results in {folder}")
+        print(
+            f"log-PSNR {fitted.log_psnr:.1f} dB, peak ratio {fitted.peak_ratio:.2f}, {fitted.seconds:.1f} s"
+            f"{' (kept from an earlier run)' if fitted.cached else ''}; results in {folder}"
+        )
         return 0
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        print(f"envedit: {error.filename}: cannot be written ({error.strerror}): give another folder with --out", file=sys.stderr)
+        reason = f"{error.filename}: cannot be written ({error.strerror})"
+        print(f"envedit: {reason}: give another folder with --out", file=sys.stderr)
         return 3
 
 

@@ -1,11 +1,12 @@
 """Camera paths of a scene, traced once without looking at the environment map.
 
-What a map of any content contributes to a picture is decided by three things found here: the surface points that a pixel sees
-directly and after further bounces (:class:`Vertex`), and the directions in which its paths leave the scene (:class:`Escape`).
+What a map of any content contributes to a picture is decided by three things found here: the surface points
+that a pixel sees directly and after further bounces (:class:`Vertex`), and the directions in which its paths
+leave the scene (:class:`Escape`).
 
-Sample positions are a rank-1 lattice (R2, Roberts 2018) shifted at random in every pixel, so that the samples of one pixel are spread
-evenly and the errors of neighbouring pixels are independent. The index is permuted anew for every pair of dimensions, otherwise
-two of them would move together.
+Sample positions are a rank-1 lattice (R2, Roberts 2018) shifted at random in every pixel, so that the
+samples of one pixel are spread evenly and the errors of neighbouring pixels are independent. The index is
+permuted anew for every pair of dimensions, otherwise two of them would move together.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ _TO_UNIT = 2.0**-32
 class Vertex:
     """Surface points of one bounce; lane = pixel * paths + path.
 
-    ``bounce`` counts from 1, the point that the camera sees. ``throughput`` is the RGB weight of the path up to the point, before its
-    BSDF; lanes that left the scene have zero throughput.
+    ``bounce`` counts from 1, the point that the camera sees. ``throughput`` is the RGB weight of the path up
+    to the point, before its BSDF; lanes that left the scene have zero throughput.
     """
 
     bounce: int
@@ -40,8 +41,8 @@ class Vertex:
 class Escape:
     """Directions in which the paths left the scene after ``bounce`` bounces (0: seen by the camera).
 
-    ``pdf`` is the solid-angle density of the BSDF sample that chose the direction, infinite for camera rays and specular
-    reflection, which no other strategy can sample.
+    ``pdf`` is the solid-angle density of the BSDF sample that chose the direction, infinite for camera rays
+    and specular reflection, which no other strategy can sample.
     """
 
     bounce: int
@@ -62,7 +63,9 @@ def lattice(index: mi.UInt32, scramble: mi.UInt32) -> mi.Point2f:
     )
 
 
-def trace(scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: int) -> Iterator[Vertex | Escape]:
+def trace(
+    scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: int
+) -> Iterator[Vertex | Escape]:
     """Trace camera paths and yield, bounce by bounce, where they leave the scene and where they hit it.
 
     Parameters
@@ -107,7 +110,9 @@ def trace(scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: i
         yield Vertex(bounce + 1, si, dr.select(active, throughput, 0), mi.Bool(active))
         bs, value = si.bsdf().sample(context, si, sample(3 * bounce + 3).x, sample(3 * bounce + 4), active)
         ray = si.spawn_ray(si.to_world(bs.wo))
-        throughput = throughput * mi.Color3f(mi.unpolarized_spectrum(si.to_world_mueller(value, -bs.wo, si.wi)))
+        throughput = throughput * mi.Color3f(
+            mi.unpolarized_spectrum(si.to_world_mueller(value, -bs.wo, si.wi))
+        )
         active &= dr.max(dr.abs(throughput)) > 0
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
 
@@ -115,23 +120,25 @@ def trace(scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: i
 def _camera_rays(sensor, pixel, sample):
     """Rays through the pixels' footprints, distributed as the film's reconstruction filter."""
     film = sensor.film()
-    size, offset = film.crop_size(), film.crop_offset()
+    size = film.crop_size()
     column, row = pixel % size.x, pixel // size.x
     u = sample(0)
     x, weight_x = _filter_offset(film.rfilter(), u.x, column, size.x, film.sample_border())
     y, weight_y = _filter_offset(film.rfilter(), u.y, row, size.y, film.sample_border())
+    # Relative to the crop window, as the sensor wants it.
     position = mi.Point2f((mi.Float(column) + x) / size.x, (mi.Float(row) + y) / size.y)
-    del offset  # positions are relative to the crop window, as the sensor wants them
     shutter = sample(2)
-    ray, weight = sensor.sample_ray(sensor.shutter_open() + sensor.shutter_open_time() * shutter.x, shutter.y, position, sample(1))
+    ray, weight = sensor.sample_ray(
+        sensor.shutter_open() + sensor.shutter_open_time() * shutter.x, shutter.y, position, sample(1)
+    )
     return mi.Ray3f(ray), mi.Color3f(mi.unpolarized_spectrum(weight)) * weight_x * weight_y
 
 
 def _filter_offset(rfilter, u, index, size, border):
-    """Offset in pixels from the pixel's lower corner, drawn from |filter|, and the weight that makes it exact.
+    """Offset in pixels from the pixel's lower corner, drawn from |filter|, and its exact weight.
 
-    The film normalises by the weights of samples that fell inside it, so the filter is cut at the borders of the image,
-    unless it samples a ``border`` around it.
+    The film normalises by the weights of samples that fell inside it, so the filter is cut at the borders of
+    the image, unless it samples a ``border`` around it.
     """
     radius = rfilter.radius()
     if rfilter.is_box_filter():

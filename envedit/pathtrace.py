@@ -1,6 +1,7 @@
 """The paper's renderer: Mitsuba's differentiable path tracer, with fresh samples at every step.
 
-Unbiased, but its noise bends any non-linear loss (docs/architecture.md): it is here as the reference that the paper used, not for speed.
+Unbiased, but its noise bends any non-linear loss (docs/architecture.md): it is here as the reference that
+the paper used, not for speed.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class PathTracer:
     max_depth : int
         Longest path in segments.
     seed : int
-        Base seed; every step draws two seeds of its own from it, one for the picture and one for the gradient.
+        Base seed; every step draws two seeds of its own from it, one for the picture and one for the
+        gradient.
     """
 
     def __init__(self, scene: Scene, spp: int | str = "auto", max_depth: int | str = "auto", seed: int = 0):
@@ -49,7 +51,14 @@ class PathTracer:
         params[self.scene.envmap_key] = mi.TensorXf(data, (height, width + 2, 3))
         params.update()
         seed = mi.sample_tea_32(2 * step, self.seed)
-        return mi.render(self.scene.mi, params, integrator=self._integrator, spp=self.spp, seed=int(seed[0]), seed_grad=int(seed[1]))
+        return mi.render(
+            self.scene.mi,
+            params,
+            integrator=self._integrator,
+            spp=self.spp,
+            seed=int(seed[0]),
+            seed_grad=int(seed[1]),
+        )
 
     def state(self) -> dict:
         """Return what a checkpoint must hold: nothing, the seeds follow from the step."""

@@ -76,7 +76,10 @@ class Stopped(NumericalError):
 
 @dataclass
 class Watch:
-    """What a run tells while it works: ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one."""
+    """What a run tells while it works.
+
+    ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one.
+    """
 
     stage: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, text: None
@@ -106,7 +109,7 @@ def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
 
 
 def active_rows(rows, height: int) -> tuple[int, int]:
-    """First and last row that the edit may change; "upper" is the half above the horizon (paper, Sec. 5.1)."""
+    """Return the first and last row that may change; "upper": above the horizon (paper, Sec. 5.1)."""
     if rows == "upper":
         return 0, (height + 1) // 2 - 1
     return (0, height - 1) if rows == "all" else (rows[0], rows[1])
@@ -117,12 +120,26 @@ def make_renderer(settings: config.Config, lit: scene.Scene, shape, progress=Non
     chosen = settings.renderer
     if chosen.kind == "path":
         return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
-    return LightTransport.build(lit, *shape, spp=chosen.spp, max_depth=chosen.max_depth, seed=settings.seed, memory_gb=chosen.memory_gb,
-                                refresh=0 if chosen.refresh == "auto" else chosen.refresh, progress=progress)
+    return LightTransport.build(
+        lit,
+        *shape,
+        spp=chosen.spp,
+        max_depth=chosen.max_depth,
+        seed=settings.seed,
+        memory_gb=chosen.memory_gb,
+        refresh=0 if chosen.refresh == "auto" else chosen.refresh,
+        progress=progress,
+    )
 
 
-def run(settings: config.Config, *, folder: Path | None = None, resume: bool = False, base: Path | None = None,
-        watch: Watch | None = None) -> Result:
+def run(
+    settings: config.Config,
+    *,
+    folder: Path | None = None,
+    resume: bool = False,
+    base: Path | None = None,
+    watch: Watch | None = None,
+) -> Result:
     """Carry out an edit.
 
     Parameters
@@ -155,7 +172,13 @@ def run(settings: config.Config, *, folder: Path | None = None, resume: bool = F
         warnings += found
         height, width, _ = original.shape
         first, last = active_rows(settings.input.rows, height)
-        lit = scene.load(settings.scene.file, settings.scene.width, settings.scene.height, dict(settings.scene.parameters), base)
+        lit = scene.load(
+            settings.scene.file,
+            settings.scene.width,
+            settings.scene.height,
+            dict(settings.scene.parameters),
+            base,
+        )
         watch.stage("rendering the target")
         wanted = target.make(settings.target, lit, original, settings.seed, settings.input.repair)
         warnings += wanted.warnings
@@ -166,17 +189,39 @@ def run(settings: config.Config, *, folder: Path | None = None, resume: bool = F
     crop = original[first : last + 1]
     with clock("fit_s"):
         watch.stage(f"fitting ({settings.representation.kind})")
-        representation = envmap.make(settings, fit.default_folder(),
-                                     lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"))
+        representation = envmap.make(
+            settings,
+            fit.default_folder(),
+            lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"),
+        )
         params = representation.encode(crop, settings.seed)
     with clock("transport_s"):
-        watch.stage("tracing light transport" if settings.renderer.kind == "transport" else "preparing the path tracer")
-        renderer = make_renderer(settings, lit, (height, width), lambda done, total: watch.progress(done, total, ""))
+        watch.stage(
+            "tracing light transport"
+            if settings.renderer.kind == "transport"
+            else "preparing the path tracer"
+        )
+        renderer = make_renderer(
+            settings, lit, (height, width), lambda done, total: watch.progress(done, total, "")
+        )
 
     with clock("edit_s"):
         watch.stage("editing")
         decode = _Decoder(representation, original, first)
-        params, state = _optimise(settings, representation, params, renderer, wanted, original, first, crop, folder, resume, decode, watch)
+        params, state = _optimise(
+            settings,
+            representation,
+            params,
+            renderer,
+            wanted,
+            original,
+            first,
+            crop,
+            folder,
+            resume,
+            decode,
+            watch,
+        )
         edited = decode(params)
 
     with clock("judge_s"):
@@ -190,12 +235,26 @@ def run(settings: config.Config, *, folder: Path | None = None, resume: bool = F
     measured = {
         "render": metrics.compare(final, wanted.picture, tonemap),
         "initial": metrics.compare(initial, wanted.picture, tonemap),
-        "envmap": None if wanted.envmap is None else metrics.compare(edited[rows], wanted.envmap[rows], tonemap),
-        "fit": None if fitted is None else {"log_psnr": fitted.log_psnr, "peak_ratio": fitted.peak_ratio, "epochs": fitted.epochs,
-                                            "cached": fitted.cached},
-        "timing": {"import_s": None, **{k: round(seconds[k], 3) for k in ("target_s", "fit_s", "transport_s", "edit_s", "judge_s")},
-                   "report_s": None, "total_s": round(time.perf_counter() - begun, 3),
-                   "per_iteration_ms": float(np.median([row["step_ms"] for row in state.history])) if iterations else None},
+        "envmap": None
+        if wanted.envmap is None
+        else metrics.compare(edited[rows], wanted.envmap[rows], tonemap),
+        "fit": None
+        if fitted is None
+        else {
+            "log_psnr": fitted.log_psnr,
+            "peak_ratio": fitted.peak_ratio,
+            "epochs": fitted.epochs,
+            "cached": fitted.cached,
+        },
+        "timing": {
+            "import_s": None,
+            **{k: round(seconds[k], 3) for k in ("target_s", "fit_s", "transport_s", "edit_s", "judge_s")},
+            "report_s": None,
+            "total_s": round(time.perf_counter() - begun, 3),
+            "per_iteration_ms": float(np.median([row["step_ms"] for row in state.history]))
+            if iterations
+            else None,
+        },
         "iterations": state.step,
         "non_finite_steps": state.bad_steps,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
@@ -205,9 +264,16 @@ def run(settings: config.Config, *, folder: Path | None = None, resume: bool = F
         measured["sun_offset_texels"] = metrics.sun_offset(edited[rows], wanted.envmap[rows])
         measured["initial_envmap"] = metrics.compare(original[rows], wanted.envmap[rows], tonemap)
     notes = [wanted.source, *renderer.choices]
-    return Result(edited, {"initial": initial, "target": wanted.picture, "edited": final},
-                  {"initial": original, "target": wanted.envmap, "edited": edited}, measured, state.history, notes, warnings,
-                  getattr(renderer, "influence", None))
+    return Result(
+        edited,
+        {"initial": initial, "target": wanted.picture, "edited": final},
+        {"initial": original, "target": wanted.envmap, "edited": edited},
+        measured,
+        state.history,
+        notes,
+        warnings,
+        getattr(renderer, "influence", None),
+    )
 
 
 _TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
@@ -223,14 +289,21 @@ class _Decoder:
         crop = self.representation.decode(params).numpy()
         if not np.isfinite(crop).all():
             row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
-            raise NumericalError(f"the edited map is not finite at row {self.first + row}, column {column}: lower [optimizer] lr")
+            raise NumericalError(
+                f"the edited map is not finite at row {self.first + row}, column {column}: "
+                "lower [optimizer] lr"
+            )
         edited = self.original.copy()
         edited[self.first : self.first + crop.shape[0]] = crop
         return edited
 
 
-def _optimise(settings, representation, params, renderer, wanted, original, first, crop, folder, resume, decode, watch):
-    objective = edit.Objective(settings.loss, wanted.picture, wanted.weight, crop, settings.optimizer.iterations)
+def _optimise(
+    settings, representation, params, renderer, wanted, original, first, crop, folder, resume, decode, watch
+):
+    objective = edit.Objective(
+        settings.loss, wanted.picture, wanted.weight, crop, settings.optimizer.iterations
+    )
     lr = representation.lr if settings.optimizer.lr == "auto" else settings.optimizer.lr
     adam, state = optim.Adam(params, lr), edit.State()
     what = checkpoint.digest(settings, [original, wanted.picture])
@@ -257,8 +330,18 @@ def _optimise(settings, representation, params, renderer, wanted, original, firs
                 saved = time.perf_counter()
 
         try:
-            return edit.optimise(representation, params, renderer, objective, original, first, settings.optimizer,
-                                 adam=adam, state=state, after_step=after_step)
+            return edit.optimise(
+                representation,
+                params,
+                renderer,
+                objective,
+                original,
+                first,
+                settings.optimizer,
+                adam=adam,
+                state=state,
+                after_step=after_step,
+            )
         except NumericalError as error:
             raise Stopped(str(error), decode(adam.params)) from error
 

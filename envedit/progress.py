@@ -46,13 +46,17 @@ class Progress:
             return
         if self._terminal:
             if self._bar is None:
-                self._bar = tqdm(total=total, desc=self._stage, file=self.stream, leave=False, dynamic_ncols=True)
+                self._bar = tqdm(
+                    total=total, desc=self._stage, file=self.stream, leave=False, dynamic_ncols=True
+                )
             self._bar.set_postfix_str(text, refresh=False)
             self._bar.update(done - self._bar.n)
         elif time.monotonic() - self._last_line >= LINE_SECONDS:
             self._last_line = time.monotonic()
             rate = done / max(self._last_line - self._begun, 1e-9)
-            print(f"{self._stage}: {done}/{total}, {rate:.3g}/s {text}".rstrip(), file=self.stream, flush=True)
+            print(
+                f"{self._stage}: {done}/{total}, {rate:.3g}/s {text}".rstrip(), file=self.stream, flush=True
+            )
 
     def _close(self):
         if self._bar is not None:

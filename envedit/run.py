@@ -1,61 +1,76 @@
 """The command line: parse, call, print, write, exit code.
 
-``python -m envedit.run CONFIG.toml`` carries out an edit and leaves the map, renderings, metrics and a report in a folder.
+``python -m envedit.run CONFIG.toml`` carries out an edit and leaves the map, renderings, metrics and a report
+in a folder.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
 import os
 import sys
 import time
 from pathlib import Path
 
-_START = time.perf_counter()
 _EARLIER = "earlier"
-_OUTPUTS = ("edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "influence.exr", "preview.png", "report.html",
-            "history.csv", "config.toml", "manifest.json", "metrics.json", "checkpoint.npz")
+_OUTPUTS = (
+    "edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "influence.exr",
+    "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "metrics.json",
+    "checkpoint.npz",
+)  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    start = time.perf_counter()
     from .errors import EnveditError
 
     arguments = _parser().parse_args(argv)
     try:
-        return _run(arguments)
+        return _run(arguments, start)
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("envedit: interrupted; nothing was written yet", file=sys.stderr)
+        print("envedit: interrupted; there is no checkpoint to resume from", file=sys.stderr)
         return 130
 
 
 def _parser():
-    parser = argparse.ArgumentParser(prog="python -m envedit.run", description="Edit an HDR environment map by inverse rendering.")
+    about = "Edit an HDR environment map by inverse rendering."
+    parser = argparse.ArgumentParser(prog="python -m envedit.run", description=about)
     parser.add_argument("config", metavar="CONFIG.toml", help="what to do")
-    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: CONFIG_out beside the configuration)")
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for the results (default: CONFIG_out beside the configuration)"
+    )
     parser.add_argument("--preset", choices=("draft", "standard", "paper"), help="named set of defaults")
-    parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides",
-                        help="change one key of the configuration; may be repeated")
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted run from its checkpoint")
+    parser.add_argument(
+        "--set",
+        metavar="table.key=value",
+        action="append",
+        default=[],
+        dest="overrides",
+        help="change one key of the configuration; may be repeated",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="continue an interrupted run from its checkpoint"
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
 
-def _run(arguments):
+def _run(arguments, start):
     from . import config, doctor
 
     overrides = list(arguments.overrides)
     if arguments.out:
-        overrides.append(f"output.dir={json.dumps(str(Path(arguments.out).absolute()))}")
+        overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
     settings = config.load(arguments.config, arguments.preset, overrides)
     folder = Path(settings.output.dir)
-    _prepare(folder, arguments.resume)
+    named = (settings.input.envmap, settings.scene.file, settings.target.file, settings.target.mask)
+    _prepare(folder, arguments.resume, [Path(path) for path in named if path])
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
+        _check_same(settings, folder)
         _say(arguments.quiet, f"{folder}: this run is complete, there is nothing to resume")
         return 0
 
@@ -66,16 +81,28 @@ def _run(arguments):
     mi.set_log_level(mi.LogLevel.Error)
     from . import image, pipeline
 
-    import_s = time.perf_counter() - _START
+    import_s = time.perf_counter() - start
     from .progress import Progress
 
     with Progress(quiet=arguments.quiet) as progress:
         try:
-            result = pipeline.run(settings, folder=folder, resume=arguments.resume, base=Path(arguments.config).absolute().parent,
-                                  watch=pipeline.Watch(progress.stage, progress.update))
+            result = pipeline.run(
+                settings,
+                folder=folder,
+                resume=arguments.resume,
+                base=Path(arguments.config).absolute().parent,
+                watch=pipeline.Watch(progress.stage, progress.update),
+            )
         except pipeline.Interrupted as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
-            print(f"envedit: {stop}; checkpoint and edited.exr so far are in {folder}; continue with --resume", file=sys.stderr)
+            kept = f"checkpoint and edited.exr so far are in {folder}; continue with --resume"
+            print(f"envedit: {stop}; {kept}", file=sys.stderr)
+            return 130
+        except KeyboardInterrupt:
+            if not (folder / "checkpoint.npz").exists():
+                raise
+            kept = f"a checkpoint is in {folder}; continue with --resume"
+            print(f"envedit: interrupted; {kept}", file=sys.stderr)
             return 130
         except pipeline.Stopped as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
@@ -84,30 +111,49 @@ def _run(arguments):
     return _write(settings, folder, result, import_s, arguments.quiet)
 
 
-def _prepare(folder, resume):
-    """Make the output folder; move what an earlier run left there out of the way."""
+def _prepare(folder, resume, inputs):
+    """Make the output folder; move what an earlier run left there out of the way, unless it is read now."""
     from .errors import InputError
 
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file, the results need a folder: give another with --out or [output] dir")
+        raise InputError(f"{folder}: is a file, the results need a folder: give another with --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         old = [folder / name for name in _OUTPUTS if (folder / name).exists()]
+        if mine := [path for path in old if path in inputs]:
+            raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
         if old and not resume:
-            number = 1 + max((int(p.name.rpartition("-")[2]) for p in folder.glob(f"{_EARLIER}-*") if p.name.rpartition("-")[2].isdigit()),
-                             default=0)
+            numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{_EARLIER}-*")]
+            number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)
             keep = folder / f"{_EARLIER}-{number}"
             keep.mkdir()
             for path in old:
                 path.rename(keep / path.name)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be used for the results ({error.strerror}): give another with --out") from error
+        reason = f"{folder}: cannot be used for the results ({error.strerror or error})"
+        raise InputError(f"{reason}: give another with --out") from error
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: cannot be written to: give another folder with --out")
 
 
+def _check_same(settings, folder):
+    """Refuse to call the run in a folder complete when it was asked for something else."""
+    from dataclasses import replace
+
+    from . import config
+    from .errors import ConfigError, InputError
+
+    try:
+        done = config.load(folder / "config.toml")
+        same = replace(done, output=replace(done.output, dir=settings.output.dir)) == settings
+    except ConfigError:
+        same = False
+    if not same:
+        raise InputError(f"{folder}: holds a finished run of another configuration: run without --resume")
+
+
 def _write(settings, folder, result, import_s, quiet):
-    from . import checkpoint, config, files, image, manifest, preview, report
+    from . import checkpoint, config, files, image, manifest, preview, report, scene
 
     start = time.perf_counter()
     source = {"source": settings.input.envmap}
@@ -115,24 +161,40 @@ def _write(settings, folder, result, import_s, quiet):
     for name, picture in result.renders.items():
         image.write_exr(folder / f"render_{name}.exr", picture, {"source": settings.scene.file})
     if result.influence is not None:
-        image.write_exr(folder / "influence.exr", result.influence[..., None].repeat(3, axis=2), {"content": "T' 1: influence per texel"})
+        grey = result.influence[..., None].repeat(3, axis=2)
+        image.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
     text = config.to_toml(settings)
     files.write_atomically(folder / "config.toml", text.encode())
     manifest.write_history(folder / "history.csv", result.history)
-    inputs = {name: path for name, path in (("envmap", settings.input.envmap), ("scene", settings.scene.file),
-                                            ("target", settings.target.file), ("mask", settings.target.mask)) if Path(path).is_file()}
+    named = {
+        "envmap": settings.input.envmap,
+        "scene": scene._find(settings.scene.file),
+        "target": settings.target.file,
+        "mask": settings.target.mask,
+    }
+    inputs = {role: path for role, path in named.items() if Path(path).is_file()}
     facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)
     manifest.write_manifest(folder / "manifest.json", facts)
 
     warnings = list(result.warnings)
     timing = result.metrics["timing"]
     timing["import_s"] = round(import_s, 3)
-    with contextlib.suppress(ImportError):
+    if settings.output.report:
         preview.preview(folder / "preview.png", result.renders, result.maps, settings.output.tonemap)
-        if settings.output.report:
-            report.write_report(folder / "report.html", title=f"{Path(settings.input.envmap).stem}, {Path(settings.scene.file).stem}",
-                                config_toml=text, metrics=result.metrics, manifest=facts, history=result.history, renders=result.renders,
-                                maps=result.maps, warnings=warnings, notes=result.notes, tonemap=settings.output.tonemap)
+        title = f"{Path(settings.input.envmap).stem}, {Path(settings.scene.file).stem}"
+        report.write_report(
+            folder / "report.html",
+            title=title,
+            config_toml=text,
+            metrics=result.metrics,
+            manifest=facts,
+            history=result.history,
+            renders=result.renders,
+            maps=result.maps,
+            warnings=warnings,
+            notes=result.notes,
+            tonemap=settings.output.tonemap,
+        )
     timing["report_s"] = round(time.perf_counter() - start, 3)
     timing["total_s"] = round(timing["total_s"] + timing["import_s"] + timing["report_s"], 3)
     lost = manifest.write_metrics(folder / "metrics.json", result.metrics)

@@ -5,12 +5,12 @@ sine layers, a linear layer and a sigmoid::
 
     h_0 = sin(omega (W_0 x + b_0)),   h_i = sin(omega (W_i h_{i-1} + b_i)),   y = sigmoid(W h_depth + b)
 
-Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out, 1) upwards. Activations are
-(width, N): points are columns, so that a bias gradient is a sum over contiguous memory and every product of
-the reverse pass is one matrix product with a transpose flag, which costs nothing.
+Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out, 1) upwards.
+Activations are (width, N): points are columns, so that a bias gradient is a sum over contiguous memory and
+every product of the reverse pass is one matrix product with a transpose flag, which costs nothing.
 
-The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the price
-of one), and needs two matrix products a layer beside the forward one: that is the least possible.
+The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the
+price of one), and needs two matrix products a layer beside the forward one: that is the least possible.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ import numpy as np
 Params = dict[str, "mi.TensorXf"]
 
 
-def init(seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inputs: int = 2, outputs: int = 3) -> Params:
+def init(
+    seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inputs: int = 2, outputs: int = 3
+) -> Params:
     """Draw the initial weights of a SIREN.
 
-    First layer U(-1/in, 1/in), later ones U(-sqrt(6/in)/omega, sqrt(6/in)/omega) (Sitzmann et al. 2020, Sec. 3.2), biases
-    U(-1/sqrt(in), 1/sqrt(in)) as in the authors' code.
+    First layer U(-1/in, 1/in), later ones U(-sqrt(6/in)/omega, sqrt(6/in)/omega) (Sitzmann et al. 2020,
+    Sec. 3.2), biases U(-1/sqrt(in), 1/sqrt(in)) as in the authors' code.
 
     Parameters
     ----------
@@ -50,8 +52,12 @@ def init(seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inpu
     for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         bound = 1.0 / fan_in if i == 0 else np.sqrt(6.0 / fan_in) / omega
         bias = 1.0 / np.sqrt(fan_in)
-        params[f"{i}.weight"] = dr.opaque(mi.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)))
-        params[f"{i}.bias"] = dr.opaque(mi.TensorXf(rng.uniform(-bias, bias, (fan_out, 1)).astype(np.float32)))
+        params[f"{i}.weight"] = dr.opaque(
+            mi.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32))
+        )
+        params[f"{i}.bias"] = dr.opaque(
+            mi.TensorXf(rng.uniform(-bias, bias, (fan_out, 1)).astype(np.float32))
+        )
     return params
 
 
@@ -68,8 +74,8 @@ def weight_names(params: Params) -> list[str]:
 def coordinates(height: int, width: int) -> mi.TensorXf:
     """Texel centres as network coordinates (2, H * W), rows (y, x) in (-1, 1), row-major over texels.
 
-    Centres, not corners: the same picture area is covered at every resolution, so that a network fitted at one
-    can be evaluated at another without a shift.
+    Centres, not corners: the same picture area is covered at every resolution, so that a network fitted at
+    one can be evaluated at another without a shift.
     """
     y = (2 * np.arange(height) + 1) / height - 1
     x = (2 * np.arange(width) + 1) / width - 1
@@ -140,12 +146,13 @@ def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
             slope = tape[i - 1][1]
             delta = dr.matmul(params[f"{i}.weight"], delta, At=True) * slope
             h = tape[i - 1][0]
-    # In the order of the parameters: dr.CustomOp.set_grad_in drops, silently, a dict whose keys come in another order.
+    # In the order of the parameters: dr.CustomOp.set_grad_in drops, silently, a dict whose keys come in
+    # another order.
     return {name: grads[name] for name in params}
 
 
 def evaluate(params: Params, x: mi.TensorXf, omega: float) -> mi.TensorXf:
-    """Evaluate the network as one differentiable operation: :func:`forward` with :func:`backward` as its adjoint."""
+    """Evaluate the network as one differentiable operation: :func:`forward`, reversed by :func:`backward`."""
     return dr.custom(_Siren, params, x, omega)
 
 

@@ -1,9 +1,10 @@
 """A sparse matrix with colour weights whose product costs what its memory traffic costs.
 
-Rows are grouped in slices of :data:`SLICE` rows of similar length, padded to the longest of the slice and stored
-column by column (sliced ELLPACK, Kreutzer et al. 2014, "SELL-C-sigma"): the lanes of a vector then read neighbouring
-memory. An entry is four floats, (r, g, b, bits of the column index), fetched by one packet load. Each output is summed by
-one lane in a fixed order: the product has no atomics and gives the same bits on every run.
+Rows are grouped in slices of :data:`SLICE` rows of similar length, padded to the longest of the slice and
+stored column by column (sliced ELLPACK, Kreutzer et al. 2014, "SELL-C-sigma"): the lanes of a vector then
+read neighbouring memory. An entry is four floats, (r, g, b, bits of the column index), fetched by one packet
+load. Each output is summed by one lane in a fixed order: the product has no atomics and gives the same bits
+on every run.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class ColourMatrix:
         slices = -(-shape[0] // SLICE)
         count = np.bincount(rows, minlength=slices * SLICE)
         by_length = np.argsort(count, kind="stable")[::-1]
-        # The work is cut into few blocks of consecutive lanes, one or more a thread: dealing the slices out by length balances them.
+        # The work is cut into few blocks of consecutive lanes, one or more a thread: dealing the slices out
+        # by length balances them.
         dealt = by_length.reshape(slices, SLICE)
         dealt = np.concatenate([dealt[0::4], dealt[2::4], dealt[1::4], dealt[3::4]])
         lane = np.empty(slices * SLICE, np.int64)
@@ -94,6 +96,18 @@ def _product(packed, x, start, stop):
     return total
 
 
+def to_packets(flat: mi.Float, count: int) -> mi.Float:
+    """Pad ``count`` colours, 3 floats each, to the 4 that :meth:`ColourMatrix.apply` loads at once."""
+    i = dr.arange(mi.UInt32, count * 4)
+    return dr.gather(mi.Float, flat, (i >> 2) * 3 + (i & 3), (i & 3) < 3)
+
+
+def scale_packets(packets: mi.Float, scale: mi.Float, count: int) -> mi.Float:
+    """Multiply each of ``count`` packets by its own number."""
+    i = dr.arange(mi.UInt32, count * 4)
+    return packets * dr.gather(mi.Float, scale, i >> 2)
+
+
 def merge(rows, columns, weights, width):
     """Sum entries that share row and column.
 
@@ -116,6 +130,14 @@ def merge(rows, columns, weights, width):
     key = rows.astype(np.int64) * width + columns
     order = np.argsort(key)
     key = key[order]
-    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]])) if len(key) else np.zeros(0, np.int64)
-    total = np.add.reduceat(weights[order].astype(np.float64), first, axis=0) if len(key) else np.zeros((0, 3))
-    return ((key[first] // width).astype(np.uint32), (key[first] % width).astype(np.uint32), total.astype(np.float32))
+    first = (
+        np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]])) if len(key) else np.zeros(0, np.int64)
+    )
+    total = (
+        np.add.reduceat(weights[order].astype(np.float64), first, axis=0) if len(key) else np.zeros((0, 3))
+    )
+    return (
+        (key[first] // width).astype(np.uint32),
+        (key[first] % width).astype(np.uint32),
+        total.astype(np.float32),
+    )

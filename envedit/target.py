@@ -1,7 +1,7 @@
 """What the rendering should look like.
 
-A target is a picture in linear radiance, an optional weight per pixel, and, where the question was made from a known answer, the map
-that answers it.
+A target is a picture in linear radiance, an optional weight per pixel, and, where the question was made from
+a known answer, the map that answers it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ class Target:
     warnings: tuple[str, ...] = ()
 
 
-def make(settings: config.Target, scene: Scene, envmap: np.ndarray, seed: int, repair: bool = False) -> Target:
+def make(
+    settings: config.Target, scene: Scene, envmap: np.ndarray, seed: int, repair: bool = False
+) -> Target:
     """Make the target of a configuration.
 
     Parameters
@@ -76,15 +78,17 @@ def make(settings: config.Target, scene: Scene, envmap: np.ndarray, seed: int, r
         source = f"rendered under the map turned by {settings.rotate_degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
     picture = scene.render(true, spp=settings.spp, seed=seed + SEED)
-    return Target(picture, None, true, f"{source}, {settings.spp} samples a pixel", warnings)
+    return Target(picture, _weight(settings, picture), true, f"{source}, {settings.spp} samples a pixel", warnings)
 
 
 def _painted(settings, scene):
     picture, info = image.read(settings.file)
     if picture.shape[:2] != (scene.height, scene.width):
         height, width = picture.shape[:2]
-        raise InputError(f"{settings.file}: is {width}x{height} pixels, the rendering is {scene.width}x{scene.height}: "
-                         "export it at that size, or set [scene] width and height to the picture's")
+        raise InputError(
+            f"{settings.file}: is {width}x{height} pixels, the rendering is {scene.width}x{scene.height}: "
+            "export it at that size, or set [scene] width and height to the picture's"
+        )
     warnings = list(info["warnings"])
     if not info["hdr"]:
         # image.read decodes sRGB; the picture was made under the declared tonemap instead.
@@ -94,14 +98,32 @@ def _painted(settings, scene):
         warnings.append(f"{settings.file}: read as a picture under the '{settings.tonemap}' tonemap")
     if not np.isfinite(picture).all():
         row, column = np.argwhere(~np.isfinite(picture).all(axis=2))[0]
-        raise InputError(f"{settings.file}: pixel at row {row}, column {column} is not finite: repair it in the program it came from")
-    weight = None
-    if settings.mask:
-        mask, _ = image.read(settings.mask)
-        if mask.shape[:2] != picture.shape[:2]:
-            raise InputError(f"{settings.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, the target is "
-                             f"{picture.shape[1]}x{picture.shape[0]}: the mask must have the target's size")
-        weight = np.clip(mask.mean(axis=2, keepdims=True), 0, 1).astype(np.float32)
-        if not weight.any():
-            raise InputError(f"{settings.mask}: is black everywhere: paint white where the target counts")
-    return Target(np.ascontiguousarray(picture, np.float32), weight, None, f"painted: {settings.file}", tuple(warnings))
+        raise InputError(
+            f"{settings.file}: pixel at row {row}, column {column} is not finite: "
+            "repair it in the program it came from"
+        )
+    picture = np.ascontiguousarray(picture, np.float32)
+    source = f"painted: {settings.file}"
+    return Target(picture, _weight(settings, picture), None, source, tuple(warnings))
+
+
+def _weight(settings, picture):
+    """Read the mask as a weight for each pixel (h, w, 1); None without one."""
+    if not settings.mask:
+        return None
+    mask, _ = image.read(settings.mask)
+    if mask.shape[:2] != picture.shape[:2]:
+        raise InputError(
+            f"{settings.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, the target is "
+            f"{picture.shape[1]}x{picture.shape[0]}: the mask must have the target's size"
+        )
+    if not np.isfinite(mask).all():
+        row, column = np.argwhere(~np.isfinite(mask).all(axis=2))[0]
+        raise InputError(
+            f"{settings.mask}: pixel at row {row}, column {column} is not finite: "
+            "paint the mask in black and white"
+        )
+    weight = np.clip(mask.mean(axis=2, keepdims=True), 0, 1).astype(np.float32)
+    if not weight.any():
+        raise InputError(f"{settings.mask}: is black everywhere: paint white where the target counts")
+    return weight

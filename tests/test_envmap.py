@@ -123,6 +123,20 @@ def test_gradient_reaches_every_parameter(kind, rng):
         assert np.isfinite(gradient).all() and np.count_nonzero(gradient) > 0.9 * gradient.size
 
 
+@pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
+@pytest.mark.parametrize("below", [0.0, 0.5])
+def test_black_texels_can_be_lit(kind, below):
+    """A slope of 0 at black, or below it where a step may have led, would keep a texel dark for good."""
+    representation = make(kind)
+    (name, start), = representation.encode(np.zeros((2, 3, 3), np.float32)).items()
+    leaf = dr.opaque(start - below)
+    dr.enable_grad(leaf)
+    decoded = representation.decode({name: leaf})
+    assert (decoded.numpy() >= 0).all()
+    dr.backward(dr.sum(decoded.array))
+    assert (np.array(dr.grad(leaf)) > 0).all()
+
+
 def test_siren_gradient_is_the_finite_difference(rng):
     representation = make("siren")
     params, weight = representation.encode(sky(rng)), rng.normal(size=(8, 16, 3))

@@ -247,7 +247,8 @@ def test_robust_fit_loses_less_to_noise_in_its_weights(rng):
             got = fit.evaluate(tensors(moved), fitted.normalisation, (16, 32), 30.0).numpy()
             scores.append(metrics.log_psnr(got, image))
         drops.append(fitted.log_psnr - np.mean(scores))
-    assert drops[1] < drops[0] - 1, drops  # dB; PRINT
+    # 15.7 and 7.1 dB where this was written, within 0.5 for other seeds.
+    assert drops[1] < drops[0] - 4
 
 
 @pytest.mark.parametrize(("shape", "value"), [((16, 32), 0.0), ((16, 32), 0.25), ((1, 2), 7.0)])

@@ -1,6 +1,6 @@
-"""Contact sheet of the runs that ``experiments.first_edit.run`` made: renderings over maps, a row a representation.
+"""Draw what ``experiments.first_edit.run`` made: renderings over maps, a column a representation.
 
-    python -m experiments.first_edit.plot [--out runs/first_edit]
+python -m experiments.first_edit.plot [--out runs/first_edit]
 """
 
 import argparse

@@ -1,6 +1,7 @@
-"""Real maps turned by 60 degrees, three representations, one scene: compute what is missing, print the table.
+r"""Turn real maps by 60 degrees, three representations, one scene: compute what is missing, print a table.
 
-    ENVEDIT_DATA=... python -m experiments.first_edit.run [--out runs/first_edit] [--maps NAME ...] [--set table.key=value ...]
+    ENVEDIT_DATA=... python -m experiments.first_edit.run \
+        [--out runs/first_edit] [--maps NAME ...] [--set table.key=value ...]
 
 Every run is ``python -m envedit.run`` with its own folder; one that is done (it has metrics.json) is skipped.
 """
@@ -22,16 +23,21 @@ def jobs(root: Path, out: Path, maps, overrides):
     for name in maps:
         for kind in KINDS:
             folder = out / f"{name}-{kind}"
-            text = (f'[input]\nenvmap = "{root / "puresky" / f"{name}_puresky_1k.hdr"}"\nwidth = 256\n'
-                    f'[scene]\nfile = "sphere"\nparameters = {{ roughness = 0.3 }}\n'
-                    f'[target]\nrotate_degrees = 60.0\n[representation]\nkind = "{kind}"\n')
+            text = (
+                f'[input]\nenvmap = "{root / "puresky" / f"{name}_puresky_1k.hdr"}"\nwidth = 256\n'
+                f'[scene]\nfile = "sphere"\nparameters = {{ roughness = 0.3 }}\n'
+                f'[target]\nrotate_degrees = 60.0\n[representation]\nkind = "{kind}"\n'
+            )
             yield name, kind, folder, text, [part for o in overrides for part in ("--set", o)]
 
 
 def table(out: Path, maps) -> str:
     """Return the results as a Markdown table; a run that is missing has dashes."""
-    lines = ["| map | representation | rendering PSNR (unedited) | SSIM | map PSNR (unedited) | SSIM | sun off, texels | fit s | edit s | total s |",
-             "|---|---|---|---|---|---|---|---|---|---|"]
+    lines = [
+        "| map | representation | rendering PSNR (unedited) | SSIM | map PSNR (unedited) | SSIM | "
+        "sun off, texels | fit s | edit s | total s |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
     means = {}
     for name in maps:
         for kind in KINDS:
@@ -40,15 +46,23 @@ def table(out: Path, maps) -> str:
                 lines.append(f"| {name} | {NAMES[kind]} | - | - | - | - | - | - | - | - |")
                 continue
             m = json.loads(path.read_text())
-            means.setdefault(kind, []).append((m["render"]["psnr"], m["render"]["ssim"], m["envmap"]["psnr"], m["envmap"]["ssim"]))
+            means.setdefault(kind, []).append(
+                (m["render"]["psnr"], m["render"]["ssim"], m["envmap"]["psnr"], m["envmap"]["ssim"])
+            )
             t = m["timing"]
             fit = "kept" if m["fit"] and m["fit"]["cached"] else f"{t['fit_s']:.0f}"
-            lines.append(f"| {name} | {NAMES[kind]} | {m['render']['psnr']:.2f} ({m['initial']['psnr']:.2f}) | {m['render']['ssim']:.3f} | "
-                         f"{m['envmap']['psnr']:.2f} ({m['initial_envmap']['psnr']:.2f}) | {m['envmap']['ssim']:.3f} | "
-                         f"{m['sun_offset_texels']:.1f} | {fit} | {t['edit_s']:.0f} | {t['total_s']:.0f} |")
+            render, before = m["render"], m["initial"]
+            found, known = m["envmap"], m["initial_envmap"]
+            lines.append(
+                f"| {name} | {NAMES[kind]} | {render['psnr']:.2f} ({before['psnr']:.2f}) | "
+                f"{render['ssim']:.3f} | {found['psnr']:.2f} ({known['psnr']:.2f}) | {found['ssim']:.3f} | "
+                f"{m['sun_offset_texels']:.1f} | {fit} | {t['edit_s']:.0f} | {t['total_s']:.0f} |"
+            )
     for kind, rows in means.items():
         a, b, c, d = (sum(column) / len(rows) for column in zip(*rows, strict=True))
-        lines.append(f"| **mean of {len(rows)}** | {NAMES[kind]} | {a:.2f} | {b:.3f} | {c:.2f} | {d:.3f} | | | | |")
+        lines.append(
+            f"| **mean of {len(rows)}** | {NAMES[kind]} | {a:.2f} | {b:.3f} | {c:.2f} | {d:.3f} | | | | |"
+        )
     return "\n".join(lines)
 
 
@@ -63,13 +77,17 @@ def main():
     if not root:
         sys.exit("ENVEDIT_DATA is not set: point it at a folder with puresky/NAME_puresky_1k.hdr")
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, kind, folder, text, overrides in jobs(Path(root).absolute(), arguments.out.absolute(), arguments.maps, arguments.overrides):
+    for name, kind, folder, text, overrides in jobs(
+        Path(root).absolute(), arguments.out.absolute(), arguments.maps, arguments.overrides
+    ):
         if (folder / "metrics.json").exists():
             continue
         config = arguments.out / f"{name}-{kind}.toml"
         config.write_text(text)
         print(f"{name}, {NAMES[kind]}", flush=True)
-        subprocess.run([sys.executable, "-m", "envedit.run", str(config), "--out", str(folder), *overrides], check=False)
+        subprocess.run(
+            [sys.executable, "-m", "envedit.run", str(config), "--out", str(folder), *overrides], check=False
+        )
     text = table(arguments.out, arguments.maps)
     (arguments.out / "table.md").write_text(text + "\n")
     print(text)

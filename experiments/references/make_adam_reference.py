@@ -23,8 +23,13 @@ def gradients(rng, scale):
     """Draw gradients with a drift, so that moments neither vanish nor settle."""
     drift = {name: rng.normal(size=shape) for name, shape in SHAPES.items()}
     return {
-        name: (scale * (drift[name] * np.cos(0.05 * np.arange(STEPS)).reshape(-1, *[1] * len(shape))
-                        + rng.normal(size=(STEPS, *shape)))).astype(np.float32)
+        name: (
+            scale
+            * (
+                drift[name] * np.cos(0.05 * np.arange(STEPS)).reshape(-1, *[1] * len(shape))
+                + rng.normal(size=(STEPS, *shape))
+            )
+        ).astype(np.float32)
         for name, shape in SHAPES.items()
     }
 

@@ -1,0 +1,171 @@
+"""Checkpoints: every bit comes back, and nothing else is taken for one."""
+
+import dataclasses
+import json
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit import checkpoint, config, optim
+from envedit.edit import State
+from envedit.errors import InputError
+
+
+def example(rng):
+    state = State(17, 3, 1, 0.125, [
+        {"iteration": 0, "loss": 1 / 3, "ssim": 1e-300, "lr": 5e-5, "step_ms": 1.25},
+        {"iteration": 1, "loss": 2.5e38, "ssim": -0.0, "lr": 0.0, "step_ms": 0.001},
+    ])  # fmt: skip
+    optimiser = {"step": np.int64(17), "params/a/b": rng.random((3, 4)).astype(np.float32)}
+    optimiser["v/x"] = np.float32([0, 1e-45, 3e38, -0.0])
+    renderer = {"columns": np.arange(5, dtype=np.uint32), "values": rng.random((2, 5)).astype(np.float16)}
+    return state, optimiser, renderer
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(
+        np.asarray(a[k]).dtype == b[k].dtype and np.asarray(a[k]).tobytes() == b[k].tobytes()
+        and np.shape(a[k]) == b[k].shape for k in a
+    )  # fmt: skip
+
+
+def test_everything_comes_back_exactly(tmp_path, rng):
+    state, optimiser, renderer = example(rng)
+    checkpoint.save(tmp_path, "what", state, optimiser, renderer)
+    found = checkpoint.load(tmp_path, "what")
+    assert found[0] == state and json.dumps(found[0].history) == json.dumps(state.history)
+    assert same(optimiser, found[1]) and same(renderer, found[2])
+    assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
+
+
+def test_a_renderer_without_state_and_a_history_with_bad_steps(tmp_path, rng):
+    _, optimiser, _ = example(rng)
+    state = State(1, 1, 1, 0.5, [{"iteration": 0, "loss": math.nan}, {"iteration": 1, "loss": math.inf}])
+    checkpoint.save(tmp_path, "what", state, optimiser, {})
+    found, _, renderer = checkpoint.load(tmp_path, "what")
+    assert renderer == {} and math.isnan(found.history[0]["loss"]) and found.history[1]["loss"] == math.inf
+
+
+def test_an_optimiser_continues_from_it(tmp_path, rng):
+    grads = [{"p": mi.TensorXf(rng.normal(size=(2, 3)).astype(np.float32))} for _ in range(6)]
+    start = {"p": mi.TensorXf(rng.random((2, 3)).astype(np.float32))}
+    whole, first, second = (optim.Adam(start, 0.1) for _ in range(3))
+    for g in grads:
+        whole.step(g)
+    for g in grads[:3]:
+        first.step(g)
+    checkpoint.save(tmp_path, "what", State(3), first.state_dict(), {})
+    state, optimiser, _ = checkpoint.load(tmp_path, "what")
+    second.load_state_dict(optimiser)
+    for g in grads[state.step :]:
+        second.step(g)
+    np.testing.assert_array_equal(second.params["p"].numpy(), whole.params["p"].numpy())
+
+
+def test_no_checkpoint_is_none(tmp_path):
+    assert checkpoint.load(tmp_path, "what") is None
+    assert checkpoint.load(tmp_path / "nowhere", "what") is None
+
+
+def test_a_newer_one_takes_the_place_of_the_older(tmp_path, rng):
+    _, optimiser, renderer = example(rng)
+    for step in (10, 20):
+        checkpoint.save(tmp_path, "what", State(step), optimiser, renderer)
+    assert checkpoint.load(tmp_path, "what")[0].step == 20
+
+
+def test_a_failed_write_leaves_the_older_one(tmp_path, rng, monkeypatch):
+    _, optimiser, renderer = example(rng)
+    checkpoint.save(tmp_path, "what", State(10), optimiser, renderer)
+
+    def full(file, **arrays):
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(InputError, match=r"checkpoint\.npz: cannot be written \(No space left on device\)"):
+        checkpoint.save(tmp_path, "what", State(20), optimiser, renderer)
+    assert checkpoint.load(tmp_path, "what")[0].step == 10
+    assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
+
+
+def test_a_checkpoint_of_another_run_is_refused(tmp_path, rng):
+    checkpoint.save(tmp_path, "what", *example(rng))
+    with pytest.raises(InputError, match=r"checkpoint\.npz.*another configuration.*without --resume") as info:
+        checkpoint.load(tmp_path, "other")
+    assert info.value.exit_code == 3 and len(str(info.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("share", [0, 0.01, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_refused(tmp_path, share, rng):
+    checkpoint.save(tmp_path, "what", *example(rng))
+    path = tmp_path / checkpoint.NAME
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match=r"checkpoint\.npz: .*cannot be read.*delete it"):
+        checkpoint.load(tmp_path, "what")
+
+
+def test_a_changed_byte_is_noticed(tmp_path, rng):
+    state, optimiser, renderer = example(rng)
+    checkpoint.save(tmp_path, "what", state, optimiser, renderer)
+    path = tmp_path / checkpoint.NAME
+    data = bytearray(path.read_bytes())
+    data[data.index(optimiser["params/a/b"].tobytes())] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="cannot be read"):
+        checkpoint.load(tmp_path, "what")
+
+
+def test_other_files_of_that_name_are_refused(tmp_path):
+    path = tmp_path / checkpoint.NAME
+    meta = {"digest": "what", "state": {"step": 1, "no such field": 2}}
+    for content in (
+        lambda file: file.write(b"a text\n"),
+        lambda file: np.save(file, np.arange(3)),
+        lambda file: np.savez(file, something=np.arange(3)),
+        lambda file: np.savez(file, meta=np.frombuffer(b"[1, 2", np.uint8)),
+        lambda file: np.savez(file, meta=np.frombuffer(b"[1, 2]", np.uint8)),
+        lambda file: np.savez(file, meta=np.frombuffer(b"{}", np.uint8)),
+        lambda file: np.savez(file, meta=np.frombuffer(b'{"state": {}}', np.uint8)),
+        lambda file: np.savez(file, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8)),
+    ):
+        with open(path, "wb") as file:
+            content(file)
+        with pytest.raises(InputError, match=r"checkpoint\.npz"):
+            checkpoint.load(tmp_path, "what")
+
+
+def test_removing_is_done_once_and_harmless_twice(tmp_path, rng):
+    checkpoint.save(tmp_path, "what", *example(rng))
+    checkpoint.remove(tmp_path)
+    checkpoint.remove(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+# ---- digest ----------------------------------------------------------------------------------------------
+
+
+def test_digest_knows_what_decides_the_result(rng):
+    settings, pixels = config.Config(), rng.random((4, 8, 3)).astype(np.float32)
+    changed = pixels.copy()
+    changed[2, 3, 1] = np.nextafter(changed[2, 3, 1], np.float32(2))
+    base = checkpoint.digest(settings, [pixels])
+    others = [
+        checkpoint.digest(settings, [changed]),
+        checkpoint.digest(settings, [pixels, pixels]),
+        checkpoint.digest(dataclasses.replace(settings, seed=1), [pixels]),
+        checkpoint.digest(config.loads("[optimizer]\niterations = 7"), [pixels]),
+        checkpoint.digest(config.loads("[loss]\nssim = [1.0, 2.0]"), [pixels]),
+        checkpoint.digest(config.loads("[fit]\nawp_gamma = 0.02"), [pixels]),
+    ]
+    assert len({base, *others}) == 1 + len(others)
+    assert checkpoint.digest(settings, [pixels.copy()]) == base
+
+
+def test_digest_does_not_know_the_output_folder():
+    a, b = (config.loads("", folder) for folder in ("/one", "/two"))
+    assert a.output.dir != b.output.dir
+    assert checkpoint.digest(a, []) == checkpoint.digest(b, [])

@@ -1,8 +1,8 @@
 """A run's state on disk, so that a killed run resumes to the same result.
 
 One ``checkpoint.npz``: the optimiser's parameters and moments, the loop's counters and history, the exact
-columns that the light transport had traced, and a digest of what the run was asked to do. It is written to a
-temporary name and renamed: a file that is there is whole.
+columns that the light transport had traced, the target's picture, and a digest of what the run was asked to
+do. It is written to a temporary name and renamed: a file that is there is whole.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from .files import replacing
 NAME = "checkpoint.npz"
 
 
-def digest(settings: config.Config, inputs: list[np.ndarray]) -> str:
-    """Hash what decides a run's result: its configuration without the output folder, and the pixels."""
+def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:
+    """Hash what decides a run's result: its configuration but for the folder, scene and pixels."""
     text = "\n".join(line for line in config.to_toml(settings).splitlines() if not line.startswith("dir ="))
-    sha = hashlib.sha256(text.encode())
+    sha = hashlib.sha256(f"{text}\n{scene}".encode())
     for array in inputs:
         sha.update(np.ascontiguousarray(array).tobytes())
     return sha.hexdigest()
 
 
-def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict) -> None:
+def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict, picture) -> None:
     """Write ``checkpoint.npz`` into a folder."""
     arrays = {f"optimiser/{k}": v for k, v in optimiser.items()} | {
         f"renderer/{k}": v for k, v in renderer.items()
     }
     text = json.dumps({"digest": what, "state": asdict(state)})
     with replacing(folder / NAME) as temporary, open(temporary, "wb") as file:
-        np.savez(file, meta=np.frombuffer(text.encode(), np.uint8), **arrays)
+        np.savez(file, meta=np.frombuffer(text.encode(), np.uint8), target=picture, **arrays)
 
 
-def load(folder: Path, what: str) -> tuple[State, dict, dict] | None:
+def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None:
     """Read ``checkpoint.npz`` back; None where there is none.
 
     Raises
@@ -56,7 +56,7 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict] | None:
     try:
         # Opened here: np.load leaves a file open that is no archive.
         with open(path, "rb") as file, np.load(file) as stored:
-            meta = json.loads(stored["meta"].tobytes())
+            meta, picture = json.loads(stored["meta"].tobytes()), stored["target"]
             parts = {
                 part: {
                     k.removeprefix(f"{part}/"): stored[k] for k in stored.files if k.startswith(f"{part}/")
@@ -73,7 +73,7 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict] | None:
             f"{path}: belongs to another configuration or other input files: "
             "run without --resume to start afresh"
         )
-    return state, parts["optimiser"], parts["renderer"]
+    return state, parts["optimiser"], parts["renderer"], picture
 
 
 def remove(folder: Path) -> None:

@@ -56,14 +56,14 @@ class Input(Table):
     """The environment map to edit."""
 
     envmap: str = _key("sunsky", string, 'HDR lat-long image, or "sunsky": Mitsuba\'s analytic sky')
-    width: int = _key(256, integer(4, MOST_DIM, even=True), "working width, texels; height is half")
+    width: int = _key(256, integer(6, MOST_DIM, even=True), "working width, texels; height is half")
     rows: str | tuple[int, int] = _key(
         "upper", row_range, 'rows the edit may change: "upper" half, "all", or [first, last] inclusive'
     )
     azimuth: float = _key(90.0, number(-360, 360), "sunsky: azimuth of the sun, degrees")
     elevation: float = _key(35.0, number(0, 90), "sunsky: elevation of the sun above the horizon, degrees")
     turbidity: float = _key(3.0, number(1, 10), "sunsky: haziness of the air, 1 (pure) to 10")
-    repair: bool = _key(False, boolean, "replace non-finite and negative texels instead of refusing the map")
+    repair: bool = _key(False, boolean, "replace NaN and Inf by their neighbours instead of refusing the map")
 
     def _check_together(self) -> None:
         if not self.envmap:

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, losses, optim
+from ._callable import make_callable
 from .errors import NumericalError
 from .ssim import Ssim
 
@@ -206,6 +207,7 @@ def optimise(
             state.bad_in_a_row += 1
             state.slowdown *= 0.5
             if state.bad_in_a_row >= MOST_BAD_STEPS:
+                _read_back(waiting, state)
                 raise NumericalError(
                     f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not "
                     "finite; the last good map is kept; lower [optimizer] lr or look at the target for "
@@ -239,3 +241,28 @@ def _read_back(waiting, state):
         }
         state.history.append({**row, "lr": lr, "step_ms": round(ms, 3)})
     waiting.clear()
+
+
+def edit(settings: config.Config | str, **named):
+    """Carry out an edit without writing files: ``envedit.edit(config)``.
+
+    Parameters
+    ----------
+    settings : config.Config or path
+        A configuration, or the TOML file of one.
+    **named
+        As :func:`envedit.pipeline.run`.
+
+    Returns
+    -------
+    pipeline.Result
+        ``envmap``, ``render``, ``metrics``, ``history``.
+    """
+    settings = settings if isinstance(settings, config.Config) else config.load(settings)
+    mi.set_variant(settings.variant)
+    from .pipeline import run
+
+    return run(settings, **named)
+
+
+make_callable(__name__, edit)

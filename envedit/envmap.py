@@ -23,7 +23,7 @@ Params = dict[str, "mi.TensorXf"]
 
 
 def _not_negative(radiance):
-    """Clip below at zero, but keep the slope: with that of the clip a texel that is black stays black for good."""
+    """Clip below at zero, but keep the slope: with the clip's, a black texel would stay black for good."""
     return dr.replace_grad(dr.maximum(radiance, 0), radiance)
 
 

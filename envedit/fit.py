@@ -23,11 +23,14 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, losses, metrics, optim, siren, ssim
-from .errors import InputError
+from ._callable import make_callable
+from .errors import InputError, NumericalError
 from .files import replacing
 
 EPSILON = 0.01
 """Added to radiance inside the logarithm (paper, below Eq. 3)."""
+MOST_REFUSED = 20
+"""Non-finite steps after which a fit gives up."""
 _RECIPE = 3  # raise when the same settings give another fit
 
 
@@ -50,7 +53,7 @@ class Normalisation:
         return (np.log(np.asarray(image, np.float64) + EPSILON) - self.low) / self.span
 
     def decode(self, values):
-        """Map network output in (0, 1) to radiance >= 0, finite (Eq. 2-3); works on Dr.Jit tensors and arrays."""
+        """Map network output in (0, 1) to finite radiance >= 0 (Eq. 2-3), on tensors and arrays."""
         # dr.exp is infinite from 88.38 on. Below 0, where a flat or black map can lead, the slope is kept.
         radiance = dr.exp(dr.minimum(values * self.span + self.low, 88)) - EPSILON
         return dr.replace_grad(dr.maximum(radiance, 0), radiance)
@@ -109,8 +112,20 @@ def fit(
     -------
     Fitted
         Read from ``folder`` if the same fit was made before.
+
+    Raises
+    ------
+    InputError
+        If a texel is not finite or is negative.
+    NumericalError
+        If too many steps were not finite.
     """
     image = np.ascontiguousarray(image, np.float32)
+    if not (good := np.isfinite(image) & (image >= 0)).all():
+        row, column = np.argwhere(~good.all(axis=2))[0]
+        raise InputError(
+            f"fit: the texel at row {row}, column {column} is not finite or is negative: repair it"
+        )
     path = folder / f"{_key(image, network, settings, seed)}.npz" if folder and settings.cache else None
     if path and (found := _load(path)):
         return found
@@ -219,6 +234,7 @@ def _train(image, normalisation, network, settings, seed, progress):
     objective = Objective(image, normalisation, settings)
     adam = optim.Adam(params, settings.lr)
     perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
+    refused = 0
     for epoch in range(settings.epochs):
         params = adam.params
         if perturbation:
@@ -231,7 +247,13 @@ def _train(image, normalisation, network, settings, seed, progress):
             params = perturbation.apply(params)
         y, tape = siren.forward(params, x, network.omega)
         loss, slope = objective.gradient(y)
-        adam.step(siren.backward(params, tape, slope), lr=learning_rate(settings, settings.lr, epoch))
+        rate = learning_rate(settings, settings.lr, epoch)
+        if not adam.step(siren.backward(params, tape, slope), lr=rate):
+            refused += 1
+            if refused > MOST_REFUSED:
+                raise NumericalError(
+                    f"the fit stopped at epoch {epoch}: {refused} steps were not finite; lower [fit] lr"
+                )
         if progress and (epoch % 20 == 0 or epoch == settings.epochs - 1):
             progress(epoch + 1, settings.epochs, float(loss[0]))
     return adam.params
@@ -287,85 +309,9 @@ def _store(path, fitted):
         pass  # a cache that cannot be written costs time, not the result
 
 
-# ---------------------------------------------------------------------- command line
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Fit a map and judge the fit, nothing else; returns the exit code.
-
-    ``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set fit.epochs=100]``
-    """
-    import argparse
-    import sys
-
-    from . import doctor, image, manifest, preview
-    from .errors import EnveditError
-    from .pipeline import active_rows, load_map
-    from .progress import Progress
-
-    parser = argparse.ArgumentParser(
-        prog="python -m envedit.fit", description="Fit a SIREN to an HDR environment map."
-    )
-    parser.add_argument("map", metavar="MAP", help="EXR, Radiance HDR, or sunsky")
-    parser.add_argument(
-        "--out", metavar="DIR", help="folder for the results (default: MAP_fit beside the map)"
-    )
-    parser.add_argument("--preset", choices=config.preset_names())
-    parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
-    arguments = parser.parse_args(argv)
-    try:
-        settings = config.loads(
-            "",
-            Path.cwd(),
-            "command line",
-            arguments.preset,
-            [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides],
-        )
-        doctor.ensure(settings.variant)
-        mi.set_variant(settings.variant)
-        original, warnings = load_map(settings.input)
-        first, last = active_rows(settings.input.rows, original.shape[0])
-        crop = original[first : last + 1]
-        folder = Path(arguments.out or Path(arguments.map).with_suffix("").name + "_fit")
-        folder.mkdir(parents=True, exist_ok=True)
-        with Progress() as progress:
-            progress.stage(f"fitting {arguments.map}")
-            fitted = fit(
-                crop,
-                settings.representation,
-                settings.fit,
-                settings.seed,
-                folder=default_folder(),
-                progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
-            )
-        params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
-        got = evaluate(params, fitted.normalisation, crop.shape[:2], settings.representation.omega).numpy()
-        image.write_exr(folder / "fitted.exr", got, {"source": arguments.map, "rows": f"{first} to {last}"})
-        preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
-        numbers = {
-            "log_psnr": fitted.log_psnr,
-            "peak_ratio": fitted.peak_ratio,
-            "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
-            "epochs": fitted.epochs,
-            "seconds": round(fitted.seconds, 2),
-            "cached": fitted.cached,
-        }
-        manifest.write_metrics(folder / "fit.json", numbers)
-        for line in warnings:
-            print(f"envedit: warning: {line}", file=sys.stderr)
-        print(
-            f"log-PSNR {fitted.log_psnr:.1f} dB, peak ratio {fitted.peak_ratio:.2f}, {fitted.seconds:.1f} s"
-            f"{' (kept from an earlier run)' if fitted.cached else ''}; results in {folder}"
-        )
-        return 0
-    except EnveditError as error:
-        print(f"envedit: {error}", file=sys.stderr)
-        return error.exit_code
-    except OSError as error:
-        reason = f"{error.filename}: cannot be written ({error.strerror})"
-        print(f"envedit: {reason}: give another folder with --out", file=sys.stderr)
-        return 3
-
+make_callable(__name__, fit)
 
 if __name__ == "__main__":
+    from .fit_command import main
+
     raise SystemExit(main())

@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -207,22 +207,9 @@ def run(
 
     with clock("edit_s"):
         watch.stage("editing")
-        decode = _Decoder(representation, original, first)
-        params, state = _optimise(
-            settings,
-            representation,
-            params,
-            renderer,
-            wanted,
-            original,
-            first,
-            crop,
-            folder,
-            resume,
-            decode,
-            watch,
-        )
-        edited = decode(params)
+        job = _Job(settings, lit, original, first, wanted, representation, renderer, folder, watch)
+        params, state = job.optimise(params, crop, resume)
+        edited, wanted = job.decode(params), job.wanted
 
     with clock("judge_s"):
         watch.stage("rendering the result")
@@ -279,13 +266,22 @@ def run(
 _TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
 
 
-class _Decoder:
-    """Parameters to a whole map on the host, refusing what is not finite."""
+@dataclass
+class _Job:
+    """One edit in progress: loop, checkpoints, and the map that parameters stand for."""
 
-    def __init__(self, representation, original, first):
-        self.representation, self.original, self.first = representation, original, first
+    settings: config.Config
+    lit: scene.Scene
+    original: np.ndarray
+    first: int
+    wanted: target.Target
+    representation: object
+    renderer: object
+    folder: Path | None
+    watch: Watch
 
-    def __call__(self, params):
+    def decode(self, params) -> np.ndarray:
+        """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
         if not np.isfinite(crop).all():
             row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
@@ -297,53 +293,53 @@ class _Decoder:
         edited[self.first : self.first + crop.shape[0]] = crop
         return edited
 
+    def optimise(self, params, crop, resume):
+        """Run the loop from the start, or from the checkpoint; returns parameters and state."""
+        chosen, wanted = self.settings.optimizer, self.wanted
+        lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
+        adam, state = optim.Adam(params, lr), edit.State()
+        known = wanted.picture if wanted.envmap is None else wanted.envmap
+        pixels = [self.original, known, *([] if wanted.weight is None else [wanted.weight])]
+        what = checkpoint.digest(self.settings, self.lit.digest, pixels)
+        if self.folder and resume and (found := checkpoint.load(self.folder, what)):
+            state, optimiser, traced, picture = found
+            adam.load_state_dict(optimiser)
+            self.renderer.restore(traced)
+            # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
+            wanted = self.wanted = replace(wanted, picture=picture)
+        objective = edit.Objective(
+            self.settings.loss, wanted.picture, wanted.weight, crop, chosen.iterations
+        )
+        saved = time.perf_counter()
 
-def _optimise(
-    settings, representation, params, renderer, wanted, original, first, crop, folder, resume, decode, watch
-):
-    objective = edit.Objective(
-        settings.loss, wanted.picture, wanted.weight, crop, settings.optimizer.iterations
-    )
-    lr = representation.lr if settings.optimizer.lr == "auto" else settings.optimizer.lr
-    adam, state = optim.Adam(params, lr), edit.State()
-    what = checkpoint.digest(settings, [original, wanted.picture])
-    if folder and resume and (found := checkpoint.load(folder, what)):
-        state, optimiser, traced = found
-        adam.load_state_dict(optimiser)
-        renderer.restore(traced)
-    saved = time.perf_counter()
+        with _ctrl_c() as interrupt:
 
-    def save(state, adam):
-        if folder:
-            checkpoint.save(folder, what, state, adam.state_dict(), renderer.state())
+            def after_step(state, adam):
+                nonlocal saved
+                self.watch.progress(state.step, chosen.iterations, f"loss {state.history[-1]['loss']:.4g}")
+                stop, due = interrupt.is_set(), time.perf_counter() - saved >= chosen.checkpoint_s
+                if self.folder and (stop or due):
+                    traced = self.renderer.state()
+                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.picture)
+                    saved = time.perf_counter()
+                if stop:
+                    raise Interrupted(self.decode(adam.params), state.step)
 
-    with _ctrl_c() as interrupt:
-
-        def after_step(state, adam):
-            nonlocal saved
-            watch.progress(state.step, settings.optimizer.iterations, f"loss {state.history[-1]['loss']:.4g}")
-            if interrupt.is_set():
-                save(state, adam)
-                raise Interrupted(decode(adam.params), state.step)
-            if time.perf_counter() - saved >= settings.optimizer.checkpoint_s:
-                save(state, adam)
-                saved = time.perf_counter()
-
-        try:
-            return edit.optimise(
-                representation,
-                params,
-                renderer,
-                objective,
-                original,
-                first,
-                settings.optimizer,
-                adam=adam,
-                state=state,
-                after_step=after_step,
-            )
-        except NumericalError as error:
-            raise Stopped(str(error), decode(adam.params)) from error
+            try:
+                return edit.optimise(
+                    self.representation,
+                    params,
+                    self.renderer,
+                    objective,
+                    self.original,
+                    self.first,
+                    chosen,
+                    adam=adam,
+                    state=state,
+                    after_step=after_step,
+                )
+            except NumericalError as error:
+                raise Stopped(str(error), self.decode(adam.params)) from error
 
 
 @contextlib.contextmanager

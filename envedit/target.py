@@ -13,7 +13,7 @@ import numpy as np
 from . import config, image, latlong
 from .errors import InputError
 from .scene import Scene
-from .tonemap import inverse_tonemap
+from .tonemap import inverse_tonemap, linear_to_srgb
 
 SEED = 7_000_003
 """Apart from the seeds of all other renderings, so that no noise is shared between question and answer."""
@@ -78,7 +78,9 @@ def make(
         source = f"rendered under the map turned by {settings.rotate_degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
     picture = scene.render(true, spp=settings.spp, seed=seed + SEED)
-    return Target(picture, _weight(settings, picture), true, f"{source}, {settings.spp} samples a pixel", warnings)
+    return Target(
+        picture, _weight(settings, picture), true, f"{source}, {settings.spp} samples a pixel", warnings
+    )
 
 
 def _painted(settings, scene):
@@ -92,8 +94,6 @@ def _painted(settings, scene):
     warnings = list(info["warnings"])
     if not info["hdr"]:
         # image.read decodes sRGB; the picture was made under the declared tonemap instead.
-        from .tonemap import linear_to_srgb
-
         picture = inverse_tonemap(linear_to_srgb(picture), settings.tonemap)
         warnings.append(f"{settings.file}: read as a picture under the '{settings.tonemap}' tonemap")
     if not np.isfinite(picture).all():
@@ -111,7 +111,7 @@ def _weight(settings, picture):
     """Read the mask as a weight for each pixel (h, w, 1); None without one."""
     if not settings.mask:
         return None
-    mask, _ = image.read(settings.mask)
+    mask, info = image.read(settings.mask)
     if mask.shape[:2] != picture.shape[:2]:
         raise InputError(
             f"{settings.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, the target is "
@@ -123,6 +123,8 @@ def _weight(settings, picture):
             f"{settings.mask}: pixel at row {row}, column {column} is not finite: "
             "paint the mask in black and white"
         )
+    if not info["hdr"]:
+        mask = linear_to_srgb(mask)  # 50 % grey is meant as a half, not as what sRGB makes of it
     weight = np.clip(mask.mean(axis=2, keepdims=True), 0, 1).astype(np.float32)
     if not weight.any():
         raise InputError(f"{settings.mask}: is black everywhere: paint white where the target counts")

@@ -80,15 +80,30 @@ def build() -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_ply(path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a binary PLY of positions alone; Mitsuba computes smooth normals when it loads it."""
+    """Write a binary PLY with smooth normals.
+
+    Mitsuba would compute the normals itself, but with atomics: other last bits, and so another rendering,
+    in every process.
+    """
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment made by scenes/make_statue.py\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        "property float nx\nproperty float ny\nproperty float nz\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     table = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
     table["n"], table["v"] = 3, faces
-    Path(path).write_bytes(header.encode() + vertices.astype("<f4").tobytes() + table.tobytes())
+    points = np.hstack([vertices, normals(vertices, faces)]).astype("<f4")
+    Path(path).write_bytes(header.encode() + points.tobytes() + table.tobytes())
+
+
+def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return unit normals ``(V, 3)``: those of the triangles around a vertex, weighted by their area."""
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    axes = [np.bincount(faces.ravel(), np.repeat(normal[:, k], 3), len(vertices)) for k in range(3)]
+    total = np.stack(axes, axis=1)
+    return total / np.linalg.norm(total, axis=1, keepdims=True)
 
 
 def _quads(i, j, rows: int, columns: int) -> np.ndarray:

@@ -12,6 +12,8 @@ from envedit import checkpoint, config, optim
 from envedit.edit import State
 from envedit.errors import InputError
 
+PICTURE = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
+
 
 def example(rng):
     state = State(17, 3, 1, 0.125, [
@@ -33,18 +35,18 @@ def same(a, b):
 
 def test_everything_comes_back_exactly(tmp_path, rng):
     state, optimiser, renderer = example(rng)
-    checkpoint.save(tmp_path, "what", state, optimiser, renderer)
+    checkpoint.save(tmp_path, "what", state, optimiser, renderer, PICTURE)
     found = checkpoint.load(tmp_path, "what")
     assert found[0] == state and json.dumps(found[0].history) == json.dumps(state.history)
-    assert same(optimiser, found[1]) and same(renderer, found[2])
+    assert same(optimiser, found[1]) and same(renderer, found[2]) and np.array_equal(found[3], PICTURE)
     assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
 
 
 def test_a_renderer_without_state_and_a_history_with_bad_steps(tmp_path, rng):
     _, optimiser, _ = example(rng)
     state = State(1, 1, 1, 0.5, [{"iteration": 0, "loss": math.nan}, {"iteration": 1, "loss": math.inf}])
-    checkpoint.save(tmp_path, "what", state, optimiser, {})
-    found, _, renderer = checkpoint.load(tmp_path, "what")
+    checkpoint.save(tmp_path, "what", state, optimiser, {}, PICTURE)
+    found, _, renderer, _ = checkpoint.load(tmp_path, "what")
     assert renderer == {} and math.isnan(found.history[0]["loss"]) and found.history[1]["loss"] == math.inf
 
 
@@ -56,8 +58,8 @@ def test_an_optimiser_continues_from_it(tmp_path, rng):
         whole.step(g)
     for g in grads[:3]:
         first.step(g)
-    checkpoint.save(tmp_path, "what", State(3), first.state_dict(), {})
-    state, optimiser, _ = checkpoint.load(tmp_path, "what")
+    checkpoint.save(tmp_path, "what", State(3), first.state_dict(), {}, PICTURE)
+    state, optimiser, _, picture = checkpoint.load(tmp_path, "what")
     second.load_state_dict(optimiser)
     for g in grads[state.step :]:
         second.step(g)
@@ -72,13 +74,13 @@ def test_no_checkpoint_is_none(tmp_path):
 def test_a_newer_one_takes_the_place_of_the_older(tmp_path, rng):
     _, optimiser, renderer = example(rng)
     for step in (10, 20):
-        checkpoint.save(tmp_path, "what", State(step), optimiser, renderer)
+        checkpoint.save(tmp_path, "what", State(step), optimiser, renderer, PICTURE)
     assert checkpoint.load(tmp_path, "what")[0].step == 20
 
 
 def test_a_failed_write_leaves_the_older_one(tmp_path, rng, monkeypatch):
     _, optimiser, renderer = example(rng)
-    checkpoint.save(tmp_path, "what", State(10), optimiser, renderer)
+    checkpoint.save(tmp_path, "what", State(10), optimiser, renderer, PICTURE)
 
     def full(file, **arrays):
         file.write(b"half of it")
@@ -86,13 +88,13 @@ def test_a_failed_write_leaves_the_older_one(tmp_path, rng, monkeypatch):
 
     monkeypatch.setattr(np, "savez", full)
     with pytest.raises(InputError, match=r"checkpoint\.npz: cannot be written \(No space left on device\)"):
-        checkpoint.save(tmp_path, "what", State(20), optimiser, renderer)
+        checkpoint.save(tmp_path, "what", State(20), optimiser, renderer, PICTURE)
     assert checkpoint.load(tmp_path, "what")[0].step == 10
     assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
 
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path, rng):
-    checkpoint.save(tmp_path, "what", *example(rng))
+    checkpoint.save(tmp_path, "what", *example(rng), PICTURE)
     with pytest.raises(InputError, match=r"checkpoint\.npz.*another configuration.*without --resume") as info:
         checkpoint.load(tmp_path, "other")
     assert info.value.exit_code == 3 and len(str(info.value).splitlines()) == 1
@@ -100,7 +102,7 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path, rng):
 
 @pytest.mark.parametrize("share", [0, 0.01, 0.5, 0.9, 0.999])
 def test_a_truncated_file_is_refused(tmp_path, share, rng):
-    checkpoint.save(tmp_path, "what", *example(rng))
+    checkpoint.save(tmp_path, "what", *example(rng), PICTURE)
     path = tmp_path / checkpoint.NAME
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
@@ -110,7 +112,7 @@ def test_a_truncated_file_is_refused(tmp_path, share, rng):
 
 def test_a_changed_byte_is_noticed(tmp_path, rng):
     state, optimiser, renderer = example(rng)
-    checkpoint.save(tmp_path, "what", state, optimiser, renderer)
+    checkpoint.save(tmp_path, "what", state, optimiser, renderer, PICTURE)
     path = tmp_path / checkpoint.NAME
     data = bytearray(path.read_bytes())
     data[data.index(optimiser["params/a/b"].tobytes())] ^= 1
@@ -139,7 +141,7 @@ def test_other_files_of_that_name_are_refused(tmp_path):
 
 
 def test_removing_is_done_once_and_harmless_twice(tmp_path, rng):
-    checkpoint.save(tmp_path, "what", *example(rng))
+    checkpoint.save(tmp_path, "what", *example(rng), PICTURE)
     checkpoint.remove(tmp_path)
     checkpoint.remove(tmp_path)
     assert not list(tmp_path.iterdir())
@@ -152,20 +154,21 @@ def test_digest_knows_what_decides_the_result(rng):
     settings, pixels = config.Config(), rng.random((4, 8, 3)).astype(np.float32)
     changed = pixels.copy()
     changed[2, 3, 1] = np.nextafter(changed[2, 3, 1], np.float32(2))
-    base = checkpoint.digest(settings, [pixels])
+    base = checkpoint.digest(settings, "scene", [pixels])
     others = [
-        checkpoint.digest(settings, [changed]),
-        checkpoint.digest(settings, [pixels, pixels]),
-        checkpoint.digest(dataclasses.replace(settings, seed=1), [pixels]),
-        checkpoint.digest(config.loads("[optimizer]\niterations = 7"), [pixels]),
-        checkpoint.digest(config.loads("[loss]\nssim = [1.0, 2.0]"), [pixels]),
-        checkpoint.digest(config.loads("[fit]\nawp_gamma = 0.02"), [pixels]),
+        checkpoint.digest(settings, "scene", [changed]),
+        checkpoint.digest(settings, "another", [pixels]),
+        checkpoint.digest(settings, "scene", [pixels, pixels]),
+        checkpoint.digest(dataclasses.replace(settings, seed=1), "scene", [pixels]),
+        checkpoint.digest(config.loads("[optimizer]\niterations = 7"), "scene", [pixels]),
+        checkpoint.digest(config.loads("[loss]\nssim = [1.0, 2.0]"), "scene", [pixels]),
+        checkpoint.digest(config.loads("[fit]\nawp_gamma = 0.02"), "scene", [pixels]),
     ]
     assert len({base, *others}) == 1 + len(others)
-    assert checkpoint.digest(settings, [pixels.copy()]) == base
+    assert checkpoint.digest(settings, "scene", [pixels.copy()]) == base
 
 
 def test_digest_does_not_know_the_output_folder():
     a, b = (config.loads("", folder) for folder in ("/one", "/two"))
     assert a.output.dir != b.output.dir
-    assert checkpoint.digest(a, []) == checkpoint.digest(b, [])
+    assert checkpoint.digest(a, "scene", []) == checkpoint.digest(b, "scene", [])

@@ -91,7 +91,7 @@ def test_an_override_without_key_or_value_is_refused(text):
         ("[[target.strokes]]\ntype = 'fill'", ["target.strokes: came 1 strokes", "comes later"]),
         ("[target]\nkind = 'imgae'", ["target.kind: came 'imgae'", "did you mean image?"]),
         ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: came [0, 64], wanted rows below 64"]),
-        ("[loss]\nssim = 0", ["loss.ssim, loss.image_l1: came 0 for both"]),
+        ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: came 0"]),
         ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["came 0 for all"]),
         ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
         ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),

@@ -164,7 +164,7 @@ def test_gradient_reaches_the_placed_rows_only(first, rows, rng):
 def test_objective_is_the_weighted_sum_of_its_losses(rng):
     picture, rendering = (rng.random((12, 14, 3)).astype(np.float32) for _ in range(2))
     original, crop = sky(rng)[:3], sky(rng)[:3]
-    weights = config.Loss(ssim=2.0, luminance=0.01, l1=0.003, tv=0.5, image_l1=0.7)
+    weights = config.Loss(ssim=2.0, luminance=0.01, l1=0.003, tv=0.5, image_l1=0.7, image_l2=3.0)
     objective = edit.Objective(weights, picture, None, original, 10)
     total, terms = objective(single(rendering), single(crop), 4)
     target, shown = (double(plain_display(np.float64(x))) for x in (picture, rendering))
@@ -174,6 +174,7 @@ def test_objective_is_the_weighted_sum_of_its_losses(rng):
         "l1": 0.003 * losses.l1(double(crop))[0],
         "tv": 0.5 * losses.tv(double(crop))[0],
         "image_l1": 0.7 * losses.image_l1(shown, target)[0],
+        "image_l2": 3.0 * losses.image_l2(shown, target)[0],
     }
     assert terms.keys() == expected.keys()
     for name, value in expected.items():
@@ -195,7 +196,7 @@ def test_weights_walk_from_start_to_end_of_the_run(step, ssim, luminance, rng):
 
 
 def test_terms_without_weight_and_dists_are_left_out(rng):
-    weights = config.Loss(ssim=1.0, luminance=0.0, l1=0.0, dists=0.6, tv=0.0, image_l1=0.0)
+    weights = config.Loss(ssim=1.0, luminance=0.0, l1=0.0, dists=0.6, tv=0.0, image_l1=0.0, image_l2=0.0)
     objective = edit.Objective(weights, rng.random((12, 14, 3)), None, sky(rng)[:3], 5)
     _, terms = objective(single(rng.random((12, 14, 3))), single(sky(rng)[:3]), 0)
     assert terms.keys() == {"ssim"}
@@ -276,9 +277,9 @@ def test_history_has_a_row_for_every_iteration(rng):
     _, state = edit.optimise(*arguments)
     assert [row["iteration"] for row in state.history] == list(range(23))
     for row in state.history:
-        assert list(row) == ["iteration", "loss", "ssim", "image_l1", "lr", "step_ms"]
+        assert list(row) == ["iteration", "loss", "ssim", "image_l1", "image_l2", "lr", "step_ms"]
         assert all(math.isfinite(value) for value in row.values())
-        np.testing.assert_allclose(row["loss"], row["ssim"] + row["image_l1"], rtol=1e-5)
+        np.testing.assert_allclose(row["loss"], row["ssim"] + row["image_l1"] + row["image_l2"], rtol=1e-5)
     json.dumps(state.history)  # plain numbers, as the checkpoint needs
 
 

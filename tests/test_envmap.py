@@ -98,7 +98,7 @@ def test_flat_maps_are_no_special_case(kind, value):
 @pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
 def test_gradient_is_the_finite_difference(kind, rng):
     representation, image = make(kind), sky(rng) + np.float32(0.1)
-    (name, start), = representation.encode(image).items()
+    ((name, start),) = representation.encode(image).items()
     weight = rng.normal(size=image.shape)
     leaf = double(start.numpy())
     dr.enable_grad(leaf)
@@ -128,7 +128,7 @@ def test_gradient_reaches_every_parameter(kind, rng):
 def test_black_texels_can_be_lit(kind, below):
     """A slope of 0 at black, or below it where a step may have led, would keep a texel dark for good."""
     representation = make(kind)
-    (name, start), = representation.encode(np.zeros((2, 3, 3), np.float32)).items()
+    ((name, start),) = representation.encode(np.zeros((2, 3, 3), np.float32)).items()
     leaf = dr.opaque(start - below)
     dr.enable_grad(leaf)
     decoded = representation.decode({name: leaf})

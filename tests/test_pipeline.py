@@ -117,8 +117,13 @@ def test_a_better_map_is_found_for_the_target(tmp_path, rng):
 
 @pytest.mark.parametrize(
     ("rows", "height", "active"),
-    [("upper", 8, (0, 3)),
-     ("upper", 7, (0, 3)), ("upper", 3, (0, 1)), ("all", 8, (0, 7)), ((2, 5), 9, (2, 5))],
+    [
+        ("upper", 8, (0, 3)),
+        ("upper", 7, (0, 3)),
+        ("upper", 3, (0, 1)),
+        ("all", 8, (0, 7)),
+        ((2, 5), 9, (2, 5)),
+    ],
 )
 def test_active_rows(rows, height, active):
     """Row r looks up by 90 - 180 r / (H - 1) degrees: the upper half ends at the last row not below 0."""
@@ -283,6 +288,45 @@ def test_a_checkpoint_of_another_scene_is_refused(tmp_path, rng):
     write_scene(tmp_path, SENSOR, BALL.replace("0.2, 0.4, 0.6", "0.6, 0.4, 0.2"), LIGHT, name="scene.xml")
     with pytest.raises(InputError, match="another configuration or other input files"):
         pipeline.run(settings, folder=folder, resume=True)
+
+
+def test_a_checkpoint_of_another_mask_is_refused(tmp_path, rng):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    mask = np.ones((18, 24, 3), np.float32)
+    image.write_exr(tmp_path / "painted.exr", 0.5 * mask)
+    image.write_exr(tmp_path / "mask.exr", mask)
+    painted = {"kind": "image", "file": "painted.exr", "mask": "mask.exr"}
+    settings = settings_of(tmp_path, sunny(rng), target=painted, optimizer={"iterations": 3})
+    with pytest.raises(pipeline.Interrupted):
+        pipeline.run(settings, folder=folder, watch=interrupting())
+    mask[:9] = 0
+    image.write_exr(tmp_path / "mask.exr", mask)
+    with pytest.raises(InputError, match="another configuration or other input files"):
+        pipeline.run(settings, folder=folder, resume=True)
+
+
+def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng, monkeypatch):
+    """Mitsuba adds samples in any order where the pixel filter is wider than a box, as its default is.
+
+    Its pictures then agree to 1e-6 only; here every picture is a little brighter than the one before.
+    """
+    settings = settings_of(tmp_path, sunny(rng))
+    whole = pipeline.run(settings)
+    monkeypatch.setattr(edit, "READ_EVERY", 7)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with pytest.raises(pipeline.Interrupted):
+        pipeline.run(settings, folder=folder, watch=interrupting())
+    render, calls = scene.Scene.render, []
+
+    def render_again(*arguments, **keys):
+        calls.append(1)
+        return render(*arguments, **keys) * np.float32(1 + 1e-6 * len(calls))
+
+    monkeypatch.setattr(scene.Scene, "render", render_again)
+    resumed = pipeline.run(settings, folder=folder, resume=True)
+    assert calls and resumed.envmap.tobytes() == whole.envmap.tobytes()
 
 
 def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):

@@ -250,9 +250,10 @@ def test_shipped_scenes_render(name, rng):
     # In the open the plane shows its albedo; nothing reflects more than it receives, and nothing is black.
     np.testing.assert_allclose(picture[0].mean(), 0.5, rtol=0.03)
     assert picture.min() > 0.1 and picture.max() < 1.2
-    box = {s.id(): s.bbox() for s in loaded.mi.shapes()}["object"]
-    low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
-    np.testing.assert_allclose([low[1], high[1]], [0, 2], atol=1e-5)
+    box = {s.id(): s.bbox() for s in loaded.mi.shapes()}.get("object")
+    if name != "pair":  # two smaller objects
+        low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
+        np.testing.assert_allclose([low[1], high[1]], [0, 2], atol=1e-5)
     # The plane below hides the lower half of the sky.
     below = np.zeros((8, 16, 3))
     below[5:] = 1
@@ -290,7 +291,7 @@ def test_the_committed_statue_is_the_scripts(statue, tmp_path):
     assert len(made) == len(committed) < 1_200_000
     body = made.index(b"end_header\n") + len(b"end_header\n")
     assert made[:body] == committed[:body]
-    count = len(statue.build()[0]) * 12
+    count = len(statue.build()[0]) * 24
     # Positions to the last digits: another machine's sine may differ there.
     ours, theirs = (np.frombuffer(t[body : body + count], "<f4") for t in (made, committed))
     np.testing.assert_allclose(ours, theirs, atol=2e-6)

@@ -39,7 +39,7 @@ def test_the_paper_preset_is_section_6():
 
 
 def test_default_then_preset_then_file_then_override():
-    assert cfg.loads("").fit.epochs == 600
+    assert cfg.loads("").fit.epochs == 400
     assert cfg.loads('preset = "draft"').fit.epochs == 150
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7').fit.epochs == 7
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7', overrides=["fit.epochs=8"]).fit.epochs == 8
@@ -49,7 +49,7 @@ def test_default_then_preset_then_file_then_override():
 def test_the_preset_argument_beats_override_beats_file():
     assert cfg.loads('preset = "draft"', overrides=["preset=paper"]).preset == "paper"
     config = cfg.loads('preset = "draft"', preset="standard", overrides=["preset=paper"])
-    assert config.preset == "standard" and config.fit.epochs == 600
+    assert config.preset == "standard" and config.fit.epochs == 400
 
 
 def test_scene_parameters_are_merged_key_by_key():

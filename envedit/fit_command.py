@@ -1,0 +1,81 @@
+"""The command line of the fit alone: ``python -m envedit.fit MAP [--out DIR] [--preset NAME]``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+
+from . import config, doctor, fit, image, manifest, metrics, preview
+from .errors import EnveditError, InputError
+from .progress import Progress
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m envedit.fit", description="Fit a SIREN to an HDR map.")
+    parser.add_argument("map", metavar="MAP", help="EXR, Radiance HDR, or sunsky")
+    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: MAP_fit, here)")
+    parser.add_argument("--preset", choices=config.preset_names())
+    parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
+    arguments = parser.parse_args(argv)
+    try:
+        return _run(arguments)
+    except EnveditError as error:
+        print(f"envedit: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("envedit: interrupted; nothing was written", file=sys.stderr)
+        return 130
+
+
+def _run(arguments):
+    chosen = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
+    settings = config.loads("", Path.cwd(), "command line", arguments.preset, chosen)
+    doctor.ensure(settings.variant)
+    mi.set_variant(settings.variant)
+    from .pipeline import active_rows, load_map
+
+    original, warnings = load_map(settings.input)
+    first, last = active_rows(settings.input.rows, original.shape[0])
+    crop = original[first : last + 1]
+    folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}): give another with --out") from error
+    with Progress() as progress:
+        progress.stage(f"fitting {arguments.map}")
+        fitted = fit.fit(
+            crop,
+            settings.representation,
+            settings.fit,
+            settings.seed,
+            folder=fit.default_folder(),
+            progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
+        )
+    params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
+    network = settings.representation
+    got = fit.evaluate(params, fitted.normalisation, crop.shape[:2], network.omega).numpy()
+    image.write_exr(folder / "fitted.exr", got, {"source": arguments.map, "rows": f"{first} to {last}"})
+    preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
+    numbers = {
+        "log_psnr": fitted.log_psnr,
+        "peak_ratio": fitted.peak_ratio,
+        "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
+        "epochs": fitted.epochs,
+        "seconds": round(fitted.seconds, 2),
+        "cached": fitted.cached,
+    }
+    manifest.write_metrics(folder / "fit.json", numbers)
+    for line in warnings:
+        print(f"envedit: warning: {line}", file=sys.stderr)
+    quality, peak = (
+        "undefined" if number is None else f"{number:.{digits}f}"
+        for number, digits in ((fitted.log_psnr, 1), (fitted.peak_ratio, 2))
+    )
+    kept = " (kept from an earlier run)" if fitted.cached else ""
+    print(f"log-PSNR {quality} dB, peak ratio {peak}, {fitted.seconds:.1f} s{kept}; results in {folder}")
+    return 0

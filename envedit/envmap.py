@@ -65,7 +65,7 @@ class Siren:
     ``fitted`` tells, after :meth:`encode`, how well the network reproduces the image.
     """
 
-    lr = 1e-4
+    lr = 5e-5
 
     def __init__(
         self,

@@ -318,6 +318,7 @@ class _Job:
                 nonlocal saved
                 self.watch.progress(state.step, chosen.iterations, f"loss {state.history[-1]['loss']:.4g}")
                 stop, due = interrupt.is_set(), time.perf_counter() - saved >= chosen.checkpoint_s
+                due |= state.step == chosen.iterations  # what follows may be interrupted too
                 if self.folder and (stop or due):
                     traced = self.renderer.state()
                     checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.picture)

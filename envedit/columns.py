@@ -92,7 +92,7 @@ class ExactColumns:
         grid = self.grid
         traced = np.full(grid.texels, -1, np.int32)
         traced[texels] = self.slot_of[texels]
-        traced = mi.Int32(traced)
+        traced = dr.opaque(mi.Int32(traced))
         areas = np.diff(latlong.row_edges(grid.height)) / grid.width
         uniform = grid.width * max(grid.height - 1, 1)  # density over (u, v) of one sample in every texel
         block = max(SLICE, LANES // count // SLICE * SLICE)
@@ -133,12 +133,11 @@ class ExactColumns:
         """Bring what the kernels read in line with the list of texels."""
         padded = np.zeros(max(self.capacity, 1), np.uint32)
         padded[: len(self.texels)] = self.texels
-        self._texel_of = mi.UInt32(padded)
+        self._texel_of = dr.opaque(mi.UInt32(padded))
         mask = np.ones(self.grid.texels, np.float32)
         mask[self.texels] = 0
-        self.mask = mi.Float(mask)
+        self.mask = dr.opaque(mi.Float(mask))
         self._count = dr.opaque(mi.UInt32, len(self.texels))
-        dr.make_opaque(self._texel_of, self.mask)
 
     def _add_escapes(self, event, slot_of, place, uniform, count):
         """Add paths that left the scene towards the traced texels.
@@ -154,16 +153,21 @@ class ExactColumns:
             wanted = event.active & (slot >= 0) & (weight * share > 0)
             # Else what is left to compute, and so the kernel, depends on who was hit.
             dr.eval(value, target, wanted)
-            keep = dr.compress(wanted)
+            keep = np.flatnonzero(wanted.numpy()).astype(np.uint32)
             if len(keep):
-                targets.append(dr.gather(mi.UInt32, target, keep).numpy())
-                values.append(dr.gather(mi.Color3f, value, keep).numpy().T)
+                index = _on_device(mi.UInt32, keep)
+                targets.append(dr.gather(mi.UInt32, target, index).numpy()[: len(keep)])
+                # Channel by channel: a Color3f is interleaved by a kernel that has its length in it.
+                rgb = [dr.gather(mi.Float, value[c], index).numpy()[: len(keep)] for c in range(3)]
+                values.append(np.stack(rgb, axis=1))
         if not targets:
             return
         rows = np.zeros(sum(map(len, targets)), np.uint32)
         _, target, value = merge(rows, np.concatenate(targets), np.concatenate(values), len(self._store) // 4)
+        place = _on_device(mi.UInt32, target) * 4
+        real = dr.arange(mi.UInt32, len(place)) < dr.opaque(mi.UInt32, len(target))
         for c in range(3):
-            dr.scatter_add(self._store, mi.Float(value[:, c].copy()), mi.UInt32(target) * 4 + c)
+            dr.scatter_add(self._store, _on_device(mi.Float, value[:, c]), place + c, real)
         dr.eval(self._store)
 
     def _clear(self, slots):
@@ -171,7 +175,7 @@ class ExactColumns:
         clear = np.zeros(max(self.capacity, 1), bool)
         clear[slots] = True
         i = dr.arange(mi.UInt32, len(self._store))
-        gone = dr.gather(mi.Bool, mi.Bool(clear), (i // (4 * SLICE)) % max(self.capacity, 1))
+        gone = dr.gather(mi.Bool, dr.opaque(mi.Bool(clear)), (i // (4 * SLICE)) % max(self.capacity, 1))
         self._store = dr.select(gone, 0, self._store)
         dr.eval(self._store)
 
@@ -221,6 +225,15 @@ class ExactColumns:
 
 
 # ---------------------------------------------------------------------- kernels
+
+
+def _on_device(kind, values: np.ndarray):
+    """Copy an array to the device, with its first element repeated where there is but one.
+
+    A copy, for numpy's memory is not aligned, and two elements at least, for one would be a scalar: either
+    makes another kernel.
+    """
+    return dr.opaque(kind(np.ascontiguousarray(values if len(values) > 1 else np.repeat(values, 2))))
 
 
 def _slices(n: int) -> int:

@@ -196,6 +196,7 @@ def optimise(
             rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
             total, terms = objective(rendering, crop, state.step)
             dr.backward(total)
+        dr.eval(total, terms)
         grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
         finite = bool(dr.isfinite(total)[0])
         rate = optim.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr

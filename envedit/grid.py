@@ -35,10 +35,9 @@ class Grid:
         self.to_world = mi.Matrix3f(np.asarray(to_world, dtype=np.float32))
         mass = np.asarray(mass, np.float64) / np.sum(mass)
         area = np.diff(latlong.row_edges(height)) / width  # of a texel in the (u, v) square
-        self.mass, self.area = mi.Float(mass.astype(np.float32)), mi.Float(area.astype(np.float32))
-        self.cdf = mi.Float(np.concatenate([[0], np.cumsum(mass)]).astype(np.float32))
-        self.density = mi.Float((mass / width / area).astype(np.float32))
-        dr.make_opaque(self.mass, self.area, self.cdf, self.density)
+        self.mass, self.area = (dr.opaque(mi.Float(x.astype(np.float32))) for x in (mass, area))
+        self.cdf = dr.opaque(mi.Float(np.concatenate([[0], np.cumsum(mass)]).astype(np.float32)))
+        self.density = dr.opaque(mi.Float((mass / width / area).astype(np.float32)))
 
     def choose(self, u: mi.Point2f):
         """Choose a texel and a direction in its tent.

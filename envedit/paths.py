@@ -88,7 +88,7 @@ def trace(
     """
     n = len(pixels) * paths
     lane = dr.arange(mi.UInt32, n)
-    pixel = dr.gather(mi.UInt32, mi.UInt32(pixels.astype(np.uint32)), lane // paths)
+    pixel = dr.gather(mi.UInt32, dr.opaque(mi.UInt32(pixels.astype(np.uint32))), lane // paths)
     path = lane % paths
     context = mi.BSDFContext()
 
@@ -148,7 +148,7 @@ def _filter_offset(rfilter, u, index, size, border):
     values = np.array(rfilter.eval(mi.Float(np.abs(centres).astype(np.float32)))).astype(np.float64)
     cumulative = np.concatenate([[0], np.cumsum(np.abs(values))])
     signed = np.concatenate([[0], np.cumsum(values)])
-    table, signed_table = mi.Float(cumulative / cumulative[-1]), mi.Float(signed / cumulative[-1])
+    table, signed_table = (dr.opaque(mi.Float(t / cumulative[-1])) for t in (cumulative, signed))
     step = 2 * radius / len(values)
 
     def at(t, x):
@@ -165,5 +165,5 @@ def _filter_offset(rfilter, u, index, size, border):
     i = dr.clip(i, 1, len(values)) - 1
     a, b = dr.gather(mi.Float, table, i), dr.gather(mi.Float, table, i + 1)
     x = -radius + (i + dr.clip((target - a) / dr.maximum(b - a, 1e-20), 0, 1)) * step
-    sign = dr.sign(dr.gather(mi.Float, mi.Float(values), i))
+    sign = dr.sign(dr.gather(mi.Float, dr.opaque(mi.Float(values)), i))
     return x + 0.5, sign * (c1 - c0) / (at(signed_table, high) - at(signed_table, low))

@@ -307,9 +307,7 @@ class _Job:
             self.renderer.restore(traced)
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
             wanted = self.wanted = replace(wanted, picture=picture)
-        objective = edit.Objective(
-            self.settings.loss, wanted.picture, wanted.weight, crop, chosen.iterations
-        )
+        objective = edit.Objective(self.settings.loss, wanted.picture, wanted.weight, crop, chosen.iterations)
         saved = time.perf_counter()
 
         with _ctrl_c() as interrupt:

@@ -60,11 +60,10 @@ class ColourMatrix:
         self.bytes = packed.nbytes
         every = np.arange(slices * SLICE)
         start = slice_start[every // SLICE] + every % SLICE
-        self._packed = mi.Float(packed.ravel())
-        self._start = mi.UInt32(start.astype(np.uint32))
-        self._stop = mi.UInt32((start + longest[every // SLICE] * SLICE).astype(np.uint32))
-        self._lane = mi.UInt32(lane[: shape[0]].astype(np.uint32))
-        dr.make_opaque(self._packed, self._start, self._stop, self._lane)
+        self._packed = dr.opaque(mi.Float(packed.ravel()))
+        self._start = dr.opaque(mi.UInt32(start.astype(np.uint32)))
+        self._stop = dr.opaque(mi.UInt32((start + longest[every // SLICE] * SLICE).astype(np.uint32)))
+        self._lane = dr.opaque(mi.UInt32(lane[: shape[0]].astype(np.uint32)))
 
     def apply(self, x: mi.Float) -> mi.Float:
         """Multiply with a vector of colours.

@@ -61,8 +61,7 @@ class LightTransport:
         offset = other_light(scene, bounces + 1, seed)
         self._record(progress)
         self._exact = ExactColumns(scene, grid, bounces, capacity)
-        self._offset = mi.Float(0) if offset is None else mi.Float(offset.ravel())
-        dr.make_opaque(self._offset)
+        self._offset = dr.opaque(mi.Float, 0) if offset is None else dr.opaque(mi.Float(offset.ravel()))
 
     # ------------------------------------------------------------------ building
 
@@ -183,8 +182,16 @@ class LightTransport:
             self._record()
             self._exact.retrace(self.seed)
         if step % RESOLVE_EVERY == 0:
+            self._warm_up()
             self.resolve(dr.detach(envmap).numpy())
         return self.apply(envmap)
+
+    def _warm_up(self):
+        """Trace one column of each kind in the first step: whatever grows bright later needs no other kernel."""
+        if len(self.columns) == 0 and self._exact.room:
+            most = np.array([int(self.influence.argmax())])
+            for count in COLUMN_PATHS:
+                self._exact.trace(most, count, self.seed)
 
     def state(self) -> dict:
         """Return what a checkpoint must hold: the exact columns, their order and paths, and the epoch."""

@@ -1,0 +1,46 @@
+"""A whole edit compiles its kernels in the first three iterations, whatever the light does later."""
+
+import drjit as dr
+import pytest
+
+from envedit import config, edit, pipeline
+
+SMALL = [
+    "input.width=64",
+    "scene.width=32",
+    "fit.epochs=30",
+    "fit.cache=false",
+    "representation.hidden=32",
+    "target.spp=32",
+    "output.spp=16",
+    "renderer.spp=64",
+    "optimizer.iterations=45",
+]
+
+
+@pytest.mark.parametrize("kind, light_moves", [("siren", True), ("pixels", True), ("log-pixels", False)])
+def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monkeypatch):
+    # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
+    settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}"])
+    fresh, columns = {}, []
+    compare, render = edit.Objective.__call__, pipeline.LightTransport.render
+
+    def counted(objective, rendering, crop, step):
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        # Compiled, or fetched from the disk: not in memory yet.
+        fresh[step] = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
+        return compare(objective, rendering, crop, step)
+
+    def watched(transport, envmap, step):
+        columns.append(len(transport.columns))
+        return render(transport, envmap, step)
+
+    monkeypatch.setattr(edit.Objective, "__call__", counted)
+    monkeypatch.setattr(pipeline.LightTransport, "render", watched)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        pipeline.run(settings)
+    assert len(fresh) == 45 and sum(fresh[step] for step in range(3)) > 0
+    assert {step: count for step, count in fresh.items() if step >= 3 and count} == {}
+    # Else nothing was traced after the first step, and nothing shown.
+    assert columns[-1] > columns[1] or not light_moves

@@ -187,7 +187,7 @@ class LightTransport:
         return self.apply(envmap)
 
     def _warm_up(self):
-        """Trace one column of each kind in the first step: whatever grows bright later needs no other kernel."""
+        """Trace one column of each kind in the first step: what grows bright later needs no other kernel."""
         if len(self.columns) == 0 and self._exact.room:
             most = np.array([int(self.influence.argmax())])
             for count in COLUMN_PATHS:

@@ -204,7 +204,7 @@ def _write(settings, folder, result, import_s, quiet):
     for line in result.notes:
         _say(quiet, line)
     _say(quiet, _verdict(result.metrics))
-    _say(quiet, f"results in {folder}")
+    _say(quiet, f"results in {folder.resolve()}")
     return 0
 
 

@@ -217,7 +217,8 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
             assert json.loads(stored["meta"].tobytes())["state"]["step"] == step
         assert [path.name for path in folder.iterdir()] == [checkpoint.NAME]
         if "columns" in name:
-            assert (len(columns) == 0) == ("no columns" in name)
+            # One column is always traced, in the first step, so that its kernels are there.
+            assert (len(columns) == 1) == ("no columns" in name)
     assert stop.value.envmap.tobytes() == whole.envmap.tobytes()
 
     resumed = pipeline.run(settings, folder=folder, resume=True)

@@ -84,8 +84,8 @@ def to_image(values: mi.TensorXf, height: int, width: int) -> mi.TensorXf:
 
 def fit(
     image: np.ndarray,
-    network: config.Representation,
-    settings: config.Fit,
+    network: config.Representation | None = None,
+    settings: config.Fit | None = None,
     seed: int = 0,
     *,
     folder: Path | None = None,
@@ -97,10 +97,10 @@ def fit(
     ----------
     image : ndarray (H, W, 3)
         Linear radiance, finite and not negative.
-    network : config.Representation
-        Width, depth and frequency.
-    settings : config.Fit
-        The recipe.
+    network : config.Representation, optional
+        Width, depth and frequency; the standard preset's by default.
+    settings : config.Fit, optional
+        The recipe; the standard preset's by default.
     seed : int
         Seed of the initial weights.
     folder : Path, optional
@@ -120,6 +120,7 @@ def fit(
     NumericalError
         If too many steps were not finite.
     """
+    network, settings = network or config.Representation(), settings or config.Fit()
     image = np.ascontiguousarray(image, np.float32)
     if not (good := np.isfinite(image) & (image >= 0)).all():
         row, column = np.argwhere(~good.all(axis=2))[0]

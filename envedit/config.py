@@ -174,6 +174,7 @@ class Optimizer(Table):
     lr: float | str = _key(
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
     )
+    beta2: float = _key(0.999, number(0, 0.999999), "Adam's decay of squared gradients; 0.99 tames spikes")
     schedule: str = _key(
         "cosine",
         choice("cosine", "constant"),

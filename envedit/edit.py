@@ -184,7 +184,7 @@ def optimise(
         After :data:`MOST_BAD_STEPS` non-finite steps in a row.
     """
     lr = representation.lr if settings.lr == "auto" else settings.lr
-    adam = adam or optim.Adam(params, lr)
+    adam = adam or optim.Adam(params, lr, (0.9, settings.beta2))
     state = state or State()
     fixed = dr.opaque(mi.TensorXf(np.ascontiguousarray(envmap, np.float32)))
     waiting, last_read = [], time.perf_counter()

@@ -297,7 +297,7 @@ class _Job:
         """Run the loop from the start, or from the checkpoint; returns parameters and state."""
         chosen, wanted = self.settings.optimizer, self.wanted
         lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
-        adam, state = optim.Adam(params, lr), edit.State()
+        adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), edit.State()
         known = wanted.picture if wanted.envmap is None else wanted.envmap
         pixels = [self.original, known, *([] if wanted.weight is None else [wanted.weight])]
         what = checkpoint.digest(self.settings, self.lit.digest, pixels)

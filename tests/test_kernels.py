@@ -25,11 +25,12 @@ SMALL = [
 def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monkeypatch):
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
     settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}"])
-    fresh, columns = {}, []
+    fresh, columns, launched = {}, [], []
     compare, render = edit.Objective.__call__, pipeline.LightTransport.render
 
     def counted(objective, rendering, crop, step):
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        launched.append(len(kernels))
         # Compiled, or fetched from the disk: not in memory yet.
         fresh[step] = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
         return compare(objective, rendering, crop, step)
@@ -43,7 +44,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         pipeline.run(settings)
-    assert len(fresh) == 45 and sum(fresh[step] for step in range(3)) > 0
+    assert len(fresh) == 45 and min(launched) > 10  # the history was kept
     assert {step: count for step, count in fresh.items() if step >= 3 and count} == {}
     # Else nothing was traced after the first step, and nothing shown.
     assert columns[-1] > columns[1] or not light_moves

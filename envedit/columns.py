@@ -71,21 +71,23 @@ class ExactColumns:
 
     # ------------------------------------------------------------------ tracing
 
-    def trace(self, texels: np.ndarray, count: int, seed: int) -> None:
+    def trace(self, texels: np.ndarray, count: int, seed: int, keep: np.ndarray | None = None, blocks=None):
         """Trace columns; one that was there is replaced.
 
         Parameters
         ----------
         texels : ndarray of int64
-            Distinct texels, at most :attr:`room` of them new.
+            Distinct texels, no more of them new than there is :attr:`room` and columns to give up.
         count : int
             Camera paths a pixel.
         seed : int
             Seed of every random choice.
+        keep : ndarray of int64, optional
+            Texels whose columns may not be given up for new ones; all by default.
+        blocks : int, optional
+            Trace only so many blocks of pixels: enough to have all kernels, but no column to be used.
         """
-        fresh = texels[self.slot_of[texels] < 0]
-        self.slot_of[fresh] = len(self.texels) + np.arange(len(fresh))
-        self.texels = np.concatenate([self.texels, fresh.astype(np.int64)])
+        self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
         self.paths_of[texels] = count
         self._clear(self.slot_of[texels])
 
@@ -97,7 +99,7 @@ class ExactColumns:
         uniform = grid.width * max(grid.height - 1, 1)  # density over (u, v) of one sample in every texel
         block = max(SLICE, LANES // count // SLICE * SLICE)
         per_pixel = dr.opaque(mi.UInt32, count)
-        for start in range(0, self.pixels, block):
+        for start in range(0, self.pixels, block)[:blocks]:
             some = np.arange(start, min(start + block, self.pixels), dtype=np.uint32)
             lane = dr.arange(mi.UInt32, len(some) * count)
             path = lane % per_pixel
@@ -122,6 +124,22 @@ class ExactColumns:
                         dr.scatter_add(self._store, dr.block_sum(value[c], count), target * 4 + c)
                     dr.eval(self._store)
         self._publish()
+
+    def _take_slots(self, fresh, texels, keep):
+        """Give slots to texels without one: new ones first, then those of columns that nobody keeps."""
+        new = min(len(fresh), self.room)
+        slots = len(self.texels) + np.arange(new)
+        self.texels = np.concatenate([self.texels, np.zeros(new, np.int64)])
+        if new < len(fresh):
+            kept = np.zeros(self.grid.texels, bool)
+            kept[texels] = True
+            kept[self.texels[: len(self.texels) - new] if keep is None else keep] = True
+            older = np.arange(len(self.texels) - new)
+            given_up = older[~kept[self.texels[older]]][: len(fresh) - new]
+            gone = self.texels[given_up]
+            self.slot_of[gone], self.paths_of[gone] = -1, 0
+            slots = np.concatenate([slots, given_up])
+        self.texels[slots], self.slot_of[fresh] = fresh, slots
 
     def retrace(self, seed: int) -> None:
         """Trace every column again with other samples, each with as many paths as before."""

@@ -124,14 +124,19 @@ class Representation(Table):
     hidden: int = _key(128, integer(1, 4096), "siren: width of a layer")
     depth: int = _key(3, integer(0, 64), "siren: hidden sine layers after the first")
     omega: float = _key(30.0, number(0, positive=True), "siren: angular frequency of the sine layers")
+    coordinates: str = _key(
+        "sphere", choice("sphere", "plane"), "siren: inputs are directions, or row and column as in the paper"
+    )
 
 
 @dataclass(frozen=True)
 class Fit(Table):
     """Fit of the SIREN to the input map (paper, Sec. 4 and 6.1)."""
 
-    epochs: int = _key(400, integer(0, 10**7), "full passes over the active texels")
-    lr: float = _key(2e-3, number(0, positive=True), "initial learning rate of Adam")
+    epochs: int = _key(1200, integer(0, 10**7), "steps of Adam")
+    lr: float = _key(1e-3, number(0, positive=True), "initial learning rate of Adam")
+    beta2: float = _key(0.99, number(0, 0.999999), "Adam's decay of squared gradients")
+    stride: int = _key(2, integer(1, 64), "a step sees every so-manieth row and column, other ones each time")
     schedule: str = _key(
         "cosine", choice("cosine", "warm-restarts", "constant"), "course of both learning rates"
     )
@@ -141,7 +146,10 @@ class Fit(Table):
     hdr: float = _key(1e-2, number(0), "weight of the absolute error of radiance")
     awp_gamma: float = _key(0.01, number(0, 1), "weight perturbation, fraction of a layer's norm; 0: off")
     awp_lr: float = _key(1e-4, number(0, positive=True), "learning rate of the proxy Adam that perturbs")
-    awp_every: int = _key(1, integer(1, 10**7), "epochs between fresh perturbations")
+    awp_every: int = _key(2, integer(1, 10**7), "epochs between fresh perturbations")
+    awp_until: float = _key(0.7, number(0, 1), "share of the epochs that are perturbed; the others polish")
+    headroom: float = _key(0.05, number(0, 0.45), "share of the network's range left free above and below")
+    light: float = _key(1.0, number(0), "weight of light when the last layer is solved for; 0: it is not")
     cache: bool = _key(True, boolean, "keep fits on disk and reuse them")
 
     def _check_together(self) -> None:
@@ -174,7 +182,7 @@ class Optimizer(Table):
     lr: float | str = _key(
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
     )
-    beta2: float = _key(0.999, number(0, 0.999999), "Adam's decay of squared gradients; 0.99 tames spikes")
+    beta2: float = _key(0.99, number(0, 0.999999), "Adam's decay of squared gradients; 0.999 spikes")
     schedule: str = _key(
         "cosine",
         choice("cosine", "constant"),
@@ -195,6 +203,12 @@ class Renderer(Table):
     )
     memory_gb: float | str = _key(
         2.0, or_auto(number(0, positive=True)), 'most memory the transport may take, GB, or "auto"'
+    )
+    cache: bool = _key(True, boolean, "keep transports on disk and reuse them")
+    influence_threshold: float = _key(
+        1e-3,
+        number(0, 1),
+        "texels with less than this share of the mean influence on the rendering keep their value; 0: none",
     )
 
 

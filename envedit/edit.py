@@ -136,6 +136,17 @@ class _PlaceRows(dr.CustomOp):
         return "place rows"
 
 
+class _Keep:
+    """Put a map's own texels, (rows, W, 3), where it may not change; differentiable in the crop."""
+
+    def __init__(self, original, free):
+        self._original = dr.opaque(mi.Float(np.ascontiguousarray(original, np.float32).ravel()))
+        self._free = dr.opaque(mi.Bool(np.repeat(free.ravel(), 3)))
+
+    def __call__(self, crop):
+        return mi.TensorXf(dr.select(self._free, crop.array, self._original), crop.shape)
+
+
 def optimise(
     representation,
     params,
@@ -145,6 +156,7 @@ def optimise(
     first_row: int,
     settings: config.Optimizer,
     *,
+    free: np.ndarray | None = None,
     adam: optim.Adam | None = None,
     state: State | None = None,
     after_step: Callable[[State, optim.Adam], None] | None = None,
@@ -167,6 +179,8 @@ def optimise(
         First active row.
     settings : config.Optimizer
         Iterations and learning rate.
+    free : ndarray of bool (rows, W), optional
+        Texels of the active rows that may change; the others stay the original's, whatever the parameters.
     adam, state : optional
         To continue an earlier run; changed in place.
     after_step : callable, optional
@@ -187,12 +201,14 @@ def optimise(
     adam = adam or optim.Adam(params, lr, (0.9, settings.beta2))
     state = state or State()
     fixed = dr.opaque(mi.TensorXf(np.ascontiguousarray(envmap, np.float32)))
+    keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
     waiting, last_read = [], time.perf_counter()
     while state.step < settings.iterations:
         start = time.perf_counter()
         leaves = adam.leaves()
         with dr.isolate_grad():
             crop = representation.decode(leaves)
+            crop = keep(crop) if keep else crop
             rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
             total, terms = objective(rendering, crop, state.step)
             dr.backward(total)

@@ -62,6 +62,7 @@ class LogPixels:
 class Siren:
     """The weights of a SIREN fitted to the image (Eq. 1-3); robust (R-SIREN) when fitted with awp_gamma > 0.
 
+    ``rows`` tells which rows of a map the images are: (first row, rows of the whole map); None: all of it.
     ``fitted`` tells, after :meth:`encode`, how well the network reproduces the image.
     """
 
@@ -73,29 +74,38 @@ class Siren:
         settings: config.Fit,
         folder: Path | None = None,
         progress: Callable[[int, int, float], None] | None = None,
+        rows: tuple[int, int] | None = None,
     ):
         self.network, self.settings, self.folder, self.progress = network, settings, folder, progress
         self.fitted: fit.Fitted | None = None
-        self._shape = None
+        self._rows, self._shape, self._points = rows, None, {}
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Fit the network, or take an earlier fit of the same image from disk."""
         self.fitted = fit.fit(
-            image, self.network, self.settings, seed, folder=self.folder, progress=self.progress
+            image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
         )
-        self._shape = image.shape[:2]
+        self._shape, self._points = image.shape[:2], {}
         return {name: dr.opaque(mi.TensorXf(value)) for name, value in self.fitted.params.items()}
 
     def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:
         """Evaluate the network at the resolution of the image, or at any other ``shape``."""
-        return fit.evaluate(params, self.fitted.normalisation, shape or self._shape, self.network.omega)
+        shape = tuple(shape or self._shape)
+        if shape not in self._points:
+            first, total = self._rows or (0, self._shape[0])
+            finer = shape[0] / self._shape[0]
+            above, below = (round(n * finer) for n in (first, total - first - self._shape[0]))
+            rows = above, above + shape[0] + below
+            self._points[shape] = fit.points(self.network, shape, rows)
+        normalisation = self.fitted.normalisation
+        return fit.evaluate(params, normalisation, self._points[shape], shape, self.network.omega)
 
 
-def make(settings: config.Config, folder: Path | None = None, progress=None):
-    """Return the representation that a configuration asks for."""
+def make(settings: config.Config, folder: Path | None = None, progress=None, rows=None):
+    """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map."""
     kind = settings.representation.kind
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":
         return LogPixels()
-    return Siren(settings.representation, settings.fit, folder, progress)
+    return Siren(settings.representation, settings.fit, folder, progress, rows)

@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and C libraries that keep quiet about the files they handle."""
+"""Files written whole or not at all, where files are kept, and C libraries that keep quiet about theirs."""
 
 import contextlib
 import io
@@ -64,6 +64,11 @@ def write_atomically(path, data: bytes) -> None:
     """
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+
+
+def cache_folder(kind: str) -> Path:
+    """Folder in which one kind of file is kept between runs: $XDG_CACHE_HOME/envedit/KIND or in ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "envedit" / kind
 
 
 @contextlib.contextmanager

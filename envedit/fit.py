@@ -11,7 +11,6 @@ d_l for every weight matrix l, where d is the direction in which a proxy Adam wo
 from __future__ import annotations
 
 import hashlib
-import os
 import time
 import zipfile
 from collections.abc import Callable
@@ -22,16 +21,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import config, losses, metrics, optim, siren, ssim
+from . import config, losses, metrics, optim, refit, siren, ssim
 from ._callable import make_callable
 from .errors import InputError, NumericalError
-from .files import replacing
+from .files import cache_folder, replacing
 
 EPSILON = 0.01
 """Added to radiance inside the logarithm (paper, below Eq. 3)."""
 MOST_REFUSED = 20
 """Non-finite steps after which a fit gives up."""
-_RECIPE = 3  # raise when the same settings give another fit
+_RECIPE = 4  # raise when the same settings give another fit
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,18 @@ class Normalisation:
     span: float
 
     @classmethod
-    def of(cls, image: np.ndarray) -> Normalisation:
-        """Measure the range of an image; a constant image is put in the middle of a range of one."""
+    def of(cls, image: np.ndarray, headroom: float = 0.0) -> Normalisation:
+        """Measure the range of an image; a constant image is put in the middle of a range of one.
+
+        ``headroom`` is the share of (0, 1) that stays free at either end: a sigmoid reaches 1, where Eq. 1
+        puts the sun, nowhere, and an edited sun may have to be brighter.
+        """
         logs = np.log(np.asarray(image, np.float64) + EPSILON)
         low, high = float(logs.min()), float(logs.max())
-        return cls(low, high - low) if high - low > 1e-4 else cls(low - 0.5, 1.0)
+        if high - low <= 1e-4:
+            return cls(low - 0.5, 1.0)
+        span = (high - low) / (1 - 2 * headroom)
+        return cls(low - headroom * span, span)
 
     def encode(self, image: np.ndarray) -> np.ndarray:
         """Map radiance to [0, 1], in float64 (Eq. 1)."""
@@ -72,21 +78,12 @@ class Fitted:
     cached: bool
 
 
-def to_image(values: mi.TensorXf, height: int, width: int) -> mi.TensorXf:
-    """Reorder network output (3, H * W) to an image (H, W, 3), differentiably."""
-    n = height * width
-    i = dr.arange(mi.UInt32, 3 * n)
-    return mi.TensorXf(
-        dr.gather(mi.Float, values.array, (i % 3) * n + i // 3, mode=dr.ReduceMode.Permute),
-        (height, width, 3),
-    )
-
-
 def fit(
     image: np.ndarray,
     network: config.Representation | None = None,
     settings: config.Fit | None = None,
     seed: int = 0,
+    rows: tuple[int, int] | None = None,
     *,
     folder: Path | None = None,
     progress: Callable[[int, int, float], None] | None = None,
@@ -103,6 +100,8 @@ def fit(
         The recipe; the standard preset's by default.
     seed : int
         Seed of the initial weights.
+    rows : (int, int), optional
+        First row of the image in its map, and the rows of that map; None: the image is a whole map.
     folder : Path, optional
         Where fits are kept under a hash of image and settings; None: nowhere.
     progress : callable, optional
@@ -127,13 +126,17 @@ def fit(
         raise InputError(
             f"fit: the texel at row {row}, column {column} is not finite or is negative: repair it"
         )
-    path = folder / f"{_key(image, network, settings, seed)}.npz" if folder and settings.cache else None
+    path = folder / f"{_key(image, network, settings, seed, rows)}.npz" if folder and settings.cache else None
     if path and (found := _load(path)):
         return found
     start = time.perf_counter()
-    normalisation = Normalisation.of(image)
-    params = _train(image, normalisation, network, settings, seed, progress)
-    got = evaluate(params, normalisation, image.shape[:2], network.omega).numpy()
+    normalisation = Normalisation.of(image, settings.headroom)
+    x = points(network, image.shape[:2], rows)
+    params = _train(image, normalisation, x, network, settings, seed, progress)
+    if settings.light:
+        wanted = normalisation.encode(image).reshape(-1, 3)
+        params = refit.last_layer(params, x, network.omega, wanted, image.reshape(-1, 3), settings.light)
+    got = evaluate(params, normalisation, x, image.shape[:2], network.omega).numpy()
     fitted = Fitted(
         {k: v.numpy() for k, v in params.items()},
         normalisation,
@@ -148,16 +151,25 @@ def fit(
     return fitted
 
 
-def evaluate(
-    params: siren.Params, normalisation: Normalisation, shape: tuple[int, int], omega: float
+def points(
+    network: config.Representation, shape: tuple[int, int], rows: tuple[int, int] | None = None
 ) -> mi.TensorXf:
-    """Evaluate a network as an image of linear radiance (H, W, 3), differentiable in its weights."""
-    y = siren.evaluate(params, siren.coordinates(*shape), omega)
-    return normalisation.decode(to_image(y, *shape))
+    """Return the network's coordinates of the texels of ``rows`` (first, total) of a map, (H * W, inputs)."""
+    if network.coordinates == "plane":
+        return dr.opaque(siren.coordinates(*shape))
+    return dr.opaque(siren.directions(*shape, *(rows or (0, shape[0]))))
+
+
+def evaluate(
+    params: siren.Params, normalisation: Normalisation, x: mi.TensorXf, shape: tuple[int, int], omega: float
+) -> mi.TensorXf:
+    """Evaluate a network at :func:`points` as linear radiance (H, W, 3), differentiable in its weights."""
+    y = siren.evaluate(params, x, omega)
+    return normalisation.decode(dr.reshape(y, (*shape, 3)))
 
 
 class Objective:
-    """Eq. 4 for one image: value and gradient with respect to the network's output (3, H * W)."""
+    """Eq. 4 for one image: value and gradient with respect to the network's output (H * W, 3)."""
 
     def __init__(self, image: np.ndarray, normalisation: Normalisation, settings: config.Fit):
         self.shape = image.shape[:2]
@@ -171,7 +183,7 @@ class Objective:
         y = mi.TensorXf(y)
         dr.enable_grad(y)
         with dr.isolate_grad():
-            values = to_image(y, *self.shape)
+            values = dr.reshape(y, (*self.shape, 3))
             if only_ssim:
                 loss = self.ssim(values)
             else:
@@ -229,16 +241,18 @@ def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
     return optim.constant(base, epoch)
 
 
-def _train(image, normalisation, network, settings, seed, progress):
-    params = siren.init(seed, network.hidden, network.depth, network.omega)
-    x = dr.opaque(siren.coordinates(*image.shape[:2]))
-    objective = Objective(image, normalisation, settings)
-    adam = optim.Adam(params, settings.lr)
+def _train(image, normalisation, x, network, settings, seed, progress):
+    params = siren.init(seed, network.hidden, network.depth, network.omega, inputs=x.shape[1])
+    grids = _grids(image, normalisation, x, settings)
+    rng, order = np.random.default_rng(seed), []
+    adam = optim.Adam(params, settings.lr, (0.9, settings.beta2))
     perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
     refused = 0
     for epoch in range(settings.epochs):
+        order = order or list(rng.permutation(len(grids)))
+        objective, x = grids[order.pop()]
         params = adam.params
-        if perturbation:
+        if perturbation and epoch < settings.awp_until * settings.epochs:
             if epoch % settings.awp_every == 0:
                 y, tape = siren.forward(params, x, network.omega)
                 _, slope = objective.gradient(y, only_ssim=True)
@@ -260,17 +274,37 @@ def _train(image, normalisation, network, settings, seed, progress):
     return adam.params
 
 
+def _grids(image, normalisation, x, settings):
+    """Cut an image into interleaved grids of every stride-th row and column; objective and points of each.
+
+    A grid is a picture itself, so that its SSIM means something. One that were smaller than the window of the
+    SSIM would not be: small images are taken whole.
+    """
+    height, width = image.shape[:2]
+    stride = settings.stride if min(height, width) >= settings.stride * ssim.WINDOW else 1
+    x = x.numpy().reshape(height, width, -1)
+    grids = []
+    for row in range(stride):
+        for column in range(stride):
+            part = (slice(row, None, stride), slice(column, None, stride))
+            objective = Objective(np.ascontiguousarray(image[part]), normalisation, settings)
+            some = np.ascontiguousarray(x[part]).reshape(-1, x.shape[-1])
+            grids.append((objective, dr.opaque(mi.TensorXf(some))))
+    return grids
+
+
 # ---------------------------------------------------------------------- fits on disk
 
 
 def default_folder() -> Path:
     """Folder in which fits are kept: $XDG_CACHE_HOME/envedit/fits, or ~/.cache/envedit/fits."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "envedit" / "fits"
+    return cache_folder("fits")
 
 
-def _key(image, network, settings, seed):
+def _key(image, network, settings, seed, rows):
     what = {
-        "network": [network.hidden, network.depth, network.omega],
+        "network": [network.hidden, network.depth, network.omega, network.coordinates],
+        "rows": rows or (0, image.shape[0]),
         "seed": seed,
         "recipe": _RECIPE,
         "shape": image.shape,

@@ -41,6 +41,7 @@ def _run(arguments):
     original, warnings = load_map(settings.input)
     first, last = active_rows(settings.input.rows, original.shape[0])
     crop = original[first : last + 1]
+    rows = first, original.shape[0]
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,12 +54,15 @@ def _run(arguments):
             settings.representation,
             settings.fit,
             settings.seed,
+            rows,
             folder=fit.default_folder(),
             progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
         )
     params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
     network = settings.representation
-    got = fit.evaluate(params, fitted.normalisation, crop.shape[:2], network.omega).numpy()
+    shape = crop.shape[:2]
+    x = fit.points(network, shape, rows)
+    got = fit.evaluate(params, fitted.normalisation, x, shape, network.omega).numpy()
     image.write_exr(folder / "fitted.exr", got, {"source": arguments.map, "rows": f"{first} to {last}"})
     preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
     numbers = {

@@ -16,7 +16,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import checkpoint, config, edit, envmap, fit, image, metrics, optim, scene, sky, target
+from . import checkpoint, config, edit, envmap, files, fit, image, metrics, optim, scene, sky, target
 from .errors import NumericalError
 from .pathtrace import PathTracer
 from .transport import LightTransport
@@ -32,7 +32,7 @@ class Result:
     Attributes
     ----------
     envmap : ndarray (H, W, 3)
-        The edited map; rows outside the active ones are the original's, bit for bit.
+        The edited map; rows outside the active ones, and frozen texels, are the original's, bit for bit.
     renders, maps : dict
         ``initial``, ``target``, ``edited``; linear radiance. ``maps["target"]`` is None where it is unknown.
     metrics : dict
@@ -41,6 +41,10 @@ class Result:
         A row an iteration.
     notes, warnings : list of str
         What was chosen automatically; what the user should know.
+    influence : ndarray (H, W), optional
+        T' 1, how much each texel adds to the picture; None where the renderer does not know.
+    frozen : ndarray of bool (H, W), optional
+        Active texels that were kept, as this view does not determine them; None as above.
     """
 
     envmap: np.ndarray
@@ -51,6 +55,7 @@ class Result:
     notes: list[str]
     warnings: list[str]
     influence: np.ndarray | None = None
+    frozen: np.ndarray | None = None
 
     @property
     def render(self) -> np.ndarray:
@@ -128,6 +133,7 @@ def make_renderer(settings: config.Config, lit: scene.Scene, shape, progress=Non
         seed=settings.seed,
         memory_gb=chosen.memory_gb,
         refresh=0 if chosen.refresh == "auto" else chosen.refresh,
+        folder=files.cache_folder("transport") if chosen.cache else None,
         progress=progress,
     )
 
@@ -193,6 +199,7 @@ def run(
             settings,
             fit.default_folder(),
             lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"),
+            (first, height),
         )
         params = representation.encode(crop, settings.seed)
     with clock("transport_s"):
@@ -204,10 +211,17 @@ def run(
         renderer = make_renderer(
             settings, lit, (height, width), lambda done, total: watch.progress(done, total, "")
         )
+        # Now: a resumed run may take up a later recording, but must freeze the same texels.
+        traced = renderer if isinstance(renderer, LightTransport) else None
+        rows, frozen = slice(first, last + 1), None
+        if traced:
+            frozen = np.zeros((height, width), bool)
+            frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
 
     with clock("edit_s"):
         watch.stage("editing")
-        job = _Job(settings, lit, original, first, wanted, representation, renderer, folder, watch)
+        free = ~frozen[rows] if traced and frozen.any() else None
+        job = _Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
         params, state = job.optimise(params, crop, resume)
         edited, wanted = job.decode(params), job.wanted
 
@@ -216,7 +230,6 @@ def run(
         final = lit.render(edited, spp=settings.output.spp, seed=settings.seed + JUDGE_SEED + 1)
     seconds = clock.seconds
     iterations = len(state.history)
-    rows = slice(first, last + 1)
     tonemap = settings.output.tonemap
     fitted = getattr(representation, "fitted", None)
     measured = {
@@ -246,11 +259,23 @@ def run(
         "non_finite_steps": state.bad_steps,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [first, last],
+        "transport": None,
     }
     if wanted.envmap is not None:
         measured["sun_offset_texels"] = metrics.sun_offset(edited[rows], wanted.envmap[rows])
         measured["initial_envmap"] = metrics.compare(original[rows], wanted.envmap[rows], tonemap)
     notes = [wanted.source, *renderer.choices]
+    if traced:
+        share = float(frozen[rows].mean())
+        measured["transport"] = {
+            **traced.summary(),
+            "predicted_error": traced.coarse_error(original),
+            "frozen": share,
+        }
+        if share:
+            least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
+            notes.append(f"{100 * share:.2g} % of the active texels keep their value: {least}")
+    measured["choices"] = notes
     return Result(
         edited,
         {"initial": initial, "target": wanted.picture, "edited": final},
@@ -259,7 +284,8 @@ def run(
         state.history,
         notes,
         warnings,
-        getattr(renderer, "influence", None),
+        traced.influence if traced else None,
+        frozen,
     )
 
 
@@ -274,6 +300,7 @@ class _Job:
     lit: scene.Scene
     original: np.ndarray
     first: int
+    free: np.ndarray | None
     wanted: target.Target
     representation: object
     renderer: object
@@ -283,6 +310,9 @@ class _Job:
     def decode(self, params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
+        rows = slice(self.first, self.first + crop.shape[0])
+        if self.free is not None:
+            crop = np.where(self.free[..., None], crop, self.original[rows])
         if not np.isfinite(crop).all():
             row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
             raise NumericalError(
@@ -290,7 +320,7 @@ class _Job:
                 "lower [optimizer] lr"
             )
         edited = self.original.copy()
-        edited[self.first : self.first + crop.shape[0]] = crop
+        edited[rows] = crop
         return edited
 
     def optimise(self, params, crop, resume):
@@ -333,6 +363,7 @@ class _Job:
                     self.original,
                     self.first,
                     chosen,
+                    free=self.free,
                     adam=adam,
                     state=state,
                     after_step=after_step,

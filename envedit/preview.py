@@ -9,6 +9,7 @@ import numpy as np
 from .curves import round_up
 from .errors import InputError
 from .files import write_atomically
+from .influence import per_solid_angle
 from .tonemap import luminance
 from .tonemap import tonemap as apply_tonemap
 
@@ -226,3 +227,72 @@ def difference_image(a, b, kind="tonemapped", tonemap="gamma", scale=None):
     pixels = np.rint(pixels).astype(np.uint8)
     pixels[~finite] = NOT_FINITE
     return pixels, float(scale)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Influence
+
+# Nine colours of viridis (Smith and van der Walt 2015), evenly spaced: their lightness rises evenly.
+RISING = np.array([[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141],
+                   [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]])  # fmt: skip
+INFLUENCE_RANGE = (1e-3, 1e1)
+"""Influence drawn in the first and the last colour, as shares of the mean."""
+
+
+def _rising(share):
+    """Colour shares (...) of the scale, cut to [0, 1], as (..., 3) uint8."""
+    place = np.clip(share, 0, 1) * (len(RISING) - 1)
+    colours = [np.interp(place, np.arange(len(RISING)), RISING[:, c]) for c in range(3)]
+    return np.rint(np.stack(colours, axis=-1)).astype(np.uint8)
+
+
+def influence_image(influence, frozen=None):
+    """Draw the influence of texels per solid angle, as shares of its mean over the sphere, logarithmically.
+
+    Parameters
+    ----------
+    influence : ndarray (H, W)
+        T' 1 of :class:`.transport.LightTransport`.
+    frozen : ndarray of bool (H, W), optional
+        Texels that were kept, drawn in grey.
+
+    Returns
+    -------
+    array (H, W, 3) uint8
+    """
+    mean = influence.sum(dtype=np.float64) / (4 * np.pi)
+    low, high = np.log10(INFLUENCE_RANGE)
+    level = np.log10(np.maximum(per_solid_angle(influence) / max(mean, 1e-300), INFLUENCE_RANGE[0]))
+    pixels = _rising((level - low) / (high - low))
+    if frozen is not None:
+        pixels[frozen] = PLACEHOLDER
+    return pixels
+
+
+def influence(path, values, frozen=None) -> None:
+    """Draw ``influence.png``: :func:`influence_image` at 512 pixels or more, over its scale.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    pixels = influence_image(values, frozen)
+    factor = -(-512 // pixels.shape[1])
+    pixels = pixels.repeat(factor, axis=0).repeat(factor, axis=1)
+    height, width, _ = pixels.shape
+    scale = 2  # of the labels: pixels a dot
+    top = GAP + 7 * scale + GAP
+    foot = slice(top + height + GAP, top + height + GAP + 7 * scale)
+    canvas = np.empty((foot.stop + GAP, width + 2 * GAP, 3), np.uint8)
+    canvas[:] = BACKGROUND
+    inside = canvas[:, GAP : GAP + width]
+    title = "influence, 1 = mean" + (" (grey: kept)" if frozen is not None and frozen.any() else "")
+    inside[GAP : top - GAP][_text(title, width, scale)] = INK
+    inside[top : top + height] = pixels
+    room = 6 * 6 * scale  # for a label of five glyphs at either end of the bar
+    low, high = (f"{share:g}" for share in INFLUENCE_RANGE)
+    inside[foot, :room][_text(low, room, scale)] = INK
+    inside[foot, -6 * scale * len(high) :][_text(high, 6 * scale * len(high), scale)] = INK
+    inside[foot, room:-room] = _rising(np.linspace(0, 1, width - 2 * room))
+    write_atomically(path, png(canvas))

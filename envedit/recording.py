@@ -26,8 +26,11 @@ DEPTH_TOLERANCE = 0.002
 """Share of the picture under a white sky that an automatic path depth may leave out."""
 LANES = 1 << 18
 """Paths traced at once: what bounds the memory of a recording."""
+PATHS = 1 << 22
+"""Paths of a recording, all pixels together: more pixels need fewer each, as neighbours see the same map."""
+FEWEST_SPP, MOST_SPP = 16, 256
 PILOT_SPP = 16
-MOST_COLUMNS = 768
+MOST_COLUMNS = 256
 
 
 class Recorded(NamedTuple):
@@ -181,6 +184,11 @@ def pilot(scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return by_row, by_bounce
 
 
+def left_out(by_bounce: np.ndarray, bounces: int) -> float:
+    """Share of the picture under a white sky that comes from beyond ``bounces``, of the light by bounce."""
+    return max(1 - float(by_bounce[: bounces + 1].sum() / by_bounce.sum()), 0.0)
+
+
 def choose_bounces(scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[int, list[str]]:
     """Choose the surface points along a path from the light by bounce that :func:`pilot` found.
 
@@ -215,10 +223,10 @@ def choose_bounces(scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[
         )
     if not automatic:
         return int(max_depth) - 1, []
-    left = 1 - np.cumsum(by_bounce) / total
-    enough = left <= DEPTH_TOLERANCE
-    bounces = int(np.argmax(enough)) if enough.any() else MAX_BOUNCES
-    added = f"further bounces add {100 * left[bounces]:.2g} % of the picture under a white sky"
+    enough = [left_out(by_bounce, bounces) <= DEPTH_TOLERANCE for bounces in range(MAX_BOUNCES + 1)]
+    bounces = enough.index(True) if any(enough) else MAX_BOUNCES
+    left = left_out(by_bounce, bounces)
+    added = f"further bounces add {100 * left:.2g} % of the picture under a white sky"
     return bounces, [f"path depth {bounces + 1}: {added}"]
 
 
@@ -230,7 +238,8 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
     scene : envedit.scene.Scene
         Whose film counts.
     spp : int or "auto"
-        Paths a pixel; taken as it is if it is a number, else 256 or what leaves 30 % to columns.
+        Paths a pixel; taken as it is if it is a number, else :data:`PATHS` over the pixels, or what leaves
+        30 % of the memory to columns.
     texels : int
         Texels of the map: no more columns are of use.
     memory_gb : float
@@ -249,13 +258,13 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
         If the samples alone do not fit.
     """
     pixels = scene.width * scene.height
-    wanted, spp = spp, 256 if spp == "auto" else int(spp)
+    wanted, spp = spp, _automatic_spp(pixels) if spp == "auto" else int(spp)
 
     def coarse_gb():
         # Two packed copies (T and its transpose) of 16 bytes an entry; a path leaves about 1.5 entries.
         return pixels * spp * 1.5 * 32 / 1e9
 
-    while wanted == "auto" and coarse_gb() > 0.7 * memory_gb and spp > 16:
+    while wanted == "auto" and coarse_gb() > 0.7 * memory_gb and spp > FEWEST_SPP:
         spp //= 2
     if coarse_gb() > memory_gb:
         raise InputError(
@@ -267,6 +276,11 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
     about = coarse_gb() + capacity * 16e-9 * pixels
     columns = f"up to {capacity} exact columns, about {about:.2g} of {memory_gb:g} GB"
     return spp, capacity, f"light transport: {spp} paths a pixel, {columns}"
+
+
+def _automatic_spp(pixels):
+    """Return the power of two next below PATHS over the pixels, within bounds."""
+    return int(np.clip(1 << (PATHS // pixels or 1).bit_length() - 1, FEWEST_SPP, MOST_SPP))
 
 
 def row_mass(sphere: np.ndarray, by_row: np.ndarray) -> np.ndarray:

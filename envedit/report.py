@@ -13,7 +13,16 @@ from .curves import curves_svg, escape, number
 from .files import write_atomically
 from .latlong import solid_angles
 from .manifest import plain
-from .preview import checked, difference_image, display, fit_finite, png
+from .preview import (
+    INFLUENCE_RANGE,
+    RISING,
+    checked,
+    difference_image,
+    display,
+    fit_finite,
+    influence_image,
+    png,
+)
 from .tonemap import luminance
 
 _STYLE = """
@@ -37,6 +46,7 @@ img.small { image-rendering: pixelated; }
   display: grid; place-items: center; font-size: .87rem; }
 .scale { height: 8px; border-radius: 2px; margin-top: .5rem;
   background: linear-gradient(90deg, #2166ac, #92c5de, #f7f7f7, #f4a582, #b2182b); }
+.scale.rising { background: linear-gradient(90deg, RISING); }
 .ends { display: flex; justify-content: space-between; color: var(--soft); font-size: .8rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; min-width: 22rem;
@@ -55,7 +65,7 @@ pre { background: #fff; border: 1px solid var(--line); border-radius: 3px; paddi
   white-space: pre-wrap; }
 summary { cursor: pointer; }
 @media (max-width: 640px) { .grid { grid-template-columns: 1fr !important; } }
-"""
+""".replace("RISING", ", ".join(f"rgb({r},{g},{b})" for r, g, b in RISING))
 
 
 def _show(value, digits=4):
@@ -118,6 +128,15 @@ def _difference_figure(a, b, caption, kind, tonemap):
     return _figure(pixels, caption, f'<div class="scale"></div>{ends}')
 
 
+def _influence_figure(influence, frozen):
+    low, high = INFLUENCE_RANGE
+    ends = f'<div class="ends"><span>{low:g}</span><span>{high:g}</span></div>'
+    caption = "influence of each texel on the rendering, per solid angle; 1 is the mean"
+    if frozen is not None and frozen.any():
+        caption += "; grey texels are not determined by this view and keep their original value"
+    return _figure(influence_image(influence, frozen), caption, f'<div class="scale rising"></div>{ends}')
+
+
 def _map_statistics(image):
     """Fill the table's cells for one map: luminances (linear) and the peak's place."""
     bad = ~np.isfinite(image).all(axis=2)
@@ -160,6 +179,8 @@ def write_report(
     history,
     renders,
     maps,
+    influence=None,
+    frozen=None,
     warnings=(),
     notes=(),
     tonemap="gamma",
@@ -180,6 +201,8 @@ def write_report(
         A row an iteration; may be empty.
     renders, maps : dict of str to array or None
         As for `preview`. Differences are drawn between the names ``initial``, ``target`` and ``edited``.
+    influence, frozen : array (H, W), optional
+        As for `envedit.preview.influence_image`.
     warnings, notes : sequence of str
         What the user should know, and the choices made for settings left at "auto".
     tonemap : str
@@ -228,7 +251,9 @@ def write_report(
     measures = {"psnr": "PSNR (dB)", "ssim": "SSIM", "mse": "MSE", "lpips": "LPIPS"}
     quality_rows = [[name, *(_show(table.get(key)) for table in quality)] for key, name in measures.items()]
     others = [(key, value) for key, value in metrics.items() if not isinstance(value, (dict, type(None)))]
-    others += [(f"fit {key}", value) for key, value in (metrics.get("fit") or {}).items()]
+    others = [(key, value) for key, value in others if key != "choices"]  # a chapter of their own
+    for part in ("fit", "transport"):
+        others += [(f"{part} {key}", value) for key, value in (metrics.get(part) or {}).items()]
     timing = {key: number(value) for key, value in (metrics.get("timing") or {}).items()}
     longest = max((t for key, t in timing.items() if t and key.endswith("_s")), default=0)
     timing_rows = []
@@ -253,6 +278,9 @@ def write_report(
         f"<h2>Renderings and maps</h2>{_grid(figures)}<p></p>{_grid(map_figures)}" if names else "",
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>' if names else "",
         f"<h2>Differences</h2>{_grid(differences)}" if differences else "",
+        f"<h2>What this view determines</h2>{_grid([_influence_figure(influence, frozen)])}"
+        if influence is not None
+        else "",
         f"<h2>Losses</h2>{curves}",
         "<h2>Quality</h2>",
         _table(["", "initial rendering", "edited rendering", "edited map"], quality_rows),

@@ -15,8 +15,8 @@ from pathlib import Path
 _EARLIER = "earlier"
 _OUTPUTS = (
     "edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "influence.exr",
-    "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "metrics.json",
-    "checkpoint.npz",
+    "influence.png", "preview.png", "report.html", "history.csv", "config.toml", "manifest.json",
+    "metrics.json", "checkpoint.npz",
 )  # fmt: skip
 
 
@@ -163,6 +163,7 @@ def _write(settings, folder, result, import_s, quiet):
     if result.influence is not None:
         grey = result.influence[..., None].repeat(3, axis=2)
         image.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
+        preview.influence(folder / "influence.png", result.influence, result.frozen)
     text = config.to_toml(settings)
     files.write_atomically(folder / "config.toml", text.encode())
     manifest.write_history(folder / "history.csv", result.history)
@@ -191,6 +192,8 @@ def _write(settings, folder, result, import_s, quiet):
             history=result.history,
             renders=result.renders,
             maps=result.maps,
+            influence=result.influence,
+            frozen=result.frozen,
             warnings=warnings,
             notes=result.notes,
             tonemap=settings.output.tonemap,

@@ -5,12 +5,13 @@ sine layers, a linear layer and a sigmoid::
 
     h_0 = sin(omega (W_0 x + b_0)),   h_i = sin(omega (W_i h_{i-1} + b_i)),   y = sigmoid(W h_depth + b)
 
-Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out, 1) upwards.
-Activations are (width, N): points are columns, so that a bias gradient is a sum over contiguous memory and
-every product of the reverse pass is one matrix product with a transpose flag, which costs nothing.
+Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out,) upwards. Activations
+are (N, width), a point a row: Dr.Jit multiplies a tall matrix by a small one 1.5 to 1.8 times as fast as a
+small one by a wide one, whose rows lie far apart in memory (``docs/engine.md``).
 
 The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the
-price of one), and needs two matrix products a layer beside the forward one: that is the least possible.
+price of one), and needs two matrix products a layer beside the forward one: that is the least possible. A
+bias gradient is one more, with a row of ones: a sum over rows of float32 would be slower and less exact.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import latlong
+
 Params = dict[str, "mi.TensorXf"]
+
+SPHERE_SCALE = 1.5
+"""Radius of the sphere on which directions lie: the higher, the finer the detail that is found first."""
 
 
 def init(
@@ -44,7 +50,7 @@ def init(
     Returns
     -------
     dict
-        ``"i.weight"`` (out, in) and ``"i.bias"`` (out, 1) for i = 0 ... depth + 1.
+        ``"i.weight"`` (out, in) and ``"i.bias"`` (out,) for i = 0 ... depth + 1.
     """
     rng = np.random.default_rng(seed)
     sizes = [inputs] + [hidden] * (depth + 1) + [outputs]
@@ -52,12 +58,9 @@ def init(
     for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         bound = 1.0 / fan_in if i == 0 else np.sqrt(6.0 / fan_in) / omega
         bias = 1.0 / np.sqrt(fan_in)
-        params[f"{i}.weight"] = dr.opaque(
-            mi.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32))
-        )
-        params[f"{i}.bias"] = dr.opaque(
-            mi.TensorXf(rng.uniform(-bias, bias, (fan_out, 1)).astype(np.float32))
-        )
+        weight = rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)
+        params[f"{i}.weight"] = dr.opaque(mi.TensorXf(weight))
+        params[f"{i}.bias"] = dr.opaque(mi.TensorXf(rng.uniform(-bias, bias, fan_out).astype(np.float32)))
     return params
 
 
@@ -72,15 +75,31 @@ def weight_names(params: Params) -> list[str]:
 
 
 def coordinates(height: int, width: int) -> mi.TensorXf:
-    """Texel centres as network coordinates (2, H * W), rows (y, x) in (-1, 1), row-major over texels.
+    """Texel centres as network coordinates (H * W, 2), columns (y, x) in (-1, 1), row-major over texels.
 
     Centres, not corners: the same picture area is covered at every resolution, so that a network fitted at
     one can be evaluated at another without a shift.
     """
     y = (2 * np.arange(height) + 1) / height - 1
     x = (2 * np.arange(width) + 1) / width - 1
-    grid = np.stack(np.meshgrid(y, x, indexing="ij")).reshape(2, -1)
+    grid = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
     return mi.TensorXf(grid.astype(np.float32))
+
+
+def directions(height: int, width: int, first: int = 0, total: int | None = None) -> mi.TensorXf:
+    """Directions through texel centres as network coordinates (H * W, 3), scaled by :data:`SPHERE_SCALE`.
+
+    On the sphere a map has no seam, its zenith is a point, and a step of a texel is as long across as down.
+
+    Parameters
+    ----------
+    height, width : int
+        Rows and columns wanted.
+    first, total : int
+        The rows are ``first`` ... ``first + height - 1`` of a map of ``total`` rows; all of them by default.
+    """
+    d = latlong.directions(total or height, width)[first : first + height]
+    return mi.TensorXf((SPHERE_SCALE * d).astype(np.float32).reshape(-1, 3))
 
 
 def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, list]:
@@ -91,14 +110,14 @@ def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, 
     params : dict
         Weights (see :func:`init`).
     x : TensorXf
-        Coordinates (inputs, N).
+        Coordinates (N, inputs).
     omega : float
         Angular frequency.
 
     Returns
     -------
     y : TensorXf
-        Values (outputs, N) in (0, 1).
+        Values (N, outputs) in (0, 1).
     tape : list
         Per layer its input and omega * cos, and the output: what :func:`backward` needs.
     """
@@ -106,13 +125,13 @@ def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, 
     tape = []
     h = x
     for i in range(last):
-        z = dr.matmul(params[f"{i}.weight"], h) + params[f"{i}.bias"]
+        z = dr.matmul(h, params[f"{i}.weight"], Bt=True) + params[f"{i}.bias"]
         sine, cosine = dr.sincos(omega * z)
         slope = omega * cosine
         dr.eval(sine, slope)
         tape.append((h, slope))
         h = sine
-    y = _sigmoid(dr.matmul(params[f"{last}.weight"], h) + params[f"{last}.bias"])
+    y = _sigmoid(dr.matmul(h, params[f"{last}.weight"], Bt=True) + params[f"{last}.bias"])
     tape.append((h, y))
     return y, tape
 
@@ -127,7 +146,7 @@ def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
     tape : list
         What it kept.
     grad : TensorXf
-        Gradient of a scalar with respect to y, (outputs, N).
+        Gradient of a scalar with respect to y, (N, outputs).
 
     Returns
     -------
@@ -138,13 +157,14 @@ def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
     grads: Params = {}
     h, y = tape[last]
     delta = grad * y * (1 - y)
+    ones = dr.opaque(dr.ones(type(delta), (1, delta.shape[0])))
     for i in range(last, -1, -1):
         dr.eval(delta)
-        grads[f"{i}.weight"] = dr.matmul(delta, h, Bt=True)
-        grads[f"{i}.bias"] = dr.reshape(type(delta)(dr.sum(delta, axis=1)), (delta.shape[0], 1))
+        grads[f"{i}.weight"] = dr.matmul(delta, h, At=True)
+        grads[f"{i}.bias"] = dr.reshape(dr.matmul(ones, delta), delta.shape[1])
         if i > 0:
             slope = tape[i - 1][1]
-            delta = dr.matmul(params[f"{i}.weight"], delta, At=True) * slope
+            delta = dr.matmul(delta, params[f"{i}.weight"]) * slope
             h = tape[i - 1][0]
     # In the order of the parameters: dr.CustomOp.set_grad_in drops, silently, a dict whose keys come in
     # another order.

@@ -24,7 +24,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "scene": {"width": 96},
         "target": {"spp": 1024},
         "representation": {"hidden": 64},
-        "fit": {"epochs": 150},
+        "fit": {"epochs": 500},
         "optimizer": {"iterations": 150},
         "output": {"spp": 1024},
     },
@@ -32,10 +32,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "input": {"width": 256, "rows": "upper"},
         "scene": {"width": 256},
-        "representation": {"kind": "siren", "hidden": 256, "depth": 6, "omega": 30.0},
+        "representation": {"kind": "siren", "hidden": 256, "depth": 6, "omega": 30.0, "coordinates": "plane"},
         "fit": {
             "epochs": 1500, "lr": 5e-5, "schedule": "warm-restarts", "restart_period": 100,
             "log_mse": 0.85, "log_ssim": 0.25, "hdr": 1e-2, "awp_gamma": 0.01, "awp_lr": 1e-4, "awp_every": 1,
+            "beta2": 0.999, "stride": 1, "awp_until": 1.0, "headroom": 0.0, "light": 0.0,
         },
         "loss": {
             "ssim": (1.0, 1e4), "luminance": (1e-4, 1e-8), "l1": (1e-4, 1e-8), "dists": 0.6,

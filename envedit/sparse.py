@@ -57,13 +57,31 @@ class ColourMatrix:
         packed = np.zeros((max(int(slice_start[-1]), 1), 4), np.float32)
         packed[position, :3] = weights[order]
         packed[position, 3] = columns[order].astype(np.uint32).view(np.float32)
-        self.bytes = packed.nbytes
         every = np.arange(slices * SLICE)
         start = slice_start[every // SLICE] + every % SLICE
-        self._packed = dr.opaque(mi.Float(packed.ravel()))
-        self._start = dr.opaque(mi.UInt32(start.astype(np.uint32)))
-        self._stop = dr.opaque(mi.UInt32((start + longest[every // SLICE] * SLICE).astype(np.uint32)))
-        self._lane = dr.opaque(mi.UInt32(lane[: shape[0]].astype(np.uint32)))
+        stop = start + longest[every // SLICE] * SLICE
+        self._upload(packed.ravel(), *(x.astype(np.uint32) for x in (start, stop, lane[: shape[0]])))
+
+    def _upload(self, packed, start, stop, lane):
+        self.bytes = packed.nbytes
+        self._packed = dr.opaque(mi.Float(packed))
+        self._start, self._stop, self._lane = (dr.opaque(mi.UInt32(x)) for x in (start, stop, lane))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all that the matrix consists of, as it is stored; :meth:`from_arrays` takes it back."""
+        return {
+            "shape": np.array(self.shape, np.int64),
+            "entries": np.array(self.entries, np.int64),
+            **{name: getattr(self, f"_{name}").numpy() for name in ("packed", "start", "stop", "lane")},
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ColourMatrix:
+        """Make a matrix of what :meth:`arrays` returned; its products have the same bits."""
+        matrix = cls.__new__(cls)
+        matrix.shape, matrix.entries = tuple(arrays["shape"].tolist()), int(arrays["entries"])
+        matrix._upload(*(arrays[name] for name in ("packed", "start", "stop", "lane")))
+        return matrix
 
     def apply(self, x: mi.Float) -> mi.Float:
         """Multiply with a vector of colours.

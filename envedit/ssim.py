@@ -48,6 +48,9 @@ def total(values):
 # Structural similarity
 # --------------------------------------------------------------------------------------------------------
 
+WINDOW = 11
+"""Texels along a side of the Gaussian window."""
+
 
 class Ssim:
     r"""Structural similarity to a fixed reference, with a hand-written gradient.
@@ -214,7 +217,7 @@ class _SsimOp(dr.CustomOp):
         return "SSIM"
 
 
-def _gaussian(length, size=11, sigma=1.5):
+def _gaussian(length, size=WINDOW, sigma=1.5):
     """Gaussian window of the largest odd size up to ``size`` that fits, with sum one."""
     radius = (min(size, length) - 1) // 2
     taps = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]

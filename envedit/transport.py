@@ -18,24 +18,37 @@ grid.
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from . import latlong
 from .columns import ExactColumns
+from .disk_cache import DiskCache
 from .errors import ConfigError
 from .grid import Grid
-from .recording import choose_bounces, choose_samples, other_light, pilot, record_all, row_mass
+from .influence import determined
+from .recording import choose_bounces, choose_samples, left_out, other_light, pilot, record_all, row_mass
 from .sparse import ColourMatrix, scale_packets, to_packets
 
 COLUMN_TOLERANCE = 0.03
 """Relative error of the coarse tier above which columns are added."""
-COLUMN_PATHS = (8, 48)
-"""Paths a pixel of a column: for a bright texel, and for one with more than SHARE_OF_A_LIGHT of the light."""
-SHARE_OF_A_LIGHT = 0.01
+COLUMN_PATHS = (8, 48, 320)
+"""Paths a pixel of a column: for a bright texel, and for one that holds more than a share of the light."""
+COLUMN_SHARES = (0.0, 0.01, 0.1)
+"""The shares of the light from which on they hold."""
 RESOLVE_EVERY = 10
 """Steps after which a renderer looks for texels that have grown bright."""
+LASTING_LOOKS = 5
+"""Looks in a row at which a texel must have been a main light before a renderer spends most paths on it."""
+COLUMNS_A_LOOK = 32
+"""Columns that a renderer traces at one look, the brightest: speckle comes and goes, and is not chased."""
+TYPICAL_PIXELS = 128 * 128
+"""Pixels from which on errors of neighbouring pixels are told together: they are independent."""
+_RECORDING = 1  # raise when the same scene, grid and seed give another recording, or other arrays of it
 
 
 class LightTransport:
@@ -50,18 +63,21 @@ class LightTransport:
         Height and width of the picture.
     spp, bounces, capacity : int
         Paths a pixel of the coarse tier, surface points along a path, most exact columns.
+    depth_error : float
+        Share of the picture under a white sky that comes from deeper paths.
     epoch : int
         Number of the present recording; only a ``refresh`` raises it.
+    cached : bool
+        The first recording was found on disk.
     """
 
-    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices, progress):
+    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices):
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
         self.spp, self.bounces, self.capacity, self.refresh = spp, bounces, capacity, refresh
         self.epoch, self._base_seed, self._choices, self._lost = 0, seed, choices, 0
-        offset = other_light(scene, bounces + 1, seed)
-        self._record(progress)
+        self.cached, self.depth_error = False, 0.0
+        self._looks = np.zeros(grid.texels, np.uint8)
         self._exact = ExactColumns(scene, grid, bounces, capacity)
-        self._offset = dr.opaque(mi.Float, 0) if offset is None else dr.opaque(mi.Float(offset.ravel()))
 
     # ------------------------------------------------------------------ building
 
@@ -77,6 +93,7 @@ class LightTransport:
         seed: int = 0,
         memory_gb=2.0,
         refresh: int = 0,
+        folder: Path | None = None,
         progress=None,
     ) -> LightTransport:
         """Trace T.
@@ -98,6 +115,9 @@ class LightTransport:
             Bound on the memory of T; "auto": 2.
         refresh : int
             Steps after which :meth:`render` records T afresh; 0: never.
+        folder : Path, optional
+            Where recordings are kept under a hash of all they depend on; None: nowhere. Recordings made by
+            ``refresh`` are not kept: they are there to be new.
         progress : callable, optional
             Called with (done, total) pixel blocks.
 
@@ -114,12 +134,40 @@ class LightTransport:
                 raise ConfigError(
                     f"renderer.{name}: came {value}, wanted a whole number of at least 1, or auto"
                 )
+        cache = DiskCache(folder)
+        origin = {
+            "version": [_RECORDING, mi.__version__, mi.variant()],
+            "scene": [scene.digest, scene.width, scene.height],
+            "grid": [height, width, np.asarray(scene.to_world).tolist()],
+            "seed": seed,
+        }
         sphere = latlong.solid_angles(height, width)
-        rows_light, bounce_light = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
-        bounces, choices = choose_bounces(scene, max_depth, bounce_light)
-        grid = Grid(height, width, scene.to_world, row_mass(sphere, rows_light))
+        light = cache.load(origin | {"part": "pilot"})
+        if light is None:
+            by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
+            light = {"by_row": by_row, "by_bounce": by_bounce}
+            cache.store(origin | {"part": "pilot"}, light)
+        bounces, choices = choose_bounces(scene, max_depth, light["by_bounce"])
+        mass = row_mass(sphere, light["by_row"])
         spp, capacity, choice = choose_samples(scene, spp, height * width, memory_gb)
-        return cls(scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice], progress)
+        grid = Grid(height, width, scene.to_world, mass)
+        transport = cls(scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice])
+        transport.depth_error = left_out(light["by_bounce"], bounces)
+        rows = hashlib.sha256(mass.tobytes()).hexdigest()
+        key = origin | {"part": "recording", "samples": spp, "bounces": bounces, "rows": rows}
+        found = cache.load(key)
+        if found is None:
+            transport._trace(progress)
+            cache.store(key, transport._recording())
+        else:
+            transport._take(found)
+        return transport
+
+    def _trace(self, progress=None):
+        """Trace the first recording, and the light of other lamps."""
+        offset = other_light(self.scene, self.bounces + 1, self._base_seed)
+        self._offset = dr.opaque(mi.Float, 0) if offset is None else dr.opaque(mi.Float(offset.ravel()))
+        self._record(progress)
 
     def _record(self, progress=None):
         """Trace the coarse tier with the seed of the present epoch."""
@@ -132,6 +180,25 @@ class LightTransport:
         self.reverse = ColourMatrix(columns, rows, weights, (texels, pixels))
         influence = np.bincount(columns, weights.astype(np.float64).mean(axis=1), minlength=texels)
         self.influence = influence.reshape(self.grid.height, self.grid.width).astype(np.float32)
+
+    def _recording(self):
+        """Return the first recording as arrays, for :meth:`_take`."""
+        parts = {"forward": self.forward.arrays(), "reverse": self.reverse.arrays()}
+        return {
+            "influence": self.influence,
+            "lost": np.array(self._lost, np.int64),
+            "offset": self._offset.numpy(),
+            **{f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()},
+        }
+
+    def _take(self, arrays):
+        """Take the first recording from arrays."""
+        self.cached, self._lost = True, int(arrays["lost"])
+        self.influence = np.array(arrays["influence"])
+        self._offset = dr.opaque(mi.Float(arrays["offset"]))
+        for part in ("forward", "reverse"):
+            own = {k.removeprefix(f"{part}/"): a for k, a in arrays.items() if k.startswith(f"{part}/")}
+            setattr(self, part, ColourMatrix.from_arrays(own))
 
     # ------------------------------------------------------------------ what it is
 
@@ -158,6 +225,23 @@ class LightTransport:
         """Bytes held by both tiers."""
         return self.forward.bytes + self.reverse.bytes + self._exact.bytes
 
+    def summary(self) -> dict:
+        """Return what T consists of, by name, for metrics.json."""
+        return {
+            "cached": self.cached,
+            "entries": self.forward.entries,
+            "memory_bytes": self.memory_bytes,
+            "columns": len(self.columns),
+            "path_depth": self.bounces + 1,
+            "depth_error": self.depth_error,
+            "samples": self.spp,
+        }
+
+    def determined(self, rows: slice, threshold: float) -> np.ndarray:
+        """Say which texels this view determines, bool (H, W); see :func:`.influence.determined`."""
+        samples = self.forward.entries * self.grid.mass.numpy() / self.grid.width
+        return determined(self.influence, samples, rows, threshold)
+
     # ------------------------------------------------------------------ using
 
     def apply(self, envmap: mi.TensorXf) -> mi.TensorXf:
@@ -183,25 +267,33 @@ class LightTransport:
             self._exact.retrace(self.seed)
         if step % RESOLVE_EVERY == 0:
             self._warm_up()
-            self.resolve(dr.detach(envmap).numpy())
+            self._look(dr.detach(envmap).numpy())
         return self.apply(envmap)
+
+    def _look(self, envmap):
+        """Resolve a map that will change: a light on its way is not worth the paths of one that stays."""
+        is_main = self._shares(envmap) > COLUMN_SHARES[-1]
+        self._looks = np.where(is_main, np.minimum(self._looks, LASTING_LOOKS) + 1, 0).astype(np.uint8)
+        self.resolve(envmap, limit=COLUMNS_A_LOOK, lasting=self._looks >= LASTING_LOOKS)
 
     def _warm_up(self):
         """Trace one column of each kind in the first step: what grows bright later needs no other kernel."""
         if len(self.columns) == 0 and self._exact.room:
             most = np.array([int(self.influence.argmax())])
-            for count in COLUMN_PATHS:
+            self._exact.trace(most, COLUMN_PATHS[-1], self.seed, blocks=1)
+            for count in COLUMN_PATHS[:-1]:
                 self._exact.trace(most, count, self.seed)
 
     def state(self) -> dict:
-        """Return what a checkpoint must hold: the exact columns, their order and paths, and the epoch."""
-        return {**self._exact.state(), "epoch": np.int64(self.epoch)}
+        """Return what a checkpoint must hold: the exact columns, their order and paths, looks, and epoch."""
+        return {**self._exact.state(), "looks": self._looks, "epoch": np.int64(self.epoch)}
 
     def restore(self, state: dict) -> None:
         """Trace the columns of an earlier :meth:`state`."""
         if int(state["epoch"]) != self.epoch:
             self.epoch = int(state["epoch"])
             self._record()
+        self._looks = np.array(state["looks"], np.uint8)
         self._exact.restore(state, self.seed)
 
     def _apply(self, envmap, offset=True):
@@ -220,7 +312,13 @@ class LightTransport:
 
     # ------------------------------------------------------------------ which texels are exact
 
-    def resolve(self, envmap, tolerance: float = COLUMN_TOLERANCE, limit: int | None = None) -> int:
+    def resolve(
+        self,
+        envmap,
+        tolerance: float = COLUMN_TOLERANCE,
+        limit: int | None = None,
+        lasting: np.ndarray | None = None,
+    ) -> int:
         """Trace exact columns for the texels that the coarse tier would render with too much error.
 
         The coarse tier's relative error for a map is predicted as the standard deviation of E over its mean,
@@ -235,34 +333,61 @@ class LightTransport:
             Relative error allowed for the coarse part.
         limit : int, optional
             Trace at most so many new columns.
+        lasting : ndarray of bool (H * W,), optional
+            Texels that may have the most paths; all by default.
 
         Returns
         -------
         int
-            Number of columns traced. Texels stay exact for good; at the capacity no more are added.
+            Number of columns traced. Texels stay exact while there is room; then those that are not bright
+            any more make room for those that are.
         """
         envmap, exact = np.asarray(envmap), self._exact
-        wanted = self.bright_texels(envmap, tolerance)
-        light = envmap.reshape(-1, 3).astype(np.float64).mean(axis=1) * self.influence.ravel()
-        is_light = light[wanted] > SHARE_OF_A_LIGHT * light.sum()
+        wanted = self.bright_texels(envmap, tolerance)[: exact.capacity]
+        tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1
+        tier = np.maximum(tier, 0)
+        if lasting is not None:
+            tier = np.minimum(tier, np.where(lasting[wanted], len(COLUMN_PATHS), len(COLUMN_PATHS) - 2))
         traced = 0
-        for count, texels in ((COLUMN_PATHS[1], wanted[is_light]), (COLUMN_PATHS[0], wanted[~is_light])):
-            new = texels[exact.paths_of[texels] < count]
-            known = new[exact.slot_of[new] >= 0]
-            fresh = new[exact.slot_of[new] < 0][: exact.room]
-            todo = np.concatenate([known, fresh])[: None if limit is None else limit - traced]
+        for i in reversed(range(len(COLUMN_PATHS))):
+            todo = wanted[(tier == i) & (exact.paths_of[wanted] < COLUMN_PATHS[i])]
+            todo = todo[: None if limit is None else limit - traced]
             if len(todo):
-                exact.trace(todo, count, self.seed)
+                exact.trace(todo, COLUMN_PATHS[i], self.seed, wanted)
                 traced += len(todo)
         return traced
 
-    def bright_texels(self, envmap: np.ndarray, tolerance: float = COLUMN_TOLERANCE) -> np.ndarray:
-        """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
+    def _shares(self, envmap):
+        """Return the share of the picture's light that comes from each texel, (H * W,)."""
+        light = envmap.reshape(-1, 3).astype(np.float64).mean(axis=1) * self.influence.ravel()
+        total = light.sum()
+        return light / total if total > 0 else np.zeros_like(light)
+
+    def coarse_error(self, envmap) -> float:
+        """Predict the relative error of the coarse tier for a map, beside the columns that there are."""
+        radiance, omega = self._radiance(np.asarray(envmap))
+        total, rest = (radiance * omega).sum(), self._exact.slot_of < 0
+        e, w = radiance[rest], omega[rest]
+        if not (total > 0 and w.sum() > 0):
+            return 0.0
+        variance = max((e * e * w).sum() - (e * w).sum() ** 2 / w.sum(), 0) * omega.sum()
+        return float(np.sqrt(variance / self._samples) / total)
+
+    @property
+    def _samples(self):
+        """Samples by which errors are told: those of a pixel, or of a typical picture's pixel if larger."""
+        return self.spp * max(1.0, self.shape[0] * self.shape[1] / TYPICAL_PIXELS)
+
+    def _radiance(self, envmap):
+        """List every texel's radiance, its largest channel, and solid angle; 0 where no light comes from."""
         omega = np.repeat(latlong.solid_angles(self.grid.height, self.grid.width), self.grid.width)
         # A texel that no sample has met may matter as much as its row: rows are told by many samples.
         seen = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
-        radiance = envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen
-        omega = omega * seen
+        return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen, omega * seen
+
+    def bright_texels(self, envmap: np.ndarray, tolerance: float = COLUMN_TOLERANCE) -> np.ndarray:
+        """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
+        radiance, omega = self._radiance(envmap)
         total, span = (radiance * omega).sum(), omega.sum()
         if not total > 0:
             return np.zeros(0, np.int64)
@@ -271,7 +396,7 @@ class LightTransport:
         e, w = radiance[order], omega[order]
         square, linear, weight = _total_from(e * e * w), _total_from(e * w), _total_from(w)
         variance = np.maximum(square - linear**2 / np.maximum(weight, 1e-30), 0) * span
-        error = np.sqrt(variance / self.spp) / total
+        error = np.sqrt(variance / self._samples) / total
         enough = np.flatnonzero(error <= tolerance)
         return order[: enough[0] if len(enough) else len(order)]
 

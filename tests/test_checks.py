@@ -38,6 +38,8 @@ quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthC
         ("loss.ssim", ["-1", "[1]", "[0, 1]", "[1, 0]", "[1, -1]", "[1, 2, 3]", '["a", 1]', "nan", "true"]),
         ("renderer.spp", ["0", '"Auto"', "1.5", "true"]),
         ("renderer.memory_gb", ["0", "-1", "nan"]),
+        ("renderer.cache", ["1", '"yes"']),
+        ("renderer.influence_threshold", ["-1e-3", "1.5", "nan", '"auto"']),
         ("output.tonemap", ['"reinhard"', "1"]),
         ("output.report", ["0"]),
     ],

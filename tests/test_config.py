@@ -24,7 +24,7 @@ def test_an_empty_file_gives_the_defaults():
     assert config.preset == "standard" and config.seed == 0 and config.variant == "llvm_ad_rgb"
     assert config == dataclasses.replace(cfg.Config(), output=config.output)
     assert config.input == cfg.Input(envmap="sunsky", width=256, rows="upper")
-    assert config.fit.lr == 2e-3 and config.renderer.spp == "auto" and config.loss.ssim == 1.0
+    assert config.fit.lr == 1e-3 and config.renderer.spp == "auto" and config.loss.ssim == 1.0
     assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
 
 

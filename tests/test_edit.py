@@ -265,6 +265,37 @@ def test_edit_of_lower_rows_leaves_the_upper_ones(rng):
     assert len(seen) == 4 and not np.array_equal(seen[-1][2:], original[2:])
 
 
+def test_texels_that_are_not_free_keep_their_bits_and_pull_nothing(rng):
+    """Neither renderer nor regularisers see what the parameters of a kept texel say."""
+    free = rng.random((3, WIDTH)) < 0.5
+    arguments, _ = case(rng, iterations=6, weights=config.Loss(tv=0.1, l1=0.1, luminance=0.1))
+    representation, params, renderer, objective, original, *_ = arguments
+    original[0, 0] = [1e-42, 65504, 0.5]
+    free[0, 0] = False
+    seen, crops = [], []
+
+    class Watching:
+        def render(self, env, step):
+            seen.append(env.numpy())
+            return renderer.render(env, step)
+
+    class Listening:
+        def __call__(self, rendering, crop, step):
+            crops.append(crop.numpy())
+            return objective(rendering, crop, step)
+
+    start = params["log_radiance"].numpy()
+    changed, state = edit.optimise(
+        representation, params, Watching(), Listening(), original, 0, arguments[-1], free=free
+    )
+    for image, crop in zip(seen, crops, strict=True):
+        assert image[:3][~free].tobytes() == original[:3][~free].tobytes() == crop[~free].tobytes()
+        assert image[3:].tobytes() == original[3:].tobytes()
+    moved = changed["log_radiance"].numpy() != start
+    assert moved[free].all() and not moved[~free].any()
+    assert len(seen) == 6 and state.bad_steps == 0
+
+
 def test_first_step_of_adam_has_the_size_of_the_learning_rate(rng):
     arguments, _ = case(rng, iterations=1, lr=0.02)
     params, _ = edit.optimise(*arguments)
@@ -391,7 +422,7 @@ def test_bad_gradients_of_a_finite_loss_are_not_taken_either(rows, rng, every_st
 
 def test_the_loop_gives_up_after_twenty_bad_steps_in_a_row():
     arguments, _ = case(np.random.default_rng(0), iterations=60, bad=range(5, 60))
-    adam, state = optim.Adam(arguments[1], 0.02), edit.State()
+    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), edit.State()
     with pytest.raises(NumericalError, match="iteration 24: 20 steps in a row .*lower") as info:
         edit.optimise(*arguments, adam=adam, state=state)
     assert info.value.exit_code == 5 and len(str(info.value).splitlines()) <= 2
@@ -436,7 +467,7 @@ def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng, every_ste
     with pytest.raises(KeyboardInterrupt):
         edit.optimise(*fresh(), after_step=kill)
     arguments = fresh()
-    adam = optim.Adam(arguments[1], 123.0)
+    adam = optim.Adam(arguments[1], 123.0, (0.9, arguments[6].beta2))
     adam.load_state_dict(kept["adam"])
     params, state = edit.optimise(*arguments, adam=adam, state=edit.State(**json.loads(kept["state"])))
     assert same(arrays(params), arrays(expected))

@@ -9,7 +9,7 @@ import pytest
 from helpers import double
 from test_siren import numpy_forward
 
-from envedit import config, envmap, fit
+from envedit import config, envmap, fit, latlong, siren
 
 EXTREMES = np.array([0, 1e-30, 1e-4, 0.01, 0.5, 65504, 1e6, 123456.789, 1.0] * 2, np.float32).reshape(2, 3, 3)
 QUICK = config.Fit(epochs=5, awp_gamma=0.0)
@@ -19,9 +19,9 @@ def sky(rng, shape=(8, 16)):
     return (rng.random((*shape, 3)) ** 4 * 20).astype(np.float32)
 
 
-def make(kind, folder=None):
-    network = config.Representation(kind=kind, hidden=10, depth=1)
-    return envmap.make(config.Config(representation=network, fit=QUICK), folder)
+def make(kind, folder=None, rows=None, **network):
+    network = config.Representation(**{"kind": kind, "hidden": 10, "depth": 1} | network)
+    return envmap.make(config.Config(representation=network, fit=QUICK), folder, rows=rows)
 
 
 KINDS = ("pixels", "log-pixels", "siren")
@@ -49,22 +49,73 @@ def test_siren_gives_back_what_was_fitted(rng):
     assert representation.fitted.log_psnr == fitted.log_psnr
     assert all(np.array_equal(params[name].numpy(), fitted.params[name]) for name in fitted.params)
     decoded = representation.decode(params)
-    expected = fit.evaluate(params, fitted.normalisation, (8, 16), representation.network.omega)
+    x = fit.points(representation.network, (8, 16))
+    expected = fit.evaluate(params, fitted.normalisation, x, (8, 16), representation.network.omega)
     np.testing.assert_array_equal(decoded.numpy(), expected.numpy())
 
 
-@pytest.mark.parametrize("shape", [(8, 16), (16, 32), (5, 7), (1, 1)])
-def test_siren_is_one_function_at_any_resolution(shape, rng):
-    """The network in float64 at the texel centres, and Eq. 2-3."""
-    representation = make("siren")
-    params = representation.encode(sky(rng))
-    height, width = shape
+def plane_points(height, width, rows):
     y, x = (2 * np.arange(height) + 1) / height - 1, (2 * np.arange(width) + 1) / width - 1
-    grid = np.stack(np.meshgrid(y, x, indexing="ij")).reshape(2, -1)
-    values = numpy_forward({name: value.numpy() for name, value in params.items()}, grid, 30.0)
+    return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def sphere_points(height, width, rows):
+    first, total = rows
+    return siren.SPHERE_SCALE * latlong.directions(total, width)[first : first + height].reshape(-1, 3)
+
+
+POINTS = {"plane": plane_points, "sphere": sphere_points}
+
+
+@pytest.mark.parametrize("coordinates", POINTS)
+@pytest.mark.parametrize(("rows", "shape", "found"), [
+    (None, (8, 16), (0, 8)), (None, (16, 32), (0, 16)), (None, (5, 7), (0, 5)), (None, (1, 1), (0, 1)),
+    ((0, 16), (8, 16), (0, 16)), ((0, 16), (4, 8), (0, 8)), ((6, 16), (16, 20), (12, 32)),
+    ((8, 16), (24, 16), (24, 48)), ((2, 12), (4, 8), (1, 6)),
+])  # fmt: skip
+def test_siren_is_one_function_at_any_resolution(coordinates, rows, shape, found, rng):
+    """The network in float64 at the texel centres, and Eq. 2-3."""
+    representation = make("siren", rows=rows, coordinates=coordinates)
+    params = representation.encode(sky(rng))
+    x = POINTS[coordinates](*shape, found)
+    values = numpy_forward({name: value.numpy() for name, value in params.items()}, x, 30.0)
     normalisation = representation.fitted.normalisation
-    expected = np.exp(values.T.reshape(height, width, 3) * normalisation.span + normalisation.low) - 0.01
+    expected = np.exp(values.reshape(*shape, 3) * normalisation.span + normalisation.low) - 0.01
     np.testing.assert_allclose(representation.decode(params, shape).numpy(), expected, rtol=1e-3, atol=1e-5)
+    again = representation.decode(params, shape).numpy()
+    assert again.tobytes() == representation.decode(params, shape).numpy().tobytes()
+    assert representation.decode(params).shape == (8, 16, 3)
+
+
+def halved(image):
+    height, width = image.shape[:2]
+    return image.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("coordinates", POINTS)
+@pytest.mark.parametrize("first", [None, 0, 6, 16])
+def test_siren_at_another_resolution_is_the_same_picture_resized(coordinates, first):
+    """Also where the rows are not a map's first ones: a step of a row would be seen in this sky."""
+    height, rows = (32, None) if first is None else (16, (first, 32))
+    d = latlong.directions(32, 64)[(first or 0) :][:height]
+    image = np.exp(d @ [[0.5, 0.3, 0.1], [1.2, 1.0, 0.8], [0.2, 0.4, 0.6]]).astype(np.float32)
+    representation = make("siren", rows=rows, coordinates=coordinates, omega=3.0, hidden=24)
+    representation.settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)
+    params = representation.encode(image)
+    picture = representation.decode(params).numpy()
+    assert np.abs(picture / image - 1).mean() < 0.1
+    # A map's first and last rows are its poles at any height, so that a finer pair of rows lies up to a
+    # quarter of a row beside the coarser one. Numbers of the plane have no such rule.
+    near = 0.002 if coordinates == "plane" else 0.03
+    for down, across in ((2, 2), (1, 2), (2, 1)):
+        finer = representation.decode(params, (down * height, across * 64)).numpy()
+        back = finer.reshape(height, down, 64, across, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(back, picture, rtol=near if down > 1 else 0.002)
+    halved = picture.reshape(height // 2, 2, 32, 2, 3).mean(axis=(1, 3))
+    coarser = representation.decode(params, (height // 2, 32)).numpy()
+    np.testing.assert_allclose(coarser, halved, rtol=0.01 if coordinates == "plane" else 0.06)
+    # Control: a row's difference is several times what is allowed above.
+    assert np.abs(picture[1:] / picture[:-1] - 1).max() > 0.12
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -144,11 +195,11 @@ def test_siren_gradient_is_the_finite_difference(rng):
     dr.enable_grad(leaves)
     dr.backward(dr.sum((representation.decode(leaves) * mi.TensorXf(weight.astype(np.float32))).array))
     gradient = {name: np.array(dr.grad(leaf), np.float64) for name, leaf in leaves.items()}
-    x, normalisation = fit.siren.coordinates(8, 16).numpy(), representation.fitted.normalisation
+    x, normalisation = siren.directions(8, 16).numpy(), representation.fitted.normalisation
 
     def loss(step):
         moved = {name: params[name].numpy() + step * gradient[name] for name in params}
-        values = numpy_forward(moved, x, 30.0).T.reshape(8, 16, 3)
+        values = numpy_forward(moved, x, 30.0).reshape(8, 16, 3)
         return np.sum(weight * np.exp(values * normalisation.span + normalisation.low))
 
     h = 1e-7
@@ -176,3 +227,21 @@ def test_siren_keeps_its_fits_in_the_folder(tmp_path, rng):
     assert not a.fitted.cached and b.fitted.cached
     assert dataclasses.asdict(a.fitted.normalisation) == dataclasses.asdict(b.fitted.normalisation)
     np.testing.assert_array_equal(a.decode(first).numpy(), b.decode(second).numpy())
+
+
+def test_siren_keeps_a_fit_for_each_place_in_a_map(tmp_path, rng):
+    image, cached = sky(rng), []
+    for rows in (None, (0, 8), (0, 16), (8, 16), (8, 16)):
+        representation = make("siren", tmp_path, rows)
+        representation.encode(image)
+        cached.append(representation.fitted.cached)
+    assert cached == [False, True, False, False, True]
+
+
+def test_siren_of_another_image_forgets_the_points_of_the_first(rng):
+    used, images = make("siren", rows=(0, 16)), [sky(rng, (8, 16)), sky(rng, (4, 16))]
+    for image in images:
+        fresh = make("siren", rows=(0, 16))
+        decoded = used.decode(used.encode(image), (8, 16)).numpy()
+        np.testing.assert_array_equal(decoded, fresh.decode(fresh.encode(image), (8, 16)).numpy())
+        assert used.decode(used.encode(image)).shape == image.shape

@@ -67,6 +67,14 @@ def test_an_impossible_place_is_an_input_error(tmp_path, name):
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 
 
+def test_caches_follow_the_desktop_standard(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert files.cache_folder("fits") == tmp_path / "envedit" / "fits"
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.setattr(files.Path, "home", lambda: tmp_path)
+    assert files.cache_folder("transport") == tmp_path / ".cache" / "envedit" / "transport"
+
+
 def test_libraries_are_heard_and_kept_quiet(capfd):
     with files.quiet_libraries() as said:
         os.write(2, b"from C, ")

@@ -10,7 +10,7 @@ import pytest
 from helpers import plain_ssim_loss
 from test_siren import launched
 
-from envedit import config, fit, metrics, siren
+from envedit import config, fit, metrics, optim, siren, ssim
 from envedit.errors import InputError
 
 NETWORK = config.Representation(hidden=12, depth=1)
@@ -36,6 +36,12 @@ def numpy(params):
 
 def tensors(params):
     return {name: mi.TensorXf(np.asarray(value, np.float32)) for name, value in params.items()}
+
+
+def picture(fitted, network, shape, rows=None):
+    """What a fitted network makes of its own points."""
+    x = fit.points(network, shape, rows)
+    return fit.evaluate(tensors(fitted.params), fitted.normalisation, x, shape, network.omega).numpy()
 
 
 def facts(fitted):
@@ -87,27 +93,70 @@ def test_decoded_radiance_is_always_finite_and_never_negative(value, flat):
     assert np.isfinite(decoded).all() and (decoded >= 0).all(), decoded
 
 
+@pytest.mark.parametrize("headroom", [0.0, 0.05, 0.45])
+def test_headroom_is_left_free_at_either_end(headroom, rng):
+    for image in (
+        sky(rng),
+        sky(rng, peak=1e6),
+        np.float32([[[0, 1e-30, 1e6]]]),
+        np.float32([[[1, 1, 1.01]]]),
+    ):
+        normalisation = fit.Normalisation.of(image, headroom)
+        values = normalisation.encode(image)
+        np.testing.assert_allclose([values.min(), values.max()], [headroom, 1 - headroom], atol=1e-9)
+        decoded = normalisation.decode(mi.TensorXf(values.astype(np.float32))).numpy()
+        # A value rounds at 6e-8, and the exponent by as much of the span, at most 185 here.
+        np.testing.assert_allclose(decoded, image, rtol=3e-5, atol=1e-6)
+        logs = np.log(image.astype(np.float64) + 0.01)
+        free = headroom / (1 - 2 * headroom) * np.ptp(logs)
+        ends = np.exp(np.minimum([logs.min() - free, logs.max() + free], 88)) - 0.01
+        decoded = normalisation.decode(mi.TensorXf(np.float32([0, 1]))).numpy()
+        np.testing.assert_allclose(decoded, np.maximum(ends, 0), rtol=1e-4, atol=1e-6)
+
+
+def test_no_headroom_is_equation_1(rng):
+    image = sky(rng)
+    assert fit.Normalisation.of(image, 0.0) == fit.Normalisation.of(image) != fit.Normalisation.of(image, 0.1)
+
+
+@pytest.mark.parametrize("headroom", [0.0, 0.05, 0.45])
+@pytest.mark.parametrize("value", [0.0, 0.3, 1e38])
+def test_a_constant_map_needs_no_headroom(value, headroom):
+    image = np.full((2, 4, 3), value, np.float32)
+    assert fit.Normalisation.of(image, headroom) == fit.Normalisation.of(image)
+
+
 # ---- objective (Eq. 4) -----------------------------------------------------------------------------------
 
 
-def columns(image):
-    """Reorder an image (H, W, 3) as the network's output (3, H * W)."""
-    return np.ascontiguousarray(np.asarray(image).reshape(-1, 3).T)
+def rows(image):
+    """Reorder an image (H, W, 3) as the network's output (H * W, 3)."""
+    return np.ascontiguousarray(np.asarray(image).reshape(-1, 3))
 
 
-def test_network_output_becomes_an_image_differentiably(rng):
-    image, weight = rng.random((4, 6, 3), dtype=np.float32), rng.random((4, 6, 3), dtype=np.float32)
-    y = mi.TensorXf(columns(image))
-    dr.enable_grad(y)
-    out = fit.to_image(y, 4, 6)
-    np.testing.assert_array_equal(out.numpy(), image)
+@pytest.mark.parametrize("coordinates", ["sphere", "plane"])
+def test_network_output_becomes_an_image_differentiably(coordinates, rng):
+    network = config.Representation(hidden=9, depth=1, coordinates=coordinates)
+    x, normalisation = fit.points(network, (4, 6)), fit.Normalisation(-2.0, 5.0)
+    assert x.shape == (24, 3 if coordinates == "sphere" else 2)
+    leaves = siren.init(0, 9, 1, inputs=x.shape[1])
+    dr.enable_grad(leaves)
+    out = fit.evaluate(leaves, normalisation, x, (4, 6), 30.0)
+    values = siren.forward({name: dr.detach(p) for name, p in leaves.items()}, x, 30.0)[0].numpy()
+    for texel in range(24):
+        expected = np.exp(5.0 * values[texel].astype(np.float64) - 2.0) - fit.EPSILON
+        np.testing.assert_allclose(out.numpy()[divmod(texel, 6)], expected, rtol=1e-5)
+    weight = rng.random((4, 6, 3), dtype=np.float32)
     dr.backward(dr.sum((out * mi.TensorXf(weight)).array))
-    np.testing.assert_array_equal(np.array(dr.grad(y)), columns(weight))
+    # The bias of the last layer: d out / d b = span (out + eps) y (1 - y).
+    slope = 5.0 * (rows(out.numpy()) + fit.EPSILON) * values * (1 - values)
+    expected = np.sum(rows(weight) * slope, axis=0, dtype=np.float64)
+    np.testing.assert_allclose(dr.grad(leaves["2.bias"]).numpy(), expected, rtol=1e-4)
 
 
 def plain_objective(y, image, normalisation, settings, only_ssim=False):
     """Eq. 4 in float64, norms as the losses say they are read."""
-    values, logs = y.T.reshape(image.shape), normalisation.encode(image)
+    values, logs = y.reshape(image.shape), normalisation.encode(image)
     ssim = plain_ssim_loss(values, logs, np.ones(()))
     if only_ssim:
         return ssim
@@ -121,7 +170,7 @@ def test_objective_is_equation_4_and_its_gradient_the_finite_difference(terms, r
     settings = config.Fit(log_mse=terms[0], log_ssim=terms[1], hdr=terms[2])
     image = sky(rng, 12, 16, peak=5.0)
     normalisation = fit.Normalisation.of(image)
-    y = np.clip(columns(normalisation.encode(image)) + 0.1 * rng.normal(size=(3, 192)), 0.01, 0.99)
+    y = np.clip(rows(normalisation.encode(image)) + 0.1 * rng.normal(size=(192, 3)), 0.01, 0.99)
     y = y.astype(np.float32).astype(np.float64)
     loss, gradient = fit.Objective(image, normalisation, settings).gradient(mi.TensorXf(y.astype(np.float32)))
     np.testing.assert_allclose(loss[0], plain_objective(y, image, normalisation, settings), rtol=1e-5)
@@ -137,7 +186,7 @@ def test_objective_is_equation_4_and_its_gradient_the_finite_difference(terms, r
 def test_objective_of_the_perturbation_is_the_ssim_alone(rng):
     image = sky(rng, 12, 16)
     normalisation = fit.Normalisation.of(image)
-    y = rng.random((3, 192)).astype(np.float32)
+    y = rng.random((192, 3)).astype(np.float32)
     loss, _ = fit.Objective(image, normalisation, config.Fit()).gradient(mi.TensorXf(y), only_ssim=True)
     expected = plain_objective(y, image, normalisation, None, only_ssim=True)
     np.testing.assert_allclose(loss[0], expected, rtol=1e-5)
@@ -146,7 +195,7 @@ def test_objective_of_the_perturbation_is_the_ssim_alone(rng):
 def test_objective_does_not_touch_the_callers_graph(rng):
     image = sky(rng, 12, 16)
     objective = fit.Objective(image, fit.Normalisation.of(image), config.Fit())
-    y = mi.TensorXf(rng.random((3, 192)).astype(np.float32))
+    y = mi.TensorXf(rng.random((192, 3)).astype(np.float32))
     objective.gradient(y)
     assert not dr.grad_enabled(y)
 
@@ -222,13 +271,15 @@ def test_perturbation_is_none_after_a_gradient_that_is_not_finite(rng):
 def test_small_fit_reaches_a_good_picture(rng):
     image = sky(rng)
     settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)
-    fitted = fit.fit(image, config.Representation(hidden=32, depth=1), settings)
-    # 41.9 dB and 0.77 where this was written; an untrained network has 8 dB.
-    assert fitted.log_psnr > 36
-    assert 0.6 < fitted.peak_ratio < 1.2
+    network = config.Representation(hidden=32, depth=1)
+    fitted = fit.fit(image, network, settings)
+    # 43.5 to 44.0 dB and 0.99 for four seeds where this was written; an untrained network has 10 dB.
+    assert fitted.log_psnr > 40
+    assert 0.9 < fitted.peak_ratio < 1.1
     assert fitted.epochs == 150 and not fitted.cached
-    got = fit.evaluate(tensors(fitted.params), fitted.normalisation, (16, 32), 30.0)
-    assert metrics.log_psnr(got.numpy(), image) == fitted.log_psnr
+    got = picture(fitted, network, (16, 32))
+    assert metrics.log_psnr(got, image) == fitted.log_psnr
+    assert metrics.peak_ratio(got, image) == fitted.peak_ratio
 
 
 def test_robust_fit_loses_less_to_noise_in_its_weights(rng):
@@ -244,11 +295,46 @@ def test_robust_fit_loses_less_to_noise_in_its_weights(rng):
             for name, w in fitted.params.items():
                 d = noise.normal(size=w.shape)
                 moved[name] = w + 0.03 * np.linalg.norm(w) / np.linalg.norm(d) * d
-            got = fit.evaluate(tensors(moved), fitted.normalisation, (16, 32), 30.0).numpy()
+            got = picture(dataclasses.replace(fitted, params=moved), network, (16, 32))
             scores.append(metrics.log_psnr(got, image))
         drops.append(fitted.log_psnr - np.mean(scores))
-    # 15.7 and 7.1 dB where this was written, within 0.5 for other seeds.
-    assert drops[1] < drops[0] - 4
+    # 19.2 to 21.5 and 5.7 to 6.6 dB for four seeds where this was written.
+    assert drops[1] < drops[0] - 8
+
+
+def sunny(height=24, width=48, sun=1e4):
+    """Make a sky of about 1 with a sun of one texel, which holds nine tenths of the light."""
+    row, column = np.mgrid[:height, :width]
+    base = 0.7 + 0.4 * np.cos(2 * np.pi * column / width) * np.sin(np.pi * (row + 0.5) / height)
+    grain = 0.05 * np.random.default_rng(0).random((height, width, 3))
+    image = (base[..., None] * [0.8, 0.9, 1.0] + grain).astype(np.float32)
+    image[height // 2, width // 3] = sun
+    return image
+
+
+def test_the_recipe_keeps_the_light_of_a_sun_of_one_texel():
+    image, network, rows = sunny(), config.Representation(hidden=48, depth=2), (0, 48)
+    ratios = []
+    for light in (1.0, 0.0):
+        fitted = fit.fit(image, network, config.Fit(epochs=200, light=light), rows=rows)
+        got = picture(fitted, network, (24, 48), rows)
+        ratios.append((metrics.peak_ratio(got, image), metrics.mean_luminance_ratio(got, image)))
+    (peak, mean), (peak_before, mean_before) = ratios
+    assert abs(peak - 1) < 0.1 and abs(mean - 1) < 0.03
+    # Gradient descent alone comes last to the sun: 0.66 and 0.68 where this was written, 0.69 and 0.71
+    # with another seed.
+    assert peak_before < 0.85 and mean_before < 0.85
+
+
+@pytest.mark.parametrize("coordinates", ["sphere", "plane"])
+def test_light_changes_the_last_layer_alone(coordinates, rng):
+    image, network = sky(rng), dataclasses.replace(NETWORK, coordinates=coordinates)
+    before, after = (
+        fit.fit(image, network, dataclasses.replace(QUICK, light=light)).params for light in (0.0, 1.0)
+    )
+    assert list(before) == list(after)
+    changed = [name for name in before if not np.array_equal(before[name], after[name])]
+    assert changed == ["2.weight", "2.bias"]
 
 
 @pytest.mark.parametrize(("shape", "value"), [((16, 32), 0.0), ((16, 32), 0.25), ((1, 2), 7.0)])
@@ -256,7 +342,7 @@ def test_flat_maps_can_be_fitted(shape, value):
     image = np.full((*shape, 3), value, np.float32)
     fitted = fit.fit(image, NETWORK, dataclasses.replace(QUICK, epochs=60, awp_gamma=0.01))
     assert all(np.isfinite(w).all() for w in fitted.params.values())
-    got = fit.evaluate(tensors(fitted.params), fitted.normalisation, shape, 30.0).numpy()
+    got = picture(fitted, NETWORK, shape)
     np.testing.assert_allclose(got, image, atol=0.05 * (value + fit.EPSILON))
 
 
@@ -269,9 +355,12 @@ def test_fit_of_extreme_peaks_stays_finite(peak, rng):
 
 
 def test_no_epochs_leaves_the_initial_weights(rng):
-    fitted = fit.fit(sky(rng), NETWORK, dataclasses.replace(QUICK, epochs=0), seed=3)
-    initial = siren.init(3, 12, 1, 30.0)
-    assert same(fitted.params, {name: value.numpy() for name, value in initial.items()})
+    initial = numpy(siren.init(3, 12, 1, 30.0, inputs=3))
+    image, settings = sky(rng), dataclasses.replace(QUICK, epochs=0, light=0.0)
+    assert same(fit.fit(image, NETWORK, settings, seed=3).params, initial)
+    solved = fit.fit(image, NETWORK, dataclasses.replace(settings, light=1.0), seed=3).params
+    changed = [name for name in initial if not np.array_equal(initial[name], solved[name])]
+    assert changed == ["2.weight", "2.bias"]
 
 
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
@@ -288,10 +377,120 @@ def test_progress_ends_with_the_last_epoch(rng):
     assert all(math.isfinite(now[2]) for now in seen)
 
 
+def test_progress_counts_perturbed_and_polishing_epochs_alike(rng):
+    seen = []
+    settings = dataclasses.replace(QUICK, epochs=43, awp_gamma=0.01, awp_until=0.4)
+    fit.fit(sky(rng), NETWORK, settings, progress=lambda *now: seen.append(now))
+    assert [now[:2] for now in seen] == [(1, 43), (21, 43), (41, 43), (43, 43)]
+
+
+# ---- perturbation for a while, grids, Adam ---------------------------------------------------------------
+
+
+def test_perturbation_that_never_starts_is_none(rng):
+    image = sky(rng)
+    none = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.0))
+    never = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.05, awp_until=0.0))
+    always = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.05, awp_until=1.0))
+    assert same(never.params, none.params) and not same(always.params, none.params)
+
+
+@pytest.mark.parametrize(("until", "every", "updates", "applied"), [
+    (0.7, 2, 4, 7), (1.0, 1, 10, 10), (0.1, 3, 1, 1), (0.75, 3, 3, 8), (0.0, 1, 0, 0),
+])  # fmt: skip
+def test_epochs_are_perturbed_up_to_a_share_of_them(until, every, updates, applied, rng, monkeypatch):
+    calls = []
+    for name in ("update", "apply"):
+        plain = getattr(fit.Perturbation, name)
+
+        def counted(self, *args, name=name, plain=plain):
+            calls.append(name)
+            return plain(self, *args)
+
+        monkeypatch.setattr(fit.Perturbation, name, counted)
+    settings = dataclasses.replace(QUICK, epochs=10, awp_gamma=0.01, awp_until=until, awp_every=every)
+    fit.fit(sky(rng), NETWORK, settings)
+    assert (calls.count("update"), calls.count("apply")) == (updates, applied)
+
+
+GRIDS = [  # height, width, stride, grids
+    (16, 32, 1, 1), (22, 22, 2, 4), (24, 48, 2, 4), (23, 35, 2, 4), (33, 34, 3, 9), (21, 64, 2, 1),
+    (64, 21, 2, 1), (32, 99, 3, 1), (1, 2, 2, 1), (16, 32, 64, 1),
+]  # fmt: skip
+
+
+def grids_of(height, width, stride):
+    """Grids of an image whose first channel numbers its texels; the points, numbered alike, beside."""
+    image = np.ones((height, width, 3), np.float32)
+    image[..., 0] = np.arange(height * width).reshape(height, width)
+    normalisation = fit.Normalisation.of(image)
+    x = fit.points(NETWORK, (height, width), (3, height + 5))
+    grids = fit._grids(image, normalisation, x, config.Fit(stride=stride))
+    return image, normalisation, x.numpy(), grids
+
+
+@pytest.mark.parametrize(("height", "width", "stride", "count"), GRIDS)
+def test_every_texel_belongs_to_one_grid_with_its_point(height, width, stride, count):
+    image, normalisation, x, grids = grids_of(height, width, stride)
+    assert len(grids) == count
+    logs, seen = normalisation.encode(image), []
+    for objective, points in grids:
+        part = objective.radiance.numpy()
+        texels = part[..., 0].astype(int)
+        assert objective.shape == texels.shape and points.shape == (texels.size, 3)
+        # A picture itself: rows and columns a stride apart, and no smaller than the window of the SSIM.
+        step = stride if count > 1 else 1
+        assert (np.diff(texels, axis=1) == step).all() and (np.diff(texels, axis=0) == step * width).all()
+        assert count == 1 or min(texels.shape) >= ssim.WINDOW
+        np.testing.assert_array_equal(part, image.reshape(-1, 3)[texels])
+        np.testing.assert_array_equal(points.numpy(), x[texels.ravel()])
+        expected = logs.reshape(-1, 3)[texels].astype(np.float32)
+        np.testing.assert_array_equal(objective.logs.numpy(), expected)
+        seen += texels.ravel().tolist()
+    assert sorted(seen) == list(range(height * width))
+
+
+def test_grids_take_turns_at_random(rng, monkeypatch):
+    image, used, plain = sky(rng, 23, 31), [], fit.Objective.gradient
+
+    def noted(self, y, only_ssim=False):
+        used.append(float(self.radiance.numpy()[0, 0, 0]))
+        return plain(self, y, only_ssim)
+
+    monkeypatch.setattr(fit.Objective, "gradient", noted)
+    corners = image[:2, :2, 0].ravel().tolist()
+    for seed in (0, 0, 1):
+        fit.fit(image, NETWORK, dataclasses.replace(QUICK, epochs=16), seed)
+    turns = [used[start : start + 4] for start in range(0, 48, 4)]
+    assert len(used) == 48 and all(sorted(turn) == sorted(corners) for turn in turns)
+    assert turns[:4] == turns[4:8] != turns[8:]
+    assert any(turn != turns[0] for turn in turns[:4])
+
+
+def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
+    betas, plain = [], optim.Adam.__init__
+
+    def noted(self, params, lr, betas_=(0.9, 0.999), *args):
+        betas.append(betas_)
+        plain(self, params, lr, betas_, *args)
+
+    monkeypatch.setattr(optim.Adam, "__init__", noted)
+    image = sky(rng)
+    a, b = (fit.fit(image, NETWORK, dataclasses.replace(QUICK, beta2=beta2)) for beta2 in (0.99, 0.9))
+    assert betas == [(0.9, 0.99), (0.9, 0.9)] and not same(a.params, b.params)
+
+
+# ---- schedules -------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
-def test_no_new_kernel_after_the_third_epoch(gamma, rng):
-    image = sky(rng, 14, 22)
-    short, long = (dataclasses.replace(QUICK, awp_gamma=gamma, epochs=epochs) for epochs in (3, 7))
+@pytest.mark.parametrize("stride", [1, 2])
+def test_no_new_kernel_after_every_grid_had_a_turn(stride, gamma, rng):
+    """Odd sizes: the grids differ in size, but no kernel depends on it."""
+    image = sky(rng, 23, 31)
+    few = 3 if stride == 1 else 8
+    settings = dataclasses.replace(QUICK, awp_gamma=gamma, awp_until=1.0, stride=stride)
+    short, long = (dataclasses.replace(settings, epochs=epochs) for epochs in (few, 2 * few + 1))
     first = launched(lambda: fit.fit(image, NETWORK, short))
     assert first and launched(lambda: fit.fit(image, NETWORK, long)) <= first
 
@@ -359,11 +558,34 @@ def test_other_settings_are_another_fit(tmp_path, rng):
         (image, NETWORK, dataclasses.replace(quick, schedule="constant"), 0),
         (image, NETWORK, dataclasses.replace(quick, hdr=0.02), 0),
         (image, NETWORK, dataclasses.replace(quick, awp_gamma=0.01), 0),
+        (image, NETWORK, dataclasses.replace(quick, awp_until=0.5), 0),
+        (image, NETWORK, dataclasses.replace(quick, beta2=0.98), 0),
+        (image, NETWORK, dataclasses.replace(quick, stride=1), 0),
+        (image, NETWORK, dataclasses.replace(quick, headroom=0.1), 0),
+        (image, NETWORK, dataclasses.replace(quick, light=0.5), 0),
+        (image, dataclasses.replace(NETWORK, coordinates="plane"), quick, 0),
+        (image, NETWORK, quick, 0, (0, 17)),
+        (image, NETWORK, quick, 0, (1, 17)),
         (image, NETWORK, quick, 1),
     ]
     for other in others:
         assert not fit.fit(*other, folder=tmp_path).cached
     assert len(list(tmp_path.iterdir())) == 1 + len(others)
+    for rows in (None, (0, 16)):  # a whole map, both
+        assert fit.fit(image, NETWORK, quick, 0, rows, folder=tmp_path).cached
+
+
+def test_the_same_texels_elsewhere_in_a_map_are_another_picture(rng):
+    image = sky(rng)
+    top, equator, whole, told = (
+        fit.fit(image, NETWORK, QUICK, rows=rows) for rows in ((0, 32), (8, 32), None, (0, 16))
+    )
+    assert same(whole.params, told.params) and not same(top.params, equator.params)
+    assert not same(top.params, whole.params)
+    # In the plane a crop is stretched to a whole, wherever it lies.
+    plane = dataclasses.replace(NETWORK, coordinates="plane")
+    top, equator = (fit.fit(image, plane, QUICK, rows=rows) for rows in ((0, 32), (8, 32)))
+    assert same(top.params, equator.params)
 
 
 def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path, rng):

@@ -13,6 +13,7 @@ SMALL = [
     "scene.width=32",
     "fit.epochs=30",
     "fit.cache=false",
+    "renderer.cache=false",
     "representation.hidden=32",
     "target.spp=32",
     "output.spp=16",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import checkpoint, config, edit, image, latlong, pipeline, scene, target
+from envedit import checkpoint, config, edit, envmap, image, latlong, pipeline, scene, target
 from envedit.errors import InputError
 
 WIDTH, HEIGHT = 16, 8
@@ -66,15 +66,20 @@ def without_times(history):
 
 
 def without_timing(measured):
-    fit = measured["fit"] and {key: value for key, value in measured["fit"].items() if key != "cached"}
-    return {**measured, "timing": None, "fit": fit}
+    """Return metrics without what may differ between a run and its repetition."""
+    parts = {
+        part: measured[part] and {key: value for key, value in measured[part].items() if key != "cached"}
+        for part in ("fit", "transport")
+    }
+    return {**measured, "timing": None, **parts}
 
 
 # ---- what comes back -------------------------------------------------------------------------------------
 
 
 def test_a_run_without_a_folder_writes_nothing_and_returns_everything(tmp_path, rng, monkeypatch):
-    settings = settings_of(tmp_path, sunny(rng), optimizer={"iterations": 3, "checkpoint_s": 0.0})
+    optimizer = {"iterations": 3, "checkpoint_s": 0.0}
+    settings = settings_of(tmp_path, sunny(rng), optimizer=optimizer, renderer={"cache": False})
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     before = {path.name for path in tmp_path.iterdir()}
@@ -167,6 +172,74 @@ def test_pictures_that_are_compared_share_no_seed(tmp_path, rng, monkeypatch):
         ))  # fmt: skip
     assert len(seeds) == 6 and len(set(seeds[:3])) == len(set(seeds[3:])) == 3
     assert seeds[0] == target.SEED  # the target of a seed is the same picture in every version
+
+
+PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
+    <transform name="to_world"><lookat origin="4,0,0" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
+    <rfilter type="box"/></film></sensor>
+    <shape type="rectangle"><transform name="to_world"><rotate y="1" angle="90"/><scale value="2"/>
+    </transform></shape>"""
+
+
+@pytest.mark.parametrize("kind", ["siren", "pixels"])
+def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
+    """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
+    settings = settings_of(
+        tmp_path, sky(rng, 32, 64) + 0.1, input={"rows": "all", "width": 64},
+        representation={"kind": kind, "hidden": 16, "depth": 1},
+        renderer={"spp": 256, "max_depth": 3}, optimizer={"iterations": 5, "lr": 1e-2},
+    )  # fmt: skip
+    write_scene(tmp_path, PLATE, LIGHT, name="scene.xml")
+    found = pipeline.run(settings)
+    original, x = found.maps["initial"], latlong.directions(32, 64)[..., 0]
+    assert not found.frozen[x > 0].any() and found.frozen[x < -0.5].all()
+    assert found.envmap[found.frozen].tobytes() == original[found.frozen].tobytes()
+    assert (found.envmap != original)[x > 0.1].any(axis=-1).mean() > 0.9
+    share = found.metrics["transport"]["frozen"]
+    assert share == pytest.approx(found.frozen.mean()) and 0.2 < share < 0.5
+    assert any("active texels keep their value" in line for line in found.metrics["choices"])
+
+    # Without the threshold, or where the influence is not known, every texel may change.
+    for renderer in ({"influence_threshold": 0.0}, {"kind": "path", "spp": 4}):
+        given = as_tables(settings)
+        given["renderer"] = given["renderer"] | renderer
+        free = pipeline.run(config.from_dict(given, tmp_path))
+        assert free.frozen is None or not free.frozen.any()
+        assert (free.envmap != original)[x < -0.5].any() or kind == "pixels"
+        assert not any("keep their value" in line for line in free.metrics["choices"])
+
+
+def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, rng):
+    tables = {"optimizer": {"iterations": 2}}
+    first = pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
+    again = pipeline.run(settings_of(tmp_path, sunny(np.random.default_rng(0)), **tables))
+    other = pipeline.run(settings_of(tmp_path, smooth(rng), representation={"kind": "log-pixels"}, **tables))
+    tables["renderer"] = {"cache": False}
+    refused = pipeline.run(settings_of(tmp_path, sunny(np.random.default_rng(0)), **tables))
+    cached = [found.metrics["transport"]["cached"] for found in (first, again, other, refused)]
+    assert cached == [False, True, True, False]
+    assert first.envmap.tobytes() == again.envmap.tobytes() == refused.envmap.tobytes()
+    assert len(list((tmp_path / "cache" / "envedit" / "transport").iterdir())) == 2  # pilot and recording
+
+
+@pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
+def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp_path, rng, monkeypatch):
+    places, plain = [], envmap.make
+
+    def noted(*args):
+        representation = plain(*args)
+        places.append(representation._rows)
+        return representation
+
+    monkeypatch.setattr(pipeline.envmap, "make", noted)
+    pipeline.run(
+        settings_of(
+            tmp_path, sunny(rng), input={"rows": rows}, representation={"kind": "siren"},
+            optimizer={"iterations": 1},
+        )
+    )  # fmt: skip
+    assert places == [place]
 
 
 def test_an_asked_for_loss_that_is_off_is_told(tmp_path, rng):

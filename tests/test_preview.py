@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from helpers import grey, read_png
 
-from envedit import preview
+from envedit import latlong, preview
 from envedit.errors import InputError
+from envedit.tonemap import luminance
 
 BAD = [np.nan, np.inf, -np.inf]
 
@@ -124,6 +125,35 @@ def test_difference_marks_what_is_not_finite(bad):
         assert np.argwhere((pixels == preview.NOT_FINITE).all(axis=2)).tolist() == [[1, 2]]
     pixels, _ = preview.difference_image(grey(bad), b)
     assert (pixels == preview.NOT_FINITE).all()
+
+
+def test_influence_is_drawn_per_solid_angle_and_logarithmically():
+    sphere = latlong.solid_angles(16, 32)[:, None] * np.ones((16, 32))
+    share = np.ones((16, 32))
+    share[2], share[5], share[8], share[11] = 0, 1e-3, 0.1, 100
+    share[14] = share[14] - (share.mean(axis=1) @ sphere[:, 0] * 32 / (4 * np.pi) - 1) * 4 * np.pi / (
+        sphere[14, 0] * 32
+    )  # so that the mean is 1
+    frozen = np.zeros((16, 32), bool)
+    frozen[3, 4] = True
+    pixels = preview.influence_image((share * sphere).astype(np.float32), frozen)
+    rising = preview.RISING
+    # From 1e-3 to 10: 0.1 is in the middle, 1 at three quarters.
+    for row, colour in ((2, rising[0]), (5, rising[0]), (8, rising[4]), (0, rising[6]), (11, rising[8])):
+        assert np.abs(pixels[row].astype(int) - colour).max() <= 1
+    assert pixels[3, 4].tolist() == list(preview.PLACEHOLDER) and np.abs(pixels[3, 5] - rising[6]).max() <= 1
+    assert (np.diff(luminance(rising)) > 0).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, 1e30])
+def test_influence_picture_has_texels_over_a_scale(value, tmp_path):
+    preview.influence(tmp_path / "influence.png", np.full((8, 16), value, np.float32))
+    png, gap = read_png(tmp_path / "influence.png"), preview.GAP
+    top = gap + 14 + gap
+    assert png.shape == (top + 256 + gap + 14 + gap, 512 + 2 * gap, 3)
+    assert (png[gap : top - gap] == preview.INK).all(axis=2).any(), "title"
+    foot = png[top + 256 + gap + 7]
+    assert foot[256 + gap].tolist() == preview.RISING[4].tolist()  # the middle of the bar
 
 
 def test_difference_refuses_other_shapes_and_kinds():

@@ -63,6 +63,8 @@ def write(path, **changes):
         "history": [{"iteration": 0, "loss": 1.0}, {"iteration": 1, "loss": 0.1}],
         "renders": {"initial": grey(0.1), "target": grey(0.5), "edited": grey(0.4)},
         "maps": {"initial": grey(1.0), "target": None, "edited": grey(2.0)},
+        "influence": None,
+        "frozen": None,
         "warnings": [],
         "notes": ["renderer.spp = 64"],
     }
@@ -83,6 +85,23 @@ def test_report_is_one_file_that_says_the_verdict(tmp_path, monkeypatch):
     assert "further from the target" not in page.text and "Warnings" not in page.text
     assert "−0.1 0 +0.1" in page.text, "0.66 - 0.73, rounded up"
     assert "+1 stops" in page.text
+
+
+def test_report_shows_what_the_view_determines(tmp_path):
+    assert "What this view determines" not in write(tmp_path / "a.html").text
+    influence, frozen = np.ones((8, 16), np.float32), np.zeros((8, 16), bool)
+    page = write(tmp_path / "b.html", influence=influence, frozen=frozen)
+    assert "What this view determines 0.001 10 influence of each texel" in page.text
+    assert "keep their original value" not in page.text and page.tags.count("img") == 5 + 2 + 1
+    frozen[3] = True
+    assert "keep their original value" in write(tmp_path / "c.html", influence=influence, frozen=frozen).text
+
+
+def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
+    metrics = {"transport": {"entries": 12345, "cached": True}, "choices": ["path depth 5"]}
+    page = write(tmp_path / "r.html", metrics=metrics, notes=["path depth 5"])
+    assert page.text.count("path depth 5") == 1 and "choices" not in page.text
+    assert "transport entries 12345" in page.text
 
 
 def test_report_of_a_known_map_and_a_failed_edit(tmp_path):

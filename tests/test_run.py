@@ -29,6 +29,7 @@ FILES = {
     "edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "preview.png",
     "report.html", "history.csv", "config.toml", "manifest.json", "metrics.json",
 }  # fmt: skip
+INFLUENCE = {"influence.exr", "influence.png"}
 TINY = {
     "input": {"width": 16},
     "scene": {"width": 24},
@@ -138,7 +139,8 @@ def done(tmp_path_factory):
 
 def test_exactly_the_promised_files_beside_the_configuration(done):
     path, folder, out, _ = done
-    assert names(folder) == FILES | {"influence.exr"}
+    assert names(folder) == FILES | INFLUENCE
+    assert all(line in out.splitlines() for line in measured(folder)["choices"])
     assert str(folder) in out and re.search(r"rendering [\d.]+ -> [\d.]+ dB, map [\d.]+ -> [\d.]+ dB", out)
 
 
@@ -161,7 +163,16 @@ def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
     assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached"}
     timing = {"import_s", "fit_s", "transport_s", "edit_s", "report_s", "total_s", "per_iteration_ms"}
     assert timing <= set(found["timing"])
-    assert {"iterations", "non_finite_steps", "tonemap", "active_rows"} <= set(found)
+    assert {"iterations", "non_finite_steps", "tonemap", "active_rows", "choices"} <= set(found)
+    traced = found["transport"]
+    assert set(traced) == {
+        "cached", "entries", "memory_bytes", "columns", "path_depth", "depth_error", "samples",
+        "predicted_error", "frozen",
+    }  # fmt: skip
+    assert traced["cached"] is False and traced["path_depth"] == 3 and traced["samples"] == 32
+    assert 0 <= traced["depth_error"] < 0.1 and 0 < traced["predicted_error"] < 1 and traced["frozen"] == 0
+    # At least the packed entries, 16 bytes each, in both directions.
+    assert traced["memory_bytes"] >= 32 * traced["entries"] > 0
     assert found["iterations"] == 4 and found["non_finite_steps"] == 0
     assert found["tonemap"] == "clip(E, 0, 1)^(1/2.2)" and found["active_rows"] == [0, 3]
     assert found["fit"]["epochs"] == 4 and found["fit"]["cached"] is False
@@ -250,7 +261,8 @@ def test_preview_and_report_are_whole(done):
     picture = read_png(folder / "preview.png")
     assert picture.ndim == 3 and picture.std() > 0
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert page.rstrip().endswith("</html>") and page.count("data:image/png;base64,") >= 6
+    assert page.rstrip().endswith("</html>") and page.count("data:image/png;base64,") >= 7
+    assert "What this view determines" in page
     assert page.count("<figure>") == page.count("</figure>") and "<svg" in page
     assert f"{measured(folder)['render']['psnr']:.4g}"[:4] in page
     assert not re.search(r'(src|href)\s*=\s*"https?:', page)  # opens offline
@@ -259,7 +271,7 @@ def test_preview_and_report_are_whole(done):
 def test_without_a_report_neither_page_nor_preview_is_written(tmp_path, rng):
     path = world(tmp_path, rng, output={"report": False})
     assert call(path, "--quiet") == 0
-    assert names(tmp_path / "c_out") == FILES - {"preview.png", "report.html"} | {"influence.exr"}
+    assert names(tmp_path / "c_out") == FILES - {"preview.png", "report.html"} | INFLUENCE
 
 
 # ---- what is computed ------------------------------------------------------------------------------------
@@ -306,7 +318,8 @@ def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path,
     found = measured(tmp_path / "c_out")
     assert found["iterations"] == 2 and found["non_finite_steps"] == 0
     assert (found["fit"] is None) == (kind != "siren")
-    assert ("influence.exr" in names(tmp_path / "c_out")) == (renderer == "transport")
+    assert names(tmp_path / "c_out") & INFLUENCE == (INFLUENCE if renderer == "transport" else set())
+    assert (found["transport"] is None) == (renderer == "path") and found["choices"]
 
 
 def test_a_painted_target_has_no_known_map(tmp_path, rng):
@@ -395,7 +408,7 @@ def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
         assert call(path, "--quiet", *changed(optimizer__iterations=1, seed=seed)) == 0
         kept.append({name: data for name, data in content(out).items() if not name.startswith("earlier-")})
     (out / "earlier-note").write_text("mine")
-    assert names(out) == FILES | {"influence.exr", "earlier-1", "earlier-2", "earlier-note"}
+    assert names(out) == FILES | INFLUENCE | {"earlier-1", "earlier-2", "earlier-note"}
     assert content(out / "earlier-1") == kept[0] and content(out / "earlier-2") == kept[1]
     # What is not ours stays where it is.
     assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
@@ -408,7 +421,7 @@ def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
     first = pixels(out / "edited.exr")
     assert call(out / "config.toml", "--quiet") == 0
     assert pixels(out / "edited.exr").tobytes() == first.tobytes()
-    assert names(out / "earlier-1") == FILES | {"influence.exr"}
+    assert names(out / "earlier-1") == FILES | INFLUENCE
 
 
 def test_an_input_is_not_moved_away_with_earlier_results(tmp_path, rng, capsys):
@@ -546,7 +559,7 @@ def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng)
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     edited = pixels(out / "edited.exr")
     assert edited.tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes() != so_far.tobytes()
-    assert names(out) == FILES | {"influence.exr"} and len(rows_of(out)) == 400
+    assert names(out) == FILES | INFLUENCE and len(rows_of(out)) == 400
 
 
 # ---- other commands --------------------------------------------------------------------------------------

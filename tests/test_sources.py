@@ -1,5 +1,7 @@
 """Where values come from: presets, precedence, targets and paths."""
 
+import dataclasses
+
 import pytest
 
 from envedit import config as cfg
@@ -24,23 +26,32 @@ def test_every_preset_takes_effect_key_by_key(preset):
 
 def test_the_paper_preset_is_section_6():
     paper = cfg.loads("", preset="paper")
-    assert paper.representation == cfg.Representation(kind="siren", hidden=256, depth=6, omega=30)
+    assert paper.representation == cfg.Representation("siren", 256, 6, 30.0, coordinates="plane")
     fit = paper.fit
     assert (fit.epochs, fit.lr, fit.schedule, fit.restart_period) == (1500, 5e-5, "warm-restarts", 100)
     assert (fit.log_mse, fit.log_ssim, fit.hdr) == (0.85, 0.25, 1e-2)
-    assert (fit.awp_gamma, fit.awp_lr) == (0.01, 1e-4)
+    assert (fit.awp_gamma, fit.awp_lr, fit.awp_every, fit.awp_until) == (0.01, 1e-4, 1, 1)
+    assert (fit.beta2, fit.stride, fit.headroom, fit.light) == (0.999, 1, 0, 0)
     assert (paper.optimizer.lr, paper.optimizer.iterations) == (5e-6, 400)
     assert (paper.loss.ssim, paper.loss.dists) == ((1, 1e4), 0.6)
     assert paper.loss.luminance == paper.loss.l1 == (1e-4, 1e-8)
     assert (paper.input.width, paper.input.rows, paper.renderer.kind) == (256, "upper", "path")
 
 
+def test_the_paper_preset_spells_out_every_number_of_the_method():
+    """A default that is changed later must not change the paper's recipe."""
+    free = {"fit": {"cache"}, "optimizer": {"checkpoint_s"}, "representation": set(), "loss": set()}
+    for table, left_out in free.items():
+        keys = {f.name for f in dataclasses.fields(getattr(cfg.Config(), table))}
+        assert set(sources.PRESETS["paper"][table]) == keys - left_out, table
+
+
 # ---- precedence --------------------------------------------------------------------------------------------
 
 
 def test_default_then_preset_then_file_then_override():
-    assert cfg.loads("").fit.epochs == 400
-    assert cfg.loads('preset = "draft"').fit.epochs == 150
+    assert cfg.loads("").fit.epochs == 1200
+    assert cfg.loads('preset = "draft"').fit.epochs == 500
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7').fit.epochs == 7
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7', overrides=["fit.epochs=8"]).fit.epochs == 8
     assert cfg.loads("", overrides=["fit.epochs=8", "fit.epochs=9"]).fit.epochs == 9
@@ -49,7 +60,7 @@ def test_default_then_preset_then_file_then_override():
 def test_the_preset_argument_beats_override_beats_file():
     assert cfg.loads('preset = "draft"', overrides=["preset=paper"]).preset == "paper"
     config = cfg.loads('preset = "draft"', preset="standard", overrides=["preset=paper"])
-    assert config.preset == "standard" and config.fit.epochs == 400
+    assert config.preset == "standard" and config.fit.epochs == 1200
 
 
 def test_scene_parameters_are_merged_key_by_key():

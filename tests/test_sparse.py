@@ -60,6 +60,19 @@ def test_matrix_without_entries_gives_zero(rows):
     assert matrix.entries == 0
 
 
+@pytest.mark.parametrize("shape, count", [((37, 101), 200), ((9, 4), 0), ((1, 5), 3)])
+def test_a_matrix_of_its_own_arrays_gives_the_same_bits(shape, count, rng):
+    first = ColourMatrix(*entries(rng, shape, count), shape)
+    arrays = {name: np.array(array) for name, array in first.arrays().items()}
+    second = ColourMatrix.from_arrays(arrays)
+    dr.sync_thread()  # Dr.Jit copies when its queue comes to it
+    for array in arrays.values():  # the matrix has its own copy
+        array[...] = 0
+    x = rng.standard_normal((shape[1], 3)).astype(np.float32)
+    assert product(second, x).tobytes() == product(first, x).tobytes()
+    assert (second.shape, second.entries, second.bytes) == (first.shape, first.entries, first.bytes)
+
+
 def test_one_long_row_does_not_spoil_the_short_ones(rng):
     rows = np.concatenate([np.full(500, 3), np.arange(20)]).astype(np.uint32)
     columns = rng.integers(0, 50, len(rows)).astype(np.uint32)

@@ -1,0 +1,184 @@
+"""What the machine can do at most: memory bandwidth, matrix products, rays.
+
+A program that has to read so many bytes, or to multiply so many numbers, cannot be quicker than these.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit import scene, sparse
+
+from . import network
+from .timing import side_by_side
+
+SHAPES = ((256, 16384), (128, 16384), (64, 16384))
+"""(width, points) of the hidden layers: the paper's network, the standard one, the draft's."""
+
+
+def measure(quick: bool = False) -> dict:
+    """Measure all floors; see the functions."""
+    return {
+        "bandwidth": bandwidth(1 << 20 if quick else None, 3 if quick else 7),
+        "matmul": matmul(((16, 256),) if quick else SHAPES, 3 if quick else 9),
+        "rays": rays(1 << 12 if quick else 1 << 20, 3 if quick else 7),
+    }
+
+
+# ---------------------------------------------------------------------- memory
+
+
+def bandwidth(elements: int | None = None, repeats: int = 7) -> dict:
+    """Measure bytes a second between memory and cores, on float32 arrays larger than the caches.
+
+    Parameters
+    ----------
+    elements : int, optional
+        Floats in an array; by default twice the largest cache, but no more than an eighth of the free memory.
+    repeats : int
+        Times each is measured.
+
+    Returns
+    -------
+    dict
+        ``array_bytes``, ``cache_bytes``; ``rates``: bytes a second by name; ``read``: the best of those that
+        only read, which is the floor that reading T is held against. A triad a = b + s c counts 12 bytes an
+        element: what the processor reads of ``a`` before it writes there is not counted (McCalpin's STREAM).
+    """
+    cache = largest_cache()
+    elements = elements or _beyond(cache)
+    b = dr.opaque(mi.Float, 1.5, elements)
+    c = dr.opaque(mi.Float, 0.25, elements)
+    s = dr.opaque(mi.Float, 3)
+    host_b, host_c = np.full(elements, 1.5, np.float32), np.full(elements, 0.25, np.float32)
+    host_a = np.zeros_like(host_b)
+
+    def host_triad():
+        np.multiply(host_c, np.float32(3), out=host_a)
+        np.add(host_a, host_b, out=host_a)
+        return host_a[0]
+
+    lanes = sparse.SLICE * 512  # enough for any number of cores; each lane then reads a long row
+    rows = dr.opaque(mi.UInt32, elements // 4 // lanes)
+    jobs = {
+        "Dr.Jit sum": (4, lambda: dr.sum(b)),
+        "Dr.Jit packets": (4, lambda: _read_packets(b, rows, lanes)),
+        "Dr.Jit triad": (12, lambda: b + s * c),
+        "numpy sum": (4, lambda: host_b.sum()),
+        # Two passes, as numpy has no fused one: c, a, then a, b, a.
+        "numpy triad": (20, host_triad),
+    }
+    taken = side_by_side({name: job for name, (_, job) in jobs.items()}, repeats)
+    rates = {name: size * elements / taken[name]["min_s"] for name, (size, _) in jobs.items()}
+    read = max(rate for name, rate in rates.items() if jobs[name][0] == 4)
+    return {"array_bytes": 4 * elements, "cache_bytes": cache, "rates": rates, "read": read}
+
+
+@dr.syntax
+def _read_packets(packed, rows, lanes):
+    """Sum packets in the order in which a product with T reads its own, but without reading a map."""
+    lane = dr.arange(mi.UInt32, lanes)
+    place = (lane // sparse.SLICE) * (rows * sparse.SLICE) + lane % sparse.SLICE
+    total, done = mi.Vector4f(0), dr.zeros(mi.UInt32, lanes)
+    while done < rows:
+        total += dr.gather(mi.Vector4f, packed, place)
+        place += sparse.SLICE
+        done += 1
+    return total
+
+
+def largest_cache() -> int | None:
+    """Return the size of the processor's largest cache in bytes; None where the system does not tell."""
+    found = []
+    for file in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size"):
+        text = file.read_text().strip()
+        unit = {"K": 2**10, "M": 2**20, "G": 2**30}.get(text[-1:], 1)
+        found.append(int(text.rstrip("KMG")) * unit)
+    return max(found, default=None)
+
+
+def _beyond(cache):
+    # Five arrays live at once.
+    elements = max(2 * (cache or 0), 256 << 20) // 4
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        elements = min(elements, int(lines["MemAvailable"].split()[0]) * 1024 // 8 // 4)
+    except (OSError, KeyError, ValueError):
+        pass
+    return elements // 2**20 * 2**20
+
+
+# ---------------------------------------------------------------------- arithmetic
+
+
+def matmul(shapes=SHAPES, repeats: int = 9) -> list[dict]:
+    """Measure Dr.Jit's matrix products of a hidden layer: forward, and the two of the reverse pass.
+
+    Returns
+    -------
+    list of dict
+        A row for each shape, layout and product: ``width``, ``points``, ``layout`` ("rows": a point a row),
+        ``product``, ``seconds`` (median), ``gflops`` (of the median) and ``gflops_best``.
+    """
+    rows, rng = [], np.random.default_rng(0)
+    for width, points in shapes:
+        operands = {
+            (layout, product): (network.operand(rng, a), network.operand(rng, b), flags)
+            for layout in network.LAYOUTS
+            for product, a, b, flags in network.products(layout, points, width, width)
+        }
+        jobs = {key: _product(*value) for key, value in operands.items()}
+        for (layout, product), taken in side_by_side(jobs, repeats).items():
+            work = 2 * width * width * points
+            rows.append(
+                {
+                    "width": width,
+                    "points": points,
+                    "layout": layout,
+                    "product": product,
+                    "seconds": taken["median_s"],
+                    "gflops": work / taken["median_s"] / 1e9,
+                    "gflops_best": work / taken["min_s"] / 1e9,
+                }
+            )
+    return rows
+
+
+def _product(a, b, flags):
+    return lambda: dr.matmul(a, b, **flags)
+
+
+# ---------------------------------------------------------------------- rays
+
+
+def rays(count: int = 1 << 20, repeats: int = 7) -> dict:
+    """Measure rays a second in the scene ``sphere``.
+
+    Returns
+    -------
+    dict
+        ``rays``, and rays a second: ``camera`` (coherent, nearest hit), ``random`` (from anywhere to
+        anywhere, nearest hit), ``shadow`` (the same, any hit).
+    """
+    lit = scene.load("sphere", 256)
+    rng = np.random.default_rng(0)
+    across = dr.opaque(mi.Point2f(*(mi.Float(rng.random(count, np.float32)) for _ in range(2))))
+    camera, _ = lit.mi.sensors()[0].sample_ray(0, 0, across, mi.Point2f(0.5))
+    origins = rng.uniform((-2, 0.01, -2), 2, (count, 3)).astype(np.float32).T
+    ways = rng.normal(size=(3, count)).astype(np.float32)
+    origins, ways = mi.Point3f(*map(mi.Float, origins)), mi.Vector3f(*map(mi.Float, ways))
+    scattered = mi.Ray3f(origins, dr.normalize(ways))
+    camera, scattered = dr.opaque(mi.Ray3f(camera)), dr.opaque(scattered)
+    taken = side_by_side(
+        {
+            "camera": lambda: lit.mi.ray_intersect(camera).t,
+            "random": lambda: lit.mi.ray_intersect(scattered).t,
+            "shadow": lambda: lit.mi.ray_test(scattered),
+        },
+        repeats,
+    )
+    return {"rays": count, **{name: count / found["median_s"] for name, found in taken.items()}}

@@ -1,0 +1,224 @@
+"""Arrays on disk: what comes back, what does not, and what a full folder loses."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from envedit import disk_cache
+from envedit.disk_cache import DiskCache
+
+KEY = {"scene": "abc", "seed": 3, "grid": [8, 16]}
+
+
+def some(rng, size=3000):
+    """Arrays of every kind that is kept."""
+    return {
+        "packed": rng.standard_normal((size, 4)).astype(np.float32),
+        "start": rng.integers(0, 2**32, 7, dtype=np.uint32),
+        "one": np.array(-5, np.int64),
+        "nothing": np.zeros((0, 3), np.float32),
+        "mask": rng.random(5) < 0.5,
+        "odd": np.array([np.nan, -0.0, np.inf, 1e-310]),
+    }
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(
+        a[k].dtype == b[k].dtype and a[k].shape == b[k].shape and a[k].tobytes() == b[k].tobytes() for k in a
+    )
+
+
+def only_file(folder):
+    (path,) = folder.iterdir()
+    return path
+
+
+def test_the_same_bits_come_back(tmp_path, rng):
+    cache, arrays = DiskCache(tmp_path / "a" / "b"), some(rng)
+    assert cache.load(KEY) is None
+    cache.store(KEY, arrays)
+    assert same(cache.load(KEY), arrays)
+    assert same(DiskCache(tmp_path / "a" / "b").load(dict(reversed(KEY.items()))), arrays)
+
+
+def test_arrays_of_any_layout_are_kept(tmp_path, rng):
+    image = rng.random((6, 5, 4))
+    DiskCache(tmp_path).store(KEY, {"a": image[::2, :, 1:3].T})
+    np.testing.assert_array_equal(DiskCache(tmp_path).load(KEY)["a"], image[::2, :, 1:3].T)
+
+
+def test_another_key_finds_nothing_and_a_new_entry_takes_the_place_of_the_old(tmp_path, rng):
+    cache = DiskCache(tmp_path)
+    cache.store(KEY, some(rng))
+    assert cache.load(KEY | {"seed": 4}) is None and cache.load({}) is None
+    newer = some(rng, 10)
+    cache.store(KEY, newer)
+    assert same(cache.load(KEY), newer) and len(list(tmp_path.iterdir())) == 1
+
+
+def test_without_a_folder_nothing_is_kept(rng):
+    cache = DiskCache(None)
+    cache.store(KEY, some(rng))
+    assert cache.load(KEY) is None
+
+
+# ---- files that are no good ------------------------------------------------------------------------------
+
+
+def test_no_damage_to_a_single_byte_goes_unseen(tmp_path, rng):
+    """Every byte of a small file is changed in turn: nothing, or the same arrays where it was padding."""
+    cache, arrays = DiskCache(tmp_path), some(rng, 5)
+    cache.store(KEY, arrays)
+    path = only_file(tmp_path)
+    whole, seen = path.read_bytes(), 0
+    for place in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        found = cache.load(KEY)
+        assert found is None or same(found, arrays)
+        seen += found is None
+    used = sum(array.nbytes for array in arrays.values())
+    assert seen > used + 200  # all of the arrays and the description
+    cache.store(KEY, arrays)
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("how", ["zeroed", "swapped", "one bit"])
+def test_damage_inside_a_large_array_is_seen(how, tmp_path, rng):
+    cache = DiskCache(tmp_path)
+    cache.store(KEY, some(rng, 3000))
+    path = only_file(tmp_path)
+    data = np.fromfile(path, np.uint8)
+    pages = data[8192:24576].reshape(4, 4096)
+    if how == "zeroed":
+        pages[1] = 0
+    elif how == "swapped":
+        pages[[1, 2]] = pages[[2, 1]]
+    else:
+        pages[2, 77] ^= 16
+    data.tofile(path)
+    assert cache.load(KEY) is None
+
+
+def test_a_file_that_was_cut_short_is_none(tmp_path, rng):
+    cache = DiskCache(tmp_path)
+    cache.store(KEY, some(rng, 50) | {"last": np.arange(16.0)})
+    path = only_file(tmp_path)
+    whole = path.read_bytes()
+    for length in (0, 1, 8, 15, 16, 300, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        assert cache.load(KEY) is None
+
+
+def test_foreign_files_are_none(tmp_path, rng):
+    cache = DiskCache(tmp_path)
+    cache.store(KEY, some(rng))
+    path = only_file(tmp_path)
+    cache.store(KEY | {"seed": 4}, some(rng))
+    (other,) = set(tmp_path.iterdir()) - {path}
+    path.write_bytes(other.read_bytes())  # whole, but of another key
+    assert cache.load(KEY) is None
+    for content in (b"not arrays at all", b"\x93NUMPY" + bytes(200), bytes(4096)):
+        path.write_bytes(content)
+        assert cache.load(KEY) is None
+    path.unlink()
+    path.mkdir()
+    assert cache.load(KEY) is None
+    cache.store(KEY, some(rng))  # cannot be written: costs time, not the run
+    assert cache.load(KEY) is None and path.is_dir()
+
+
+def test_a_folder_that_cannot_be_is_no_error(tmp_path, rng):
+    (tmp_path / "file").write_text("mine")
+    cache = DiskCache(tmp_path / "file" / "cache")
+    cache.store(KEY, some(rng))
+    assert cache.load(KEY) is None and (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path, rng, monkeypatch):
+    cache, arrays = DiskCache(tmp_path), some(rng)
+    cache.store(KEY, arrays)
+
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(disk_cache.os, "replace", full)
+        cache.store(KEY, some(rng, 10))
+        cache.store({}, some(rng, 10))
+    assert same(cache.load(KEY), arrays) and len(list(tmp_path.iterdir())) == 1
+
+
+# ---- the bound -------------------------------------------------------------------------------------------
+
+
+def filled(folder, count, used):
+    """Store entries of 10 kB and say when each was used last, in seconds; returns cache and paths."""
+    cache, paths = DiskCache(folder, most_bytes=35_000), []
+    for i in range(count):
+        before = set(folder.iterdir()) if folder.exists() else set()
+        cache.store({"i": i}, {"a": np.full(2500, i, np.float32)})
+        (path,) = set(folder.iterdir()) - before
+        os.utime(path, (used[i], used[i]))
+        paths.append(path)
+    return cache, paths
+
+
+def test_what_was_not_used_for_longest_makes_room(tmp_path):
+    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
+    cache.store({"i": 3}, {"a": np.full(2500, 3, np.float32)})
+    kept = [i for i in range(4) if cache.load({"i": i}) is not None]
+    assert kept == [0, 2, 3]
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 35_000
+
+
+def test_a_look_is_a_use(tmp_path):
+    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
+    assert cache.load({"i": 1}) is not None
+    cache.store({"i": 3}, {"a": np.full(2500, 3, np.float32)})
+    assert cache.load({"i": 0}) is None and cache.load({"i": 1}) is not None
+
+
+def test_an_entry_takes_the_place_of_itself(tmp_path):
+    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
+    cache.store({"i": 2}, {"a": np.full(2500, 9, np.float32)})
+    assert all(cache.load({"i": i}) is not None for i in range(3))
+
+
+def test_an_entry_above_the_bound_is_not_kept_and_drives_nothing_out(tmp_path):
+    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
+    cache.store({"i": 3}, {"a": np.zeros(10_000, np.float32)})
+    assert [cache.load({"i": i}) is not None for i in range(4)] == [True, True, True, False]
+
+
+def test_nothing_but_its_own_files_is_deleted(tmp_path):
+    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
+    outside = tmp_path.parent / "outside"
+    outside.write_bytes(bytes(50_000))
+    mine = [tmp_path / "notes.txt", tmp_path / "map.arrays", tmp_path / f"{'0' * 32}.npz",
+            tmp_path / f"x{'0' * 32}.arrays"]  # fmt: skip
+    for path in mine:
+        path.write_bytes(bytes(50_000))
+        os.utime(path, (1, 1))
+    link, inside = tmp_path / f"{'1' * 32}.arrays", tmp_path / f"{'2' * 32}.arrays"
+    link.symlink_to(outside)
+    inside.mkdir()
+    for i in range(3, 9):
+        cache.store({"i": i}, {"a": np.full(2500, i, np.float32)})
+    assert all(path.stat().st_size == 50_000 for path in [*mine, outside])
+    assert link.is_symlink() and inside.is_dir()
+    assert sum(cache.load({"i": i}) is not None for i in range(9)) == 3
+
+
+def test_what_a_killed_writer_left_is_deleted_but_not_what_is_being_written(tmp_path):
+    cache, _ = filled(tmp_path, 1, used=[100])
+    left, current = tmp_path / f".{'3' * 32}.arrays.123", tmp_path / f".{'4' * 32}.arrays.124"
+    for path, age in ((left, 7200), (current, 60)):
+        path.write_bytes(bytes(30_000))
+        os.utime(path, (time.time() - age,) * 2)
+    cache.store({"i": 1}, {"a": np.full(2500, 1, np.float32)})
+    assert not left.exists() and current.exists()
+    assert cache.load({"i": 0}) is None and cache.load({"i": 1}) is not None  # both count

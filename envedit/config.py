@@ -125,7 +125,7 @@ class Representation(Table):
     depth: int = _key(3, integer(0, 64), "siren: hidden sine layers after the first")
     omega: float = _key(30.0, number(0, positive=True), "siren: angular frequency of the sine layers")
     coordinates: str = _key(
-        "sphere", choice("sphere", "plane"), "siren: inputs are directions, or row and column as in the paper"
+        "plane", choice("plane", "sphere"), "siren: inputs are row and column as in the paper, or directions"
     )
 
 
@@ -147,9 +147,12 @@ class Fit(Table):
     awp_gamma: float = _key(0.01, number(0, 1), "weight perturbation, fraction of a layer's norm; 0: off")
     awp_lr: float = _key(1e-4, number(0, positive=True), "learning rate of the proxy Adam that perturbs")
     awp_every: int = _key(2, integer(1, 10**7), "epochs between fresh perturbations")
-    awp_until: float = _key(0.7, number(0, 1), "share of the epochs that are perturbed; the others polish")
     headroom: float = _key(0.05, number(0, 0.45), "share of the network's range left free above and below")
-    light: float = _key(1.0, number(0), "weight of light when the last layer is solved for; 0: it is not")
+    polish: str = _key(
+        "auto", choice("auto", "always", "never"), "finish exactly; auto: unless the fit is to be edited"
+    )
+    awp_until: float = _key(0.7, number(0, 1), "polish: share of the epochs that are perturbed before")
+    light: float = _key(1.0, number(0), "polish: weight of light in the last layer's solution; 0: none")
     cache: bool = _key(True, boolean, "keep fits on disk and reuse them")
 
     def _check_together(self) -> None:

@@ -108,4 +108,5 @@ def make(settings: config.Config, folder: Path | None = None, progress=None, row
         return Pixels()
     if kind == "log-pixels":
         return LogPixels()
-    return Siren(settings.representation, settings.fit, folder, progress, rows)
+    recipe = settings.fit if settings.fit.polish == "always" else fit.unpolished(settings.fit)
+    return Siren(settings.representation, recipe, folder, progress, rows)

@@ -14,7 +14,7 @@ import hashlib
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import drjit as dr
@@ -78,6 +78,15 @@ class Fitted:
     cached: bool
 
 
+def unpolished(settings: config.Fit) -> config.Fit:
+    """Return a recipe that perturbs to the end and leaves the last layer as it was trained.
+
+    A polished fit has the map's sun, sharp and bright; a robust one is vague about it. To move a sun that is
+    not there yet is easier: edits of sunny maps that start from a robust fit end better (docs/engine.md).
+    """
+    return replace(settings, awp_until=1.0, light=0.0)
+
+
 def fit(
     image: np.ndarray,
     network: config.Representation | None = None,
@@ -120,6 +129,7 @@ def fit(
         If too many steps were not finite.
     """
     network, settings = network or config.Representation(), settings or config.Fit()
+    settings = unpolished(settings) if settings.polish == "never" else settings
     image = np.ascontiguousarray(image, np.float32)
     if not (good := np.isfinite(image) & (image >= 0)).all():
         row, column = np.argwhere(~good.all(axis=2))[0]
@@ -308,7 +318,7 @@ def _key(image, network, settings, seed, rows):
         "seed": seed,
         "recipe": _RECIPE,
         "shape": image.shape,
-        **{k: v for k, v in asdict(settings).items() if k != "cache"},
+        **{k: v for k, v in asdict(settings).items() if k not in ("cache", "polish")},
     }
     return hashlib.sha256(repr(sorted(what.items())).encode() + image.tobytes()).hexdigest()[:32]
 

@@ -36,7 +36,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fit": {
             "epochs": 1500, "lr": 5e-5, "schedule": "warm-restarts", "restart_period": 100,
             "log_mse": 0.85, "log_ssim": 0.25, "hdr": 1e-2, "awp_gamma": 0.01, "awp_lr": 1e-4, "awp_every": 1,
-            "beta2": 0.999, "stride": 1, "awp_until": 1.0, "headroom": 0.0, "light": 0.0,
+            "beta2": 0.999, "stride": 1, "headroom": 0.0, "polish": "never", "awp_until": 1.0, "light": 0.0,
         },
         "loss": {
             "ssim": (1.0, 1e4), "luminance": (1e-4, 1e-8), "l1": (1e-4, 1e-8), "dists": 0.6,

@@ -12,7 +12,7 @@ from test_siren import numpy_forward
 from envedit import config, envmap, fit, latlong, siren
 
 EXTREMES = np.array([0, 1e-30, 1e-4, 0.01, 0.5, 65504, 1e6, 123456.789, 1.0] * 2, np.float32).reshape(2, 3, 3)
-QUICK = config.Fit(epochs=5, awp_gamma=0.0)
+QUICK = config.Fit(polish="always", epochs=5, awp_gamma=0.0)
 
 
 def sky(rng, shape=(8, 16)):
@@ -195,7 +195,7 @@ def test_siren_gradient_is_the_finite_difference(rng):
     dr.enable_grad(leaves)
     dr.backward(dr.sum((representation.decode(leaves) * mi.TensorXf(weight.astype(np.float32))).array))
     gradient = {name: np.array(dr.grad(leaf), np.float64) for name, leaf in leaves.items()}
-    x, normalisation = siren.directions(8, 16).numpy(), representation.fitted.normalisation
+    x, normalisation = siren.coordinates(8, 16).numpy(), representation.fitted.normalisation
 
     def loss(step):
         moved = {name: params[name].numpy() + step * gradient[name] for name in params}
@@ -245,3 +245,11 @@ def test_siren_of_another_image_forgets_the_points_of_the_first(rng):
         decoded = used.decode(used.encode(image), (8, 16)).numpy()
         np.testing.assert_array_equal(decoded, fresh.decode(fresh.encode(image), (8, 16)).numpy())
         assert used.decode(used.encode(image)).shape == image.shape
+
+
+def test_a_fit_that_is_edited_is_not_polished_unless_asked_for():
+    settings = config.Config(representation=config.Representation(hidden=8, depth=1))
+    recipe = envmap.make(settings).settings
+    assert (recipe.awp_until, recipe.light) == (1.0, 0.0) and recipe == fit.unpolished(settings.fit)
+    asked = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, polish="always"))
+    assert envmap.make(asked).settings == asked.fit

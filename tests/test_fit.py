@@ -13,7 +13,7 @@ from test_siren import launched
 from envedit import config, fit, metrics, optim, siren, ssim
 from envedit.errors import InputError
 
-NETWORK = config.Representation(hidden=12, depth=1)
+NETWORK = config.Representation(hidden=12, depth=1, coordinates="sphere")
 QUICK = config.Fit(epochs=4, lr=5e-3, awp_gamma=0.0)
 
 
@@ -271,7 +271,7 @@ def test_perturbation_is_none_after_a_gradient_that_is_not_finite(rng):
 def test_small_fit_reaches_a_good_picture(rng):
     image = sky(rng)
     settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)
-    network = config.Representation(hidden=32, depth=1)
+    network = config.Representation(hidden=32, depth=1, coordinates="sphere")
     fitted = fit.fit(image, network, settings)
     # 43.5 to 44.0 dB and 0.99 for four seeds where this was written; an untrained network has 10 dB.
     assert fitted.log_psnr > 40

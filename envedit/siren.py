@@ -11,7 +11,8 @@ small one by a wide one, whose rows lie far apart in memory (``docs/engine.md``)
 
 The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the
 price of one), and needs two matrix products a layer beside the forward one: that is the least possible. A
-bias gradient is one more, with a row of ones: a sum over rows of float32 would be slower and less exact.
+bias gradient is a sum over points, of which every lane takes a stretch: ``dr.sum`` along that axis, or a
+product with ones, takes several times as long.
 """
 
 from __future__ import annotations
@@ -157,11 +158,10 @@ def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
     grads: Params = {}
     h, y = tape[last]
     delta = grad * y * (1 - y)
-    ones = dr.opaque(dr.ones(type(delta), (1, delta.shape[0])))
     for i in range(last, -1, -1):
         dr.eval(delta)
         grads[f"{i}.weight"] = dr.matmul(delta, h, At=True)
-        grads[f"{i}.bias"] = dr.reshape(dr.matmul(ones, delta), delta.shape[1])
+        grads[f"{i}.bias"] = _sum_of_rows(delta)
         if i > 0:
             slope = tape[i - 1][1]
             delta = dr.matmul(delta, params[f"{i}.weight"]) * slope
@@ -174,6 +174,33 @@ def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
 def evaluate(params: Params, x: mi.TensorXf, omega: float) -> mi.TensorXf:
     """Evaluate the network as one differentiable operation: :func:`forward`, reversed by :func:`backward`."""
     return dr.custom(_Siren, params, x, omega)
+
+
+_STRETCHES = 32
+
+
+def _sum_of_rows(x):
+    """Sum a tensor (N, width) over N: stretches of rows first, then the stretches."""
+    n, width = x.shape
+    parts = _sum_of_stretches(x.array, n, width)
+    dr.eval(parts)
+    lane, total = dr.arange(mi.UInt32, width), dr.zeros(type(x.array), width)
+    for stretch in range(_STRETCHES):
+        total += dr.gather(type(x.array), parts, lane + stretch * width)
+    return type(x)(total, (width,))
+
+
+@dr.syntax
+def _sum_of_stretches(x, n, width):
+    lane = dr.arange(mi.UInt32, width * _STRETCHES)
+    rows = dr.opaque(mi.UInt32, -(-n // _STRETCHES))
+    i = (lane // width) * rows * width + lane % width
+    stop = dr.minimum((lane // width + 1) * rows, dr.opaque(mi.UInt32, n)) * width
+    total = dr.zeros(type(x), width * _STRETCHES)
+    while i < stop:
+        total += dr.gather(type(x), x, i)
+        i += width
+    return total
 
 
 class _Siren(dr.CustomOp):

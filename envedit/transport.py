@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import latlong
+from . import bright, latlong
 from .columns import ExactColumns
 from .disk_cache import DiskCache
 from .errors import ConfigError
@@ -321,9 +321,8 @@ class LightTransport:
     ) -> int:
         """Trace exact columns for the texels that the coarse tier would render with too much error.
 
-        The coarse tier's relative error for a map is predicted as the standard deviation of E over its mean,
-        over sqrt(samples a pixel); the brightest texels are taken out until the rest stays under
-        ``tolerance``.
+        The brightest texels are taken out until the error that is predicted for the rest (:mod:`.bright`)
+        stays under ``tolerance``.
 
         Parameters
         ----------
@@ -365,13 +364,8 @@ class LightTransport:
 
     def coarse_error(self, envmap) -> float:
         """Predict the relative error of the coarse tier for a map, beside the columns that there are."""
-        radiance, omega = self._radiance(np.asarray(envmap))
-        total, rest = (radiance * omega).sum(), self._exact.slot_of < 0
-        e, w = radiance[rest], omega[rest]
-        if not (total > 0 and w.sum() > 0):
-            return 0.0
-        variance = max((e * e * w).sum() - (e * w).sum() ** 2 / w.sum(), 0) * omega.sum()
-        return float(np.sqrt(variance / self._samples) / total)
+        rest = self._exact.slot_of < 0
+        return bright.error(*self._radiance(np.asarray(envmap)), self._samples, rest)
 
     @property
     def _samples(self):
@@ -387,28 +381,12 @@ class LightTransport:
 
     def bright_texels(self, envmap: np.ndarray, tolerance: float = COLUMN_TOLERANCE) -> np.ndarray:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
-        radiance, omega = self._radiance(envmap)
-        total, span = (radiance * omega).sum(), omega.sum()
-        if not total > 0:
-            return np.zeros(0, np.int64)
-        order = np.argsort(-radiance, kind="stable")
-        # Variance of what is left when the first k are taken out, k = 0 ... n.
-        e, w = radiance[order], omega[order]
-        square, linear, weight = _total_from(e * e * w), _total_from(e * w), _total_from(w)
-        variance = np.maximum(square - linear**2 / np.maximum(weight, 1e-30), 0) * span
-        error = np.sqrt(variance / self._samples) / total
-        enough = np.flatnonzero(error <= tolerance)
-        return order[: enough[0] if len(enough) else len(order)]
+        return bright.brightest(*self._radiance(envmap), self._samples, tolerance)
 
 
 def _check(tensor, shape, what):
     if tuple(tensor.shape) != shape:
         raise ValueError(f"light transport: the {what} must have shape {shape}, got {tuple(tensor.shape)}")
-
-
-def _total_from(x):
-    """Sum of x[k:] for k = 0 ... len(x)."""
-    return np.concatenate([np.cumsum(x[::-1])[::-1], [0.0]])
 
 
 class _Apply(dr.CustomOp):

@@ -11,8 +11,8 @@ small one by a wide one, whose rows lie far apart in memory (``docs/engine.md``)
 
 The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the
 price of one), and needs two matrix products a layer beside the forward one: that is the least possible. A
-bias gradient is a sum over points, of which every lane takes a stretch: ``dr.sum`` along that axis, or a
-product with ones, takes several times as long.
+bias gradient is a sum over points, of which every lane takes a stretch; a product with ones takes longer
+(``docs/engine.md``).
 """
 
 from __future__ import annotations

@@ -68,7 +68,8 @@ def curves_svg(rows: list[dict], width=860, height=340) -> str:
             label = name if len(name) <= 14 else name[:13] + "…"
             level = top + 10 + 21 * i
             out.append(f'<rect x="{right + 16}" y="{level - 6}" width="16" height="3" fill="{colour}"/>')
-            out.append(f'<text x="{right + 38}" y="{level}">{escape(label)} {10.0 ** min(last, 308.25):.3g}</text>')
+            value = 10.0 ** min(last, 308.25)  # the logarithm of the largest float is rounded up
+            out.append(f'<text x="{right + 38}" y="{level}">{escape(label)} {value:.3g}</text>')
     return "\n".join([*out, "</svg>"])
 
 

@@ -135,13 +135,6 @@ def row_range(value: Any) -> str | tuple[int, int]:
     raise WantedError('"upper", "all" or [first, last], rows from 0 at the zenith, last included')
 
 
-def representation_kind(value: Any) -> str:
-    """Accept the name of a representation."""
-    if isinstance(value, str) and value == "layers":
-        raise WantedError("siren, pixels or log-pixels: the layers representation comes later")
-    return choice("siren", "pixels", "log-pixels")(value)
-
-
 def plain(value: Any, depth: int = 8) -> Any:
     """Accept what the writer below can write: strings, numbers, booleans, and lists and tables of them."""
     if isinstance(value, bool):

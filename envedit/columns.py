@@ -209,6 +209,12 @@ class ExactColumns:
         """
         return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity)
 
+    def read(self, texels: np.ndarray) -> np.ndarray:
+        """Return the columns of texels that have one: (n, pixels, 3)."""
+        store = self._store.numpy().reshape(_slices(self.pixels), self.capacity, SLICE, 4)
+        columns = store[:, self.slot_of[texels], :, :3].transpose(1, 0, 2, 3)
+        return columns.reshape(len(texels), -1, 3)[:, : self.pixels]
+
     def add_adjoint(self, flat: mi.Float, packets: mi.Float) -> None:
         """Put the adjoint, the sum over pixels of column * I, in the places of the texels that have a column.
 
@@ -236,6 +242,7 @@ class ExactColumns:
     def restore(self, state: dict, seed: int) -> None:
         """Trace the columns of an earlier :meth:`state` again."""
         # The same slots as before: the order of a sum is part of its result.
+        self.slot_of[:], self.paths_of[:] = -1, 0
         self.texels = state["columns"].astype(np.int64)
         self.slot_of[self.texels] = np.arange(len(self.texels))
         self.paths_of[self.texels] = state["paths"]

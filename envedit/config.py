@@ -1,8 +1,9 @@
 r"""The configuration: TOML to frozen dataclasses, presets, overrides. The only module that knows TOML.
 
-A value comes from the last of these that gives it: the dataclass default, the preset, the file, a
-``--set table.key=value`` override. Each layer is checked by itself, so that an error names the place the
-value came from; what depends on two keys at once is checked when the dataclasses are built, however they are.
+A value comes from the last of these that gives it: the dataclass default, the preset, what the preset has for
+the kind of representation, the file, a ``--set table.key=value`` override. Each layer is checked by itself,
+so that an error names the place the value came from; what depends on two keys at once is checked when the
+dataclasses are built, however they are.
 Whether input files exist is not looked at here: the modules that read them say so.
 
 >>> config = loads("[fit]\nepochs = 100", preset="draft", overrides=["seed=3"])
@@ -33,7 +34,6 @@ from .checks import (
     number,
     or_auto,
     parameter_table,
-    representation_kind,
     row_range,
     show,
     string,
@@ -103,7 +103,7 @@ class Target(Table):
     mask: str = _key("", string, "image that is white where the target counts; empty: everywhere")
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image was painted")
     strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes, which comes later: list of tables")
-    spp: int = _key(2048, integer(1, 1 << 20), "samples a pixel of the target's rendering")
+    spp: int = _key(1024, integer(1, 1 << 20), "samples a pixel of the target's rendering")
 
     def _check_together(self) -> None:
         if self.kind == "envmap" and self.file:
@@ -120,7 +120,12 @@ class Target(Table):
 class Representation(Table):
     """What the optimiser's parameters are."""
 
-    kind: str = _key("siren", representation_kind, "siren, pixels (radiance) or log-pixels")
+    kind: str = _key(
+        "layers",
+        choice("layers", "siren", "pixels", "log-pixels"),
+        "layers (lights and a smooth gain), siren (the paper's), pixels (radiance) or log-pixels",
+    )
+    cycles: int = _key(12, integer(1, 256), "layers: finest detail of the gain, cycles around the horizon")
     hidden: int = _key(128, integer(1, 4096), "siren: width of a layer")
     depth: int = _key(3, integer(0, 64), "siren: hidden sine layers after the first")
     omega: float = _key(30.0, number(0, positive=True), "siren: angular frequency of the sine layers")
@@ -164,7 +169,7 @@ class Fit(Table):
 class Loss(Table):
     """Weights of the edit's losses (Eq. 10): a number, or [start, end] for a geometric ramp over the run."""
 
-    ssim: Ramp = _key(1.0, weight, "1 - SSIM of rendering and target")
+    ssim: Ramp = _key(0.1, weight, "1 - SSIM of rendering and target")
     luminance: Ramp = _key(0.0, weight, "change of the map's summed luminance (Eq. 8)")
     l1: Ramp = _key(0.0, weight, "sum of the map's radiance (Eq. 9)")
     dists: Ramp = _key(0.0, weight, "DISTS of map and original")
@@ -181,7 +186,7 @@ class Loss(Table):
 class Optimizer(Table):
     """The edit loop's Adam."""
 
-    iterations: int = _key(600, integer(0, 10**7), "steps of the edit")
+    iterations: int = _key(150, integer(0, 10**7), "steps of the edit")
     lr: float | str = _key(
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
     )
@@ -221,7 +226,7 @@ class Output(Table):
 
     dir: str = _key("", string, "folder of the results; empty: <config stem>_out beside the file")
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap of previews and metrics")
-    spp: int = _key(2048, integer(1, 1 << 20), "samples a pixel of the judged renderings")
+    spp: int = _key(1024, integer(1, 1 << 20), "samples a pixel of the judged renderings")
     report: bool = _key(True, boolean, "write preview.png and report.html")
 
 
@@ -380,7 +385,8 @@ def from_dict(
     chosen = assigned.get("preset", file.get("preset", "standard"))
     if preset is not None:
         chosen = checked(_TOP["preset"], "preset", preset)
-    merged = sources.overlaid(sources.overlaid(sources.PRESETS[chosen], file), assigned) | {"preset": chosen}
+    given = sources.overlaid(file, assigned)
+    merged = sources.overlaid(sources.defaults(chosen, given), given) | {"preset": chosen}
     merged["target"] = sources.one_target(merged, {name: file, "--set": assigned})
     try:
         sources.resolve_paths(merged, Path(base_dir).absolute(), Path(name).stem or "config")

@@ -6,6 +6,8 @@ All share one interface, so that the edit loop knows none of them:
   as the representation can;
 * ``decode(params) -> (H, W, 3)``: linear radiance, finite and not negative, differentiable in the parameters;
 * ``lr``: the learning rate that suits its parameters.
+
+``layers.Layers`` represents the edit and not the map; the others are here.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, fit
+from .layers import Layers
 
 Params = dict[str, "mi.TensorXf"]
 
@@ -104,6 +107,8 @@ class Siren:
 def make(settings: config.Config, folder: Path | None = None, progress=None, rows=None):
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map."""
     kind = settings.representation.kind
+    if kind == "layers":
+        return Layers(rows, settings.representation.cycles)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":

@@ -208,7 +208,7 @@ def _row_weights(old: int, new: int):
         source, target = row_edges(old), row_edges(new)
         yield from _overlaps(source, target, _caps)
     else:
-        position = np.zeros(1) if old == 1 else np.arange(new) * ((old - 1) / (new - 1))
+        position = np.zeros(new) if old == 1 else np.arange(new) * ((old - 1) / (new - 1))
         for p in position:
             first = min(int(p), max(old - 2, 0))
             yield [first, min(first + 1, old - 1)], np.array([1 - (p - first), p - first])

@@ -16,13 +16,17 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import checkpoint, config, edit, envmap, files, fit, image, metrics, optim, scene, sky, target
+from . import checkpoint, config, edit, envmap, files, fit, image, metrics, optim, scene, search, sky, target
 from .errors import NumericalError
+from .layers import Layers
 from .pathtrace import PathTracer
+from .separate import Separation
 from .transport import LightTransport
 
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
+INITIAL_SHARE = 4
+"""The initial rendering, far from the target, is judged with this share of the samples."""
 
 
 @dataclass
@@ -45,6 +49,8 @@ class Result:
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
         Active texels that were kept, as this view does not determine them; None as above.
+    separation : separate.Separation, optional
+        Lights and background of the active rows, where the representation has them.
     """
 
     envmap: np.ndarray
@@ -56,6 +62,7 @@ class Result:
     warnings: list[str]
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
+    separation: Separation | None = None
 
     @property
     def render(self) -> np.ndarray:
@@ -125,6 +132,12 @@ def make_renderer(settings: config.Config, lit: scene.Scene, shape, progress=Non
     chosen = settings.renderer
     if chosen.kind == "path":
         return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
+    return trace(settings, lit, shape, progress)
+
+
+def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> LightTransport:
+    """Trace the light transport of a configuration for maps of the given (H, W), or take it from disk."""
+    chosen = settings.renderer
     return LightTransport.build(
         lit,
         *shape,
@@ -133,6 +146,7 @@ def make_renderer(settings: config.Config, lit: scene.Scene, shape, progress=Non
         seed=settings.seed,
         memory_gb=chosen.memory_gb,
         refresh=0 if chosen.refresh == "auto" else chosen.refresh,
+        few=settings.representation.kind == "layers",
         folder=files.cache_folder("transport") if chosen.cache else None,
         progress=progress,
     )
@@ -188,13 +202,15 @@ def run(
         watch.stage("rendering the target")
         wanted = target.make(settings.target, lit, original, settings.seed, settings.input.repair)
         warnings += wanted.warnings
-        initial = lit.render(original, spp=settings.output.spp, seed=settings.seed + JUDGE_SEED)
+        few = -(-settings.output.spp // INITIAL_SHARE)
+        initial = lit.render(original, spp=few, seed=settings.seed + JUDGE_SEED)
     if settings.loss.dists:
         warnings.append("loss.dists is off: no backbone weights are given")
 
     crop = original[first : last + 1]
     with clock("fit_s"):
-        watch.stage(f"fitting ({settings.representation.kind})")
+        layered = settings.representation.kind == "layers"
+        watch.stage("separating lights" if layered else f"fitting ({settings.representation.kind})")
         representation = envmap.make(
             settings,
             fit.default_folder(),
@@ -218,9 +234,18 @@ def run(
             frozen = np.zeros((height, width), bool)
             frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
 
+    notes, free = [], ~frozen[rows] if traced and frozen.any() else None
+    if isinstance(representation, Layers):
+        with clock("start_s"):
+            watch.stage("searching for lights")
+            through = traced or trace(settings, lit, (height, width))
+            representation.keep(free)
+            free = None  # a light may move across texels that are kept otherwise
+            params, notes = search.start(
+                representation, params, through, wanted.picture, wanted.weight, original
+            )
     with clock("edit_s"):
         watch.stage("editing")
-        free = ~frozen[rows] if traced and frozen.any() else None
         job = _Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
         params, state = job.optimise(params, crop, resume)
         edited, wanted = job.decode(params), job.wanted
@@ -248,7 +273,10 @@ def run(
         },
         "timing": {
             "import_s": None,
-            **{k: round(seconds[k], 3) for k in ("target_s", "fit_s", "transport_s", "edit_s", "judge_s")},
+            **{
+                f"{part}_s": round(seconds.get(f"{part}_s", 0.0), 3)
+                for part in ("target", "fit", "transport", "start", "edit", "judge")
+            },
             "report_s": None,
             "total_s": round(time.perf_counter() - begun, 3),
             "per_iteration_ms": float(np.median([row["step_ms"] for row in state.history]))
@@ -264,12 +292,12 @@ def run(
     if wanted.envmap is not None:
         measured["sun_offset_texels"] = metrics.sun_offset(edited[rows], wanted.envmap[rows])
         measured["initial_envmap"] = metrics.compare(original[rows], wanted.envmap[rows], tonemap)
-    notes = [wanted.source, *renderer.choices]
+    notes = [wanted.source, *renderer.choices, *notes]
     if traced:
         share = float(frozen[rows].mean())
         measured["transport"] = {
             **traced.summary(),
-            "predicted_error": traced.coarse_error(original),
+            "predicted_error": traced.coarse_error(edited),
             "frozen": share,
         }
         if share:
@@ -286,6 +314,7 @@ def run(
         warnings,
         traced.influence if traced else None,
         frozen,
+        getattr(representation, "separation", None),
     )
 
 

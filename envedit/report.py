@@ -137,6 +137,19 @@ def _influence_figure(influence, frozen):
     return _figure(influence_image(influence, frozen), caption, f'<div class="scale rising"></div>{ends}')
 
 
+def _separation_figures(separation, tonemap):
+    """Draw background, glow and cores of a separation, or nothing where no light was found."""
+    if separation is None or not separation.lights:
+        return []
+    count = len(separation.lights)
+    pictures = {
+        "background: the map without its lights": separation.background,
+        "glow: what the lights add to the sky": separation.background * (separation.glow - 1),
+        "the light" if count == 1 else f"the {count} lights": separation.core,
+    }
+    return [_figure(_shrunk(image, tonemap), caption) for caption, image in pictures.items()]
+
+
 def _map_statistics(image):
     """Fill the table's cells for one map: luminances (linear) and the peak's place."""
     bad = ~np.isfinite(image).all(axis=2)
@@ -181,6 +194,7 @@ def write_report(
     maps,
     influence=None,
     frozen=None,
+    separation=None,
     warnings=(),
     notes=(),
     tonemap="gamma",
@@ -203,6 +217,8 @@ def write_report(
         As for `preview`. Differences are drawn between the names ``initial``, ``target`` and ``edited``.
     influence, frozen : array (H, W), optional
         As for `envedit.preview.influence_image`.
+    separation : envedit.separate.Separation, optional
+        Lights and background of the rows that were edited.
     warnings, notes : sequence of str
         What the user should know, and the choices made for settings left at "auto".
     tonemap : str
@@ -266,6 +282,8 @@ def write_report(
     map_rows = [[name, *_map_statistics(maps[name])] for name in names if name in maps]
     map_head = ["map", "size", "peak luminance", "at row, column", "mean", "median", "lowest", "not finite"]
 
+    parts = _separation_figures(separation, tonemap)
+
     # The page
     curves = curves_svg(history) or f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
@@ -278,6 +296,7 @@ def write_report(
         f"<h2>Renderings and maps</h2>{_grid(figures)}<p></p>{_grid(map_figures)}" if names else "",
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>' if names else "",
         f"<h2>Differences</h2>{_grid(differences)}" if differences else "",
+        f"<h2>Lights and background</h2>{_grid(parts)}" if parts else "",
         f"<h2>What this view determines</h2>{_grid([_influence_figure(influence, frozen)])}"
         if influence is not None
         else "",

@@ -194,6 +194,7 @@ def _write(settings, folder, result, import_s, quiet):
             maps=result.maps,
             influence=result.influence,
             frozen=result.frozen,
+            separation=result.separation,
             warnings=warnings,
             notes=result.notes,
             tonemap=settings.output.tonemap,

@@ -157,7 +157,7 @@ class Scene:
         return result
 
 
-def load(file, width=None, height=None, parameters=None, base=None) -> Scene:
+def load(file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter") -> Scene:
     """Load a scene and make its environment emitter replaceable.
 
     Parameters
@@ -172,6 +172,9 @@ def load(file, width=None, height=None, parameters=None, base=None) -> Scene:
     base : path, optional
         Folder for relative file names that are not beside the XML, such as a mesh in ``parameters``.
         Default: the working folder.
+    sampler : str
+        Sampler of Mitsuba's renderings, where the scene asks for none or for ``independent``. Stratified
+        samples of 256 a pixel have less noise than 2048 independent ones in the shipped scenes.
 
     Returns
     -------
@@ -213,6 +216,7 @@ def load(file, width=None, height=None, parameters=None, base=None) -> Scene:
         stage.smooth_limit(state, node)
         stage.fit_to_stage(state, node)
         stage.hash_node(digest, node)
+    stage.set_sampler(state, sampler)  # after the digest: light transport has its own samples
     emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
     # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
     for node in state.nodes:

@@ -22,11 +22,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "input": {"width": 128},
         "scene": {"width": 96},
-        "target": {"spp": 1024},
+        "target": {"spp": 512},
         "representation": {"hidden": 64},
         "fit": {"epochs": 500},
-        "optimizer": {"iterations": 150},
-        "output": {"spp": 1024},
+        "optimizer": {"iterations": 60},
+        "output": {"spp": 512},
     },
     "standard": {},
     "paper": {
@@ -46,6 +46,14 @@ PRESETS: dict[str, dict[str, Any]] = {
         "renderer": {"kind": "path", "spp": 16, "refresh": 1},
     },
 }  # fmt: skip
+
+# Layers start near the end and have few parameters; a map of many parameters needs more steps, and the SSIM,
+# to which noise matters, to hold its structure together.
+MANY_PARAMETERS: dict[str, dict[str, Any]] = {
+    "draft": {"loss": {"ssim": 1.0}, "optimizer": {"iterations": 150}},
+    "standard": {"loss": {"ssim": 1.0}, "optimizer": {"iterations": 600}},
+    "paper": {},
+}
 
 _PATHS = (("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"))
 
@@ -95,6 +103,13 @@ def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = overlaid(merged[key], value) if both else value
     return merged
+
+
+def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Return a preset's defaults for the kind of representation that it, or what is given, names."""
+    chosen = PRESETS[preset]
+    kind = overlaid(chosen, given).get("representation", {}).get("kind", "layers")
+    return chosen if kind == "layers" else overlaid(chosen, MANY_PARAMETERS[preset])
 
 
 def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, Any]:

@@ -83,6 +83,18 @@ class ColourMatrix:
         matrix._upload(*(arrays[name] for name in ("packed", "start", "stop", "lane")))
         return matrix
 
+    def coordinates(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rows (n,), columns (n,) and weights (n, 3) of the entries that are not zero."""
+        stored = self.arrays()
+        packed, first = stored["packed"].reshape(-1, 4), stored["start"][::SLICE].astype(np.int64)
+        row_of = np.full(len(stored["start"]), -1, np.int64)
+        row_of[stored["lane"]] = np.arange(len(stored["lane"]))
+        place = np.arange(len(packed))
+        part = np.searchsorted(first, place, side="right") - 1
+        rows = row_of[part * SLICE + (place - first[part]) % SLICE]
+        real = (rows >= 0) & packed[:, :3].any(axis=1)
+        return rows[real], packed[real, 3].copy().view(np.uint32), packed[real, :3]
+
     def apply(self, x: mi.Float) -> mi.Float:
         """Multiply with a vector of colours.
 

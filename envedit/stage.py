@@ -117,6 +117,22 @@ def set_film(state, where: str, width: int, height: int) -> None:
     film["pixel_format"], film["component_format"] = "rgb", "float32"
 
 
+def set_sampler(state, plugin: str) -> None:
+    """Give the first sensor a sampler of the asked kind, unless it has another than ``independent``."""
+    sensor = next(n for n in state.nodes if n.type == mi.ObjectType.Sensor)
+    for _, value in sensor.props.items():
+        if isinstance(value, mi.Properties.ResolvedReference):
+            node = state.nodes[value.index()]
+            if node.type == mi.ObjectType.Sampler:
+                if node.props.plugin_name() == "independent":
+                    node.props.set_plugin_name(plugin)
+                return
+    node = mi.parser.SceneNode()
+    node.type, node.props = mi.ObjectType.Sampler, mi.Properties(plugin)
+    state.nodes.append(node)
+    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+
+
 def find_files(state, where: str, folders) -> None:
     """Make every file name absolute; the environment's own bitmap is already gone and need not exist."""
     for node in state.nodes:

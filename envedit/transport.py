@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import bright, latlong
+from . import overview as overviews
 from .columns import ExactColumns
 from .disk_cache import DiskCache
 from .errors import ConfigError
@@ -38,6 +39,8 @@ COLUMN_TOLERANCE = 0.03
 """Relative error of the coarse tier above which columns are added."""
 COLUMN_PATHS = (8, 48, 320)
 """Paths a pixel of a column: for a bright texel, and for one that holds more than a share of the light."""
+FEW_PATHS, FEW_TOLERANCE = (8, 48, 48), 0.08
+"""The same two for a map with few parameters, which cannot follow the noise of a column."""
 COLUMN_SHARES = (0.0, 0.01, 0.1)
 """The shares of the light from which on they hold."""
 RESOLVE_EVERY = 10
@@ -69,6 +72,8 @@ class LightTransport:
         Number of the present recording; only a ``refresh`` raises it.
     cached : bool
         The first recording was found on disk.
+    paths, tolerance : (int, int, int), float
+        Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
     """
 
     def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices):
@@ -76,7 +81,10 @@ class LightTransport:
         self.spp, self.bounces, self.capacity, self.refresh = spp, bounces, capacity, refresh
         self.epoch, self._base_seed, self._choices, self._lost = 0, seed, choices, 0
         self.cached, self.depth_error = False, 0.0
+        self.paths, self.tolerance = COLUMN_PATHS, COLUMN_TOLERANCE
         self._looks = np.zeros(grid.texels, np.uint8)
+        self._overview: overviews.Overview | None = None
+        self._stored = DiskCache(None), {}
         self._exact = ExactColumns(scene, grid, bounces, capacity)
 
     # ------------------------------------------------------------------ building
@@ -93,6 +101,7 @@ class LightTransport:
         seed: int = 0,
         memory_gb=2.0,
         refresh: int = 0,
+        few: bool = False,
         folder: Path | None = None,
         progress=None,
     ) -> LightTransport:
@@ -115,6 +124,8 @@ class LightTransport:
             Bound on the memory of T; "auto": 2.
         refresh : int
             Steps after which :meth:`render` records T afresh; 0: never.
+        few : bool
+            The maps have few parameters: exact columns need fewer paths, and fewer texels have one.
         folder : Path, optional
             Where recordings are kept under a hash of all they depend on; None: nowhere. Recordings made by
             ``refresh`` are not kept: they are there to be new.
@@ -152,9 +163,12 @@ class LightTransport:
         spp, capacity, choice = choose_samples(scene, spp, height * width, memory_gb)
         grid = Grid(height, width, scene.to_world, mass)
         transport = cls(scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice])
+        if few:
+            transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
         transport.depth_error = left_out(light["by_bounce"], bounces)
         rows = hashlib.sha256(mass.tobytes()).hexdigest()
         key = origin | {"part": "recording", "samples": spp, "bounces": bounces, "rows": rows}
+        transport._stored = cache, key | {"part": "overview"}
         found = cache.load(key)
         if found is None:
             transport._trace(progress)
@@ -242,12 +256,29 @@ class LightTransport:
         samples = self.forward.entries * self.grid.mass.numpy() / self.grid.width
         return determined(self.influence, samples, rows, threshold)
 
+    def overview(self) -> overviews.Overview:
+        """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
+        if self._overview is None:
+            cache, key = self._stored
+            stored = cache.load(key)
+            if stored is None:
+                made = overviews.make(self.forward, self.shape, (self.grid.height, self.grid.width))
+                cache.store(key, vars(made))
+                stored = vars(made)
+            self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
+        return self._overview
+
     # ------------------------------------------------------------------ using
 
     def apply(self, envmap: mi.TensorXf) -> mi.TensorXf:
         """Render: (H, W, 3) linear radiance to (h, w, 3), differentiable, T E + I_0."""
         _check(envmap, (self.grid.height, self.grid.width, 3), "map")
         return dr.custom(_Apply, self, envmap)
+
+    def linear(self, envmap: mi.TensorXf) -> mi.TensorXf:
+        """Render a map without the light of other lamps: T E, not differentiable."""
+        _check(envmap, (self.grid.height, self.grid.width, 3), "map")
+        return self._apply(envmap, offset=False)
 
     def adjoint(self, image: mi.TensorXf) -> mi.TensorXf:
         """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3)."""
@@ -280,8 +311,8 @@ class LightTransport:
         """Trace one column of each kind in the first step: what grows bright later needs no other kernel."""
         if len(self.columns) == 0 and self._exact.room:
             most = np.array([int(self.influence.argmax())])
-            self._exact.trace(most, COLUMN_PATHS[-1], self.seed, blocks=1)
-            for count in COLUMN_PATHS[:-1]:
+            self._exact.trace(most, self.paths[-1], self.seed, blocks=1)
+            for count in self.paths[:-1]:
                 self._exact.trace(most, count, self.seed)
 
     def state(self) -> dict:
@@ -312,10 +343,19 @@ class LightTransport:
 
     # ------------------------------------------------------------------ which texels are exact
 
+    def probe(self, texels: np.ndarray) -> np.ndarray:
+        """Trace columns with the fewest paths, where there are none, and return them: (n, pixels, 3)."""
+        exact = self._exact
+        texels = np.asarray(texels, np.int64)
+        todo = texels[exact.slot_of[texels] < 0]
+        if len(todo):
+            exact.trace(todo, self.paths[0], self.seed, texels)
+        return exact.read(texels)
+
     def resolve(
         self,
         envmap,
-        tolerance: float = COLUMN_TOLERANCE,
+        tolerance: float | None = None,
         limit: int | None = None,
         lasting: np.ndarray | None = None,
     ) -> int:
@@ -328,8 +368,8 @@ class LightTransport:
         ----------
         envmap : array_like (H, W, 3)
             Map that is about to be rendered.
-        tolerance : float
-            Relative error allowed for the coarse part.
+        tolerance : float, optional
+            Relative error allowed for the coarse part; :attr:`tolerance` by default.
         limit : int, optional
             Trace at most so many new columns.
         lasting : ndarray of bool (H * W,), optional
@@ -346,13 +386,13 @@ class LightTransport:
         tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1
         tier = np.maximum(tier, 0)
         if lasting is not None:
-            tier = np.minimum(tier, np.where(lasting[wanted], len(COLUMN_PATHS), len(COLUMN_PATHS) - 2))
+            tier = np.minimum(tier, np.where(lasting[wanted], len(self.paths), len(self.paths) - 2))
         traced = 0
-        for i in reversed(range(len(COLUMN_PATHS))):
-            todo = wanted[(tier == i) & (exact.paths_of[wanted] < COLUMN_PATHS[i])]
+        for i in reversed(range(len(self.paths))):
+            todo = wanted[(tier == i) & (exact.paths_of[wanted] < self.paths[i])]
             todo = todo[: None if limit is None else limit - traced]
             if len(todo):
-                exact.trace(todo, COLUMN_PATHS[i], self.seed, wanted)
+                exact.trace(todo, self.paths[i], self.seed, wanted)
                 traced += len(todo)
         return traced
 
@@ -379,8 +419,9 @@ class LightTransport:
         seen = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
         return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen, omega * seen
 
-    def bright_texels(self, envmap: np.ndarray, tolerance: float = COLUMN_TOLERANCE) -> np.ndarray:
+    def bright_texels(self, envmap: np.ndarray, tolerance: float | None = None) -> np.ndarray:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
+        tolerance = self.tolerance if tolerance is None else tolerance
         return bright.brightest(*self._radiance(envmap), self._samples, tolerance)
 
 

@@ -69,7 +69,7 @@ def test_the_configuration_of_these_tests_runs(path, tmp_path):
         ("input = 3", ["input", "[input]"]),
         ('preset = "drafty"', ["preset", "drafty", "did you mean draft"]),
         ('variant = "scalar_rgb"', ["variant", "scalar_rgb"]),
-        ('[representation]\nkind = "layers"', ["representation.kind", "layers", "comes later"]),
+        ('[representation]\nkind = "layer"', ["representation.kind", "'layer'", "did you mean layers"]),
         ('[target]\nkind = "strokes"', ["target.kind", "strokes", "comes later"]),
         ('[target]\nkind = "image"', ["target.file"]),
         ('[target]\nfile = "a.exr"\nrotate_degrees = 3', ["target.file", "rotate_degrees"]),

@@ -16,6 +16,8 @@ from envedit.tonemap import TONEMAPS
 
 quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 
+KINDS = ("layers", "siren", "pixels", "log-pixels")
+
 # ---- defaults ----------------------------------------------------------------------------------------------
 
 
@@ -24,7 +26,9 @@ def test_an_empty_file_gives_the_defaults():
     assert config.preset == "standard" and config.seed == 0 and config.variant == "llvm_ad_rgb"
     assert config == dataclasses.replace(cfg.Config(), output=config.output)
     assert config.input == cfg.Input(envmap="sunsky", width=256, rows="upper")
-    assert config.fit.lr == 1e-3 and config.renderer.spp == "auto" and config.loss.ssim == 1.0
+    assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
+    assert config.representation.kind == "layers" and config.representation.cycles == 12
+    assert config.loss.ssim == 0.1 and config.optimizer.iterations == 150
     assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
 
 
@@ -32,6 +36,13 @@ def test_every_key_says_what_it_means():
     for f in dataclasses.fields(cfg.Fit):
         assert f.metadata["doc"] and f"{f.name} : " in cfg.Fit.__doc__
     assert "turbidity : float" in cfg.Input.__doc__ and "variant : str" in cfg.Config.__doc__
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_representation_is_accepted_and_comes_back(kind):
+    config = cfg.loads(f'[representation]\nkind = "{kind}"')
+    assert config.representation.kind == kind
+    assert cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="other.toml") == config
 
 
 @pytest.mark.parametrize("name", TONEMAPS)
@@ -83,7 +94,8 @@ def test_an_override_without_key_or_value_is_refused(text):
         ("fit = 3", ["fit: came 3, wanted a table"]),
         ("[seed]\na = 1", ["seed: came {'a': 1}, wanted an integer"]),
         ('preset = "drift"', ["preset: came 'drift'", "did you mean draft?"]),
-        ('[representation]\nkind = "layers"', ["representation.kind", "comes later"]),
+        ('[representation]\nkind = "layer"', ["representation.kind: came 'layer'", "did you mean layers?"]),
+        ("[representation]\ncycles = 0", ["representation.cycles: came 0", "from 1 to 256"]),
         ('[fit]\nschedule = "cosin"', ["fit.schedule: came 'cosin'", "did you mean cosine?"]),
         ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
         ("[target]\nkind = 'image'", ["target.file", "wanted the painted image"]),
@@ -160,6 +172,7 @@ tables = given_keys(
         file=words.filter(bool),
         parameters=st.dictionaries(words, words | numbers | st.booleans() | st.integers(-9, 9), max_size=3),
     ),
+    representation=given_keys(kind=st.sampled_from(KINDS), cycles=st.integers(1, 256)),
     target=given_keys(file=words, mask=words, spp=st.integers(1, 4096))
     | given_keys(rotate_degrees=st.floats(-360, 360, allow_subnormal=False, width=32)),
     loss=given_keys(ssim=rates | st.tuples(rates, rates), luminance=weights, tv=weights),

@@ -22,7 +22,9 @@ SMALL = [
 ]
 
 
-@pytest.mark.parametrize("kind, light_moves", [("siren", True), ("pixels", True), ("log-pixels", False)])
+@pytest.mark.parametrize(
+    "kind, light_moves", [("layers", False), ("siren", True), ("pixels", True), ("log-pixels", False)]
+)
 def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monkeypatch):
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
     settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}"])

@@ -181,3 +181,7 @@ def test_refusals():
         latlong.from_envmap_data(np.zeros((4, 3, 3)))
     with pytest.raises(ConfigError, match="got 0 x 4 texels"):
         latlong.resize(np.zeros((4, 8, 3)), 4, 0)
+
+
+def test_a_single_row_grows():
+    assert np.array_equal(latlong.resize(np.full((1, 4, 3), 2.0), 5, 4), np.full((5, 4, 3), 2.0))

@@ -13,6 +13,7 @@ from envedit import checkpoint, config, edit, envmap, image, latlong, pipeline, 
 from envedit.errors import InputError
 
 WIDTH, HEIGHT = 16, 8
+PIXELS = {"representation": {"kind": "pixels"}}
 
 
 @pytest.fixture(autouse=True)
@@ -28,7 +29,7 @@ def settings_of(folder, picture, **tables):
         "input": {"envmap": "map.exr", "width": WIDTH},
         "scene": {"file": "scene.xml", "width": 24},
         "target": {"spp": 16},
-        "representation": {"kind": "pixels", "hidden": 16, "depth": 1},
+        "representation": {"hidden": 16, "depth": 1},  # of the default kind
         "fit": {"epochs": 4},
         "optimizer": {"iterations": 20},
         "renderer": {"spp": 32, "max_depth": 3},
@@ -98,7 +99,9 @@ def test_a_run_without_a_folder_writes_nothing_and_returns_everything(tmp_path, 
 
 def test_the_true_map_is_the_input_turned(tmp_path, rng):
     picture = sunny(rng)
-    settings = settings_of(tmp_path, picture, target={"rotate_degrees": 22.5}, optimizer={"iterations": 0})
+    settings = settings_of(
+        tmp_path, picture, target={"rotate_degrees": 22.5}, optimizer={"iterations": 0}, **PIXELS
+    )
     found = pipeline.run(settings)
     true = found.maps["target"]
     assert min(np.abs(true - np.roll(picture, s, axis=1)).max() for s in (1, -1)) < 1e-4 * picture.max()
@@ -182,7 +185,7 @@ PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
     </transform></shape>"""
 
 
-@pytest.mark.parametrize("kind", ["siren", "pixels"])
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels"])
 def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
     settings = settings_of(
@@ -210,8 +213,98 @@ def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
         assert not any("keep their value" in line for line in free.metrics["choices"])
 
 
+def plated(folder, picture, **tables):
+    """Return the configuration of a run on all rows of a 64 x 32 map whose plate sees the half with x > 0."""
+    given = {"input": {"rows": "all", "width": 64}, "renderer": {"spp": 256, "max_depth": 3}} | tables
+    settings = settings_of(folder, picture, **given)
+    write_scene(folder, PLATE, LIGHT, name="scene.xml")
+    return settings
+
+
+def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
+    """The sun goes from one place that the plate sees to another; behind it no bit changes."""
+    picture = np.full((32, 64, 3), 0.3, np.float32)
+    wanted = picture.copy()
+    picture[10, 12], wanted[14, 20] = 300, 300
+    image.write_exr(tmp_path / "wanted.exr", wanted)
+    target = {"file": "wanted.exr", "rotate_degrees": 0.0, "spp": 256}
+    found = pipeline.run(plated(tmp_path, picture, target=target, optimizer={"iterations": 5}))
+    assert found.frozen.mean() > 0.2 and len(found.separation.lights) == 1
+    assert found.envmap[found.frozen].tobytes() == found.maps["initial"][found.frozen].tobytes()
+    assert found.envmap[10, 12].max() < 3 and found.metrics["sun_offset_texels"] <= 2
+
+
+def test_the_separation_of_a_run_makes_up_its_active_rows(tmp_path, rng):
+    picture = sunny(rng)
+    found = pipeline.run(settings_of(tmp_path, picture, optimizer={"iterations": 1}))
+    parts = found.separation
+    assert parts.background.shape == (4, WIDTH, 3) and len(parts.lights) >= 1
+    np.testing.assert_allclose(parts.background * parts.glow + parts.core, picture[:4], rtol=1e-5)
+    plain = pipeline.run(settings_of(tmp_path, picture, optimizer={"iterations": 1}, **PIXELS))
+    assert plain.separation is None
+
+
+def test_the_error_that_is_told_is_that_of_the_edited_map(tmp_path, rng, monkeypatch):
+    told, predict = [], pipeline.LightTransport.coarse_error
+
+    def noted(self, envmap):
+        told.append((envmap.copy(), predict(self, envmap)))
+        return told[-1][1]
+
+    monkeypatch.setattr(pipeline.LightTransport, "coarse_error", noted)
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), optimizer={"iterations": 3}, **PIXELS))
+    ((given, error),) = told
+    assert given.tobytes() == found.envmap.tobytes() != found.maps["initial"].tobytes()
+    assert found.metrics["transport"]["predicted_error"] == error > 0
+
+
+@pytest.mark.parametrize("kind, few", [("layers", True), ("pixels", False)])
+def test_layers_are_traced_with_few_paths(kind, few, tmp_path, rng, monkeypatch):
+    asked, build = [], pipeline.LightTransport.build.__func__
+
+    def noted(cls, *arguments, **keys):
+        asked.append(keys["few"])
+        return build(cls, *arguments, **keys)
+
+    monkeypatch.setattr(pipeline.LightTransport, "build", classmethod(noted))
+    tables = {"representation": {"kind": kind}, "optimizer": {"iterations": 1}}
+    pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
+    assert asked == [few]
+
+
+@pytest.mark.parametrize("mask", [None, "mask.exr"])
+def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
+    """Painted: the ball under a sun elsewhere, a black bar across it, which the mask leaves out."""
+    picture, wanted = np.full((16, 32, 3), 0.3, np.float32), np.full((16, 32, 3), 0.3, np.float32)
+    picture[4, 20], wanted[4, 4] = 60, 60
+    tables = {
+        "input": {"width": 32, "rows": "all"}, "scene": {"width": 48},
+        "renderer": {"spp": 256, "max_depth": 3}, "output": {"spp": 256},
+    }  # fmt: skip
+    lit = scene.load(settings_of(tmp_path, picture, **tables).scene.file, 48, 36)
+    painted, counted = lit.render(wanted, spp=1024, seed=5), np.ones((36, 48, 3), np.float32)
+    painted[8:13], counted[8:13] = 0, 0
+    image.write_exr(tmp_path / "painted.exr", painted)
+    image.write_exr(tmp_path / "mask.exr", counted)
+    target = {"kind": "image", "file": "painted.exr"} | ({"mask": mask} if mask else {})
+    found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
+    rest = counted[..., 0] > 0
+
+    def error(name):
+        return np.square(found.renders[name] - painted)[rest].mean()
+
+    if mask:
+        assert error("edited") < 0.1 * error("initial")
+        assert found.metrics["envmap"] is None
+        peak = np.unravel_index(found.envmap.sum(axis=2).argmax(), (16, 32))
+        assert abs(peak[0] - 4) <= 2 and abs(peak[1] - 4) <= 2
+    else:  # without it the black bar counts
+        assert error("edited") > 0.02 * error("initial")
+
+
 def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, rng):
     tables = {"optimizer": {"iterations": 2}}
+    # Layers need an overview too, which is summed up and kept; it is no other recording.
     first = pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
     again = pipeline.run(settings_of(tmp_path, sunny(np.random.default_rng(0)), **tables))
     other = pipeline.run(settings_of(tmp_path, smooth(rng), representation={"kind": "log-pixels"}, **tables))
@@ -220,7 +313,8 @@ def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, r
     cached = [found.metrics["transport"]["cached"] for found in (first, again, other, refused)]
     assert cached == [False, True, True, False]
     assert first.envmap.tobytes() == again.envmap.tobytes() == refused.envmap.tobytes()
-    assert len(list((tmp_path / "cache" / "envedit" / "transport").iterdir())) == 2  # pilot and recording
+    # Pilot, recording and overview.
+    assert len(list((tmp_path / "cache" / "envedit" / "transport").iterdir())) == 3
 
 
 @pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
@@ -250,8 +344,10 @@ def test_an_asked_for_loss_that_is_off_is_told(tmp_path, rng):
 # ---- stopping and continuing -----------------------------------------------------------------------------
 
 CASES = {
-    "pixels, columns": (sunny, {}),
-    "pixels, no columns": (smooth, {"optimizer": {"iterations": 20, "lr": 1e-4}}),
+    "layers, columns": (sunny, {}),
+    "layers recorded afresh": (sunny, {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
+    "pixels, columns": (sunny, PIXELS),
+    "pixels, no columns": (smooth, PIXELS | {"optimizer": {"iterations": 20, "lr": 1e-4}}),
     "siren, columns": (sunny, {"representation": {"kind": "siren", "hidden": 16, "depth": 1}}),
     "siren, no columns": (
         smooth,
@@ -261,7 +357,7 @@ CASES = {
             "fit": {"epochs": 60},
         },
     ),
-    "transport recorded afresh": (sunny, {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
+    "transport recorded afresh": (sunny, PIXELS | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
 }
 
 

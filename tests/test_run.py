@@ -34,7 +34,7 @@ TINY = {
     "input": {"width": 16},
     "scene": {"width": 24},
     "target": {"spp": 16},
-    "representation": {"kind": "pixels", "hidden": 16, "depth": 1},
+    "representation": {"hidden": 16, "depth": 1},  # of the default kind
     "fit": {"epochs": 4},
     "optimizer": {"iterations": 4},
     "renderer": {"spp": 32, "max_depth": 3},
@@ -161,8 +161,9 @@ def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
     image_keys = {"psnr", "ssim", "mse", "lpips"}
     assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
     assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached"}
-    timing = {"import_s", "fit_s", "transport_s", "edit_s", "report_s", "total_s", "per_iteration_ms"}
-    assert timing <= set(found["timing"])
+    timing = {"import", "target", "fit", "transport", "start", "edit", "judge", "report", "total"}
+    assert set(found["timing"]) == {f"{part}_s" for part in timing} | {"per_iteration_ms"}
+    assert found["timing"]["start_s"] == 0 < found["timing"]["fit_s"]
     assert {"iterations", "non_finite_steps", "tonemap", "active_rows", "choices"} <= set(found)
     traced = found["transport"]
     assert set(traced) == {
@@ -299,7 +300,9 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
 
 
 def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share_no_noise(tmp_path, rng):
-    path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": 256})
+    path = world(
+        tmp_path, rng, representation={"kind": "pixels"}, optimizer={"iterations": 0}, output={"spp": 256}
+    )
     assert call(path, "--quiet") == 0
     out = tmp_path / "c_out"
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
@@ -309,7 +312,7 @@ def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share
     assert found["iterations"] == 0 and found["timing"]["per_iteration_ms"] is None and rows_of(out) == []
 
 
-@pytest.mark.parametrize("kind", ["siren", "pixels", "log-pixels"])
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 @pytest.mark.parametrize("renderer", ["transport", "path"])
 def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path, rng):
     path = world(tmp_path, rng)
@@ -344,7 +347,7 @@ def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30])
-@pytest.mark.parametrize("kind", ["siren", "pixels", "log-pixels"])
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
     path = world(tmp_path, rng, representation={"kind": kind})
     image.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
@@ -363,6 +366,41 @@ def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
     assert all(math.isfinite(number) for number in numbers(measured(tmp_path / "c_out")))
 
 
+def test_layers_without_iterations_are_where_the_search_put_them(tmp_path, rng):
+    """A sun in an even sky, turned by a quarter: most of the way is made before the first step."""
+    path = world(tmp_path, rng, target={"rotate_degrees": 90.0, "spp": 64}, optimizer={"iterations": 0})
+    image.write_exr(tmp_path / "map.exr", one_sun(1, 3))
+    assert call(path, "--quiet", *changed(renderer__spp=256)) == 0
+    found = measured(tmp_path / "c_out")
+    assert found["render"]["mse"] < 0.2 * found["initial"]["mse"]
+    assert found["sun_offset_texels"] <= 1 and found["iterations"] == 0
+    assert found["timing"]["start_s"] > 0 and found["fit"] is None
+    told = [line for line in found["choices"] if line.startswith("light 1 of 1")]
+    assert len(told) == 1 and "degrees from where it was" in told[0]
+    assert told[0] in (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8").replace("&#x27;", "'")
+
+
+def one_sun(row, column):
+    picture = np.full((8, 16, 3), 0.3, np.float32)
+    picture[row, column] = 60
+    return picture
+
+
+def test_the_initial_rendering_has_a_quarter_of_the_samples(tmp_path, rng, monkeypatch):
+    seen, render = [], pipeline.scene.Scene.render
+
+    def noted(self, envmap, spp, *rest, **keys):
+        seen.append(spp)
+        return render(self, envmap, spp, *rest, **keys)
+
+    monkeypatch.setattr(pipeline.scene.Scene, "render", noted)
+    for spp, few in ((16, 4), (18, 5), (1, 1)):
+        seen.clear()
+        path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp})
+        assert call(path, "--quiet", *changed(representation__kind="pixels")) == 0
+        assert seen == [16, few, spp]  # target, before, after
+
+
 # ---- what is said and set --------------------------------------------------------------------------------
 
 
@@ -376,7 +414,16 @@ def test_progress_goes_to_stderr_and_results_to_stdout(done):
     stages = ["loading", "rendering the target", "fitting (siren)", "tracing light transport", "editing",
               "rendering the result", "writing"]  # fmt: skip
     assert [line for line in err.splitlines() if line in stages] == stages
+    assert "lights" not in err
     assert not set(out.splitlines()) & set(stages) and out.splitlines()[-1] == f"results in {folder}"
+
+
+def test_layers_are_separated_and_searched_for_not_fitted(tmp_path, rng, capsys):
+    assert call(world(tmp_path, rng)) == 0
+    err = capsys.readouterr().err
+    stages = ["loading", "rendering the target", "separating lights", "tracing light transport",
+              "searching for lights", "editing", "rendering the result", "writing"]  # fmt: skip
+    assert [line for line in err.splitlines() if line in stages] == stages and "fitting" not in err
 
 
 def test_presets_and_overrides_take_effect(tmp_path, rng, capsys):
@@ -508,7 +555,7 @@ class NotANumber:
 
 def test_an_edit_that_cannot_go_on_leaves_the_last_good_map(tmp_path, rng, capsys, monkeypatch):
     monkeypatch.setattr(pipeline, "make_renderer", lambda *_: NotANumber())
-    path = world(tmp_path, rng)
+    path = world(tmp_path, rng, representation={"kind": "pixels"})
     assert call(path, "--quiet", *changed(optimizer__iterations=50)) == 5
     said = capsys.readouterr().err
     assert len(said.splitlines()) <= 2 and "20 steps in a row" in said and "lr" in said

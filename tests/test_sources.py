@@ -6,6 +6,7 @@ import pytest
 
 from envedit import config as cfg
 from envedit import sources
+from envedit.errors import ConfigError
 
 # ---- presets -----------------------------------------------------------------------------------------------
 
@@ -26,7 +27,7 @@ def test_every_preset_takes_effect_key_by_key(preset):
 
 def test_the_paper_preset_is_section_6():
     paper = cfg.loads("", preset="paper")
-    assert paper.representation == cfg.Representation("siren", 256, 6, 30.0, coordinates="plane")
+    assert paper.representation == cfg.Representation("siren", 12, 256, 6, 30.0, coordinates="plane")
     fit = paper.fit
     assert (fit.epochs, fit.lr, fit.schedule, fit.restart_period) == (1500, 5e-5, "warm-restarts", 100)
     assert (fit.log_mse, fit.log_ssim, fit.hdr) == (0.85, 0.25, 1e-2)
@@ -40,7 +41,7 @@ def test_the_paper_preset_is_section_6():
 
 def test_the_paper_preset_spells_out_every_number_of_the_method():
     """A default that is changed later must not change the paper's recipe."""
-    free = {"fit": {"cache"}, "optimizer": {"checkpoint_s"}, "representation": set(), "loss": set()}
+    free = {"fit": {"cache"}, "optimizer": {"checkpoint_s"}, "representation": {"cycles"}, "loss": set()}
     for table, left_out in free.items():
         keys = {f.name for f in dataclasses.fields(getattr(cfg.Config(), table))}
         assert set(sources.PRESETS["paper"][table]) == keys - left_out, table
@@ -66,6 +67,75 @@ def test_the_preset_argument_beats_override_beats_file():
 def test_scene_parameters_are_merged_key_by_key():
     config = cfg.loads("[scene.parameters]\na = 1\nb = true", overrides=["scene.parameters.a=glossy"])
     assert config.scene.parameters == {"a": "glossy", "b": True}
+
+
+# ---- defaults of a kind of representation ----------------------------------------------------------------
+
+MANY = ("siren", "pixels", "log-pixels")
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind", "ssim", "iterations"),
+    [
+        ("standard", "layers", 0.1, 150),
+        ("draft", "layers", 0.1, 60),
+        *(("standard", kind, 1.0, 600) for kind in MANY),
+        *(("draft", kind, 1.0, 150) for kind in MANY),
+        *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
+    ],
+)
+def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
+    given = [
+        cfg.loads(f'preset = "{preset}"\n[representation]\nkind = "{kind}"'),
+        cfg.loads("", preset=preset, overrides=[f"representation.kind={kind}"]),
+        cfg.from_dict({"representation": {"kind": kind}}, overrides=[f"preset={preset}"]),
+    ]
+    for config in given:
+        assert config.representation.kind == kind
+        assert (config.loss.ssim, config.optimizer.iterations) == (ssim, iterations)
+
+
+def test_the_kind_that_counts_is_the_last_one_given():
+    text = '[representation]\nkind = "siren"'
+    assert cfg.loads(text).optimizer.iterations == 600
+    assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 150
+    assert cfg.loads(text, overrides=["representation.kind=pixels"]).loss.ssim == 1.0
+    assert cfg.loads("", preset="paper").representation.kind == "siren"
+
+
+def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
+    text = 'preset = "draft"\n[representation]\nkind = "pixels"\n[optimizer]\niterations = 7'
+    config = cfg.loads(text)
+    assert (config.optimizer.iterations, config.loss.ssim) == (7, 1.0)
+    config = cfg.loads(text, overrides=["optimizer.iterations=8", "loss.ssim=[1, 2]"])
+    assert (config.optimizer.iterations, config.loss.ssim) == (8, (1, 2))
+    # What neither the kind nor the file names is the preset's.
+    assert config.target.spp == 1024 and config.scene.width == 96
+    # A given key that has the value of another kind's default is kept.
+    same = cfg.loads("[loss]\nssim = 0.1", overrides=["representation.kind=siren"])
+    assert same.loss.ssim == 0.1 and same.optimizer.iterations == 600
+
+
+def test_asking_for_a_kind_changes_nothing_else():
+    for preset in ("draft", "standard"):
+        plain = cfg.loads("", preset=preset)
+        for kind in MANY:
+            config = cfg.loads("", preset=preset, overrides=[f"representation.kind={kind}"])
+            back = dataclasses.replace(
+                config,
+                representation=plain.representation,
+                loss=dataclasses.replace(config.loss, ssim=plain.loss.ssim),
+                optimizer=dataclasses.replace(config.optimizer, iterations=plain.optimizer.iterations),
+            )
+            assert back == plain
+
+
+def test_a_kind_that_is_none_is_refused_by_its_own_key():
+    for value in ("3", "[1]", '"network"'):
+        with pytest.raises(ConfigError, match="representation.kind"):
+            cfg.loads(f"[representation]\nkind = {value}")
+    with pytest.raises(ConfigError, match="representation"):
+        cfg.loads("representation = 3")
 
 
 # ---- targets -----------------------------------------------------------------------------------------------

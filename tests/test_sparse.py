@@ -102,6 +102,42 @@ def test_product_has_the_same_bits_every_time(rng):
         np.testing.assert_array_equal(product(ColourMatrix(rows, columns, weights, (300, 40)), x), first)
 
 
+# ---- coordinates -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "shape, count", [((37, 101), 200), ((9, 4), 0), ((1, 5), 3), ((64, 1), 20), ((300, 7), 900), ((16, 9), 1)]
+)
+def test_coordinates_are_the_entries(shape, count, rng):
+    rows, columns, weights = merge(*entries(rng, shape, count), shape[1])
+    emptied = ~np.isin(rows, rng.integers(0, shape[0], shape[0] // 4))
+    rows, columns, weights = rows[emptied], columns[emptied], weights[emptied]
+    shuffle = rng.permutation(len(rows))
+    matrix = ColourMatrix(rows[shuffle], columns[shuffle], weights[shuffle], shape)
+    r, c, w = matrix.coordinates()
+    assert r.shape == c.shape == (len(rows),) and w.shape == (len(rows), 3)
+    order = np.lexsort((c, r))
+    np.testing.assert_array_equal(r[order], rows)
+    np.testing.assert_array_equal(c[order], columns)
+    assert w[order].tobytes() == weights.tobytes()
+
+
+def test_coordinates_of_a_matrix_with_slices_that_are_empty():
+    rows, columns = np.array([3, 20, 3], np.uint32), np.array([0, 1, 4], np.uint32)
+    weights = np.array([[1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
+    r, c, w = ColourMatrix(rows, columns, weights, (50, 5)).coordinates()
+    found = sorted(zip(r.tolist(), c.tolist(), w.tolist(), strict=True))
+    assert found == [(3, 0, [1, 0, 0]), (3, 4, [0, 0, 3]), (20, 1, [0, 2, 0])]
+
+
+def test_coordinates_leave_out_what_is_zero(rng):
+    rows, columns, weights = merge(*entries(rng, (20, 30), 100), 30)
+    weights[::3] = 0
+    r, c, w = ColourMatrix(rows, columns, weights, (20, 30)).coordinates()
+    assert len(r) == weights.any(axis=1).sum() < len(rows)
+    np.testing.assert_array_equal(dense(r, c, w, (20, 30)), dense(rows, columns, weights, (20, 30)))
+
+
 # ---- merge -------------------------------------------------------------------------------------------------
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_paths import LEVEL, disagreement
 
-from envedit import latlong, scene
+from envedit import latlong, overview, scene
 from envedit.errors import InputError
 from envedit.image import load_envmap
-from envedit.transport import LightTransport
+from envedit.transport import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE, LightTransport
 
 DEPTH = 4  # of every path, here and in the reference: both leave out the same light
 SEEDS = 8
@@ -419,6 +419,15 @@ def test_rendering_is_linear(transport, rng):
     np.testing.assert_allclose(together, apart, rtol=1e-5, atol=1e-5 * picture(transport, a).max())
 
 
+def test_linear_is_the_rendering_without_other_lamps(transport, rng):
+    x = rng.random((HEIGHT, WIDTH, 3), dtype=np.float32)
+    alone, lamp = transport.linear(mi.TensorXf(x)).numpy(), picture(transport, black())
+    # The difference cancels digits where the lamp is bright.
+    np.testing.assert_allclose(alone, picture(transport, x) - lamp, rtol=1e-5, atol=1e-6 * lamp.max())
+    assert lamp.max() > 0.1 * alone.max() > 0  # a lamp that crept in would be seen
+    assert (transport.linear(mi.TensorXf(black())).numpy() == 0).all()
+
+
 @pytest.mark.parametrize("scale", [1e-30, 65504.0, 1e6, 1e30])
 def test_scale_of_the_map_is_the_scale_of_the_picture(scale):
     t = build(load("matte"), 6, 12, spp=16)
@@ -536,6 +545,138 @@ def test_refreshed_transport_is_another_estimate_of_the_same(lamp_scene):
     theirs = references(lamp_scene, sun(7, 9))
     assert disagreement(ours, theirs) == ""
     assert (ours[0] != ours[1]).any()
+
+
+def one_hot(texel):
+    image = np.zeros((HEIGHT * WIDTH, 3), np.float32)
+    image[texel] = 1
+    return image.reshape(HEIGHT, WIDTH, 3)
+
+
+def test_probes_are_the_columns_that_render(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    texels = np.array([4 * WIDTH, 7 * WIDTH + 9, 3 * WIDTH + 31, 2])
+    before = t.linear(mi.TensorXf(one_hot(texels[1]))).numpy()
+    columns = t.probe(texels)
+    assert columns.shape == (4, 17 * 23, 3) and set(t.columns) == set(texels)
+    assert (t._exact.paths_of[texels] == t.paths[0]).all()
+    for texel, column in zip(texels, columns, strict=True):
+        drawn = t.linear(mi.TensorXf(one_hot(texel))).numpy()
+        np.testing.assert_array_equal(column.reshape(drawn.shape), drawn)
+        assert drawn.max() > 0
+    assert (before != t.linear(mi.TensorXf(one_hot(texels[1]))).numpy()).any()  # it was coarse
+    # What is there is not traced again, and comes in the order in which it is asked for.
+    again = t.probe(texels[::-1])
+    np.testing.assert_array_equal(again[::-1], columns)
+
+
+def test_probing_a_texel_that_has_a_better_column_keeps_it(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    assert t.resolve(sun(7, 9)) == 1
+    texels = np.array([7 * WIDTH + 9, 7 * WIDTH + 10])
+    better = t.linear(mi.TensorXf(one_hot(texels[0]))).numpy()
+    columns = t.probe(texels)
+    np.testing.assert_array_equal(columns[0].reshape(better.shape), better)
+    assert t._exact.paths_of[texels].tolist() == [COLUMN_PATHS[-1], COLUMN_PATHS[0]]
+
+
+def test_probes_are_mitsubas_pictures_of_one_texel(lamp_scene):
+    image, depth = 100 * one_hot(4 * WIDTH + 12), {"max_depth": DEPTH}
+    lamp = np.stack([lamp_scene.render(black(), spp=2048, seed=k, **depth) for k in range(2)]).mean(axis=0)
+    lit = np.stack([lamp_scene.render(refined(image), spp=2048, seed=9 + k, **depth) for k in range(2)])
+    theirs = (lit.mean(axis=0) - lamp).mean(axis=(0, 1))
+    ours = 100 * build(lamp_scene, spp=4).probe(np.array([4 * WIDTH + 12]))[0].mean(axis=0)
+    np.testing.assert_allclose(ours, theirs, rtol=0.05)
+
+
+def test_few_paths_for_maps_of_few_parameters(lamp_scene, tmp_path):
+    plain = build(lamp_scene, spp=32, folder=tmp_path)
+    few = build(lamp_scene, spp=32, folder=tmp_path, few=True)
+    assert few.cached  # the recording is the same
+    assert (few.paths, few.tolerance) == (FEW_PATHS, FEW_TOLERANCE) != (plain.paths, plain.tolerance)
+    for t in (plain, few):
+        assert t.resolve(sun(7, 9)) == 1
+        assert t._exact.paths_of[t.columns].tolist() == [t.paths[-1]]
+    assert few.paths[-1] < plain.paths[-1]
+    counts = [len(t.bright_texels(noise() ** 4)) for t in (plain, few)]
+    assert counts[0] > counts[1]
+
+
+def test_a_state_replaces_the_columns_that_are_there(lamp_scene):
+    t, other = build(lamp_scene, spp=32), build(lamp_scene, spp=32)
+    t.resolve(sun(7, 9))
+    other.resolve(sun(4, 0))
+    other.probe(np.arange(5 * WIDTH, 5 * WIDTH + 6))
+    other.restore({key: np.array(value) for key, value in t.state().items()})
+    np.testing.assert_array_equal(other.columns, t.columns)
+    for image in (noise(), sun(4, 0)):
+        np.testing.assert_array_equal(picture(other, image), picture(t, image))
+    assert other.resolve(sun(4, 0)) == 1  # it is known that its column is gone
+
+
+# ---- at a glance -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """Coarse transport with tiles of 2 x 2 pixels and of 3 x 3 texels, cut off at both far borders."""
+    s = scene.load(stage(ball(METAL), WALL, LAMP, film={"width": 39, "height": 33}))
+    return build(s, 80, 160, spp=16)
+
+
+def tile(index, size, height, width):
+    """Return rows and columns of one tile of an image."""
+    row, column = divmod(index, -(-width // size))
+    return np.s_[row * size : (row + 1) * size, column * size : (column + 1) * size]
+
+
+def blocks_of(image, size):
+    """Average tiles, one by one."""
+    count = -(-image.shape[0] // size) * -(-image.shape[1] // size)
+    tiles = [image[tile(i, size, *image.shape[:2])] for i in range(count)]
+    return np.array([t.reshape(-1, 3).mean(axis=0) for t in tiles], np.float64)
+
+
+def test_overview_is_the_picture_of_cells_averaged_over_blocks(wide, rng):
+    found = wide.overview()
+    assert found.matrix.shape == (3, 20 * 17, 27 * 54) and len(found.omega) == 27 * 54
+    # Some that matter, and those at the borders: the zenith, the last column.
+    often = np.argsort(-found.matrix.sum(axis=(0, 1)))[:200]
+    for cell in [0, 53, 5 * 54 + 53, 26 * 54 + 53, *rng.choice(often, 8)]:
+        image = np.zeros((80, 160, 3), np.float32)
+        image[tile(int(cell), 3, 80, 160)] = 1
+        drawn = blocks_of(wide.linear(mi.TensorXf(image)).numpy(), 2)
+        np.testing.assert_allclose(found.matrix[:, :, cell].T, drawn, rtol=1e-4, atol=1e-4 * drawn.max())
+        assert drawn.max() > 0 or cell not in often
+    # All cells at once, of any values.
+    values = rng.random((27 * 54, 3))
+    image = values.reshape(27, 54, 3).repeat(3, axis=0).repeat(3, axis=1)[:80, :160].astype(np.float32)
+    drawn = blocks_of(wide.linear(mi.TensorXf(image)).numpy(), 2)
+    told = np.stack([found.matrix[c] @ values[:, c] for c in range(3)], axis=1)
+    np.testing.assert_allclose(told, drawn, rtol=1e-4)
+
+
+def test_overview_does_not_depend_on_columns(wide):
+    before = wide.overview()
+    fresh = build(wide.scene, 80, 160, spp=16)
+    fresh.probe(np.array([20 * 160 + 40]))
+    assert fresh.overview().matrix.tobytes() == before.matrix.tobytes()
+    assert wide.overview() is before  # summed up once
+
+
+def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
+    first = build(lamp_scene, spp=32, folder=tmp_path).overview()
+    with monkeypatch.context() as patch:
+        patch.setattr(overview, "make", lambda *_: 1 / 0)
+        again = build(lamp_scene, spp=32, folder=tmp_path).overview()
+        with pytest.raises(ZeroDivisionError):  # of another recording it is not
+            build(lamp_scene, spp=32, seed=1, folder=tmp_path).overview()
+    assert vars(first).keys() == vars(again).keys()
+    for name, value in vars(first).items():
+        loaded = getattr(again, name)
+        assert loaded.dtype == value.dtype and loaded.shape == value.shape
+        assert loaded.tobytes() == value.tobytes(), name
+        assert loaded.flags.writeable
 
 
 # ---- compiled once -----------------------------------------------------------------------------------------

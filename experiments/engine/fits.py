@@ -51,12 +51,13 @@ def measure(
     dict
         ``preset``, ``overrides``, ``recipe``, ``about``; ``rows``: see :func:`one_map`; ``skipped``.
     """
-    overrides = [f"input.width={WIDTH}", *overrides]
+    fixed = [f"input.width={WIDTH}", "representation.kind=siren"]
+    overrides = [*fixed, *overrides]
     files = {"analytic sun and sky": "sunsky"} if quick else maps.skies(names)
     settings = config.loads("", preset=preset, overrides=overrides)
     record = {
         "preset": preset,
-        "overrides": overrides[1:],
+        "overrides": overrides[len(fixed) :],
         "recipe": asdict(settings.fit) | asdict(settings.representation),
         "about": manifest({"seed": settings.seed}, {}, settings.variant),
         "rows": [],

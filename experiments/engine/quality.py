@@ -50,7 +50,7 @@ def measure(quick: bool = False) -> dict:
         chosen, suns, pixels, width, spp = {"sphere": {}}, {"45 degrees": SUNS["45 degrees"]}, 24, 32, 2048
     rows, parts, choices = [], [], {}
     for name, parameters in chosen.items():
-        lit = scene.load(name, pixels, pixels, parameters)
+        lit = scene.load(name, pixels, pixels, parameters, sampler="independent")
         shape = (width // 2, width)
         # A T for each sun: columns stay, and would make the next sun's T better than an edit's.
         for sun, place in suns.items():
@@ -150,7 +150,7 @@ def without_caustics(lit, sky: np.ndarray, spp: int) -> list[dict]:
 
 def curve(name: str, pixels: int, sky: np.ndarray, spp: int, quick: bool = False) -> list[dict]:
     """Measure error against time of a step: T of several sizes, prb at several samples a pixel."""
-    lit = scene.load(name, pixels, pixels)
+    lit = scene.load(name, pixels, pixels, sampler="independent")
     height, width, _ = sky.shape
     wanted, noise = reference(lit, sky, spp)
     env = dr.opaque(mi.TensorXf(sky))

@@ -45,7 +45,7 @@ def one_size(pixels: int, width: int, spp, quick: bool = False) -> dict:
         ``trace_s`` and ``cold``, whether kernels were compiled in it; ``spp``, ``columns``, ``bytes`` that
         both products read, ``held``, ``apply``, ``adjoint``, ``choices``.
     """
-    lit = scene.load("sphere", pixels, pixels)
+    lit = scene.load("sphere", pixels, pixels, sampler="independent")
     height = width // 2
     transport, trace = build(lit, height, width, spp)
     cold = trace > SLOW

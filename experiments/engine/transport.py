@@ -68,7 +68,7 @@ def one_scene(name, parameters, pixels, width, spp, read, quick=False) -> dict:
             the same by path tracing, map set as an edit has to (Mitsuba builds its sampling table anew);
             ``prb_bare_step_s`` is without setting the map, which no edit can do.
     """
-    lit = scene.load(name, pixels, pixels, parameters)
+    lit = scene.load(name, pixels, pixels, parameters, sampler="independent")  # Mitsuba's default
     height = width // 2
     map_name, sky = maps.sunny(width, real=not quick)
     transport, first = build(lit, height, width, spp)
@@ -181,7 +181,9 @@ def gradient(render, env: mi.TensorXf, weight: mi.TensorXf):
 
 def bare_prb(file, parameters, pixels, sky, depth, weight):
     """Return a function that renders and differentiates by prb under a map that was set once."""
-    lit = scene.load(file, pixels, pixels, parameters)  # its own: the other one's map is set at every step
+    lit = scene.load(
+        file, pixels, pixels, parameters, sampler="independent"
+    )  # its own: the other one's map is set at every step
     leaf = mi.TensorXf(latlong.to_envmap_data(sky))
     dr.enable_grad(leaf)
     lit.params[lit.envmap_key] = leaf

@@ -1,0 +1,127 @@
+"""Layers: a representation of the edit instead of the map.
+
+    E = E_0' * prod((1 + G_l) / (1 + G_l^0)) * exp(g) + sum(C_l)
+
+E_0' is the original without the cores of its lights, G_l and C_l are glow and core of light l
+(``separate.py``, ``lights.py``), with index 0 before they moved, and g is the smooth gain of the sky
+(``gain.py``). Unmoved lights and no gain give the original back, bit for bit outside the cores: there is
+nothing to fit, the sky's own detail is kept, and the map has any resolution.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import latlong
+from .gain import GridGain
+from .lights import DARK, SPARE, Lights
+from .separate import Separation, separate
+
+VEIL = 0.2
+"""Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
+SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
+"""What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
+
+
+class Layers:
+    """Lights that move, a background under a smooth gain.
+
+    Parameters
+    ----------
+    rows : (int, int)
+        First row of the images in their map, and the rows of that map.
+    cycles : int
+        Cycles of the gain around the horizon.
+
+    Attributes
+    ----------
+    separation : Separation
+        What :meth:`encode` found in the image.
+    lights : Lights
+        Its lights and spare ones.
+    gain : GridGain
+        The gain's grids.
+    rows, shape : (int, int)
+        As given, and rows and columns of the image.
+    scales : dict
+        What a unit of each parameter is.
+    """
+
+    lr = 0.02
+    Gain = GridGain
+
+    def __init__(self, rows: tuple[int, int] | None = None, cycles: int = 12):
+        self.rows, self._cycles = rows, cycles
+        self.separation: Separation | None = None
+        self._kept: np.ndarray | None = None
+
+    def encode(self, image: np.ndarray, seed: int = 0) -> dict:
+        """Separate the image; ``seed`` is not used."""
+        self.rows = self.rows or (0, image.shape[0])
+        image = np.ascontiguousarray(image, np.float32)
+        self.separation = separate(image, self.rows)
+        self.lights = Lights(self.separation.lights, self.rows, image.shape[1])
+        self.shape = image.shape[:2]
+        core = self.separation.core
+        base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)
+        self._base = np.maximum(base, 0).astype(np.float32)
+        self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1])
+        self.scales = SCALES | self.gain.scales()
+        self._prepared = {}
+        n = self.lights.count
+        flux = np.zeros((n, 3), np.float32)
+        flux[n - SPARE :] = DARK / SCALES["flux"]
+        params = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
+        params |= self.gain.init()
+        return {name: dr.opaque(mi.TensorXf(value)) for name, value in params.items()}
+
+    def keep(self, free: np.ndarray | None) -> None:
+        """Say which texels (rows, W) may change other than by a light's moving; None: all."""
+        self._kept = free
+        self._prepared = {}
+
+    def decode(self, params: dict, shape: tuple[int, int] | None = None) -> mi.TensorXf:
+        """Compose the map at the resolution of the image, or at any other ``shape`` (rows, W)."""
+        shape = tuple(shape or self.shape)
+        if shape not in self._prepared:
+            self._prepared[shape] = self._prepare(shape)
+        rows, d, base, before, gain, free = self._prepared[shape]
+        real = {name: value * self.scales[name] for name, value in params.items()}
+        factor = dr.exp(self.gain.evaluate(real, gain))
+        factor = dr.select(free, factor, 1) if free is not None else factor
+        # What is brightened is brightened in part by its luminance: a channel that is black stays in step.
+        grey = base * (1 - VEIL) + mi.luminance(base) * VEIL
+        sky = dr.select(factor > 1, base + (factor - 1) * grey, base * factor)
+        if self.lights.glowing:
+            sky *= self.lights.glow(real["turn"], real["flux"], d) / before
+        sky = mi.TensorXf(dr.ravel(sky), (*shape, 3))
+        return sky + self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
+
+    def _prepare(self, shape):
+        first, total = self.rows
+        height, width = self.shape
+        finer = shape[0] / height
+        rows = (0, shape[0])
+        if (first, total) != (0, height):
+            rows = round(first * finer), round(total * finer)
+        d = latlong.directions(rows[1], shape[1])[rows[0] : rows[0] + shape[0]]
+        base = self._base
+        if shape != self.shape:
+            whole = np.repeat(base[-1:], total, axis=0)
+            whole[first : first + height] = base
+            whole[:first] = base[:1]
+            base = latlong.lookup(whole, d).astype(np.float32)
+        d = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)))
+        n, before = self.lights.count, mi.Color3f(1)
+        if self.lights.glowing:
+            still = mi.TensorXf(np.zeros((n, 3), np.float32))
+            before = dr.opaque(self.lights.glow(still, still, d))
+        base = dr.opaque(mi.Color3f(np.ascontiguousarray(base.reshape(-1, 3).T)))
+        free = None
+        if self._kept is not None:
+            row = np.arange(shape[0]) * height // shape[0]
+            column = np.arange(shape[1]) * width // shape[1]
+            free = dr.opaque(mi.Bool(self._kept[row][:, column].ravel()))
+        return rows, d, base, before, self.gain.prepare(shape, rows), free

@@ -1,0 +1,253 @@
+"""Which lights a picture asks for, and where on the sphere: a matching pursuit through the overview of T.
+
+The atoms are pictures of a light in each cell of the sphere, its glow taken along; the background may
+meanwhile take on any gain of low order. The strongest light is placed first, each where it explains most of
+what is left (orthogonal matching pursuit: Mallat and Zhang 1993, Pati et al. 1993). Nothing depends on where
+a light was, but that it stays where that explains as much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .overview import Overview
+from .separate import Light, glow_at
+
+STAY = 0.98
+"""A light stays where it was if that explains this share of what the best place explains."""
+LEAST_FLUX = 1e-3
+"""A light whose flux falls below this share of what it was is taken away."""
+GAIN_ORDER = 2
+"""Order of the gains, as polynomials of the direction, that the background may take on meanwhile."""
+APART = 20.0
+"""Degrees from all others that a light is born at least."""
+BIRTH_ORDER = 4
+"""Order of the background's gains that must fail to explain what a new light explains."""
+BIRTH = 0.6
+"""A light is born where it explains this share of what all others leave unexplained."""
+BIRTH_LIGHT = 0.03
+"""And adds this share to the light of the picture."""
+UNEXPLAINED = 0.003
+"""Share of the squared picture that must be left unexplained before a light can be born."""
+FAINT = 0.2
+"""Pixels count by 1 / (brightness + this share of the mean brightness)."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a light is to start: direction (3,), None where it stays, and flux per channel as a factor."""
+
+    direction: np.ndarray | None
+    flux: np.ndarray
+
+
+def place(
+    overview: Overview,
+    picture: np.ndarray,
+    weight: np.ndarray | None,
+    known: np.ndarray,
+    background: np.ndarray,
+    omega: np.ndarray,
+    active: np.ndarray,
+    start: int,
+    lights: list[Light],
+    spare: int,
+    spare_flux: np.ndarray,
+) -> list[Place]:
+    """Place every light.
+
+    Parameters
+    ----------
+    overview : Overview
+        T at a glance.
+    picture : ndarray (h, w, 3)
+        What is wanted, less the light of everything that cannot change.
+    weight : ndarray (h, w, 1), optional
+        How much each pixel counts.
+    known : ndarray (h, w, 3)
+        The picture wanted as it is; tells how bright a pixel is.
+    background : ndarray (H * W, 3)
+        The map without its lights; 0 where it cannot change.
+    omega : ndarray (H * W,)
+        Solid angle of every texel, as a rendering receives it.
+    active : ndarray of bool (H * W,)
+        Texels that may change.
+    start : int
+        Texel from which those of the lights are counted.
+    lights : list of Light
+        The map's lights.
+    spare : int
+        Lights that may be born.
+    spare_flux : ndarray (3,)
+        Flux of a spare light.
+
+    Returns
+    -------
+    list of Place
+        For the map's lights, then for the spare ones; flux 0: not there.
+    """
+    search = _Pursuit(overview, picture, weight, known, background, omega, active)
+    directions, atoms = [], []
+    for light in lights:
+        flux = light.radiance * omega[start + light.texels][:, None]
+        atom = search.atoms(flux.sum(axis=0), light.glow)
+        cells = overview.cell_of[start + light.texels]
+        stay = search.atom_of(cells, flux, light.direction, light.glow)
+        score = search.scores(atom)
+        if search.scores(stay)[0] >= STAY * score.max():
+            directions.append(None)
+            chosen = stay[..., 0]
+        else:
+            best = int(score.argmax())
+            directions.append(search.between(score, best))
+            chosen = atom[..., best]
+        atoms.append(chosen)
+        search.explain(chosen)
+    factors = search.solve(atoms)
+    # Whether lights are missing is asked only where much is left.
+    missing = search.left() > UNEXPLAINED * search.asked()
+    if missing:
+        search.allow(products(overview.directions, BIRTH_ORDER))
+        atom = search.atoms(spare_flux, None)
+    for _ in range(spare if missing else 0):
+        score = search.scores(atom)
+        for light, direction in zip(lights, directions, strict=False):
+            there = light.direction if direction is None else direction
+            score[overview.directions[search.candidates] @ there > np.cos(np.radians(APART))] = 0
+        best = int(score.argmax())
+        candidate = atom[..., best]
+        grown = search.solve([*atoms, candidate])
+        light = (candidate * grown[-1][:, None]).sum()
+        if not (score[best] > BIRTH * search.left() and light > BIRTH_LIGHT * search.light):
+            break
+        directions.append(search.between(score, best))
+        atoms.append(candidate)
+        search.explain(candidate)
+        factors = grown
+    places = []
+    for direction, factor in zip(directions, factors, strict=True):
+        gone = factor.max() < LEAST_FLUX
+        places.append(Place(direction, np.zeros(3) if gone else np.maximum(factor, LEAST_FLUX)))
+    return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))
+
+
+class _Pursuit:
+    """The residual picture, block by block, and what explains it; channels are apart."""
+
+    def __init__(self, overview, picture, weight, known, background, omega, active):
+        self.overview = overview
+        bright = overview.to_blocks(known).mean(axis=1)
+        mean = bright.mean()
+        count = 1.0 if weight is None else overview.to_blocks(weight)[:, 0]
+        self.weight = count / (bright + FAINT * mean) if mean > 0 else np.zeros(len(bright))
+        wanted = overview.to_blocks(picture).T
+        self.light = float(np.abs(wanted * self.weight).sum())
+        cells = overview.to_cells(background, omega)
+        self.background = np.where(np.isfinite(cells), cells, 0)
+        share = overview.to_cells(active[:, None].astype(float), omega)[:, 0]
+        self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
+        d = overview.directions
+        self.cosine = d @ d[self.candidates].T
+        self.wanted = [w * self.weight for w in wanted]
+        self.residual = list(self.wanted)
+        self.spans = [np.zeros((len(bright), 0)) for _ in range(3)]
+        self.allow(products(d, GAIN_ORDER))
+
+    def allow(self, gains):
+        """Let the background take on any mixture of gains (cells, n)."""
+        for c in range(3):
+            span = self.overview.matrix[c] @ (self.background[:, c : c + 1] * gains) * self.weight[:, None]
+            q, r = np.linalg.qr(self._off(c, self._off(c, span)))
+            q = q[:, np.abs(np.diag(r)) > 1e-4 * max(np.linalg.norm(span, axis=0).max(), 1e-30)]
+            self.spans[c] = np.concatenate([self.spans[c], q], axis=1)
+            self.residual[c] = self._off(c, self.residual[c])
+
+    def _off(self, c, x):
+        return x - self.spans[c] @ (self.spans[c].T @ x)
+
+    def atoms(self, flux, glow):
+        """Pictures of a light in each candidate cell: (3, blocks, candidates), weighted."""
+        matrix = self.overview.matrix
+        unit = flux[:, None] / self.overview.omega[self.candidates]
+        found, shine = [], None if glow is None else glow_at(glow, self.cosine)
+        for c in range(3):
+            atom = matrix[c][:, self.candidates] * unit[c].astype(np.float32)
+            if glow is not None:
+                atom = atom + matrix[c] @ (self.background[:, c : c + 1] * shine[..., c]).astype(np.float32)
+            found.append(atom * self.weight[:, None])
+        return np.stack(found)
+
+    def atom_of(self, cells, flux, centre, glow):
+        """Picture of a light with flux in given cells: (3, blocks, 1), weighted."""
+        found, shine = [], None if glow is None else glow_at(glow, self.overview.directions @ centre)
+        for c in range(3):
+            light = np.bincount(cells, flux[:, c], len(self.overview.omega)) / self.overview.omega
+            if glow is not None:
+                light = light + self.background[:, c] * shine[:, c]
+            found.append(self.overview.matrix[c] @ light * self.weight)
+        return np.stack(found)[..., None]
+
+    def scores(self, atoms):
+        """Squared residual that each atom explains, summed over channels."""
+        score = 0.0
+        for c in range(3):
+            atom = self._off(c, atoms[c])
+            power = (atom * atom).sum(axis=0)
+            score = score + np.maximum(atom.T @ self.residual[c], 0) ** 2 / np.maximum(power, 1e-30)
+        return score
+
+    def between(self, score, best):
+        """Direction of the best cell, drawn towards neighbours that explain nearly as much."""
+        d = self.overview.directions[self.candidates]
+        near = d @ d[best] > np.cos(np.radians(1.6 * 360 / 64))
+        weight = np.maximum(score[near] - 0.8 * score[best], 0) ** 2
+        middle = (d[near] * weight[:, None]).sum(axis=0)
+        return middle / np.linalg.norm(middle)
+
+    def explain(self, atom):
+        """Let an atom of any strength explain what it can."""
+        for c in range(3):
+            new = self._off(c, atom[c])
+            size = np.linalg.norm(new)
+            if size > 1e-6 * max(np.linalg.norm(atom[c]), 1e-30):
+                self.spans[c] = np.concatenate([self.spans[c], (new / size)[:, None]], axis=1)
+                self.residual[c] = self._off(c, self.residual[c])
+
+    def left(self):
+        """Squared residual."""
+        return sum(float(r @ r) for r in self.residual)
+
+    def asked(self):
+        """Squared picture."""
+        return sum(float(w @ w) for w in self.wanted)
+
+    def solve(self, atoms):
+        """Strength of each atom per channel, (n, 3), not negative, beside any gain of the background."""
+        found = np.zeros((len(atoms), 3))
+        for c in range(3):
+            span = self.overview.matrix[c] @ self.background[:, c] * self.weight
+            columns = np.stack([span, *(a[c] for a in atoms)], axis=1)
+            found[:, c] = not_negative(columns, self.wanted[c])[1:]
+        return found
+
+
+def products(d: np.ndarray, order: int) -> np.ndarray:
+    """Return all products of powers of x, y, z up to an order, at unit vectors d: (n, functions)."""
+    x, y, z = d.T
+    powers = [(i, j, k) for i in range(order + 1) for j in range(order + 1 - i) for k in range(2)]
+    return np.stack([x**i * y**j * z**k for i, j, k in powers if i + j + k <= order], axis=1)
+
+
+def not_negative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solve min |a x - b| with x >= 0 (Lawson and Hanson 1974, by leaving out what turns negative)."""
+    keep = np.ones(a.shape[1], bool)
+    for _ in range(a.shape[1]):
+        x = np.zeros(a.shape[1])
+        if keep.any():
+            x[keep] = np.linalg.lstsq(a[:, keep], b, rcond=None)[0]
+        if (x >= 0).all():
+            return x
+        keep &= x > 0
+    return np.maximum(x, 0)

@@ -1,0 +1,342 @@
+"""Where lights must be, and how bright the sky, for a picture to look as wanted: the start of an edit.
+
+Three steps, from far to near, all through T and none from where a light was:
+
+1. a matching pursuit over the whole sphere (``pursuit.py``);
+2. for every light that moves, exact columns of T around its cell: the same, to a fraction of a texel;
+3. multiplicative updates (Richardson 1972, Lucy 1974) of the lights' flux and of the gain of the sky, from a
+   coarse grid to a fine one.
+
+What comes out is most of the way.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import latlong
+from .layers import VEIL, Layers
+from .lights import DARK, SPARE, rotation_vector
+from .pursuit import FAINT, GAIN_ORDER, Place, place, products
+from .separate import glow_at
+from .tonemap import LUMINANCE
+from .transport import LightTransport
+
+KEPT_FLUX = 3.0
+"""A light that moves starts with its own flux unless the picture wants this many times more or less."""
+LEAST, MOST = 0.05, 20.0
+"""Bounds of every factor that a start may have."""
+UPDATES = 30
+"""Multiplicative updates of :func:`spread`."""
+SPACINGS = (2, 1)
+"""Distances of the probes of :func:`refine`, texels: first five by five of them, then three by three."""
+
+
+def start(
+    layers: Layers,
+    params: dict,
+    transport: LightTransport,
+    picture: np.ndarray,
+    weight: np.ndarray | None,
+    envmap: np.ndarray,
+) -> tuple[dict, list[str]]:
+    """Find where the optimisation of layers starts.
+
+    Parameters
+    ----------
+    layers : Layers
+        Lights and background of the map's active rows.
+    params : dict
+        As its ``encode`` returned them.
+    transport : LightTransport
+        T; gets exact columns for the texels that are looked at.
+    picture : ndarray (h, w, 3)
+        What is wanted.
+    weight : ndarray (h, w, 1), optional
+        How much each pixel counts.
+    envmap : ndarray (H, W, 3)
+        The whole map.
+
+    Returns
+    -------
+    params : dict
+        Of the start.
+    notes : list of str
+        What was found.
+    """
+    scene = _Question(layers, transport, picture, weight, envmap)
+    overview, lights = transport.overview(), layers.separation.lights
+    places = place(
+        overview, scene.wanted, weight, picture, scene.background, scene.omega, scene.active,
+        scene.start, lights, SPARE, layers.lights.flux[-1],
+    )  # fmt: skip
+    notes, pictures = [], []
+    factor = np.ones((len(overview.omega), 3))
+    for i, (light, found) in enumerate(zip(lights, places, strict=False)):
+        name = f"light {i + 1} of {len(lights)} ({100 * light.share:.2g} % of the map's)"
+        if not found.flux.max() > 0:
+            notes.append(f"{name}: the picture does not want it")
+            continue
+        direction, flux = light.direction, 1.0
+        if found.direction is not None:
+            direction, flux = scene.refine(found.direction, layers.lights.flux[i], light.glow)
+            angle = np.degrees(np.arccos(np.clip(direction @ light.direction, -1, 1)))
+            notes.append(f"{name}: starts {angle:.1f} degrees from where it was")
+        else:
+            notes.append(f"{name}: starts where it was")
+        places[i] = Place(direction if found.direction is not None else None, np.full(3, flux))
+        pictures.append((i, scene.light(i, places[i])))
+        if light.glow is not None:
+            factor *= 1 + glow_at(light.glow, overview.directions @ direction)
+    for i in range(len(lights), len(places)):
+        if places[i].flux.max() > 0:
+            notes.append("a light is born: the picture wants one where the map has none")
+            pictures.append((i, scene.light(i, places[i])))
+
+    # Flux and gain, from the coarse grid to the finest.
+    stack = np.zeros((3, len(overview.matrix[0]), 0))
+    if pictures:
+        stack = np.stack([overview.to_blocks(p).T for _, p in pictures], axis=2)
+    found = dict(params)
+    for level in range(len(layers.gain.sizes)):
+        hats = scene.hats(level) * factor.T[..., None]
+        gain, strength = spread(overview, scene.wanted, weight, picture, hats, stack)
+        gain = np.clip(gain, LEAST, MOST)
+        name = f"gain.{level}"
+        logs = np.log(gain).reshape(*layers.gain.sizes[level], 3) / layers.scales[name]
+        found[name] = _tensor(logs)
+        factor = factor * scene.in_cells(level, gain)
+    for (i, _), s in zip(pictures, strength, strict=True):
+        places[i] = Place(places[i].direction, places[i].flux * np.clip(s, LEAST, MOST))
+    turn, flux = scene.parameters(places)
+    found["turn"] = _tensor(turn / layers.scales["turn"])
+    found["flux"] = _tensor(flux / layers.scales["flux"])
+    return found, notes
+
+
+class _Question:
+    """What is asked: the picture less all that is fixed, and what may make it."""
+
+    def __init__(self, layers, transport, picture, weight, envmap):
+        self.layers, self.transport, self.weight = layers, transport, weight
+        first, _ = layers.rows
+        height, width = layers.shape
+        rows = slice(first, first + height)
+        rest = envmap.copy()
+        rest[rows] = 0
+        self.known = picture
+        self.wanted = picture - transport.apply(_tensor(rest)).numpy()
+        self.active = np.zeros(envmap.shape[:2], bool)
+        self.active[rows] = True
+        self.active = self.active.ravel()
+        self.start, self.rows = first * width, rows
+        self.omega = np.repeat(latlong.lookup_solid_angles(*envmap.shape[:2]), width)
+        self.background = np.zeros((len(self.omega), 3))
+        self.background[self.active] = layers.separation.background.reshape(-1, 3)
+        self.directions = latlong.directions(*envmap.shape[:2])
+        self.shape = envmap.shape
+        self._gains = None
+
+    def _render(self, values):
+        """Picture of a map (H * W, 3) alone, without other lamps' light."""
+        return self.transport.linear(_tensor(values.reshape(self.shape))).numpy()
+
+    def refine(self, direction, flux, glow):
+        """Find the direction of a light, and its flux as a factor."""
+        if self._gains is None:
+            gains = products(self.directions.reshape(-1, 3), GAIN_ORDER)
+            self._gains = [self._render(self.background * g[:, None]).reshape(-1, 3) for g in gains.T]
+        mixed = list(self._gains)
+        if glow is not None:
+            shine = glow_at(glow, self.directions @ direction).reshape(-1, 3)
+            mixed.append(self._render(self.background * shine).reshape(-1, 3))
+        weight = None if self.weight is None else self.weight.reshape(-1, 1)
+        wanted, known = self.wanted.reshape(-1, 3), self.known.reshape(-1, 3)
+        last = self.rows.stop - 1
+        direction, factor = refine(
+            self.transport, wanted, known, weight, np.stack(mixed), direction, flux, self.rows.start, last
+        )
+        factor = float(np.median(factor))
+        kept = 1 / KEPT_FLUX < factor < KEPT_FLUX
+        return direction, 1.0 if kept else float(np.clip(factor, LEAST, MOST))
+
+    def parameters(self, places):
+        """Rotation vectors and log fluxes of lights as they are placed."""
+        centres = self.layers.lights.centres
+        turn, flux = np.zeros((len(centres), 3)), np.full((len(centres), 3), DARK)
+        for i, found in enumerate(places):
+            if found.direction is not None:
+                turn[i] = rotation_vector(centres[i], found.direction)
+            flux[i] = np.log(np.maximum(found.flux, np.exp(DARK)))
+        return turn, flux
+
+    def light(self, i, found):
+        """Picture of one light as it is placed, through exact columns."""
+        dark = [Place(None, np.zeros(3))] * self.layers.lights.count
+        dark[i] = found
+        turn, flux = self.parameters(dark)
+        size = _tensor(np.zeros((len(turn), 1)))
+        core = np.zeros(self.shape, np.float32)
+        core[self.rows] = self.layers.lights.core(
+            _tensor(turn), _tensor(flux), size, self.layers.shape, self.layers.rows
+        ).numpy()
+        self.transport.resolve(core + self.background.reshape(self.shape))
+        return self._render(core)
+
+    def hats(self, level):
+        """Radiance of what a gain adds, times each hat of a grid, in cells: (3, cells, nodes)."""
+        overview = self.transport.overview()
+        base = self.background[self.active]
+        base = (1 - VEIL) * base + VEIL * (base @ LUMINANCE)[:, None]
+        rows, columns = self.layers.gain.sizes[level]
+        cell, omega, cells, nodes = *self._cells(), len(overview.omega), rows * columns
+        hats = np.zeros((3, cells * nodes))
+        for node, share in self.layers.gain.hats(level, self.layers.shape):
+            for c in range(3):
+                hats[c] += np.bincount(cell * nodes + node, share * omega * base[:, c], cells * nodes)
+        total = np.bincount(overview.cell_of, self.omega, cells)
+        return hats.reshape(3, cells, nodes) / np.maximum(total, 1e-30)[None, :, None]
+
+    def in_cells(self, level, gain):
+        """Mean of a gain (nodes, 3) over each cell, by its logarithm: (cells, 3)."""
+        cell, omega = self._cells()
+        cells = len(self.transport.overview().omega)
+        logs = np.zeros((cells, 3))
+        for node, share in self.layers.gain.hats(level, self.layers.shape):
+            for c in range(3):
+                logs[:, c] += np.bincount(cell, share * omega * np.log(gain[node, c]), cells)
+        return np.exp(logs / np.maximum(np.bincount(cell, omega, cells), 1e-30)[:, None])
+
+    def _cells(self):
+        return self.transport.overview().cell_of[self.active], self.omega[self.active]
+
+
+def _tensor(values):
+    return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
+
+
+def spread(overview, wanted, weight, known, hats, lights):
+    """Find strengths, not negative, of overlapping hats of background and of lights that make a picture.
+
+    Multiplicative updates (Richardson 1972, Lucy 1974), a <- a * H'(w I / H a) / H' w, from a = 1: they stay
+    positive, and what the picture does not tell about stays 1.
+
+    Parameters
+    ----------
+    overview : Overview
+        T at a glance.
+    wanted, known : ndarray (h, w, 3)
+        The picture, less the light of all that cannot change; and as it is.
+    weight : ndarray (h, w, 1), optional
+        How much each pixel counts.
+    hats : ndarray (3, cells, n)
+        Radiance of the background times each hat.
+    lights : ndarray (3, blocks, m)
+        Pictures of the lights.
+
+    Returns
+    -------
+    hats, lights : ndarray (n, 3), (m, 3)
+        Strengths.
+    """
+    count = np.ones(len(overview.matrix[0])) if weight is None else overview.to_blocks(weight)[:, 0]
+    wanted = np.maximum(overview.to_blocks(wanted), 0)
+    bright = overview.to_blocks(known).mean(axis=1)
+    # Equal relative errors count alike; Lucy's own weights, counts of photons, are the pixels' brightness.
+    w = count / (bright + FAINT * max(bright.mean(), 1e-30))
+    n = hats.shape[2]
+    found = np.ones((n + lights.shape[2], 3))
+    for c in range(3):
+        h = np.concatenate([overview.matrix[c] @ hats[c], lights[c]], axis=1)
+        down = w @ h
+        seen = down > 1e-9 * max(down.max(), 1e-30)
+        a = found[:, c]
+        for _ in range(UPDATES):
+            picture = h @ a
+            ratio = wanted[:, c] / np.maximum(picture, 1e-6 * max(picture.max(), 1e-30))
+            a[seen] *= (h.T @ (w * ratio))[seen] / down[seen]
+    return found[:n], found[n:]
+
+
+def refine(transport, wanted, known, weight, gains, direction, flux, first, last):
+    """Find the place of a light to a fraction of a texel, by exact columns around a first guess.
+
+    Parameters
+    ----------
+    transport : LightTransport
+        T; gets exact columns for the texels that are looked at.
+    wanted : ndarray (pixels, 3)
+        The picture, less all that is not this light or the background.
+    known : ndarray (pixels, 3)
+        The picture wanted as it is.
+    weight : ndarray (pixels, 1) or None
+        How much each pixel counts.
+    gains : ndarray (n, pixels, 3)
+        Pictures that may be mixed in at will: the background under gains of low order, the glow.
+    direction : ndarray (3,)
+        First guess.
+    flux : ndarray (3,)
+        Flux of the light.
+    first, last : int
+        Rows it may be in.
+
+    Returns
+    -------
+    direction : ndarray (3,)
+        Of the best place.
+    factor : ndarray (3,)
+        Its flux as a factor of ``flux``.
+    """
+    height, width = transport.grid.height, transport.grid.width
+    omega = latlong.lookup_solid_angles(height, width)
+    bright = known.mean(axis=1)
+    scale = 1 / (bright + FAINT * bright.mean())
+    if weight is not None:
+        scale = scale * weight[:, 0]
+    spans, rest = [], []
+    for c in range(3):
+        q, r = np.linalg.qr((gains[..., c] * scale).T)
+        q = q[:, np.abs(np.diag(r)) > 1e-6 * np.abs(r).max()]
+        spans.append(q)
+        y = wanted[:, c] * scale
+        rest.append(y - q @ (q.T @ y))
+
+    def score(texels):
+        columns = transport.probe(texels) * (flux / omega[texels // width][:, None])[:, None, :]
+        found, factor = 0.0, []
+        for c in range(3):
+            a = (columns[..., c] * scale).T
+            a = a - spans[c] @ (spans[c].T @ a)
+            power, along = (a * a).sum(axis=0), a.T @ rest[c]
+            found = found + np.maximum(along, 0) ** 2 / np.maximum(power, 1e-30)
+            factor.append(np.maximum(along, 0) / np.maximum(power, 1e-30))
+        return found, np.stack(factor, axis=1)
+
+    row, column = (float(x) for x in latlong.texel_position(direction, height, width))
+    row, column = round(row), round(column)
+    for spacing, reach in zip(SPACINGS, (2, 1), strict=True):
+        steps = np.arange(-reach, reach + 1) * spacing
+        rows = np.unique(np.clip(row + steps, first, last))
+        columns = (column + steps) % width
+        texels = (rows[:, None] * width + columns).ravel()
+        found, factor = score(texels)
+        best = int(found.argmax())
+        row, column = divmod(int(texels[best]), width)
+    # Between the texels around the best, by how much each explains.
+    grid = found.reshape(len(rows), len(columns))
+    i, j = np.unravel_index(best, grid.shape)
+    row, column = row + _vertex(grid[:, j], i), column + _vertex(grid[i], j)
+    theta, phi = np.pi * row / (height - 1), 2 * np.pi * (column + 0.5) / width
+    d = np.array([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)])
+    return d, factor[best]
+
+
+def _vertex(values, i):
+    """Return the vertex of the parabola through three neighbours, from the middle, within half a step."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    a, b, c = values[i - 1 : i + 2]
+    bend = a - 2 * b + c
+    return float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5)) if bend < 0 else 0.0

@@ -1,0 +1,132 @@
+r"""Compare what may carry the gain of the sky: bilinear grids, or a small SIREN on the sphere.
+
+    ENVEDIT_DATA=... python -m experiments.layers.gain [--maps NAME ...] [--angle 140] [--scene sphere]
+
+Every variant starts from the same lights, those that the search finds, and from a gain of zero; the last one
+is the product's, whose gain starts from the search's too. Rendering and map PSNR are against the truth, by
+Mitsuba with fresh samples; "sharp" is the energy of high frequencies over the original's.
+"""
+
+import argparse
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit import config, edit, files, latlong, metrics, scene, search, siren
+from envedit.gain import GridGain
+from envedit.layers import Layers
+from envedit.pipeline import load_map
+from envedit.transport import LightTransport
+
+from .run import SCENES, maps
+
+ITERATIONS = 150
+AMPLITUDE = 6.0
+
+
+class SirenGain:
+    """Log gain by a SIREN on directions, its last layer zero at the start: 2 A (sigmoid - 1/2).
+
+    A first-layer weight w makes omega |w| cycles around a great circle; |w| <= sqrt(3) / 3 for three inputs.
+    """
+
+    def __init__(self, omega, hidden, depth, rate):
+        self.omega, self.hidden, self.depth, self.rate = omega, hidden, depth, rate
+
+    def __call__(self, cycles, share):
+        """Stand in for the class that the representation makes its gain of."""
+        return self
+
+    def init(self):
+        """Weights whose field is zero."""
+        params = siren.init(0, self.hidden, self.depth, self.omega, inputs=3)
+        last = siren.layers(params) - 1
+        found = {f"gain.{k}": v.numpy() for k, v in params.items()}
+        for part in ("weight", "bias"):
+            found[f"gain.{last}.{part}"] *= 0
+        return {k: v / self.rate for k, v in found.items()}
+
+    def scales(self):
+        """One rate for all weights."""
+        return {name: self.rate for name in self.init()}
+
+    def prepare(self, shape, rows):
+        """Directions of the texels."""
+        d = latlong.directions(rows[1], shape[1])[rows[0] : rows[0] + shape[0]]
+        return dr.opaque(mi.TensorXf(d.reshape(-1, 3).astype(np.float32)))
+
+    def evaluate(self, params, x):
+        """Return the log gain at every texel."""
+        weights = {k.removeprefix("gain."): v for k, v in params.items() if k.startswith("gain.")}
+        y = siren.evaluate(weights, x, self.omega).array
+        i = dr.arange(mi.UInt32, x.shape[0]) * 3
+        return mi.Color3f(*(2 * AMPLITUDE * (dr.gather(mi.Float, y, i + c) - 0.5) for c in range(3)))
+
+
+VARIANTS = {
+    "grids, 12 cycles": GridGain,
+    "SIREN 32x1, omega 8 (5 cycles)": SirenGain(8.0, 32, 1, 0.1),
+    "SIREN 32x1, omega 16 (9 cycles)": SirenGain(16.0, 32, 1, 0.1),
+    "SIREN 64x2, omega 16": SirenGain(16.0, 64, 2, 0.05),
+    "SIREN 64x2, omega 30": SirenGain(30.0, 64, 2, 0.05),
+}
+
+
+def one(lit, transport, original, true, picture, gain, from_search):
+    """Edit one map with one kind of gain; returns PSNRs, sharpness and milliseconds."""
+    height = original.shape[0]
+    crop = original[: height // 2]
+    rows = (0, height)
+    plain = Layers(rows)
+    begun, _ = search.start(plain, plain.encode(crop), transport, picture, None, original)
+    layers = type("Variant", (Layers,), {"Gain": gain})(rows)
+    params = layers.encode(crop)
+    params |= {k: v for k, v in begun.items() if from_search or not k.startswith("gain")}
+    chosen = config.Optimizer(iterations=ITERATIONS)
+    objective = edit.Objective(config.Loss(), picture, None, crop, ITERATIONS)
+    start = time.perf_counter()
+    params, _ = edit.optimise(layers, params, transport, objective, original, 0, chosen)
+    ms = 1000 * (time.perf_counter() - start) / ITERATIONS
+    edited = original.copy()
+    edited[: height // 2] = layers.decode(params).numpy()
+    final = lit.render(edited, spp=2048, seed=11)
+    sharp = [metrics.high_frequency_energy(m[: height // 2]) for m in (edited, original)]
+    return (
+        metrics.compare(final, picture)["psnr"],
+        metrics.compare(edited[: height // 2], true[: height // 2])["psnr"],
+        sharp[0] / sharp[1],
+        ms,
+    )
+
+
+def main():
+    """Compute and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--maps", nargs="+", metavar="NAME")
+    parser.add_argument("--angle", type=int, default=140)
+    parser.add_argument("--scene", default="sphere", choices=SCENES)
+    given = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    lit = scene.load(given.scene, 128, 0, {"roughness": 0.3} if given.scene == "sphere" else {}, None)
+    folder = files.cache_folder("transport")
+    transport = LightTransport.build(lit, 128, 256, few=True, folder=folder)
+    print("| gain | map | rendering PSNR | map PSNR | sharp | ms a step |\n|---|---|---|---|---|---|")
+    for name, file in maps(given.maps).items():
+        original, _ = load_map(config.Input(envmap=str(file), width=256))
+        true = np.ascontiguousarray(latlong.rotate(original, given.angle), np.float32)
+        picture = lit.render(true, spp=2048, seed=7)
+        for label, gain, searched in [
+            *((label, gain, False) for label, gain in VARIANTS.items()),
+            ("grids, from the search's gain", GridGain, True),
+        ]:
+            found = one(lit, transport, original, true, picture, gain, searched)
+            print(
+                "| {} | {} | {:.1f} dB | {:.1f} dB | {:.2f} | {:.0f} |".format(label, name, *found),
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""The smooth gain: interpolation between nodes, periodic, bounded, and no finer than it says."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit import gain
+
+SHAPES = [(1, 2), (3, 7), (5, 8), (17, 33), (32, 64)]
+GAINS = [(8, 1.0), (8, 0.5), (6, 0.3), (1, 1.0), (5, 0.1)]
+
+
+def tensors(params):
+    return {name: mi.TensorXf(value) for name, value in params.items()}
+
+
+def random(g, rng, size=1.0):
+    """Random parameters, each in its own unit."""
+    scales = g.scales()
+    return {
+        n: size * scales[n] * rng.standard_normal(v.shape).astype(np.float32) for n, v in g.init().items()
+    }
+
+
+def field(g, params, shape):
+    """Evaluate on the device: (rows, W, 3)."""
+    return np.array(g.evaluate(tensors(params), g.prepare(shape))).T.reshape(*shape, 3)
+
+
+def interpolated(grid, shape):
+    """Interpolate one grid in float64: nodes of a row from u = 0 on, rows from the top to the bottom edge."""
+    (rows, columns, channels), (height, width) = grid.shape, shape
+    y, x = (np.arange(height) + 0.5) / height * (rows - 1), (np.arange(width) + 0.5) / width * columns
+    across = np.empty((rows, width, channels))
+    result = np.empty((height, width, channels))
+    for c in range(channels):
+        for r in range(rows):
+            across[r, :, c] = np.interp(x, np.arange(columns), grid[r, :, c], period=columns)
+        for k in range(width):
+            result[:, k, c] = np.interp(y, np.arange(rows), across[:, k, c])
+    return result
+
+
+def levels(g):
+    return range(len(g.sizes))
+
+
+# ---- grids -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cycles, share", [(8, 1.0), (16, 0.5), (32, 0.25)])
+def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
+    g = gain.GridGain(cycles, share)
+    columns = [c for _, c in g.sizes]
+    assert columns == [cycles // 2, cycles, 2 * cycles]
+    assert [180 * share / (rows - 1) for rows, _ in g.sizes] == [360 / c for c in columns]
+    assert set(g.init()) == set(g.scales()) == {"gain.0", "gain.1", "gain.2"}
+    assert list(g.scales().values()) == [1, 0.5, 0.25]
+
+
+@pytest.mark.parametrize("cycles, share", GAINS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gain_starts_at_exactly_nothing(cycles, share, shape):
+    g = gain.GridGain(cycles, share)
+    assert {n: v.shape for n, v in g.init().items()} == {f"gain.{i}": (*s, 3) for i, s in enumerate(g.sizes)}
+    np.testing.assert_array_equal(field(g, g.init(), shape), np.zeros((*shape, 3)))
+
+
+@pytest.mark.parametrize("cycles, share", GAINS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_hats_are_a_partition_of_unity(cycles, share, shape):
+    g = gain.GridGain(cycles, share)
+    for level in levels(g):
+        taps = g.hats(level, shape)
+        assert len(taps) == 4
+        for node, weight in taps:
+            assert node.shape == weight.shape == (shape[0] * shape[1],)
+            assert node.min() >= 0 and node.max() < np.prod(g.sizes[level])
+            assert weight.min() >= 0
+        np.testing.assert_allclose(sum(weight for _, weight in taps), 1, rtol=1e-12)
+        ones = {n: np.full_like(v, n == f"gain.{level}") for n, v in g.init().items()}
+        np.testing.assert_allclose(field(g, ones, shape), 1, rtol=1e-6)
+
+
+# ---- the field ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cycles, share", GAINS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_field_is_the_interpolation_of_its_grids(cycles, share, shape, rng):
+    g = gain.GridGain(cycles, share)
+    params = random(g, rng)
+    expected = sum(interpolated(grid.astype(np.float64), shape) for grid in params.values())
+    # Twelve products of numbers of order 1, rounded to float32.
+    np.testing.assert_allclose(field(g, params, shape), expected, atol=2e-6)
+    by_hats = 0
+    for level, grid in enumerate(params.values()):
+        nodes = grid.reshape(-1, 3).astype(np.float64)
+        by_hats = by_hats + sum(nodes[node] * weight[:, None] for node, weight in g.hats(level, shape))
+    np.testing.assert_allclose(by_hats.reshape(*shape, 3), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [64, 61, 9])
+def test_seam_is_like_any_other_place(width, rng):
+    """From a column to the next, no node's step is exceeded, nor from the last to the first."""
+    g = gain.GridGain(4, 1.0)
+    for level in levels(g):
+        name, columns = f"gain.{level}", g.sizes[level][1]
+        params = {n: v * (n == name) for n, v in random(g, rng).items()}
+        nodes = params[name]
+        values = field(g, params, (16, width))
+        step = np.abs(np.roll(nodes, -1, axis=1) - nodes).max()
+        jump = np.abs(values - np.roll(values, 1, axis=1))
+        assert jump.max() <= step * columns / width + 1e-5 and jump[:, 0].max() > 0
+
+
+def test_field_turns_with_its_nodes(rng):
+    g = gain.GridGain(4, 1.0)
+    params = random(g, rng)
+    width = 40  # 5 columns for one of 8 nodes
+    still = field(g, params, (9, width))
+    for turns in (1, 3):  # nodes of the coarsest grid, of which there are 2
+        turned = {n: np.roll(v, turns * v.shape[1] // 2, axis=1) for n, v in params.items()}
+        np.testing.assert_allclose(
+            field(g, turned, (9, width)), np.roll(still, width // 2, axis=1), atol=2e-6
+        )
+    one = {"gain.2": np.roll(params["gain.2"], 1, axis=1)}
+    zero = g.init()
+    a, b = field(g, zero | {"gain.2": params["gain.2"]}, (9, width)), field(g, zero | one, (9, width))
+    np.testing.assert_allclose(b, np.roll(a, 5, axis=1), atol=2e-6)
+    assert np.abs(b - a).max() > 0.1
+
+
+@pytest.mark.parametrize("cycles", [4, 6, 16])
+def test_spectrum_around_the_horizon_ends_at_the_stated_cycles(cycles, rng):
+    """Random nodes of a bilinear grid: sinc^4 of their energy, 93 % of it below the highest of their own."""
+    g = gain.GridGain(cycles, 1.0)
+    shape = (64, 256)
+    share = []
+    for _ in range(8):
+        energy = np.abs(np.fft.rfft(field(g, random(g, rng), shape), axis=1)) ** 2
+        energy[:, 1:-1] *= 2
+        share.append(energy[:, : cycles + 1].sum() / energy.sum())
+    assert min(share) >= 0.9
+    finest = {n: v * (n == "gain.2") for n, v in random(g, rng).items()}
+    energy = np.abs(np.fft.rfft(field(g, finest, shape), axis=1)).sum(axis=(0, 2))
+    assert energy[cycles // 2 + 1 : cycles + 1].sum() > 0.15 * energy.sum(), "and reaches there"
+
+
+def test_gain_is_bounded_and_only_at_its_bounds(rng):
+    g = gain.GridGain(4, 1.0)
+    shape = (9, 40)
+    for sign in (1, -1):
+        far = {n: np.full_like(v, sign * 1e6) for n, v in g.init().items()}
+        np.testing.assert_array_equal(field(g, far, shape), sign * gain.MOST)
+    params = random(g, rng, size=15)
+    free = sum(interpolated(grid.astype(np.float64), shape) for grid in params.values())
+    assert (np.abs(free) > gain.MOST).any() and (np.abs(free) < gain.MOST).any()
+    np.testing.assert_allclose(field(g, params, shape), np.clip(free, -12, 12), atol=3e-5)
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cycles, share", GAINS)
+@pytest.mark.parametrize("shape", [(5, 8), (17, 33)])
+def test_gradient_is_the_adjoint_of_the_hats(cycles, share, shape, rng):
+    g = gain.GridGain(cycles, share)
+    params = tensors(random(g, rng))
+    for value in params.values():
+        dr.enable_grad(value)
+    weight = rng.standard_normal((shape[0] * shape[1], 3)).astype(np.float32)
+    field = g.evaluate(params, g.prepare(shape))
+    dr.backward(dr.sum(dr.sum(field * mi.Color3f(*(mi.Float(w) for w in weight.T)))))
+    for level, (rows, columns) in enumerate(g.sizes):
+        expected = np.zeros((rows * columns, 3))
+        for node, hat in g.hats(level, shape):
+            np.add.at(expected, node, hat[:, None] * weight)
+        found = np.array(dr.grad(params[f"gain.{level}"])).reshape(-1, 3)
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+        assert np.abs(expected).max() > 0.01

@@ -58,20 +58,28 @@ class GridGain:
         return taps
 
     def prepare(self, shape, rows=None) -> list:
-        """Bring nodes and weights of the texels of an image (rows, W) to the device; ``rows`` is not used."""
-        return [
-            [
-                (dr.opaque(mi.UInt32(i.astype(np.uint32))), dr.opaque(mi.Float(w.astype(np.float32))))
-                for i, w in self.hats(level, shape)
-            ]
-            for level in range(LEVELS)
-        ]
+        """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
+        height, width = shape
+        found = []
+        for level, (nodes, columns) in enumerate(self.sizes):
+            down, across = np.zeros((height, nodes)), np.zeros((columns, width))
+            texel = np.arange(height * width)
+            for node, weight in self.hats(level, shape):
+                # A tap's weight is that of its row times that of its column.
+                np.add.at(down, (texel // width, node // columns), weight / width)
+                np.add.at(across, (node % columns, texel % width), weight / height)
+            across = np.kron(across, np.eye(3))  # three channels, one apart from the other
+            found.append([dr.opaque(mi.TensorXf(m.astype(np.float32))) for m in (down, across)])
+        return found
 
     def evaluate(self, params: dict, prepared) -> mi.Color3f:
-        """Return the log gain at every texel."""
-        g = mi.Color3f(0)
-        for level, taps in enumerate(prepared):
-            values = params[f"gain.{level}"].array
-            for index, weight in taps:
-                g += dr.gather(mi.Color3f, values, index) * weight
-        return dr.clip(g, -MOST, MOST)
+        """Return the log gain at every texel.
+
+        Products of matrices and not gathers, whose adjoint adds in the order in which threads come.
+        """
+        g = 0
+        for level, (down, across) in enumerate(prepared):
+            rows, columns = self.sizes[level]
+            nodes = dr.reshape(params[f"gain.{level}"], (rows, 3 * columns))
+            g = g + dr.matmul(dr.matmul(down, nodes), across)
+        return dr.clip(dr.unravel(mi.Color3f, g.array), -MOST, MOST)

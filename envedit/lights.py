@@ -83,6 +83,9 @@ class Lights:
         self._point = dr.opaque(mi.Vector3f(np.concatenate(points).T.astype(np.float32)))
         self._flux = dr.opaque(mi.Color3f(np.concatenate(fluxes).T.astype(np.float32)))
         self._which = dr.opaque(mi.UInt32(np.concatenate(which).astype(np.uint32)))
+        # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
+        owner = np.concatenate(which)[:, None] == np.arange(self.count)
+        self._owner = dr.opaque(mi.TensorXf(owner.astype(np.float32)))
         self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
         self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
         self._glow = [
@@ -117,13 +120,12 @@ class Lights:
             Linear radiance; what falls on rows that are not wanted is lost.
         """
         first, total = rows
-        i = self._which
-        centre = dr.gather(mi.Vector3f, self._centre, i)
+        centre = dr.gather(mi.Vector3f, self._centre, self._which)
         along = dr.dot(self._point, centre)
-        size = dr.exp(dr.clip(dr.gather(mi.Float, log_size.array, i), -6, 3))
+        size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, -6, 3))
         scaled = dr.normalize(self._point + (self._point - centre * along) * (size - 1))
-        d = rotate(_vector(turn, i), scaled)
-        flux = self._flux * _exp(_colour(log_flux, i))
+        d = rotate(dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array), scaled)
+        flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
         # As in latlong.texel_position; the horizontal part is held off 0, where a column is not defined.
         across = dr.sqrt(dr.maximum(d.x * d.x + d.z * d.z, _LEAST_SINE**2))
         row = dr.atan2(across, d.y) * dr.opaque(mi.Float, (total - 1) / math.pi)

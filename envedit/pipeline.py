@@ -238,7 +238,8 @@ def run(
     if isinstance(representation, Layers):
         with clock("start_s"):
             watch.stage("searching for lights")
-            through = traced or trace(settings, lit, (height, width))
+            enough = replace(settings, renderer=replace(settings.renderer, spp="auto"))
+            through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
             free = None  # a light may move across texels that are kept otherwise
             params, notes = search.start(

@@ -29,6 +29,9 @@ BIRTH = 0.6
 """A light is born where it explains this share of what all others leave unexplained."""
 BIRTH_LIGHT = 0.03
 """And adds this share to the light of the picture."""
+SEEN, UNWANTED = 1e-3, 1e-2
+"""A light that adds less than the first share to the picture, and would explain less than the second of its
+square anywhere, stays as it is."""
 UNEXPLAINED = 0.003
 """Share of the squared picture that must be left unexplained before a light can be born."""
 FAINT = 0.2
@@ -96,6 +99,11 @@ def place(
         cells = overview.cell_of[start + light.texels]
         stay = search.atom_of(cells, flux, light.direction, light.glow)
         score = search.scores(atom)
+        unseen = np.abs(stay).sum() < SEEN * search.light and score.max() < UNWANTED * search.asked()
+        if unseen:  # nothing is known of it, and nothing else wants it
+            directions.append(None)
+            atoms.append(None)
+            continue
         if search.scores(stay)[0] >= STAY * score.max():
             directions.append(None)
             chosen = stay[..., 0]
@@ -105,7 +113,10 @@ def place(
             chosen = atom[..., best]
         atoms.append(chosen)
         search.explain(chosen)
-    factors = search.solve(atoms)
+    seen = [i for i, a in enumerate(atoms) if a is not None]
+    factors = np.ones((len(lights), 3))
+    factors[seen] = search.solve([atoms[i] for i in seen])
+    atoms = [atoms[i] for i in seen]
     # Whether lights are missing is asked only where much is left.
     missing = search.left() > UNEXPLAINED * search.asked()
     if missing:
@@ -125,7 +136,8 @@ def place(
         directions.append(search.between(score, best))
         atoms.append(candidate)
         search.explain(candidate)
-        factors = grown
+        factors = np.concatenate([factors, np.ones((1, 3))])
+        factors[[*seen, *range(len(lights), len(factors))]] = grown
     places = []
     for direction, factor in zip(directions, factors, strict=True):
         gone = factor.max() < LEAST_FLUX

@@ -216,8 +216,9 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         stage.smooth_limit(state, node)
         stage.fit_to_stage(state, node)
         stage.hash_node(digest, node)
-    stage.set_sampler(state, sampler)  # after the digest: light transport has its own samples
     emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
+    own = str(emitter.id())
+    stage.set_sampler(state, sampler)  # after the digest: light transport has its own samples
     # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
     for node in state.nodes:
         for name in node.props.keys():  # noqa: SIM118 (no dict)
@@ -225,10 +226,10 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
 
     built = stage.told(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
-    if scene.environment() is None or scene.environment().id() != emitter.id():
+    if scene.environment() is None or scene.environment().id() != own:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
-    key = next(name for name, _ in params if name.split(".")[-2:] == [emitter.id(), "data"])
+    key = next(k for k, _ in params if k.split(".")[-2:] == [own, "data"])
     columns, rows = (int(n) for n in scene.sensors()[0].film().crop_size())
     return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params)
 

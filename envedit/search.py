@@ -32,6 +32,8 @@ UPDATES = 30
 """Multiplicative updates of :func:`spread`."""
 SPACINGS = (2, 1)
 """Distances of the probes of :func:`refine`, texels: first five by five of them, then three by three."""
+PROBES = 25
+"""Exact columns that are looked at together."""
 
 
 def start(
@@ -80,7 +82,10 @@ def start(
             notes.append(f"{name}: the picture does not want it")
             continue
         direction, flux = light.direction, 1.0
-        if found.direction is not None:
+        if found.direction is not None and transport.capacity < PROBES:
+            direction = found.direction
+            notes.append(f"{name}: placed to a few degrees: memory_gb leaves no exact columns to refine")
+        elif found.direction is not None:
             direction, flux = scene.refine(found.direction, layers.lights.flux[i], light.glow)
             angle = np.degrees(np.arccos(np.clip(direction @ light.direction, -1, 1)))
             notes.append(f"{name}: starts {angle:.1f} degrees from where it was")
@@ -100,6 +105,7 @@ def start(
     if pictures:
         stack = np.stack([overview.to_blocks(p).T for _, p in pictures], axis=2)
     found = dict(params)
+    total = np.ones((len(pictures), 3))
     for level in range(len(layers.gain.sizes)):
         hats = scene.hats(level) * factor.T[..., None]
         gain, strength = spread(overview, scene.wanted, weight, picture, hats, stack)
@@ -108,8 +114,10 @@ def start(
         logs = np.log(gain).reshape(*layers.gain.sizes[level], 3) / layers.scales[name]
         found[name] = _tensor(logs)
         factor = factor * scene.in_cells(level, gain)
-    for (i, _), s in zip(pictures, strength, strict=True):
-        places[i] = Place(places[i].direction, places[i].flux * np.clip(s, LEAST, MOST))
+        strength = np.clip(strength, LEAST, MOST)
+        total, stack = total * strength, stack * strength.T[:, None, :]
+    for (i, _), s in zip(pictures, total, strict=True):
+        places[i] = Place(places[i].direction, places[i].flux * s)
     turn, flux = scene.parameters(places)
     found["turn"] = _tensor(turn / layers.scales["turn"])
     found["flux"] = _tensor(flux / layers.scales["flux"])

@@ -118,7 +118,10 @@ def set_film(state, where: str, width: int, height: int) -> None:
 
 
 def set_sampler(state, plugin: str) -> None:
-    """Give the first sensor a sampler of the asked kind, unless it has another than ``independent``."""
+    """Give the first sensor a sampler of the asked kind, unless it has another than ``independent``.
+
+    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+    """
     sensor = next(n for n in state.nodes if n.type == mi.ObjectType.Sensor)
     for _, value in sensor.props.items():
         if isinstance(value, mi.Properties.ResolvedReference):
@@ -127,10 +130,11 @@ def set_sampler(state, plugin: str) -> None:
                 if node.props.plugin_name() == "independent":
                     node.props.set_plugin_name(plugin)
                 return
+    # Before the append, which moves the nodes: references to them, ``sensor`` too, are void after it.
+    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes))
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Sampler, mi.Properties(plugin)
     state.nodes.append(node)
-    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
 def find_files(state, where: str, folders) -> None:

@@ -248,7 +248,7 @@ def test_siren_of_another_image_forgets_the_points_of_the_first(rng):
 
 
 def test_a_fit_that_is_edited_is_not_polished_unless_asked_for():
-    settings = config.Config(representation=config.Representation(hidden=8, depth=1))
+    settings = config.Config(representation=config.Representation(kind="siren", hidden=8, depth=1))
     recipe = envmap.make(settings).settings
     assert (recipe.awp_until, recipe.light) == (1.0, 0.0) and recipe == fit.unpolished(settings.fit)
     asked = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, polish="always"))

@@ -112,7 +112,8 @@ def test_seam_is_like_any_other_place(width, rng):
         values = field(g, params, (16, width))
         step = np.abs(np.roll(nodes, -1, axis=1) - nodes).max()
         jump = np.abs(values - np.roll(values, 1, axis=1))
-        assert jump.max() <= step * columns / width + 1e-5 and jump[:, 0].max() > 0
+        assert jump.max() <= step * columns / width + 1e-5
+        assert columns == 2 or jump[:, 0].max() > 0  # of two columns the seam is an axis of symmetry
 
 
 def test_field_turns_with_its_nodes(rng):

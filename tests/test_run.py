@@ -463,7 +463,7 @@ def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
 
 
 def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
-    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     first = pixels(out / "edited.exr")
     assert call(out / "config.toml", "--quiet") == 0
@@ -524,7 +524,7 @@ def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypat
 
 
 def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, rng, capsys, monkeypatch):
-    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     from envedit.progress import Progress
 
@@ -587,7 +587,9 @@ def stop_at_checkpoint(process, file, number):
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng):
     """Ctrl-C, then SIGKILL, each in a process of its own; the third process, this one, ends it."""
-    path, out = world(tmp_path, rng, optimizer={"iterations": 400, "checkpoint_s": 0.0}), tmp_path / "c_out"
+    optimizer = {"iterations": 400, "checkpoint_s": 0.0}
+    path = world(tmp_path, rng, representation={"kind": "pixels"}, optimizer=optimizer)
+    out = tmp_path / "c_out"
     code, said, errors = stop_at_checkpoint(started(path, tmp_path), out / "checkpoint.npz", signal.SIGINT)
     assert code == 130, errors
     assert "Traceback" not in errors and "--resume" in errors.splitlines()[-1]

@@ -18,16 +18,18 @@ SCENES = Path(__file__).parent.parent / "scenes"
 # ---- rendering ---------------------------------------------------------------------------------------------
 
 
-def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(tmp_path, rng):
+@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(sampler, tmp_path, rng):
     image = sky(rng)
     turn = '<transform name="to_world"><rotate x="0.48" y="0.8" z="0.36" angle="70"/></transform>'
     missing = f'<emitter type="envmap"><string name="filename" value="not-there.exr"/>{turn}</emitter>'
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, missing))
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, missing), sampler=sampler)
     ours = loaded.render(image, spp=16, seed=3, max_depth=4)
 
     mi.Bitmap(image).write(str(tmp_path / "sky.exr"))
+    sampled = SENSOR.replace("</sensor>", f'<sampler type="{sampler}"/></sensor>')
     there = f'<emitter type="envmap"><string name="filename" value="sky.exr"/>{turn}</emitter>'
-    theirs = mi.load_file(str(write_scene(tmp_path, SENSOR, BALL, there, name="theirs.xml")))
+    theirs = mi.load_file(str(write_scene(tmp_path, sampled, BALL, there, name="theirs.xml")))
     seed = int(np.random.SeedSequence([3, 0]).generate_state(1)[0])
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
     expected = np.array(mi.render(theirs, integrator=integrator, spp=16, seed=seed))
@@ -61,7 +63,7 @@ def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT, lamp))
     dark = loaded.render(np.zeros((8, 16, 3)), spp=64)
     lit = loaded.render(np.ones((8, 16, 3)), spp=256)
-    assert dark[0, 0].max() == 0 and dark.max() > 0.01
+    assert dark[0, 0].max() == 0 and dark.max() > 0.005
     middle = (slice(5, 7), slice(7, 9))
     albedo = lit[middle].mean((0, 1)) - dark[middle].mean((0, 1))
     np.testing.assert_allclose(albedo, [0.2, 0.4, 0.6], rtol=0.05)

@@ -88,7 +88,7 @@ def measure(folder: Path, file: Path, angle: float) -> dict | None:
 
 HEAD = (
     "| map | {} | rendering PSNR (unedited) | SSIM | map PSNR (unedited) | gain | SSIM (unedited) | "
-    "light off, texels | flux | high frequencies (true map) | s |\n|---|---|---|---|---|---|---|---|---|---|---|"
+    "light off, texels | flux | high frequencies (true map) | s |\n" + "|---" * 11 + "|"
 )
 
 

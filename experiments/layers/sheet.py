@@ -47,7 +47,8 @@ def main():
     mi.set_variant("llvm_ad_rgb")
     for scene in SCENES:
         for angle in (60, 140):
-            rows = [row(given.out, n, f, scene, angle, list(NAMES)) for n, f in maps().items()]
+            kinds = [k for k in NAMES if any(given.out.glob(f"*-{scene}-{angle}-{k}/metrics.json"))]
+            rows = [row(given.out, n, f, scene, angle, kinds) for n, f in maps().items()]
             rows = [r for r in rows if r is not None]
             if rows:
                 pixels = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)

@@ -36,7 +36,8 @@ class Result:
     Attributes
     ----------
     envmap : ndarray (H, W, 3)
-        The edited map; rows outside the active ones, and frozen texels, are the original's, bit for bit.
+        The edited map; rows outside the active ones are the original's, bit for bit, and so are frozen texels
+        but where layers move a light or its glow across them.
     renders, maps : dict
         ``initial``, ``target``, ``edited``; linear radiance. ``maps["target"]`` is None where it is unknown.
     metrics : dict

@@ -95,24 +95,37 @@ class Scene(Table):
 class Target(Table):
     """What the rendering should look like."""
 
-    kind: str = _key("envmap", target_kind, "given by: another map, or a painted image")
+    kind: str = _key("envmap", target_kind, "given by: another map, a painted image, or strokes")
     file: str = _key("", string, "kind envmap: the other map; kind image: the painted rendering")
     rotate_degrees: float = _key(
         60.0, number(-360, 360), "kind envmap: turn of the input about the vertical, degrees; 0 with a file"
     )
     mask: str = _key("", string, "image that is white where the target counts; empty: everywhere")
-    tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image was painted")
-    strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes, which comes later: list of tables")
-    spp: int = _key(1024, integer(1, 1 << 20), "samples a pixel of the target's rendering")
+    tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted")
+    strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes: list of tables, see envedit.strokes")
+    paint: float = _key(1.0, number(0), "kinds image, strokes: weight of all that was painted together")
+    hold: float = _key(1.0, number(0), "kinds image, strokes: weight of all pixels that were not painted")
+    spp: int | str = _key(
+        "auto", or_auto(integer(1, 1 << 20)), "samples a pixel of the target's rendering; auto: until quiet"
+    )
 
     def _check_together(self) -> None:
         if self.kind == "envmap" and self.file:
             object.__setattr__(self, "rotate_degrees", 0.0)
         if self.kind == "image" and not self.file:
             raise ConfigError('target.file: came "", wanted the painted image, as target.kind is "image"')
-        if self.strokes:
+        if self.kind == "strokes" and not self.strokes:
+            raise ConfigError('target.strokes: came none, wanted at least one, as target.kind is "strokes"')
+        if self.kind == "strokes" and self.file:
             raise ConfigError(
-                f"target.strokes: came {len(self.strokes)} strokes, wanted none: that target comes later"
+                f"target.file: came {show(self.file)}, wanted none: strokes go on the initial rendering"
+            )
+        if self.kind != "envmap" and not self.paint + self.hold:
+            raise ConfigError("target.paint, target.hold: came 0 for both, wanted one above 0")
+        if self.kind != "strokes" and self.strokes:
+            raise ConfigError(
+                f'target.strokes: came {len(self.strokes)}, wanted none, as target.kind is "{self.kind}": '
+                'set target.kind = "strokes"'
             )
 
 
@@ -174,6 +187,7 @@ class Loss(Table):
     l1: Ramp = _key(0.0, weight, "sum of the map's radiance (Eq. 9)")
     dists: Ramp = _key(0.0, weight, "DISTS of map and original")
     tv: Ramp = _key(0.0, weight, "total variation of the map")
+    change: Ramp = _key(0.0, weight, "mean change of the map's logarithm: what need not change stays")
     image_l1: Ramp = _key(1.0, weight, "mean absolute difference of rendering and target")
     image_l2: Ramp = _key((1.0, 100.0), weight, "mean squared difference of rendering and target")
 
@@ -226,8 +240,11 @@ class Output(Table):
 
     dir: str = _key("", string, "folder of the results; empty: <config stem>_out beside the file")
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap of previews and metrics")
-    spp: int = _key(1024, integer(1, 1 << 20), "samples a pixel of the judged renderings")
+    spp: int | str = _key(
+        "auto", or_auto(integer(1, 1 << 20)), "samples a pixel of the judged rendering; auto: until quiet"
+    )
     report: bool = _key(True, boolean, "write preview.png and report.html")
+    full: bool = _key(True, boolean, "write edited_full.exr, at the resolution of the input's file")
 
 
 def _table_key(table: type[Table]) -> Any:

@@ -1,12 +1,14 @@
 """Decoders of OpenEXR, Radiance, PNG and JPEG, behind :func:`envedit.image.read`.
 
-A decoder takes the file's name, its first bytes and the ``info`` of :func:`envedit.image.read`, which it
-fills. Damage is told as ``InputError`` or left to the caller as the library's own exception.
+A decoder takes the file's name, its first bytes, the ``info`` of :func:`envedit.image.read`, which it
+fills, and whether the pixels are wanted as stored (:func:`envedit.image.read_stored`). Damage is told as
+``InputError`` or left to the caller as the library's own exception.
 """
 
 import os
 import re
 import stat
+import zlib
 
 import numpy as np
 
@@ -64,7 +66,7 @@ def damaged(name, reason):
 # OpenEXR
 
 
-def _read_exr(name, head, info):
+def _read_exr(name, head, info, stored):
     import OpenEXR
 
     try:
@@ -80,6 +82,12 @@ def _read_exr(name, head, info):
             f"{name}: its {len(parts)} parts hold more than {MAX_TEXELS} texels; save only colour"
         )
     index, names = _choose_channels(name, [p.header for p in parts], info)
+    header = parts[index].header
+    if stored:
+        layer = names[0].rpartition(".")[0]
+        beside = [c for c in header["channels"] if c.name.rpartition(".")[0] == layer]
+        alpha = [c for c in beside if c.name.rpartition(".")[2].upper() == "A"]
+        names += [c.name for c in alpha if c.xSampling == c.ySampling == 1]
 
     # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
     try:
@@ -95,10 +103,12 @@ def _read_exr(name, head, info):
     # A part that cannot be decoded is dropped with a printed warning, and the others move up.
     if planes is None or any(p.shape != (height, width) for p in planes):
         raise damaged(name, said and said[0] or "not all of its parts could be decoded")
-    image = np.stack(planes if len(planes) == 3 else planes * 3, axis=-1)
-    header = parts[index].header
+    display = _window(header["displayWindow"])
+    if stored and len(planes) in (1, 3) and windows[index] != display:
+        planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
+    image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
     _describe(header, info)
-    return _to_display(image, (left, top), _window(header["displayWindow"]), name, info)
+    return _to_display(image, (left, top), display, name, info)
 
 
 def _window(box):
@@ -159,7 +169,7 @@ def _to_display(image, corner, display, name, info):
         f"data window {image.shape[1]} x {image.shape[0]} at {corner[0]}, {corner[1]} differs from the "
         f"display window {width} x {height} at {left}, {top}: cropped, or filled with black"
     )
-    whole = np.zeros((height, width, 3), np.float32)
+    whole = np.zeros((height, width, image.shape[2]), np.float32)
     y, x = corner[1] - top, corner[0] - left
     y0, x0 = max(y, 0), max(x, 0)
     y1, x1 = min(y + image.shape[0], height), min(x + image.shape[1], width)
@@ -172,7 +182,7 @@ def _to_display(image, corner, display, name, info):
 # Radiance
 
 
-def _read_radiance(name, head, info):
+def _read_radiance(name, head, info, stored):
     end = re.search(rb"\n\r?\n([^\n]*)\n", head)
     size = end and re.fullmatch(rb"([-+][XY]) +(\d{1,9}) +([-+][XY]) +(\d{1,9})\s*", end[1])
     if not size:
@@ -251,16 +261,20 @@ def _radiance_pixels(name, data, height, width):
 # PNG and JPEG
 
 
-def _read_ldr(name, head, info):
+def _read_ldr(name, head, info, stored):
     if info["format"] == "png":
         size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
     else:
-        size = _jpeg_size(name)
+        size = _jpeg_header(name, info if stored else {})
     check_declared(name, *size)
     image = _bitmap(name)
     if image.dtype not in (np.uint8, np.uint16):
         raise damaged(name, f"unexpected samples of type {image.dtype}")
     info["hdr"] = False
+    if stored:
+        if info["format"] == "png":
+            _png_marks(name, info)
+        return image
     depth = 8 * image.dtype.itemsize
     info["warnings"].append(f"a {depth}-bit {info['format'].upper()} is not HDR: light above 1 is missing")
     image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
@@ -268,21 +282,88 @@ def _read_ldr(name, head, info):
     return values[image]
 
 
-def _jpeg_size(name):
-    """Return (width, height) from the frame header, wherever the markers before it end."""
+def _jpeg_header(name, info):
+    """Return (width, height), and note the quality and the marks of a JPEG file."""
+    size, mean = None, 0.0
     with open(name, "rb") as file:
         file.seek(2)
         while True:
             marker = file.read(4)
             if len(marker) < 4 or marker[0] != 0xFF:
-                raise damaged(name, "no JPEG frame header")
+                break
             if marker[1] == 0xFF:  # padding before a marker
                 file.seek(-3, os.SEEK_CUR)
                 continue
-            if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
-                frame = file.read(5)
-                return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
-            file.seek(max(int.from_bytes(marker[2:], "big") - 2, 0), os.SEEK_CUR)
+            if marker[1] == 0xDA:  # the picture begins
+                break
+            data = file.read(max(int.from_bytes(marker[2:], "big") - 2, 0))
+            if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC) and size is None:
+                if len(data) < 6:
+                    break
+                size = int.from_bytes(data[3:5], "big"), int.from_bytes(data[1:3], "big")
+                if data[5] not in (1, 3):
+                    raise InputError(f"{name}: holds {data[5]} channels (CMYK?); save it as RGB")
+            elif marker[1] == 0xDB and not mean and data and not data[0] & 15:
+                wide = 2 if data[0] >> 4 else 1
+                mean = float(np.frombuffer(data[1 : 1 + 64 * wide], f">u{wide}").mean())
+            elif marker[1] == 0xE1 and data[:6] == b"Exif\0\0":
+                info["orientation"] = _orientation(data[6:])
+            elif marker[1] == 0xE2 and data[:12] == b"ICC_PROFILE\0":
+                info["profile"] = info.get("profile", b"") + data[14:]
+    if size is None:
+        raise damaged(name, "no JPEG frame header")
+    scale = mean / _JPEG_MEAN
+    quality = round(100 - 50 * scale if scale < 1 else 50 / scale)
+    info["quality"] = min(max(quality, 1), 100)
+    return size
+
+
+_JPEG_MEAN = 3688 / 64
+"""Mean of the luminance table of the JPEG standard (Annex K), which libjpeg takes for quality 50."""
+
+
+def _png_marks(name, info):
+    """Note texts, orientation and colour profile of a PNG that has been decoded."""
+    with open(name, "rb") as file:
+        file.seek(8)
+        while len(start := file.read(8)) == 8 and start[4:] != b"IEND":
+            length, kind = int.from_bytes(start[:4], "big"), start[4:]
+            if kind not in (b"eXIf", b"iCCP", b"tEXt", b"iTXt", b"zTXt"):
+                file.seek(length + 4, os.SEEK_CUR)
+                continue
+            data = file.read(length + 4)[:length]
+            key, _, rest = data.partition(b"\0")
+            if kind == b"eXIf":
+                info["orientation"] = _orientation(data)
+            elif kind == b"iCCP":
+                info["profile"] = _inflated(rest[1:])
+            elif kind == b"iTXt":
+                text = rest[2:].split(b"\0", 2)[-1]
+                text = _inflated(text) if rest[:1] == b"\1" else text
+                info["metadata"][key.decode("latin-1")] = text.decode("utf-8", "replace")
+            else:  # read here, as Mitsuba fails on letters beyond ASCII
+                text = rest if kind == b"tEXt" else _inflated(rest[1:])
+                info["metadata"][key.decode("latin-1")] = text.decode("latin-1")
+
+
+def _inflated(data, most=1 << 22):
+    """Decompress a PNG's chunk, of at most 4 MiB; nothing if it is damaged."""
+    try:
+        return zlib.decompressobj().decompress(data, most)
+    except zlib.error:
+        return b""
+
+
+def _orientation(exif):
+    """Return tag 274 of the first directory of EXIF data; 1, upright, where it has none."""
+    order = {b"II": "little", b"MM": "big"}.get(exif[:2], "big")
+    at = int.from_bytes(exif[4:8], order)
+    for entry in range(at + 2, at + 2 + 12 * int.from_bytes(exif[at : at + 2], order), 12):
+        if int.from_bytes(exif[entry : entry + 2], order) == 274:
+            return int.from_bytes(exif[entry + 8 : entry + 10], order)
+        if entry > len(exif):
+            break
+    return 1
 
 
 def _bitmap(name):

@@ -17,7 +17,7 @@ import numpy as np
 
 from . import config, losses, optim
 from ._callable import make_callable
-from .errors import NumericalError
+from .errors import ConfigError, NumericalError
 from .ssim import Ssim
 
 MOST_BAD_STEPS = 20
@@ -260,13 +260,18 @@ def _read_back(waiting, state):
     waiting.clear()
 
 
-def edit(settings: config.Config | str, **named):
+def edit(settings: config.Config | str, *, target=None, mask=None, **named):
     """Carry out an edit without writing files: ``envedit.edit(config)``.
 
     Parameters
     ----------
     settings : config.Config or path
         A configuration, or the TOML file of one.
+    target : ndarray (h, w, 3), optional
+        A painted picture in linear radiance, in place of the configuration's target: what
+        :func:`envedit.painted.initial` rendered, with something painted over it.
+    mask : ndarray (h, w), optional
+        Where it was painted, in [0, 1]; by default where it differs from the initial rendering.
     **named
         As :func:`envedit.pipeline.run`.
 
@@ -274,12 +279,19 @@ def edit(settings: config.Config | str, **named):
     -------
     pipeline.Result
         ``envmap``, ``render``, ``metrics``, ``history``.
+
+    Raises
+    ------
+    EnveditError
+        As :func:`envedit.pipeline.run`; ConfigError if there is a mask without a target.
     """
+    if mask is not None and target is None:
+        raise ConfigError("mask: given without a target; it says where that was painted")
     settings = settings if isinstance(settings, config.Config) else config.load(settings)
     mi.set_variant(settings.variant)
     from .pipeline import run
 
-    return run(settings, **named)
+    return run(settings, picture=target, mask=mask, **named)
 
 
 make_callable(__name__, edit)

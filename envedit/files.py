@@ -10,6 +10,13 @@ from pathlib import Path
 
 from .errors import EnveditError, InputError
 
+RESULTS = (
+    "edited.exr", "edited_full.exr", "edited_layers.exr", "render_initial.exr", "render_target.exr",
+    "render_edited.exr", "influence.exr", "influence.png", "unreachable.png", "preview.png", "report.html",
+    "history.csv", "config.toml", "manifest.json", "metrics.json", "checkpoint.npz",
+)  # fmt: skip
+"""Every file that a run may leave in its folder, the last only while it runs."""
+
 
 @contextlib.contextmanager
 def replacing(path, suffix: str = ""):

@@ -7,6 +7,7 @@ sentences.
 
 import os
 import sys
+import zlib
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from .decoders import FORMATS, MAX_SIDE, REC709, damaged, head_of
 from .errors import ConfigError, EnveditError, InputError, NumericalError
 from .files import quiet_libraries, replacing
 
-__all__ = ["load_envmap", "read", "write_exr", "write_png"]
+__all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_png"]
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -49,6 +50,47 @@ def read(path) -> tuple[np.ndarray, dict]:
         If the file is missing, empty, truncated, of another kind, or declares more than 32768 texels on a
         side or 2^27 in all.
     """
+    return _decode(path, stored=False)
+
+
+def read_stored(path) -> tuple[np.ndarray, dict]:
+    """Read an image file as it was painted: with alpha, and without undoing any display curve.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    pixels : array (H, W, C)
+        float32 linear radiance for OpenEXR and Radiance; uint8 or uint16 codes of display values for PNG
+        and JPEG. C is 1 (grey), 2 (grey and alpha), 3 (RGB) or 4 (RGB and alpha). Alpha is premultiplied in
+        OpenEXR and straight in PNG, by convention.
+    info : dict
+        As of :func:`read`; ``metadata`` holds a PNG's texts. A JPEG also has ``quality``, as libjpeg
+        counts it, estimated from its first table.
+
+    Raises
+    ------
+    InputError
+        As :func:`read`, and if the picture is marked to be turned (EXIF orientation).
+    """
+    pixels, info = _decode(path, stored=True)
+    if (orientation := info.pop("orientation", 1)) not in (0, 1):
+        raise InputError(
+            f"{info['path']}: is marked as turned (EXIF orientation {orientation}), which is not undone: "
+            "save it upright, without that mark"
+        )
+    profile = info.pop("profile", b"sRGB").replace(b"\0", b"")  # its name may be UTF-16
+    if b"sRGB" not in profile or b"inear" in profile:
+        info["warnings"].append(
+            "its colour profile is not sRGB: values are used as they are, hues may be off"
+        )
+    return pixels, info
+
+
+def _decode(path, stored):
     name = os.fsdecode(path)
     head = head_of(name)
     info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
@@ -56,7 +98,7 @@ def read(path) -> tuple[np.ndarray, dict]:
         if head.startswith(magic):
             info["format"] = kind
             try:
-                image = reader(name, head, info)
+                image = reader(name, head, info, stored)
             except MemoryError:
                 raise InputError(f"{name}: not enough memory to read this image; make it smaller") from None
             except EnveditError:
@@ -146,10 +188,11 @@ def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[n
 # Writing
 
 
-def write_exr(path, image, metadata: dict | None = None) -> None:
+def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) -> None:
     """Write an image as a float32 OpenEXR file, whole or not at all.
 
-    Marked as lat-long with Rec.709 primaries. Written under another name in the same folder and then renamed.
+    Marked as lat-long, unless it is no ``panorama``, with Rec.709 primaries.
+    Written under another name in the same folder and then renamed.
 
     Parameters
     ----------
@@ -159,6 +202,8 @@ def write_exr(path, image, metadata: dict | None = None) -> None:
         Linear radiance, finite in float32. Never written as half: 65504 is less than many a sun.
     metadata : dict, optional
         Attributes to add (str, int or float; anything else as its text), such as ``{"source": "sky.hdr"}``.
+    panorama : bool
+        Mark it as a lat-long map, which some viewers show as a sphere.
 
     Raises
     ------
@@ -175,11 +220,11 @@ def write_exr(path, image, metadata: dict | None = None) -> None:
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "chromaticities": REC709,
-        "envmap": OpenEXR.ENVMAP_LATLONG,
+        **({"envmap": OpenEXR.ENVMAP_LATLONG} if panorama else {}),
         "software": f"envedit {_version()}",
     }
-    reserved = {"channels", "dataWindow", "displayWindow", "lineOrder", "name", "view", "tiles", *header}
-    reserved.remove("software")
+    reserved = {"channels", "dataWindow", "displayWindow", "envmap", "lineOrder", "name", "tiles", "view"}
+    reserved |= header.keys() - {"software"}
     for key, value in (metadata or {}).items():
         if key in reserved or not 0 < len(str(key)) < 256:
             raise ConfigError(f"{name}: '{key}' cannot be used as the name of a metadata attribute")
@@ -189,8 +234,8 @@ def write_exr(path, image, metadata: dict | None = None) -> None:
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
 
 
-def write_png(path, image) -> None:
-    """Write a picture in [0, 1] as an 8-bit PNG, whole or not at all.
+def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
+    """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel, whole or not at all.
 
     Parameters
     ----------
@@ -198,6 +243,10 @@ def write_png(path, image) -> None:
         The file; an existing one is replaced.
     image : array (H, W, 3) or (H, W)
         Display values, already tonemapped; values outside [0, 1] are cut.
+    bits : int
+        8 or 16.
+    metadata : dict, optional
+        Texts to add, as ``tEXt`` chunks.
 
     Raises
     ------
@@ -209,8 +258,27 @@ def write_png(path, image) -> None:
     name = os.fsdecode(path)
     image = np.asarray(image)
     image = _checked(name, np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image)
-    bitmap = mi.Bitmap(np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8))
-    _write_whole(name, ".png", bitmap.write)
+    codes = np.rint(np.clip(image, 0, 1) * np.float32(2**bits - 1))
+    bitmap = mi.Bitmap(codes.astype({8: np.uint8, 16: np.uint16}[bits]))
+
+    def write(temporary):
+        bitmap.write(temporary)
+        if metadata:  # by hand: Mitsuba puts its own texts in quotation marks
+            with open(temporary, "r+b") as file:
+                data = file.read()
+                file.seek(_PNG_HEADER)
+                file.write(b"".join(_text_chunk(*item) for item in metadata.items()) + data[_PNG_HEADER:])
+
+    _write_whole(name, ".png", write)
+
+
+_PNG_HEADER = 8 + 25  # magic and IHDR
+
+
+def _text_chunk(key, value):
+    """Return a PNG chunk ``tEXt``, whose characters are Latin-1; others become question marks."""
+    body = b"tEXt" + f"{key}\0{value}".encode("latin-1", "replace")
+    return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
 
 
 def _checked(name, image):

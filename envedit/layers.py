@@ -25,6 +25,12 @@ SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
 
 
+def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:
+    """Scale radiance; what is brightened is so in part by its luminance: a black channel stays in step."""
+    grey = base * (1 - VEIL) + mi.luminance(base) * VEIL
+    return dr.select(factor > 1, base + (factor - 1) * grey, base * factor)
+
+
 class Layers:
     """Lights that move, a background under a smooth gain.
 
@@ -45,6 +51,8 @@ class Layers:
         The gain's grids.
     rows, shape : (int, int)
         As given, and rows and columns of the image.
+    free : ndarray of bool (rows, W) or None
+        As :meth:`keep` was told.
     scales : dict
         What a unit of each parameter is.
     """
@@ -55,7 +63,7 @@ class Layers:
     def __init__(self, rows: tuple[int, int] | None = None, cycles: int = 12):
         self.rows, self._cycles = rows, cycles
         self.separation: Separation | None = None
-        self._kept: np.ndarray | None = None
+        self.free: np.ndarray | None = None
 
     def encode(self, image: np.ndarray, seed: int = 0) -> dict:
         """Separate the image; ``seed`` is not used."""
@@ -79,7 +87,7 @@ class Layers:
 
     def keep(self, free: np.ndarray | None) -> None:
         """Say which texels (rows, W) may change other than by a light's moving; None: all."""
-        self._kept = free
+        self.free = free
         self._prepared = {}
 
     def decode(self, params: dict, shape: tuple[int, int] | None = None) -> mi.TensorXf:
@@ -91,13 +99,20 @@ class Layers:
         real = {name: value * self.scales[name] for name, value in params.items()}
         factor = dr.exp(self.gain.evaluate(real, gain))
         factor = dr.select(free, factor, 1) if free is not None else factor
-        # What is brightened is brightened in part by its luminance: a channel that is black stays in step.
-        grey = base * (1 - VEIL) + mi.luminance(base) * VEIL
-        sky = dr.select(factor > 1, base + (factor - 1) * grey, base * factor)
+        sky = brightened(base, factor)
         if self.lights.glowing:
             sky *= self.lights.glow(real["turn"], real["flux"], d) / before
         sky = mi.TensorXf(dr.ravel(sky), (*shape, 3))
         return sky + self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
+
+    def log_gain(self, params: dict) -> np.ndarray:
+        """Return the logarithm of the gain (rows, W, 3) float32, at the resolution of the image.
+
+        Of all texels, also of those that :meth:`keep` excepts from it.
+        """
+        real = {name: value * self.scales[name] for name, value in params.items()}
+        field = self.gain.evaluate(real, self.gain.prepare(self.shape, self.rows))
+        return mi.TensorXf(dr.ravel(field), (*self.shape, 3)).numpy()
 
     def _prepare(self, shape):
         first, total = self.rows
@@ -120,8 +135,8 @@ class Layers:
             before = dr.opaque(self.lights.glow(still, still, d))
         base = dr.opaque(mi.Color3f(np.ascontiguousarray(base.reshape(-1, 3).T)))
         free = None
-        if self._kept is not None:
+        if self.free is not None:
             row = np.arange(shape[0]) * height // shape[0]
             column = np.arange(shape[1]) * width // shape[1]
-            free = dr.opaque(mi.Bool(self._kept[row][:, column].ravel()))
+            free = dr.opaque(mi.Bool(self.free[row][:, column].ravel()))
         return rows, d, base, before, self.gain.prepare(shape, rows), free

@@ -26,7 +26,7 @@ SPARE = 2
 """Lights beside the map's own, dark until one is needed: lobes, without a glow."""
 DARK = -30.0
 """Logarithm of the flux of a light that is not there."""
-LOBE_POINTS = 64
+LOBE_POINTS = 512
 LOBE_DEGREES = 2.0
 """Points and radius of a lobe of size 1."""
 _LEAST_SINE = 1e-8
@@ -63,24 +63,24 @@ class Lights:
         first, total = rows
         self.count, self.width, self.total = len(lights) + SPARE, width, total
         omega = latlong.lookup_solid_angles(total, width)
-        points, fluxes, which, sines = [], [], [], []
+        directions, fluxes, which, sines = [], [], [], []
         for i, light in enumerate(lights):
             row, column = first + light.texels // width, light.texels % width
-            points.append(_points(row, column, total, width))
+            directions.append(points(row, column, total, width))
             fluxes.append(light.radiance * omega[row][:, None])
             which.append(np.full(len(row), i))
             sines.append(np.sin(np.pi * row / max(total - 1, 1)))
         own = np.array([f.sum(axis=0) for f in fluxes]).reshape(-1, 3)
         spare = own.mean(axis=0) if len(own) else np.ones(3)
         for i in range(SPARE):
-            d, weight, spacing = _lobe()
-            points.append(d)
+            d, weight, spacing = lobe()
+            directions.append(d)
             fluxes.append(weight[:, None] * spare)
             which.append(np.full(len(d), len(lights) + i))
             sines.append(np.full(len(d), spacing / (2 * math.pi / width)))
         self.centres = np.array([light.direction for light in lights] + [[0.0, 1.0, 0.0]] * SPARE)
         self.flux = np.concatenate([own, np.repeat(spare[None], SPARE, axis=0)])
-        self._point = dr.opaque(mi.Vector3f(np.concatenate(points).T.astype(np.float32)))
+        self._point = dr.opaque(mi.Vector3f(np.concatenate(directions).T.astype(np.float32)))
         self._flux = dr.opaque(mi.Color3f(np.concatenate(fluxes).T.astype(np.float32)))
         self._which = dr.opaque(mi.UInt32(np.concatenate(which).astype(np.uint32)))
         # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
@@ -119,24 +119,14 @@ class Lights:
         TensorXf (rows, W, 3)
             Linear radiance; what falls on rows that are not wanted is lost.
         """
-        first, total = rows
         centre = dr.gather(mi.Vector3f, self._centre, self._which)
-        along = dr.dot(self._point, centre)
         size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, -6, 3))
-        scaled = dr.normalize(self._point + (self._point - centre * along) * (size - 1))
-        d = rotate(dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array), scaled)
+        turn = dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array)
         flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
-        # As in latlong.texel_position; the horizontal part is held off 0, where a column is not defined.
-        across = dr.sqrt(dr.maximum(d.x * d.x + d.z * d.z, _LEAST_SINE**2))
-        row = dr.atan2(across, d.y) * dr.opaque(mi.Float, (total - 1) / math.pi)
-        column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, shape[1] / (2 * math.pi)) - 0.5
-        snap = max(_SNAP, _SNAP_SHARE * shape[1])
-        row, column = _snapped(row, snap), _snapped(column, snap)
         finer = shape[1] / self.width
-        half = dr.clip(self._sine * size / across * finer, 1, _WIDEST * shape[1])
-        half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
-        half_row = max(1.0, (total - 1) / max(self.total - 1, 1))
-        return dr.custom(_Share, row, column, half, flux, half_row, shape, rows)
+        spread = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
+        places = placed(self._point, centre, turn, size, self._sine, finer, (rows[1], shape[1]))
+        return shared_out(*places, flux, spread, shape, rows)
 
     def glow(self, turn, log_flux, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate the product of 1 + G over all lights, as they are placed, at directions ``d``."""
@@ -148,6 +138,66 @@ class Lights:
             centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
             factor *= 1 + _glow_of(table, dr.dot(d, centre)) * _exp(_colour(log_flux, index))
         return factor
+
+
+def placed(point, centre, turn, size, sine, finer: float, grid: tuple[int, int]):
+    """Return where points of lights come to lie: row, column and half-width in columns, each Float (n,).
+
+    Parameters
+    ----------
+    point, centre, turn : Vector3f (n,)
+        Direction of a point, centre and rotation vector of its light.
+    size : Float
+        Size of the light over what it was.
+    sine : Float (n,)
+        Sine of the polar angle of the texel that the point came from.
+    finer : float
+        Columns of the grid over columns of the map that the points came from.
+    grid : (int, int)
+        Rows and columns of the whole map.
+    """
+    total, width = grid
+    along = dr.dot(point, centre)
+    scaled = dr.normalize(point + (point - centre * along) * (size - 1))
+    d = rotate(turn, scaled)
+    # As in latlong.texel_position; the horizontal part is held off 0, where a column is not defined.
+    across = dr.sqrt(dr.maximum(d.x * d.x + d.z * d.z, _LEAST_SINE**2))
+    row = dr.atan2(across, d.y) * dr.opaque(mi.Float, (total - 1) / math.pi)
+    column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, width / (2 * math.pi)) - 0.5
+    snap = max(_SNAP, _SNAP_SHARE * width)
+    row, column = _snapped(row, snap), _snapped(column, snap)
+    half = dr.clip(sine * size / across * finer, 1, _WIDEST * width)
+    half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
+    return row, column, half
+
+
+def shared_out(row, column, half, flux, half_row: float, shape, rows) -> mi.TensorXf:
+    """Share points out among the texels around them.
+
+    Parameters
+    ----------
+    row, column, half : Float (n,)
+        As :func:`placed` returns them.
+    flux : Color3f (n,)
+        Radiance times steradian.
+    half_row : float
+        Half-width of a tent in rows, at least 1.
+    shape, rows : (int, int)
+        As in :meth:`Lights.core`.
+
+    Returns
+    -------
+    TensorXf (rows, W, 3)
+        Linear radiance; what falls on rows that are not wanted is lost.
+    """
+    return dr.custom(_Share, row, column, half, flux, half_row, shape, rows)
+
+
+def points(row: np.ndarray, column: np.ndarray, total: int, width: int) -> np.ndarray:
+    """Return the directions (n, 3) of texels; those of the poles' rows each keep their azimuth."""
+    theta = np.pi * np.clip(row, _OFF_POLE, total - 1 - _OFF_POLE) / max(total - 1, 1)
+    phi = 2 * np.pi * (column + 0.5) / width
+    return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
 
 
 def rotate(v: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
@@ -186,8 +236,8 @@ def rotation_vector(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return 2 * math.atan2(sine, q[0]) * q[1:] / sine if sine > 1e-12 else np.zeros(3)
 
 
-def _lobe():
-    """Directions around the zenith, weights and spacing, in radians, of the points of a Gaussian lobe."""
+def lobe():
+    """Return the points of a Gaussian lobe: directions around the zenith, weights, and spacing in radians."""
     k = np.arange(LOBE_POINTS) + 0.5
     radius = math.radians(LOBE_DEGREES)
     angle = radius * np.sqrt(-2 * np.log(1 - k / (LOBE_POINTS + 0.5)))
@@ -211,13 +261,6 @@ def _exp(x):
 def _sign(x):
     # Not dr.sign, which is 1 at 0: on a texel's centre the mean of both sides' derivatives.
     return dr.select(x > 0, 1, dr.select(x < 0, -1, mi.Float(0)))
-
-
-def _points(row, column, total, width):
-    """Directions of texels; those of the poles' rows each keep their azimuth."""
-    theta = np.pi * np.clip(row, _OFF_POLE, total - 1 - _OFF_POLE) / max(total - 1, 1)
-    phi = 2 * np.pi * (column + 0.5) / width
-    return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
 
 
 def _snapped(place, snap):

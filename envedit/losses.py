@@ -15,6 +15,11 @@ from .errors import InputError
 from .ssim import check_image, check_pair, expand, ssim_loss, total
 from .tonemap import LUMINANCE
 
+CHANGE_SOFT = 0.05
+"""Factors less than 5 % from 1 count by their square."""
+CHANGE_FLOOR = 0.01
+"""Share of a map's mean below which radiance is as good as black."""
+
 # --------------------------------------------------------------------------------------------------------
 # Differences, light and smoothness
 # --------------------------------------------------------------------------------------------------------
@@ -108,6 +113,21 @@ def tv(x, reference=None, weight=None):
     return _mean(across + dr.select(index < (height - 1) * row, down, 0), x.shape, weight)
 
 
+def change(x, reference, weight=None):
+    """Compare the logarithms of two maps: mean of sqrt(d^2 + s^2) - s, d = log((x + e) / (reference + e)).
+
+    About the mean factor by which texels were changed: a sun that moves counts as a few texels, a sky that
+    takes on another colour as many. s is :data:`CHANGE_SOFT`, e :data:`CHANGE_FLOOR` of the mean of the
+    reference. Arguments and errors as `image_l1`; x must not be negative.
+    """
+    check_pair(x, reference)
+    values = type(x.array)
+    floor = CHANGE_FLOOR * total(dr.detach(reference.array)) / math.prod(x.shape)
+    floor = values(dr.maximum(floor, 1e-12))
+    distance = dr.log((x.array + floor) / (reference.array + floor))
+    return _mean(dr.sqrt(dr.square(distance) + CHANGE_SOFT**2) - CHANGE_SOFT, x.shape, weight)
+
+
 def _sum(values, shape, weight):
     return type(values)(total(values if weight is None else values * expand(weight, shape)))
 
@@ -127,6 +147,7 @@ LOSSES = {
     "luminance": luminance,
     "l1": l1,
     "tv": tv,
+    "change": change,
     "image_l1": image_l1,
     "image_l2": image_l2,
     "log_mse": log_mse,

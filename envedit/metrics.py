@@ -110,6 +110,42 @@ def compare(a, b, tonemap: str = "gamma") -> dict:
     return {"psnr": psnr(a, b), "ssim": ssim(a, b), "mse": mse(a, b), "lpips": None}
 
 
+def painted(edited, wanted, initial, coverage, tonemap: str = "gamma") -> dict:
+    """Tell how far a painted picture was followed, and how still the rest was held.
+
+    On display values d, with coverage c in [0, 1], means over pixels and channels.
+
+    Parameters
+    ----------
+    edited, wanted, initial : array (h, w, 3)
+        The result's rendering, the painted picture and what it was painted on; linear radiance.
+    coverage : array (h, w, 1)
+        How much each pixel was painted.
+    tonemap : str
+        Of the display values.
+
+    Returns
+    -------
+    dict
+        ``towards``: 1 - sum c |edited - wanted| / sum c |initial - wanted|, None where nothing was asked;
+        ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    """
+    edited, wanted = _pair(edited, wanted)
+    _, initial = _pair(edited, initial)
+    d, t, before = (apply_tonemap(image, tonemap) for image in (edited, wanted, initial))
+    cover = np.broadcast_to(coverage, d.shape).astype(np.float64)
+    asked, rest = float((cover * np.abs(before - t)).sum()), float((1 - cover).sum())
+    return {
+        "towards": 1 - float((cover * np.abs(d - t)).sum()) / asked if asked > 0 else None,
+        "elsewhere": float(((1 - cover) * np.abs(d - before)).sum()) / rest if rest > 0 else None,
+    }
+
+
 def _log(values):
     return np.log(np.maximum(values, 0) + LOG_EPS)
 

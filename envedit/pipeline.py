@@ -16,7 +16,23 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import checkpoint, config, edit, envmap, files, fit, image, metrics, optim, scene, search, sky, target
+from . import (
+    carry,
+    checkpoint,
+    config,
+    edit,
+    envmap,
+    files,
+    fit,
+    image,
+    metrics,
+    optim,
+    scene,
+    search,
+    sky,
+    target,
+)
+from . import reach as reaches
 from .errors import NumericalError
 from .layers import Layers
 from .pathtrace import PathTracer
@@ -25,8 +41,11 @@ from .transport import LightTransport
 
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
-INITIAL_SHARE = 4
-"""The initial rendering, far from the target, is judged with this share of the samples."""
+INITIAL_SPP = 128
+"""Samples a pixel of the initial rendering, which is far from the target."""
+
+TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
+"""Steps after which the better of two starts is chosen, and by which share of the loss it must be better."""
 
 
 @dataclass
@@ -52,6 +71,10 @@ class Result:
         Active texels that were kept, as this view does not determine them; None as above.
     separation : separate.Separation, optional
         Lights and background of the active rows, where the representation has them.
+    reach : reach.Reach, optional
+        How much of a painted request any light can do; None where T is not at hand or nothing was painted.
+    found : Found, optional
+        What the map was decoded from, for :func:`at_full_resolution`.
     """
 
     envmap: np.ndarray
@@ -64,11 +87,23 @@ class Result:
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
     separation: Separation | None = None
+    reach: reaches.Reach | None = None
+    found: Found | None = None
 
     @property
     def render(self) -> np.ndarray:
         """The rendering under the edited map, by Mitsuba with fresh samples."""
         return self.renders["edited"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A representation of the active rows with its parameters; ``free`` as for :func:`.carry.carry`."""
+
+    representation: object
+    params: dict
+    first_row: int
+    free: np.ndarray | None
 
 
 class Interrupted(Exception):
@@ -121,6 +156,25 @@ def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
     return picture, list(info["warnings"])
 
 
+def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
+    """Carry a result to the resolution of its input's file; None where that has no more texels.
+
+    Raises
+    ------
+    InputError, NumericalError
+        If the file cannot be read any more, or the carried map is not finite.
+    """
+    if settings.envmap == "sunsky":
+        return None
+    source, _ = image.load_envmap(settings.envmap, None, settings.repair)
+    if source.shape[1] <= settings.width:
+        return None
+    found, before = result.found, result.maps["initial"]
+    first, last = active_rows(settings.rows, before.shape[0])
+    rows = first, last - first + 1
+    return carry.carry(found.representation, found.params, before, result.envmap, source, rows, found.free)
+
+
 def active_rows(rows, height: int) -> tuple[int, int]:
     """Return the first and last row that may change; "upper": above the horizon (paper, Sec. 5.1)."""
     if rows == "upper":
@@ -160,6 +214,8 @@ def run(
     resume: bool = False,
     base: Path | None = None,
     watch: Watch | None = None,
+    picture: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
 ) -> Result:
     """Carry out an edit.
 
@@ -175,6 +231,10 @@ def run(
         Folder that file names in scene parameters are relative to.
     watch : Watch, optional
         Told of progress.
+    picture : ndarray (h, w, 3), optional
+        A painted picture, linear radiance, in place of the configuration's target.
+    mask : ndarray (h, w), optional
+        Where it was painted, in [0, 1]; None: where it differs from the initial rendering.
 
     Raises
     ------
@@ -201,10 +261,12 @@ def run(
             base,
         )
         watch.stage("rendering the target")
-        wanted = target.make(settings.target, lit, original, settings.seed, settings.input.repair)
+        wanted = target.make(settings, lit, original, picture, mask)
         warnings += wanted.warnings
-        few = -(-settings.output.spp // INITIAL_SHARE)
-        initial = lit.render(original, spp=few, seed=settings.seed + JUDGE_SEED)
+        few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
+        initial = wanted.initial
+        if initial is None:
+            initial = lit.render(original, spp=few, seed=settings.seed + JUDGE_SEED)
     if settings.loss.dists:
         warnings.append("loss.dists is off: no backbone weights are given")
 
@@ -236,6 +298,18 @@ def run(
             frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
 
     notes, free = [], ~frozen[rows] if traced and frozen.any() else None
+    within = None
+    if traced and wanted.coverage is not None:
+        with clock("reach_s"):
+            watch.stage("asking what any light could do")
+            within = reaches.reachable(
+                traced, original, wanted.picture, wanted.weight, rows, free, wanted.coverage[..., 0], initial
+            )
+            notes.append(within.note)
+            warnings += [within.warning] if within.warning else []
+    judged_by = wanted
+    if traced and wanted.coverage is not None:
+        wanted = replace(wanted, picture=_as_seen(traced, original, wanted))
     if isinstance(representation, Layers):
         with clock("start_s"):
             watch.stage("searching for lights")
@@ -243,18 +317,29 @@ def run(
             through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
             free = None  # a light may move across texels that are kept otherwise
-            params, notes = search.start(
-                representation, params, through, wanted.picture, wanted.weight, original
-            )
+            asked = judged_by.picture, wanted.weight, original
+            if wanted.coverage is None:
+                starts = [search.start(representation, params, through, *asked)]
+            else:
+                begin = representation, params, through, initial, *asked
+                daring = (False, True) if (wanted.coverage < 1).any() else (False,)
+                starts = [search.start_painted(*begin, bold=bold) for bold in daring]
+                if representation.separation.lights:
+                    starts.append(search.softened(representation, params))
+    job = _Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
+    if isinstance(representation, Layers):
+        with clock("start_s"):
+            params, placed = job.best(starts, crop)
+            notes += placed
     with clock("edit_s"):
         watch.stage("editing")
-        job = _Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
         params, state = job.optimise(params, crop, resume)
-        edited, wanted = job.decode(params), job.wanted
+        edited = job.decode(params)
+        wanted = job.wanted if judged_by is wanted else judged_by
 
     with clock("judge_s"):
         watch.stage("rendering the result")
-        final = lit.render(edited, spp=settings.output.spp, seed=settings.seed + JUDGE_SEED + 1)
+        final, judged = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
     seconds = clock.seconds
     iterations = len(state.history)
     tonemap = settings.output.tonemap
@@ -277,7 +362,7 @@ def run(
             "import_s": None,
             **{
                 f"{part}_s": round(seconds.get(f"{part}_s", 0.0), 3)
-                for part in ("target", "fit", "transport", "start", "edit", "judge")
+                for part in ("target", "fit", "transport", "reach", "start", "edit", "judge")
             },
             "report_s": None,
             "total_s": round(time.perf_counter() - begun, 3),
@@ -290,11 +375,15 @@ def run(
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [first, last],
         "transport": None,
+        "painted": None,
     }
+    if wanted.coverage is not None:
+        measured["painted"] = metrics.painted(final, wanted.picture, initial, wanted.coverage, tonemap)
+        measured["painted"]["reachable"] = None if within is None else within.share
     if wanted.envmap is not None:
         measured["sun_offset_texels"] = metrics.sun_offset(edited[rows], wanted.envmap[rows])
         measured["initial_envmap"] = metrics.compare(original[rows], wanted.envmap[rows], tonemap)
-    notes = [wanted.source, *renderer.choices, *notes]
+    notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     if traced:
         share = float(frozen[rows].mean())
         measured["transport"] = {
@@ -317,7 +406,20 @@ def run(
         traced.influence if traced else None,
         frozen,
         getattr(representation, "separation", None),
+        within,
+        Found(representation, params, first, free),
     )
+
+
+def _as_seen(traced, original, wanted):
+    """Return a painted picture as T sees it: its change added to T E_0.
+
+    What is not painted is then matched exactly by the map as it is, and no gain is spent on the noise of T
+    and of the rendering that was painted on.
+    """
+    traced.resolve(original)
+    seen = traced.apply(mi.TensorXf(original)).numpy()
+    return np.maximum(wanted.picture + (seen - wanted.initial), 0).astype(np.float32)
 
 
 _TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
@@ -354,14 +456,41 @@ class _Job:
         edited[rows] = crop
         return edited
 
+    def best(self, starts, crop):
+        """Return the start, (parameters, notes), that gets farthest in a few steps."""
+        notes = {tuple(notes) for _, notes in starts}
+        if len(notes) == 1:
+            return starts[0]
+        reached = []
+        for params, _ in starts:
+            few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
+            wanted = self.wanted.picture, self.wanted.weight
+            objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS)
+            _, state = edit.optimise(
+                self.representation,
+                params,
+                self.renderer,
+                objective,
+                self.original,
+                self.first,
+                few,
+                free=self.free,
+            )
+            reached.append(state.history[-1]["loss"])
+        least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
+        losses = ", ".join(f"{loss:.3g}" for loss in reached)
+        chosen = [
+            *starts[least][1],
+            f"start {least + 1} of {len(starts)}: losses after {TRIAL_STEPS} steps {losses}",
+        ]
+        return starts[least][0], chosen
+
     def optimise(self, params, crop, resume):
         """Run the loop from the start, or from the checkpoint; returns parameters and state."""
         chosen, wanted = self.settings.optimizer, self.wanted
         lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
         adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), edit.State()
-        known = wanted.picture if wanted.envmap is None else wanted.envmap
-        pixels = [self.original, known, *([] if wanted.weight is None else [wanted.weight])]
-        what = checkpoint.digest(self.settings, self.lit.digest, pixels)
+        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, optimiser, traced, picture = found
             adam.load_state_dict(optimiser)

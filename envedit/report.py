@@ -1,6 +1,6 @@
 """The HTML report of a run: one file that opens offline, with inline SVG curves and base64 PNG pictures.
 
-Pictures come in as linear radiance, ``(H, W, 3)``, and are tonemapped for display only. Only the command line
+Pictures come in as linear radiance, ``(H, W, 3)``, and are tonemapped for display only. Only ``outputs.py``
 imports this module.
 """
 
@@ -150,6 +150,14 @@ def _separation_figures(separation, tonemap):
     return [_figure(_shrunk(image, tonemap), caption) for caption, image in pictures.items()]
 
 
+def _unreachable_figure(pixels, share):
+    within = "" if share is None else f"; {100 * share:.0f} % of the request is within reach"
+    ends = '<div class="ends"><span>red: stays darker than asked</span><span>blue: brighter</span></div>'
+    return _figure(
+        np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), f"what no light can do{within}", ends
+    )
+
+
 def _map_statistics(image):
     """Fill the table's cells for one map: luminances (linear) and the peak's place."""
     bad = ~np.isfinite(image).all(axis=2)
@@ -195,6 +203,7 @@ def write_report(
     influence=None,
     frozen=None,
     separation=None,
+    unreachable=None,
     warnings=(),
     notes=(),
     tonemap="gamma",
@@ -219,6 +228,8 @@ def write_report(
         As for `envedit.preview.influence_image`.
     separation : envedit.separate.Separation, optional
         Lights and background of the rows that were edited.
+    unreachable : array (h, w, 3), optional
+        Display values of `envedit.reach.unreachable`.
     warnings, notes : sequence of str
         What the user should know, and the choices made for settings left at "auto".
     tonemap : str
@@ -268,7 +279,7 @@ def write_report(
     quality_rows = [[name, *(_show(table.get(key)) for table in quality)] for key, name in measures.items()]
     others = [(key, value) for key, value in metrics.items() if not isinstance(value, (dict, type(None)))]
     others = [(key, value) for key, value in others if key != "choices"]  # a chapter of their own
-    for part in ("fit", "transport"):
+    for part in ("fit", "transport", "painted"):
         others += [(f"{part} {key}", value) for key, value in (metrics.get(part) or {}).items()]
     timing = {key: number(value) for key, value in (metrics.get("timing") or {}).items()}
     longest = max((t for key, t in timing.items() if t and key.endswith("_s")), default=0)
@@ -283,6 +294,8 @@ def write_report(
     map_head = ["map", "size", "peak luminance", "at row, column", "mean", "median", "lowest", "not finite"]
 
     parts = _separation_figures(separation, tonemap)
+    painted = metrics.get("painted") or {}
+    asked = [] if unreachable is None else [_unreachable_figure(unreachable, painted.get("reachable"))]
 
     # The page
     curves = curves_svg(history) or f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
@@ -300,6 +313,7 @@ def write_report(
         f"<h2>What this view determines</h2>{_grid([_influence_figure(influence, frozen)])}"
         if influence is not None
         else "",
+        f"<h2>What was painted</h2>{_grid(asked)}" if asked else "",
         f"<h2>Losses</h2>{curves}",
         "<h2>Quality</h2>",
         _table(["", "initial rendering", "edited rendering", "edited map"], quality_rows),

@@ -13,11 +13,6 @@ import time
 from pathlib import Path
 
 _EARLIER = "earlier"
-_OUTPUTS = (
-    "edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "influence.exr",
-    "influence.png", "preview.png", "report.html", "history.csv", "config.toml", "manifest.json",
-    "metrics.json", "checkpoint.npz",
-)  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -52,8 +47,14 @@ def _parser():
         dest="overrides",
         help="change one key of the configuration; may be repeated",
     )
-    parser.add_argument(
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument(
         "--resume", action="store_true", help="continue an interrupted run from its checkpoint"
+    )
+    instead.add_argument(
+        "--export-initial",
+        metavar="FILE",
+        help="only write the rendering to paint on: float .exr, or 16-bit .png under [target] tonemap",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
@@ -66,6 +67,8 @@ def _run(arguments, start):
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
     settings = config.load(arguments.config, arguments.preset, overrides)
+    if arguments.export_initial is not None:
+        return _export_initial(settings, arguments)
     folder = Path(settings.output.dir)
     named = (settings.input.envmap, settings.scene.file, settings.target.file, settings.target.mask)
     _prepare(folder, arguments.resume, [Path(path) for path in named if path])
@@ -111,15 +114,44 @@ def _run(arguments, start):
     return _write(settings, folder, result, import_s, arguments.quiet)
 
 
+def _export_initial(settings, arguments):
+    """Write the picture to paint on, and nothing else."""
+    from . import doctor
+
+    file = Path(arguments.export_initial)
+    doctor.ensure(settings.variant)
+    import mitsuba as mi
+
+    mi.set_variant(settings.variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    from . import painted, pipeline, scene
+    from .progress import Progress
+
+    painted.check_export(file)
+    with Progress(quiet=arguments.quiet) as progress:
+        progress.stage("rendering the picture to paint on")
+        envmap, warnings = pipeline.load_map(settings.input)
+        size, base = (settings.scene.width, settings.scene.height), Path(arguments.config).absolute().parent
+        lit = scene.load(settings.scene.file, *size, dict(settings.scene.parameters), base)
+        warnings += painted.export(file, painted.initial(lit, envmap, settings), settings)
+    for line in warnings:
+        print(f"envedit: warning: {line}", file=sys.stderr)
+    under = "linear" if file.suffix.lower() == ".exr" else f"under the '{settings.target.tonemap}' tonemap"
+    ask = f'[target] kind = "image", file = "{file.absolute()}"'
+    _say(arguments.quiet, f"{file}: {lit.width}x{lit.height}, {under}; paint on it, then set {ask}")
+    return 0
+
+
 def _prepare(folder, resume, inputs):
     """Make the output folder; move what an earlier run left there out of the way, unless it is read now."""
     from .errors import InputError
+    from .files import RESULTS
 
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file, the results need a folder: give another with --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        old = [folder / name for name in _OUTPUTS if (folder / name).exists()]
+        old = [folder / name for name in RESULTS if (folder / name).exists()]
         if mine := [path for path in old if path in inputs]:
             raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
         if old and not resume:
@@ -153,57 +185,9 @@ def _check_same(settings, folder):
 
 
 def _write(settings, folder, result, import_s, quiet):
-    from . import checkpoint, config, files, image, manifest, preview, report, scene
+    from . import outputs
 
-    start = time.perf_counter()
-    source = {"source": settings.input.envmap}
-    image.write_exr(folder / "edited.exr", result.envmap, source)
-    for name, picture in result.renders.items():
-        image.write_exr(folder / f"render_{name}.exr", picture, {"source": settings.scene.file})
-    if result.influence is not None:
-        grey = result.influence[..., None].repeat(3, axis=2)
-        image.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
-        preview.influence(folder / "influence.png", result.influence, result.frozen)
-    text = config.to_toml(settings)
-    files.write_atomically(folder / "config.toml", text.encode())
-    manifest.write_history(folder / "history.csv", result.history)
-    named = {
-        "envmap": settings.input.envmap,
-        "scene": scene._find(settings.scene.file),
-        "target": settings.target.file,
-        "mask": settings.target.mask,
-    }
-    inputs = {role: path for role, path in named.items() if Path(path).is_file()}
-    facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)
-    manifest.write_manifest(folder / "manifest.json", facts)
-
-    warnings = list(result.warnings)
-    timing = result.metrics["timing"]
-    timing["import_s"] = round(import_s, 3)
-    if settings.output.report:
-        preview.preview(folder / "preview.png", result.renders, result.maps, settings.output.tonemap)
-        title = f"{Path(settings.input.envmap).stem}, {Path(settings.scene.file).stem}"
-        report.write_report(
-            folder / "report.html",
-            title=title,
-            config_toml=text,
-            metrics=result.metrics,
-            manifest=facts,
-            history=result.history,
-            renders=result.renders,
-            maps=result.maps,
-            influence=result.influence,
-            frozen=result.frozen,
-            separation=result.separation,
-            warnings=warnings,
-            notes=result.notes,
-            tonemap=settings.output.tonemap,
-        )
-    timing["report_s"] = round(time.perf_counter() - start, 3)
-    timing["total_s"] = round(timing["total_s"] + timing["import_s"] + timing["report_s"], 3)
-    lost = manifest.write_metrics(folder / "metrics.json", result.metrics)
-    checkpoint.remove(folder)
-    for line in [*warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]:
+    for line in outputs.write(settings, folder, result, import_s):
         print(f"envedit: warning: {line}", file=sys.stderr)
     for line in result.notes:
         _say(quiet, line)
@@ -216,6 +200,9 @@ def _verdict(measured):
     line = f"rendering {measured['initial']['psnr']:.1f} -> {measured['render']['psnr']:.1f} dB"
     if measured["envmap"]:
         line += f", map {measured['initial_envmap']['psnr']:.1f} -> {measured['envmap']['psnr']:.1f} dB"
+    painted = measured["painted"]
+    if painted and painted["towards"] is not None:
+        line += f", {100 * painted['towards']:.0f} % of the way to the paint"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 

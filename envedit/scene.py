@@ -35,6 +35,9 @@ __all__ = ["SHIPPED", "Scene", "load"]
 SHIPPED = ("sphere", "mirror", "matte", "statue", "pair", "mesh")
 """Names of the scenes that come with the package."""
 
+QUIET_DECIBELS = 48.0
+"""PSNR of a rendering that is quiet, against one without noise: beyond what an edit reaches under a sun."""
+_QUIET_PASS, _QUIET_LEAST, _QUIET_MOST = 64, 256, 1024  # samples a pixel
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -138,14 +141,66 @@ class Scene:
         seed = _whole("seed", seed, 0)
         max_depth = _whole("max_depth", max_depth, -1)
         self.set_envmap(image)
-        integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": False})
-        most = max(1, _PASS_SAMPLES // (self.width * self.height))
+        most = self._pass_samples()
         counts = [most] * (spp // most) + ([spp % most] if spp % most else [])
         total = np.zeros((self.height, self.width, 3))
         for i, count in enumerate(counts):
-            pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-            picture = mi.render(self.mi, integrator=integrator, spp=count, seed=pass_seed)
-            total += count / spp * np.array(picture, dtype=np.float64)
+            total += count / spp * self._pass(count, seed, i, max_depth)
+        return self._checked(total)
+
+    def sampled(self, image, spp: int | str = "auto", seed: int = 0) -> tuple[np.ndarray, int]:
+        """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
+
+        Passes of 64 samples a pixel are added until the error of their mean, told by how much their display
+        values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at least,
+        1024 at most.
+
+        Returns
+        -------
+        picture : array (height, width, 3) float32
+            Linear radiance.
+        spp : int
+            Samples a pixel that were taken.
+
+        Raises
+        ------
+        ConfigError, InputError, NumericalError
+            As :meth:`render`.
+        """
+        if spp != "auto":
+            return self.render(image, spp, seed), spp
+        seed = _whole("seed", seed, 0)
+        self.set_envmap(image)
+        count = min(self._pass_samples(), _QUIET_PASS)
+        total, shown, power = 0.0, 0.0, 0.0
+        for i in range(_QUIET_MOST // count):
+            picture = self._pass(count, seed, i, -1)
+            display = np.clip(picture, 0, 1) ** (1 / 2.2)
+            total, shown, power = total + picture, shown + display, power + display**2
+            n = i + 1
+            if n > 1 and n * count >= _QUIET_LEAST:
+                variance = np.maximum(power / n - (shown / n) ** 2, 0).mean() / (n - 1)
+                if variance < 10 ** (-QUIET_DECIBELS / 10):
+                    break
+        return self._checked(total / n), n * count
+
+    def _pass_samples(self):
+        """Most samples a pixel of one pass, a power of four.
+
+        So no pixel is split between threads, which would add its samples in any order, and the sampler has as
+        many strata across as down.
+        """
+        return 4 ** (max(0, (_PASS_SAMPLES // (self.width * self.height)).bit_length() - 1) // 2)
+
+    def _pass(self, count, seed, i, max_depth):
+        """Render one pass, float64."""
+        integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": False})
+        pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+        picture = mi.render(self.mi, integrator=integrator, spp=count, seed=pass_seed)
+        return np.array(picture, dtype=np.float64)
+
+    def _checked(self, total):
+        """Round to float32, refusing what is not finite."""
         with np.errstate(over="ignore"):
             result = total.astype(np.float32)
         if not (finite := np.isfinite(result).all(axis=2)).all():

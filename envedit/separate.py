@@ -11,7 +11,7 @@ any resolution and exposure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -79,12 +79,39 @@ class Separation:
         B, the product of 1 + G over all lights, and the sum of all cores.
     lights : list of Light
         Those with most flux first.
+    survey : Survey or None
+        Where the lights were found, to tell the same lights in another resolution of the map; None without.
     """
 
     background: np.ndarray
     glow: np.ndarray
     core: np.ndarray
     lights: list[Light] = field(default_factory=list)
+    survey: Survey | None = None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the small copy of a map tells of its lights: all that does not depend on the map's resolution.
+
+    Attributes
+    ----------
+    label : ndarray of int64 (h, w)
+        Index in :attr:`Separation.lights` of the light that a texel of the copy belongs to, or -1.
+    below : ndarray (h, w, 3)
+        The background of the copy, filled in under the lights.
+    rows : (int, int)
+        First row of the copy in its map, and the rows of that map.
+    centres, glows, shares : lists
+        Direction, :attr:`Light.glow` and share of the irradiance of each light.
+    """
+
+    label: np.ndarray
+    below: np.ndarray
+    rows: tuple[int, int]
+    centres: list[np.ndarray]
+    glows: list[np.ndarray | None]
+    shares: list[float]
 
 
 def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separation:
@@ -106,11 +133,39 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separati
     first, total = rows or (0, image.shape[0])
     height, width = image.shape[:2]
     small = _reduced(image, first, total)
-    label, count, shares = _find(small)
-    if not count:
+    found = _survey(small)
+    if found is None:
         return Separation(image, np.ones_like(image), np.zeros_like(image), [])
 
-    # The background under the lights, and the glow of each, on the small copy.
+    # The same at the map's own resolution.
+    toward = latlong.directions(total, width)[first : first + height]
+    glow = np.ones_like(image)
+    for table, centre in zip(found.glows, found.centres, strict=True):
+        if table is not None:
+            glow *= 1 + glow_at(table, toward @ centre)
+    here = small.at(found.label, height, width)
+    lit = here >= 0
+    base = small.upsampled(found.below, height, width)
+    core = np.where(lit[..., None], np.maximum(image - base * glow, 0), 0)
+    background = np.where(lit[..., None], (image - core) / glow, image / glow)
+    lights, kept = [], np.full(len(found.centres) + 1, -1)
+    for i, centre in enumerate(found.centres):
+        texels = np.flatnonzero((here == i).ravel() & (core > 0).any(axis=2).ravel())
+        if len(texels):
+            kept[i] = len(lights)
+            radiance = core.reshape(-1, 3)[texels]
+            lights.append(Light(centre, texels, radiance, found.glows[i], float(found.shares[i])))
+        else:
+            core.reshape(-1, 3)[(here == i).ravel()] = 0
+    found = replace(found, label=kept[found.label])  # the last, -1, for texels of none
+    return Separation(background, glow, core, lights, found)
+
+
+def _survey(small: _Small) -> Survey | None:
+    """Find lights, the background under them and the glow of each on the small copy; None without lights."""
+    label, count, shares = _find(small)
+    if not count:
+        return None
     cores = label >= 0
     free = filled(small.image, cores)
     glows, centres = [], []
@@ -121,28 +176,7 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separati
             free = free / (1 + glow_at(table, small.directions @ centre))
         glows.append(table)
         centres.append(centre)
-    below = filled(free, cores)
-
-    # The same at the map's own resolution.
-    toward = latlong.directions(total, width)[first : first + height]
-    glow = np.ones_like(image)
-    for table, centre in zip(glows, centres, strict=True):
-        if table is not None:
-            glow *= 1 + glow_at(table, toward @ centre)
-    here = small.at(label, height, width)
-    lit = here >= 0
-    base = small.upsampled(below, height, width)
-    core = np.where(lit[..., None], np.maximum(image - base * glow, 0), 0)
-    background = np.where(lit[..., None], (image - core) / glow, image / glow)
-    lights = []
-    for i in range(count):
-        texels = np.flatnonzero((here == i).ravel() & (core > 0).any(axis=2).ravel())
-        if len(texels):
-            radiance = core.reshape(-1, 3)[texels]
-            lights.append(Light(centres[i], texels, radiance, glows[i], float(shares[i])))
-        else:
-            core.reshape(-1, 3)[(here == i).ravel()] = 0
-    return Separation(background, glow, core, lights)
+    return Survey(label, filled(free, cores), small.rows, centres, glows, shares)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -276,6 +310,12 @@ def _grown(mask):
     for shifted in list(_neighbours(mask, False)):
         mask = mask | shifted
     return mask
+
+
+def grown(label: np.ndarray) -> np.ndarray:
+    """Give texels of no light (-1) that touch one the largest label around them; columns are periodic."""
+    most = np.maximum.reduce(list(_neighbours(label, -1)))
+    return np.where(label < 0, most, label)
 
 
 def _components(mask):

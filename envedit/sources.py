@@ -22,11 +22,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "input": {"width": 128},
         "scene": {"width": 96},
-        "target": {"spp": 512},
+        "target": {"spp": 256},
         "representation": {"hidden": 64},
         "fit": {"epochs": 500},
         "optimizer": {"iterations": 60},
-        "output": {"spp": 512},
+        "output": {"spp": 256},
     },
     "standard": {},
     "paper": {
@@ -40,7 +40,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
         "loss": {
             "ssim": (1.0, 1e4), "luminance": (1e-4, 1e-8), "l1": (1e-4, 1e-8), "dists": 0.6,
-            "tv": 0.0, "image_l1": 0.0, "image_l2": 0.0,
+            "tv": 0.0, "change": 0.0, "image_l1": 0.0, "image_l2": 0.0,
         },
         "optimizer": {"iterations": 400, "lr": 5e-6, "beta2": 0.999, "schedule": "constant"},
         "renderer": {"kind": "path", "spp": 16, "refresh": 1},
@@ -53,6 +53,14 @@ MANY_PARAMETERS: dict[str, dict[str, Any]] = {
     "draft": {"loss": {"ssim": 1.0}, "optimizer": {"iterations": 150}},
     "standard": {"loss": {"ssim": 1.0}, "optimizer": {"iterations": 600}},
     "paper": {},
+}
+
+# Paint need not be what any sky does: the map is held where the paint leaves it free. For the paper's method,
+# luminance weighs less, so that light may be added (Sec. 6.4; a tenth: the paper gives no number).
+PAINTED: dict[str, dict[str, Any]] = {
+    "draft": {"loss": {"change": 0.002}},
+    "standard": {"loss": {"change": 0.002}},
+    "paper": {"loss": {"luminance": (1e-5, 1e-9)}},
 }
 
 _PATHS = (("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"))
@@ -106,10 +114,14 @@ def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
-    """Return a preset's defaults for the kind of representation that it, or what is given, names."""
+    """Return a preset's defaults for the representation and the target that it, or what is given, names."""
     chosen = PRESETS[preset]
-    kind = overlaid(chosen, given).get("representation", {}).get("kind", "layers")
-    return chosen if kind == "layers" else overlaid(chosen, MANY_PARAMETERS[preset])
+    asked = overlaid(chosen, given)
+    if asked.get("representation", {}).get("kind", "layers") != "layers":
+        chosen = overlaid(chosen, MANY_PARAMETERS[preset])
+    if asked.get("target", {}).get("kind", "envmap") != "envmap":
+        chosen = overlaid(chosen, PAINTED[preset])
+    return chosen
 
 
 def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, Any]:

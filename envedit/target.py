@@ -1,7 +1,8 @@
-"""What the rendering should look like.
+"""What the rendering should look like: under another light, as a painted picture, or under strokes.
 
-A target is a picture in linear radiance, an optional weight per pixel, and, where the question was made from
-a known answer, the map that answers it.
+A picture that was painted asks two things: that the pixels under the paint become as painted, and that all
+others stay as they are. Each of the two has a weight of its own, shared among its pixels, so that a small
+stroke is not outvoted by the many pixels around it.
 """
 
 from __future__ import annotations
@@ -10,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import config, image, latlong
+from . import config, image, latlong, painted, strokes
 from .errors import InputError
 from .scene import Scene
-from .tonemap import inverse_tonemap, linear_to_srgb
 
 SEED = 7_000_003
 """Apart from the seeds of all other renderings, so that no noise is shared between question and answer."""
@@ -28,13 +28,20 @@ class Target:
     picture : ndarray (h, w, 3)
         Linear radiance.
     weight : ndarray (h, w, 1) or None
-        How much each pixel counts; None: all the same.
+        How much each pixel counts, 1 on average; None: all the same.
     envmap : ndarray (H, W, 3) or None
         The map that makes the picture, where it is known.
     source : str
         One line for the report.
     warnings : tuple of str
         What the user should know about the picture.
+    initial : ndarray (h, w, 3) or None
+        What was painted on: the rendering under the map as it is; None where nothing was painted.
+    coverage : ndarray (h, w, 1) or None
+        How much each pixel was painted; None likewise.
+    asked : tuple of ndarray
+        What the target was made from beside the configuration, for a checkpoint to know it by. Not the
+        rendering that was painted on: rendered anew, it may differ in its last bits.
     """
 
     picture: np.ndarray
@@ -42,90 +49,95 @@ class Target:
     envmap: np.ndarray | None
     source: str
     warnings: tuple[str, ...] = ()
+    initial: np.ndarray | None = None
+    coverage: np.ndarray | None = None
+    asked: tuple[np.ndarray, ...] = ()
 
 
 def make(
-    settings: config.Target, scene: Scene, envmap: np.ndarray, seed: int, repair: bool = False
+    settings: config.Config,
+    scene: Scene,
+    envmap: np.ndarray,
+    picture: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
 ) -> Target:
     """Make the target of a configuration.
 
     Parameters
     ----------
-    settings : config.Target
-        What is wanted.
+    settings : config.Config
+        What is wanted: its target, and seed and repair of the input.
     scene : Scene
         The scene that it is a picture of.
     envmap : ndarray (H, W, 3)
         The map that will be edited; turned by ``rotate_degrees`` where the target names no file.
-    seed : int
-        Base seed of the rendering.
-    repair : bool
-        Repair non-finite texels of the target's map.
+    picture : ndarray (h, w, 3), optional
+        A painted picture, linear radiance, in place of what the configuration names.
+    mask : ndarray (h, w), optional
+        How much each pixel of it was painted, in [0, 1]; None: seen by comparing with the initial rendering.
 
     Raises
     ------
     InputError
-        If a file cannot be read or does not fit the film.
+        If a file cannot be read, or a picture does not fit the film.
     """
-    if settings.kind == "image":
-        return _painted(settings, scene)
-    height, width, _ = envmap.shape
-    if settings.file:
-        true, info = image.load_envmap(settings.file, width, repair)
-        source, warnings = f"rendered under {settings.file}", tuple(info["warnings"])
+    chosen = settings.target
+    if picture is None and chosen.kind == "envmap":
+        return _rendered(settings, scene, envmap)
+    shape = scene.height, scene.width
+    initial, asked = painted.initial(scene, envmap, settings), ()
+    if picture is not None:
+        found = painted.given(picture, shape, initial, mask)
+        source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
+    elif chosen.kind == "image":
+        found = painted.read(chosen.file, shape, chosen.tonemap, initial, chosen.mask)
+        files = [chosen.file, *([chosen.mask] if chosen.mask else [])]
+        source, asked = f"painted: {chosen.file}", tuple(np.fromfile(file, np.uint8) for file in files)
     else:
-        true, warnings = latlong.rotate(envmap, settings.rotate_degrees), ()
-        source = f"rendered under the map turned by {settings.rotate_degrees:g} degrees"
-    true = np.ascontiguousarray(true, np.float32)
-    picture = scene.render(true, spp=settings.spp, seed=seed + SEED)
-    return Target(
-        picture, _weight(settings, picture), true, f"{source}, {settings.spp} samples a pixel", warnings
+        made = strokes.paint(initial, chosen.strokes, chosen.tonemap)
+        if not made.coverage.any():
+            raise InputError(f"target.strokes: {'; '.join(made.warnings) or 'none of them paints anything'}")
+        found = painted.Painted(made.picture, made.coverage, np.zeros(shape, bool), made.warnings)
+        source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
+    untold = found.excluded & (found.coverage[..., 0] > 0)  # what was not painted has the initial value
+    weight = pixel_weight(found.coverage, untold, chosen.paint, chosen.hold)
+    share = 100 * float((found.coverage > 0).mean())
+    source += (
+        f", {share:.2g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
     )
+    return Target(found.picture, weight, None, source, found.warnings, initial, found.coverage, asked)
 
 
-def _painted(settings, scene):
-    picture, info = image.read(settings.file)
-    if picture.shape[:2] != (scene.height, scene.width):
-        height, width = picture.shape[:2]
-        raise InputError(
-            f"{settings.file}: is {width}x{height} pixels, the rendering is {scene.width}x{scene.height}: "
-            "export it at that size, or set [scene] width and height to the picture's"
-        )
-    warnings = list(info["warnings"])
-    if not info["hdr"]:
-        # image.read decodes sRGB; the picture was made under the declared tonemap instead.
-        picture = inverse_tonemap(linear_to_srgb(picture), settings.tonemap)
-        warnings.append(f"{settings.file}: read as a picture under the '{settings.tonemap}' tonemap")
-    if not np.isfinite(picture).all():
-        row, column = np.argwhere(~np.isfinite(picture).all(axis=2))[0]
-        raise InputError(
-            f"{settings.file}: pixel at row {row}, column {column} is not finite: "
-            "repair it in the program it came from"
-        )
-    picture = np.ascontiguousarray(picture, np.float32)
-    source = f"painted: {settings.file}"
-    return Target(picture, _weight(settings, picture), None, source, tuple(warnings))
+def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
+    """Share the weights of paint and rest among their pixels: (h, w, 1) float32, 1 on average.
 
-
-def _weight(settings, picture):
-    """Read the mask as a weight for each pixel (h, w, 1); None without one."""
-    if not settings.mask:
-        return None
-    mask, info = image.read(settings.mask)
-    if mask.shape[:2] != picture.shape[:2]:
-        raise InputError(
-            f"{settings.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, the target is "
-            f"{picture.shape[1]}x{picture.shape[0]}: the mask must have the target's size"
-        )
-    if not np.isfinite(mask).all():
-        row, column = np.argwhere(~np.isfinite(mask).all(axis=2))[0]
-        raise InputError(
-            f"{settings.mask}: pixel at row {row}, column {column} is not finite: "
-            "paint the mask in black and white"
-        )
-    if not info["hdr"]:
-        mask = linear_to_srgb(mask)  # 50 % grey is meant as a half, not as what sRGB makes of it
-    weight = np.clip(mask.mean(axis=2, keepdims=True), 0, 1).astype(np.float32)
+    weight = paint c / sum(c) + hold (1 - c) / sum(1 - c), where c is coverage, over the pixels that are not
+    ``excluded``.
+    """
+    told = ~np.asarray(excluded, bool)[..., None]
+    weight = np.zeros(told.shape)
+    for share, part in ((paint, coverage * told), (hold, (1 - coverage) * told)):
+        total = part.sum(dtype=np.float64)
+        if total > 0:
+            weight += share * part / total
     if not weight.any():
-        raise InputError(f"{settings.mask}: is black everywhere: paint white where the target counts")
-    return weight
+        raise InputError(
+            "target: no pixel counts: set target.paint above 0, or target.hold if pixels are left unpainted"
+        )
+    return (weight / weight.mean()).astype(np.float32)
+
+
+def _rendered(settings, scene, envmap):
+    """Render the scene under another map."""
+    chosen = settings.target
+    if chosen.file:
+        true, info = image.load_envmap(chosen.file, envmap.shape[1], settings.input.repair)
+        source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
+    else:
+        true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
+        source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
+    true = np.ascontiguousarray(true, np.float32)
+    picture, spp = scene.sampled(true, chosen.spp, settings.seed + SEED)
+    weight = painted.read_mask(chosen.mask, picture.shape[:2]) if chosen.mask else None
+    asked = (true,) if weight is None else (true, weight)
+    return Target(picture, weight, true, f"{source}, {spp} samples a pixel", warnings, asked=asked)

@@ -70,7 +70,7 @@ def test_the_configuration_of_these_tests_runs(path, tmp_path):
         ('preset = "drafty"', ["preset", "drafty", "did you mean draft"]),
         ('variant = "scalar_rgb"', ["variant", "scalar_rgb"]),
         ('[representation]\nkind = "layer"', ["representation.kind", "'layer'", "did you mean layers"]),
-        ('[target]\nkind = "strokes"', ["target.kind", "strokes", "comes later"]),
+        ('[target]\nkind = "strokes"', ["target.strokes", "came none", "at least one"]),
         ('[target]\nkind = "image"', ["target.file"]),
         ('[target]\nfile = "a.exr"\nrotate_degrees = 3', ["target.file", "rotate_degrees"]),
         ("[fit\nepochs = 3", ["not TOML", "line 1"]),
@@ -124,6 +124,19 @@ def test_a_bad_command_line(arguments, says, capsys):
     out, err = capsys.readouterr()
     assert stop.value.code == 2 and out == ""
     assert "usage:" in err and says in err.splitlines()[-1] and "Traceback" not in err
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a", ".exr", "a.exr.tif"])
+def test_an_export_of_another_kind(name, path, capsys, tmp_path):
+    said = fails(2, capsys, path, "--export-initial", tmp_path / name)
+    assert "--export-initial" in said and ".exr or .png" in said
+    assert not (tmp_path / name).exists()
+
+
+def test_an_export_does_not_resume(path, capsys, tmp_path):
+    with pytest.raises(SystemExit) as stop:
+        call(path, "--resume", "--export-initial", tmp_path / "a.png")
+    assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
 
 
 def test_a_parameter_that_the_scene_does_not_have(path, capsys):
@@ -265,6 +278,17 @@ def test_an_output_folder_that_is_read_only(path, capsys, tmp_path):
     folder.mkdir(mode=0o555)
     said = fails(3, capsys, path, "--out", str(folder))
     assert str(folder) in said and "--out" in said
+
+
+def test_an_export_overwrites_nothing(path, capsys, tmp_path):
+    map_before = (tmp_path / "map.exr").read_bytes()
+    said = fails(3, capsys, path, "--export-initial", tmp_path / "map.exr")
+    assert str(tmp_path / "map.exr") in said and "not overwritten" in said
+    assert (tmp_path / "map.exr").read_bytes() == map_before
+    (tmp_path / "link.png").symlink_to(tmp_path / "nowhere.png")
+    assert "link.png" in fails(3, capsys, path, "--export-initial", tmp_path / "link.png")
+    assert "folder" in fails(3, capsys, path, "--export-initial", tmp_path / "none" / "a.png")
+    assert not (tmp_path / "nowhere.png").exists()
 
 
 def test_a_damaged_checkpoint(path, capsys, tmp_path):

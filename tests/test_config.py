@@ -99,8 +99,11 @@ def test_an_override_without_key_or_value_is_refused(text):
         ('[fit]\nschedule = "cosin"', ["fit.schedule: came 'cosin'", "did you mean cosine?"]),
         ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
         ("[target]\nkind = 'image'", ["target.file", "wanted the painted image"]),
-        ("[target]\nkind = 'strokes'", ["target.kind: came 'strokes'", "comes later"]),
-        ("[[target.strokes]]\ntype = 'fill'", ["target.strokes: came 1 strokes", "comes later"]),
+        ("[target]\nkind = 'strokes'", ["target.strokes: came none, wanted at least one"]),
+        (
+            "[[target.strokes]]\ntype = 'contrast'",
+            ["target.strokes: came 1, wanted none", 'kind = "strokes"'],
+        ),
         ("[target]\nkind = 'imgae'", ["target.kind: came 'imgae'", "did you mean image?"]),
         ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: came [0, 64], wanted rows below 64"]),
         ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: came 0"]),

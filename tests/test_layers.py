@@ -249,6 +249,16 @@ def test_even_gain_is_a_factor(level, value):
     np.testing.assert_allclose(made.decode(params).numpy(), 0.7 * np.exp(value), rtol=1e-5)
 
 
+def test_log_gain_is_that_of_the_map(rng):
+    made, params = encoded(grey(1.0, 24, 48))
+    params = random_gain(params, rng, 0.3)
+    log = made.log_gain(params)
+    got = made.decode(params).numpy()
+    down = (log < 0).all(axis=2)
+    assert log.shape == got.shape and log.dtype == np.float32 and down.mean() > 0.02
+    np.testing.assert_allclose(np.log(got)[down], log[down], rtol=1e-4, atol=1e-6)
+
+
 def test_gain_is_limited():
     made, params = encoded(grey(1.0))
     for sign in (1, -1):

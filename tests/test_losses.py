@@ -19,10 +19,17 @@ def numpy_tv(x, w):
     return np.sum(w * (across + down)) / np.sum(w)
 
 
+def numpy_change(x, y, w):
+    floor = 0.01 * y.mean()
+    d = np.log((x + floor) / (y + floor))
+    return np.sum(w * (np.sqrt(d * d + 0.05**2) - 0.05)) / np.sum(w)
+
+
 PLAIN = {
     "luminance": lambda x, y, w: abs(np.sum(w * x * REC709) - np.sum(w * y * REC709)),
     "l1": lambda x, y, w: np.sum(w * np.abs(x)),
     "tv": lambda x, y, w: numpy_tv(x, w),
+    "change": numpy_change,
     "image_l1": lambda x, y, w: np.sum(w * np.abs(x - y)) / np.sum(w),
     "hdr": lambda x, y, w: np.sum(w * np.abs(x - y)) / np.sum(w),
     "image_l2": lambda x, y, w: np.sum(w * (x - y) ** 2) / np.sum(w),

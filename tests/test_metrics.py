@@ -128,3 +128,29 @@ def test_data_range_must_be_positive(function, data_range):
     a = np.ones((12, 12, 3))
     with pytest.raises(ConfigError, match="data_range must be a positive number"):
         function(a, a, data_range)
+
+
+# ---- painted pictures --------------------------------------------------------------------------------------
+
+
+def test_painted_tells_how_far_the_paint_was_followed_and_how_still_the_rest_was_held():
+    initial = np.full((4, 6, 3), 0.25)
+    coverage = np.zeros((4, 6, 1))
+    coverage[:, :2], coverage[:, 2] = 1, 0.5
+    wanted = np.where(coverage > 0, 0.64, initial)
+    edited = initial.copy()
+    edited[:, :3] = 0.49
+    edited[:, 5] = 0.36
+    found = metrics.painted(edited, wanted, initial, coverage, "linear")
+    assert found["towards"] == pytest.approx(1 - 0.15 / 0.39)
+    assert found["elsewhere"] == pytest.approx((0.5 * 0.24 + 0.11) / 3.5)
+    assert metrics.painted(wanted, wanted, initial, coverage)["towards"] == 1
+    assert metrics.painted(initial, wanted, initial, coverage) == {"towards": 0, "elsewhere": 0}
+
+
+def test_painted_without_a_question_is_unknown():
+    initial = np.full((4, 6, 3), 0.25)
+    assert metrics.painted(initial, initial, initial, np.ones((4, 6, 1))) == {
+        "towards": None,
+        "elsewhere": None,
+    }

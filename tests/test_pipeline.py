@@ -290,7 +290,7 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
     painted[8:13], counted[8:13] = 0, 0
     image.write_exr(tmp_path / "painted.exr", painted)
     image.write_exr(tmp_path / "mask.exr", counted)
-    target = {"kind": "image", "file": "painted.exr"} | ({"mask": mask} if mask else {})
+    target = {"kind": "image", "file": "painted.exr"} | ({"mask": mask, "hold": 0.0} if mask else {})
     found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
     rest = counted[..., 0] > 0
 

@@ -27,7 +27,7 @@ from envedit.transport import LightTransport
 ROOT = Path(run.__file__).parent.parent
 FILES = {
     "edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "preview.png",
-    "report.html", "history.csv", "config.toml", "manifest.json", "metrics.json",
+    "report.html", "history.csv", "config.toml", "manifest.json", "metrics.json", "edited_layers.exr",
 }  # fmt: skip
 INFLUENCE = {"influence.exr", "influence.png"}
 TINY = {
@@ -150,10 +150,11 @@ def test_images_are_float32_of_the_right_size_and_finite(done):
         expected = (18, 24) if path.name.startswith("render") else (8, 16)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: channel.pixels.copy() for name, channel in file.channels().items()}
-        assert set(planes) == set("RGB")
-        for plane in planes.values():
+        beside = {f"{layer}.{c}" for layer in ("initial", "difference") for c in "RGB"} | {"influence.Y"}
+        assert set(planes) == set("RGB") | (beside if path.name == "edited_layers.exr" else set())
+        for name, plane in planes.items():
             assert plane.dtype == np.float32 and plane.shape == expected
-            assert np.isfinite(plane).all() and (plane >= 0).all()
+            assert np.isfinite(plane).all() and (name.startswith("difference") or (plane >= 0).all())
 
 
 def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
@@ -161,7 +162,19 @@ def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
     image_keys = {"psnr", "ssim", "mse", "lpips"}
     assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
     assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached"}
-    timing = {"import", "target", "fit", "transport", "start", "edit", "judge", "report", "total"}
+    timing = {
+        "import",
+        "target",
+        "fit",
+        "transport",
+        "reach",
+        "start",
+        "edit",
+        "judge",
+        "full",
+        "report",
+        "total",
+    }
     assert set(found["timing"]) == {f"{part}_s" for part in timing} | {"per_iteration_ms"}
     assert found["timing"]["start_s"] == 0 < found["timing"]["fit_s"]
     assert {"iterations", "non_finite_steps", "tonemap", "active_rows", "choices"} <= set(found)
@@ -386,7 +399,7 @@ def one_sun(row, column):
     return picture
 
 
-def test_the_initial_rendering_has_a_quarter_of_the_samples(tmp_path, rng, monkeypatch):
+def test_the_initial_rendering_has_few_samples(tmp_path, rng, monkeypatch):
     seen, render = [], pipeline.scene.Scene.render
 
     def noted(self, envmap, spp, *rest, **keys):
@@ -394,7 +407,8 @@ def test_the_initial_rendering_has_a_quarter_of_the_samples(tmp_path, rng, monke
         return render(self, envmap, spp, *rest, **keys)
 
     monkeypatch.setattr(pipeline.scene.Scene, "render", noted)
-    for spp, few in ((16, 4), (18, 5), (1, 1)):
+    monkeypatch.setattr(pipeline, "INITIAL_SPP", 8)
+    for spp, few in ((16, 8), (8, 8), (1, 1)):
         seen.clear()
         path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp})
         assert call(path, "--quiet", *changed(representation__kind="pixels")) == 0
@@ -633,3 +647,29 @@ def test_doctor_finds_this_machine_well():
     found = subprocess.run([sys.executable, "-m", "envedit.doctor"], cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
     assert "llvm_ad_rgb: ready" in found.stdout and found.stderr == ""
+
+
+# ---- the picture to paint on -----------------------------------------------------------------------------
+
+
+def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsys):
+    path = world(tmp_path, rng, target={"kind": "image", "file": "later.png"})
+    before = content(tmp_path)
+    for name in ("a.exr", "b.png", "c.exr"):
+        assert call(path, "--quiet", "--export-initial", tmp_path / name) == 0
+    assert capsys.readouterr().out == ""
+    after = content(tmp_path)
+    assert after.keys() - before.keys() == {"a.exr", "b.png", "c.exr"}
+    assert all(after[key] == before[key] for key in before)
+    assert after["a.exr"] == after["c.exr"]  # the same picture again
+    assert pixels(tmp_path / "a.exr").shape == (18, 24, 3)
+    expected = np.rint(np.clip(pixels(tmp_path / "a.exr").astype(np.float64), 0, 1) ** (1 / 2.2) * 65535)
+    assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
+
+
+def test_the_export_says_what_to_do_next(tmp_path, rng, capsys):
+    path = world(tmp_path, rng)
+    assert call(path, "--export-initial", tmp_path / "b.png") == 0
+    out, _ = capsys.readouterr()
+    assert len(out.splitlines()) == 1 and "24x18" in out and "'gamma'" in out
+    assert f'[target] kind = "image", file = "{tmp_path / "b.png"}"' in out

@@ -89,6 +89,29 @@ def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, mon
     assert not np.array_equal(loaded.render(image, spp=10, seed=1), split)
 
 
+def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
+    """A lone bright texel over a rough ball is noisier than an even sky."""
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    even = np.ones((8, 16, 3), np.float32)
+    sunny = 0.05 * even
+    sunny[2, 3] = 300
+    quiet, few = loaded.sampled(even, "auto", 4)
+    _, many = loaded.sampled(sunny, "auto", 4)
+    assert few == 256 <= many <= 1024
+    truth = loaded.render(even, spp=4096, seed=99)
+    error = np.mean((np.clip(quiet, 0, 1) ** (1 / 2.2) - np.clip(truth, 0, 1) ** (1 / 2.2)) ** 2)
+    assert error < 2 * 10 ** (-scene.QUIET_DECIBELS / 10)
+    assert np.array_equal(loaded.sampled(even, "auto", 4)[0], quiet)
+    picture, taken = loaded.sampled(even, 16, 4)
+    assert taken == 16 and np.array_equal(picture, loaded.render(even, spp=16, seed=4))
+
+
+def test_noise_that_does_not_fall_ends_at_the_most_samples(tmp_path, monkeypatch):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    monkeypatch.setattr(scene, "QUIET_DECIBELS", 200.0)
+    assert loaded.sampled(np.ones((8, 16, 3)), "auto")[1] == 1024
+
+
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e6])
 def test_extreme_maps_render_in_proportion(tmp_path, value):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))

@@ -58,10 +58,15 @@ def picture(transport, image):
 class Start:
     """What a search finds for a map and a picture."""
 
-    def __init__(self, transport, image, wanted, weight=None):
+    def __init__(self, transport, image, wanted, weight=None, initial=None):
         layers = Layers((0, HEIGHT))
         encoded = layers.encode(image[:ROWS])
-        params, self.notes = search.start(layers, encoded, transport, wanted, weight, image)
+        if initial is None:
+            params, self.notes = search.start(layers, encoded, transport, wanted, weight, image)
+        else:
+            asked = initial, wanted, weight, image
+            params, self.notes = search.start_painted(layers, encoded, transport, *asked)
+            assert not any(params[name].numpy().any() for name in params if name.startswith("gain"))
         assert params.keys() == encoded.keys()
         assert all(params[name].shape == encoded[name].shape for name in params)
         self.count = len(layers.separation.lights)
@@ -315,3 +320,40 @@ def test_refinement_finds_a_light_from_three_texels_off(transport):
     )
     assert degrees_apart(direction, DIRECTIONS[7, 33]) < 0.3 * TEXEL
     np.testing.assert_allclose(factor, 2.5, rtol=0.05)
+
+
+# ---- painted changes -------------------------------------------------------------------------------------
+
+
+def painted(transport, image, wanted):
+    """Return what a search finds for the change from one map's picture to another's."""
+    initial = picture(transport, image)
+    return Start(transport, image, picture(transport, wanted), initial=initial)
+
+
+@pytest.mark.parametrize("place", [(6, 52), (5, 62), (9, 0)])
+def test_a_painted_shadow_elsewhere_moves_the_sun(place, transport):
+    found = painted(transport(), sky(SUN), sky(place))
+    assert degrees_apart(found.direction[0], DIRECTIONS[place]) < NEAR
+    np.testing.assert_allclose(found.flux[0], 1, rtol=0.2)
+    assert (found.flux[1:] < 1e-9).all() and len(found.notes) == 1
+
+
+@pytest.mark.parametrize("suns", [(), (SUN,)])
+def test_a_painted_light_is_born_beside_those_that_stay(suns, transport):
+    place = (7, 44)
+    found = painted(transport(), sky(*suns), sky(*suns, place))
+    born = found.count
+    assert degrees_apart(found.direction[born], DIRECTIONS[place]) < NEAR
+    assert found.flux[born].max() > 0.1 and "born" in found.notes[-1]
+    for i in range(found.count):
+        assert degrees_apart(found.direction[i], DIRECTIONS[suns[i]]) < 0.5 * TEXEL
+        np.testing.assert_allclose(found.flux[i], 1, atol=0.25)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5, 1.5])
+def test_paint_that_any_gain_makes_asks_for_no_light(factor, transport):
+    image = sky(SUN)
+    found = painted(transport(), image, factor * image)
+    assert degrees_apart(found.direction[0], DIRECTIONS[SUN]) < 0.5 * TEXEL
+    assert (found.flux[1:] < 1e-9).all() and found.notes == []

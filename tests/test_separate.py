@@ -389,6 +389,34 @@ def test_nothing_known_is_black_and_nothing_missing_is_the_map():
     np.testing.assert_array_equal(separate.filled(m, np.zeros((5, 7), bool)), m)
 
 
+# ---- survey ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [None, (8, 64)])
+def test_a_survey_tells_where_the_lights_are(rows):
+    m = discs((toward(40, 0.2), 3, 3e4), (toward(10, 120), 9, 300))
+    s = checked(m[8:50] if rows else m, rows)
+    assert len(s.lights) == 2 and s.survey.rows == (rows or (0, HEIGHT))
+    assert s.survey.label.shape == s.core.shape[:2] and set(np.unique(s.survey.label)) == {-1, 0, 1}
+    for i, light in enumerate(s.lights):
+        inside = (s.survey.label == i).ravel() & (s.core > 0).any(axis=2).ravel()
+        np.testing.assert_array_equal(np.flatnonzero(inside), light.texels)
+    lit = s.survey.label >= 0
+    np.testing.assert_allclose(s.survey.below[lit], s.background[lit], rtol=1e-6)
+    assert checked(sky()).survey is None
+
+
+def test_a_label_grows_into_what_has_none():
+    label = np.full((5, 8), -1)
+    label[2, 0], label[2, 4] = 0, 3
+    result = separate.grown(label)
+    assert (result == 0).sum() == (result == 3).sum() == 9 and (result[1:4, [7, 0, 1]] == 0).all()
+    assert result[0].max() == result[4].max() == -1
+    label[2, 2] = 1
+    result = separate.grown(label)
+    assert (result[2, 0], result[2, 4]) == (0, 3), "what a light has it keeps"
+
+
 # ---- real maps ---------------------------------------------------------------------------------------------
 
 SUNNY = [

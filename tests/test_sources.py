@@ -110,7 +110,7 @@ def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
     config = cfg.loads(text, overrides=["optimizer.iterations=8", "loss.ssim=[1, 2]"])
     assert (config.optimizer.iterations, config.loss.ssim) == (8, (1, 2))
     # What neither the kind nor the file names is the preset's.
-    assert config.target.spp == 512 and config.scene.width == 96
+    assert config.target.spp == 256 and config.scene.width == 96
     # A given key that has the value of another kind's default is kept.
     same = cfg.loads("[loss]\nssim = 0.1", overrides=["representation.kind=siren"])
     assert same.loss.ssim == 0.1 and same.optimizer.iterations == 600
@@ -177,3 +177,15 @@ def test_names_that_are_no_paths_stay():
     assert config.scene.file == "mirror" and config.input.envmap == "sunsky" and config.target.file == ""
     config = cfg.loads("[scene]\nfile = './mirror'\n[input]\nenvmap = './sunsky'", base_dir="/d")
     assert config.scene.file == "/d/mirror" and config.input.envmap == "/d/sunsky"
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ['kind = "image"\nfile = "p.png"', 'kind = "strokes"\nstrokes = [{type = "temperature", kelvin = 4000}]'],
+)
+def test_painted_targets_have_their_own_defaults(kind):
+    assert cfg.loads("").loss.change == 0
+    assert cfg.loads(f"[target]\n{kind}").loss.change > 0
+    assert cfg.loads(f"[loss]\nchange = 0\n[target]\n{kind}").loss.change == 0
+    paper = cfg.loads(f"[target]\n{kind}", preset="paper")
+    assert paper.loss.change == 0 and paper.loss.luminance[0] < 1e-4

@@ -1,18 +1,14 @@
-"""Targets: rendered under a known map, or painted by hand under a stated tonemap."""
-
-import types
+"""Targets: rendered under a known map, painted as a picture, or painted by strokes."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, exr, sky, write_scene
 
-from envedit import config, image, latlong, scene, target
-from envedit.errors import InputError
-from envedit.tonemap import inverse_tonemap, tonemap
+from envedit import config, image, latlong, painted, scene, target
+from envedit.errors import ConfigError, InputError
 
-FILM = types.SimpleNamespace(width=6, height=4)
-"""All that a painted target asks of a scene."""
+SIZE = (12, 16)
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +16,8 @@ def ball(tmp_path_factory):
     return scene.load(write_scene(tmp_path_factory.mktemp("scene"), SENSOR, BALL, LIGHT))
 
 
-def rendered(**kwargs):
-    return config.Target(kind="envmap", spp=4, **kwargs)
-
-
-def painted(file, **kwargs):
-    return config.Target(kind="image", file=str(file), rotate_degrees=0, **kwargs)
+def asking(seed=0, repair=False, **kwargs):
+    return config.Config(seed=seed, input=config.Input(repair=repair), target=config.Target(spp=4, **kwargs))
 
 
 def paint(path, picture):
@@ -43,7 +35,7 @@ def png(path, values):
 
 def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     envmap = sky(rng)
-    made = target.make(rendered(rotate_degrees=40), ball, envmap, seed=5)
+    made = target.make(asking(5, rotate_degrees=40), ball, envmap)
     np.testing.assert_array_equal(made.envmap, latlong.rotate(envmap, 40).astype(np.float32))
     expected = ball.render(made.envmap, spp=4, seed=5 + target.SEED)
     np.testing.assert_array_equal(made.picture, expected)
@@ -53,15 +45,15 @@ def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
 
 def test_a_turn_by_whole_texels_only_moves_columns(ball, rng):
     envmap = sky(rng)
-    made = target.make(rendered(rotate_degrees=360 * 3 / 16), ball, envmap, seed=0)
+    made = target.make(asking(rotate_degrees=360 * 3 / 16), ball, envmap)
     assert min(np.abs(made.envmap - np.roll(envmap, shift, axis=1)).max() for shift in (3, -3)) < 1e-6
-    back = target.make(rendered(rotate_degrees=-360 * 3 / 16), ball, made.envmap, seed=0)
+    back = target.make(asking(rotate_degrees=-360 * 3 / 16), ball, made.envmap)
     np.testing.assert_allclose(back.envmap, envmap, atol=1e-6)
 
 
 def test_target_shares_no_noise_with_other_renderings(ball, rng):
     envmap = sky(rng)
-    made = target.make(rendered(rotate_degrees=0), ball, envmap, seed=0)
+    made = target.make(asking(rotate_degrees=0), ball, envmap)
     assert not np.array_equal(made.picture, ball.render(envmap, spp=4, seed=0))
 
 
@@ -69,7 +61,7 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
     other = sky(rng, 16, 32)
     other[0, 0, 0] = -1
     file = paint(tmp_path / "other.exr", other)
-    made = target.make(rendered(file=str(file)), ball, sky(rng), seed=1)
+    made = target.make(asking(1, file=str(file)), ball, sky(rng))
     expected, info = image.load_envmap(file, 16)
     np.testing.assert_array_equal(made.envmap, expected)
     np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=1 + target.SEED))
@@ -80,116 +72,120 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
 def test_a_map_that_is_not_finite_is_refused_or_repaired(ball, tmp_path, rng):
     other = sky(rng)
     other[3, 4] = np.nan
-    settings = rendered(file=str(paint(tmp_path / "other.exr", other)))
+    file = str(paint(tmp_path / "other.exr", other))
     with pytest.raises(InputError, match=r"other\.exr.*row 3, column 4"):
-        target.make(settings, ball, sky(rng), seed=0)
-    made = target.make(settings, ball, sky(rng), seed=0, repair=True)
+        target.make(asking(file=file), ball, sky(rng))
+    made = target.make(asking(file=file, repair=True), ball, sky(rng))
     assert np.isfinite(made.picture).all() and np.isfinite(made.envmap).all()
 
 
 def test_a_missing_map_is_refused(ball, tmp_path, rng):
     with pytest.raises(InputError, match=r"nowhere\.exr"):
-        target.make(rendered(file=str(tmp_path / "nowhere.exr")), ball, sky(rng), seed=0)
+        target.make(asking(file=str(tmp_path / "nowhere.exr")), ball, sky(rng))
 
 
 def test_black_map_makes_a_black_target(ball):
-    made = target.make(rendered(rotate_degrees=60), ball, np.zeros((8, 16, 3), np.float32), seed=0)
+    made = target.make(asking(rotate_degrees=60), ball, np.zeros((8, 16, 3), np.float32))
     assert not made.picture.any()
+
+
+def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
+    values = np.zeros((*SIZE, 3), np.uint8)
+    values[:6] = 255
+    settings = asking(rotate_degrees=30, mask=str(png(tmp_path / "m.png", values)))
+    made = target.make(settings, ball, sky(rng))
+    np.testing.assert_array_equal(made.weight[..., 0], values[..., 0] / 255)
 
 
 # ---- painted ---------------------------------------------------------------------------------------------
 
 
-def test_painted_exr_is_taken_as_it_is(tmp_path, rng):
-    picture = (rng.random((4, 6, 3)) * 10).astype(np.float32)
+@pytest.fixture(scope="module")
+def seen(ball):
+    envmap = sky(np.random.default_rng(3))
+    return envmap, painted.initial(ball, envmap, asking())
+
+
+def a_stroke(**kwargs):
+    return {"type": "shadow", "rectangle": [0.25, 0.25, 0.75, 0.75], "amount": 0.5, **kwargs}
+
+
+def test_strokes_lie_on_the_initial_rendering(ball, seen):
+    envmap, initial = seen
+    made = target.make(asking(kind="strokes", strokes=(a_stroke(),)), ball, envmap)
+    np.testing.assert_array_equal(made.initial, initial)
+    np.testing.assert_allclose(made.picture[3:9, 4:12], 0.5 * initial[3:9, 4:12], rtol=1e-6)
+    np.testing.assert_array_equal(made.picture[:3], initial[:3])
+    assert made.envmap is None and made.asked == () and "1 strokes" in made.source
+
+
+def test_strokes_beside_the_picture_are_refused(ball, seen):
+    with pytest.raises(InputError, match=r"target\.strokes"):
+        beside = a_stroke(rectangle=[3, 3, 4, 4])
+        target.make(asking(kind="strokes", strokes=(beside,)), ball, seen[0])
+
+
+def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):
+    envmap, initial = seen
+    picture = initial.copy()
+    picture[2:5, 3:9] *= 2
     file = paint(tmp_path / "painted.exr", picture)
-    made = target.make(painted(file, tonemap="log"), FILM, None, 0)
-    np.testing.assert_array_equal(made.picture, picture)
-    assert made.weight is None and made.envmap is None and made.warnings == ()
-    assert str(file) in made.source
+    from_file = target.make(asking(kind="image", file=str(file), rotate_degrees=0), ball, envmap)
+    from_array = target.make(asking(), ball, envmap, picture)
+    np.testing.assert_array_equal(from_array.picture, from_file.picture)
+    np.testing.assert_array_equal(from_array.weight, from_file.weight)
+    assert from_array.coverage.sum() == 3 * 6
 
 
-@pytest.mark.parametrize("name", ["gamma", "srgb", "log", "linear"])
-def test_painted_png_is_undone_by_its_tonemap(tmp_path, name):
-    values = np.arange(72, dtype=np.uint8).reshape(4, 6, 3) * 3
-    values[0, 0] = 255
-    made = target.make(painted(png(tmp_path / "p.png", values), tonemap=name), FILM, None, 0)
-    np.testing.assert_allclose(made.picture, inverse_tonemap(values / 255, name), rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(tonemap(made.picture, name) * 255, values, atol=0.01)
-    assert made.picture.dtype == np.float32
-    assert any(f"'{name}'" in line and "p.png" in line for line in made.warnings)
+def test_mask_of_an_array_overrides_what_is_seen(ball, seen):
+    envmap, initial = seen
+    mask = np.zeros(SIZE)
+    mask[:2] = 0.5
+    made = target.make(asking(), ball, envmap, 2 * initial, mask)
+    np.testing.assert_array_equal(made.coverage[..., 0], mask)
+    np.testing.assert_array_equal(made.picture[2:], initial[2:])
+    np.testing.assert_allclose(made.picture[:2], 2 * initial[:2], rtol=1e-6)
 
 
-@pytest.mark.parametrize("size", [(6, 4), (5, 6), (8, 12)])
-def test_picture_of_another_size_is_refused(tmp_path, size):
-    file = paint(tmp_path / "painted.exr", np.ones((*size, 3)))
-    with pytest.raises(InputError) as info:
-        target.make(painted(file), FILM, None, 0)
-    message = str(info.value)
-    assert "painted.exr" in message and f"{size[1]}x{size[0]}" in message and "6x4" in message
-    assert len(message.splitlines()) <= 2 and info.value.exit_code == 3
+@pytest.mark.parametrize(
+    ("picture", "mask", "says"),
+    [
+        (np.ones((3, 4, 3)), None, "shape"),
+        (np.full((*SIZE, 3), np.nan), None, "not finite"),
+        (np.ones((*SIZE, 3)), np.ones((4, 4)), "mask"),
+        (np.ones((*SIZE, 3)), np.full(SIZE, np.inf), "mask.*not finite"),
+        (np.ones((*SIZE, 3)), np.zeros(SIZE), "nothing"),
+    ],
+)
+def test_arrays_that_cannot_be_used(ball, seen, picture, mask, says):
+    with pytest.raises(InputError, match=says):
+        target.make(asking(), ball, seen[0], picture, mask)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_picture_that_is_not_finite_is_refused(tmp_path, value):
-    picture = np.ones((4, 6, 3))
-    picture[2, 3, 1] = value
-    with pytest.raises(InputError, match=r"painted\.exr.*row 2, column 3"):
-        target.make(painted(paint(tmp_path / "painted.exr", picture)), FILM, None, 0)
+# ---- weights ---------------------------------------------------------------------------------------------
 
 
-def test_missing_picture_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere\.png"):
-        target.make(painted(tmp_path / "nowhere.png"), FILM, None, 0)
+def test_paint_and_rest_have_their_weights_whatever_their_size():
+    coverage = np.zeros((10, 10, 1))
+    coverage[0, :2] = 1
+    coverage[0, 2] = 0.5
+    weight = target.pixel_weight(coverage, np.zeros((10, 10), bool), paint=3, hold=1)
+    assert weight.mean() == pytest.approx(1, rel=1e-6)
+    painted_part = 3 * coverage / coverage.sum()
+    np.testing.assert_allclose(
+        weight / weight.sum(), (painted_part + (1 - coverage) / (1 - coverage).sum()) / 4, rtol=1e-5
+    )
 
 
-# ---- masks -----------------------------------------------------------------------------------------------
+def test_what_tells_nothing_has_no_weight():
+    excluded = np.zeros((4, 5), bool)
+    excluded[1] = True
+    weight = target.pixel_weight(np.ones((4, 5, 1)), excluded, paint=1, hold=1)
+    assert not weight[1].any() and (weight[[0, 2, 3]] == weight[0, 0]).all()
 
 
-def masked(tmp_path, mask):
-    return painted(paint(tmp_path / "painted.exr", np.ones((4, 6, 3))), mask=str(mask))
-
-
-def test_mask_is_a_weight_for_each_pixel(tmp_path):
-    values = np.zeros((4, 6, 3), np.uint8)
-    values[1:, :2] = 255
-    values[0, 5] = 128
-    weight = target.make(masked(tmp_path, png(tmp_path / "mask.png", values)), FILM, None, 0).weight
-    assert weight.shape == (4, 6, 1) and weight.dtype == np.float32
-    # As painted, half grey counts half; sRGB's curve is undone in float32.
-    np.testing.assert_allclose(weight[..., 0], values[..., 0] / 255, atol=1e-6)
-
-
-def test_mask_beyond_white_counts_as_white(tmp_path):
-    values = np.full((4, 6, 3), 7.0)
-    values[0] = -3
-    weight = target.make(masked(tmp_path, paint(tmp_path / "mask.exr", values)), FILM, None, 0).weight
-    assert not weight[0].any() and (weight[1:] == 1).all()
-
-
-def test_mask_of_another_size_is_refused(tmp_path):
-    file = png(tmp_path / "mask.png", np.full((4, 5, 3), 255, np.uint8))
-    with pytest.raises(InputError, match=r"mask\.png: is 5x4 pixels, the target is 6x4"):
-        target.make(masked(tmp_path, file), FILM, None, 0)
-
-
-def test_black_mask_is_refused(tmp_path):
-    file = png(tmp_path / "mask.png", np.zeros((4, 6, 3), np.uint8))
-    with pytest.raises(InputError, match=r"mask\.png: is black everywhere: paint white"):
-        target.make(masked(tmp_path, file), FILM, None, 0)
-
-
-def test_mask_that_is_not_finite_is_refused(tmp_path):
-    values = np.ones((4, 6, 3))
-    values[3, 1] = np.nan
-    with pytest.raises(InputError, match=r"mask\.exr.*row 3, column 1"):
-        target.make(masked(tmp_path, paint(tmp_path / "mask.exr", values)), FILM, None, 0)
-
-
-def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
-    values = np.zeros((12, 16, 3), np.uint8)
-    values[:6] = 255
-    settings = rendered(rotate_degrees=30, mask=str(png(tmp_path / "m.png", values)))
-    made = target.make(settings, ball, sky(rng), 0)
-    assert made.weight is not None
-    np.testing.assert_allclose(made.weight[..., 0], values[..., 0] / 255, atol=1e-6)  # sRGB undone in float32
+def test_a_target_without_weight_is_refused():
+    with pytest.raises(InputError, match="no pixel counts"):
+        target.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
+    with pytest.raises(ConfigError, match=r"target\.paint"):
+        asking(kind="strokes", strokes=(a_stroke(),), paint=0.0, hold=0.0)

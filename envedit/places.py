@@ -1,0 +1,117 @@
+"""Where the texels of a large map lie among those of a coarser one, and the bands in which it is worked on.
+
+A band is some rows of the large map. What is known at the coarser map's texels is interpolated along the rows
+on the host, where it is small, and across the columns on the device.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+BAND_TEXELS = 1 << 21
+"""Texels of the source that are worked on at a time."""
+
+
+class Places:
+    """Where the texels of a source lie among rows of a coarser map.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the source.
+    coarse : (int, int, int, int)
+        First row and number of rows of the coarser image, rows and columns of its map.
+
+    Attributes
+    ----------
+    row, column : ndarray of int64 (H,), (W,)
+        The nearest texel of the coarser image.
+    place : ndarray (H,)
+        Row of the coarser image, with its fraction.
+    start, stop : int
+        Rows of the source whose nearest row is in the coarser image.
+    """
+
+    def __init__(self, shape, coarse):
+        self.shape, (first, self.count, total, self.columns) = shape, coarse
+        height, width = shape
+        place = np.arange(height) * ((total - 1) / max(height - 1, 1)) - first
+        nearest = np.rint(place)
+        inside = np.flatnonzero((nearest >= 0) & (nearest < self.count))
+        self.start, self.stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
+        self.row = np.clip(nearest, 0, self.count - 1).astype(np.int64)
+        across = (np.arange(width) + 0.5) * (self.columns / width)
+        self.column = np.minimum(across.astype(np.int64), self.columns - 1)
+        self.place = place
+        left = np.floor(across - 0.5)
+        tables = left % self.columns, (left + 1) % self.columns, self.column, self.column + 1, self.column
+        index = np.stack(tables, axis=1).astype(np.uint32)
+        part = np.stack([across - 0.5 - left, across - self.column], axis=1).astype(np.float32)
+        self._index = [dr.opaque(mi.UInt32(np.ascontiguousarray(i))) for i in index.T]
+        self._part = [dr.opaque(mi.Float(np.ascontiguousarray(p))) for p in part.T]
+
+    def bands(self):
+        """Yield (first row, first row not in an earlier band, rows): bands of one size over start to stop."""
+        height = self.stop - self.start
+        size = min(max(BAND_TEXELS // self.shape[1], 1), height)
+        for fresh in range(self.start, self.stop, max(size, 1)):
+            yield min(fresh, self.stop - size), fresh, size
+
+    def along_rows(self, values, start, size):
+        """Interpolate values (rows, w, C) at rows of the source; float32 (size, w, C)."""
+        return _between(values, np.clip(self.place[start : start + size], 0, self.count - 1))
+
+    def inner(self, mask, start, size):
+        """Interpolate a mask (rows, w) by its corners, 0 wherever a texel is not in it; (size, w + 1)."""
+        around = np.pad(mask, ((1, 1), (0, 0)), mode="edge")
+        across = around & np.roll(around, 1, axis=1)
+        corners = across[:-1] & across[1:]
+        corners = np.concatenate([corners, corners[:, :1]], axis=1).astype(np.float64)
+        place = np.clip(self.place[start : start + size] + 0.5, 0, self.count)
+        return _between(corners[..., None], place)[..., 0]
+
+    def across(self, kind, table, row, column, corners=False):
+        """Interpolate a table of :meth:`along_rows`, or of :meth:`inner`, at texels of a band."""
+        left, right = self._index[2:4] if corners else self._index[:2]
+        part = dr.gather(mi.Float, self._part[1 if corners else 0], column)
+        first = row * dr.opaque(mi.UInt32, self.columns + (1 if corners else 0))
+        a = dr.gather(kind, table, first + dr.gather(mi.UInt32, left, column))
+        b = dr.gather(kind, table, first + dr.gather(mi.UInt32, right, column))
+        return a + (b - a) * part
+
+    def nearest(self, kind, table, row, column):
+        """Look up a table (size, w) at texels of a band."""
+        place = row * dr.opaque(mi.UInt32, self.columns) + dr.gather(mi.UInt32, self._index[4], column)
+        return dr.gather(kind, table, place)
+
+    def beside(self, column):
+        """Columns from the nearest, -1/2 to 1/2."""
+        return dr.gather(mi.Float, self._part[1], column) - 0.5
+
+    def texels(self, size):
+        """Row and column in the band of all its texels."""
+        index = dr.arange(mi.UInt32, size * self.shape[1])
+        row = index // dr.opaque(mi.UInt32, self.shape[1])
+        return row, index - row * dr.opaque(mi.UInt32, self.shape[1])
+
+
+def _between(values, place):
+    top = np.minimum(place.astype(np.int64), max(len(values) - 2, 0))
+    part = (place - top)[:, None, None]
+    bottom = np.minimum(top + 1, len(values) - 1)
+    return (values[top] + (values[bottom] - values[top]) * part).astype(np.float32)
+
+
+def to_device(kind, array):
+    """Copy a numpy array to the device; done when this returns, so that the array may be reused."""
+    made = dr.opaque(kind(np.ascontiguousarray(array).ravel()))
+    dr.eval(made)
+    dr.sync_thread()
+    return made
+
+
+def as_image(colour, size, width):
+    """Arrange the texels of a band as a tensor (size, width, 3)."""
+    return mi.TensorXf(dr.ravel(colour), (size, width, 3))

@@ -200,7 +200,7 @@ class Loss(Table):
 class Optimizer(Table):
     """The edit loop's Adam."""
 
-    iterations: int = _key(150, integer(0, 10**7), "steps of the edit")
+    iterations: int = _key(100, integer(0, 10**7), "steps of the edit")
     lr: float | str = _key(
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
     )

@@ -57,7 +57,7 @@ class Layers:
         What a unit of each parameter is.
     """
 
-    lr = 0.02
+    lr = 0.03
     Gain = GridGain
 
     def __init__(self, rows: tuple[int, int] | None = None, cycles: int = 12):

@@ -28,7 +28,7 @@ def test_an_empty_file_gives_the_defaults():
     assert config.input == cfg.Input(envmap="sunsky", width=256, rows="upper")
     assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
     assert config.representation.kind == "layers" and config.representation.cycles == 12
-    assert config.loss.ssim == 0.1 and config.optimizer.iterations == 150
+    assert config.loss.ssim == 0.1 and config.optimizer.iterations == 100
     assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
 
 

@@ -62,7 +62,8 @@ def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     assert full.shape == picture.shape and edited.shape == (16, 32, 3)
     assert full[WIDTH // 4 :].tobytes() == picture[WIDTH // 4 :].tobytes()  # below the horizon
     assert not np.array_equal(full, picture)
-    flux = [(m * latlong.lookup_solid_angles(*m.shape[:2])[:, None, None]).sum((0, 1)) for m in (full, edited)]
+    omega = [latlong.lookup_solid_angles(*m.shape[:2])[:, None, None] for m in (full, edited)]
+    flux = [(m * o).sum((0, 1)) for m, o in zip((full, edited), omega, strict=True)]
     np.testing.assert_allclose(*flux, rtol=0.02)
 
 

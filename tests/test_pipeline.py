@@ -14,6 +14,7 @@ from envedit.errors import InputError
 
 WIDTH, HEIGHT = 16, 8
 PIXELS = {"representation": {"kind": "pixels"}}
+STROKES = [{"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}]
 
 
 @pytest.fixture(autouse=True)
@@ -360,6 +361,9 @@ CASES = {
         },
     ),
     "transport recorded afresh": (sunny, PIXELS | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
+    "layers, columns": (sunny, {}),
+    "layers, transport recorded afresh": (sunny, {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
+    "layers, painted, columns": (sunny, {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}}),
 }
 
 

@@ -77,7 +77,7 @@ MANY = ("siren", "pixels", "log-pixels")
 @pytest.mark.parametrize(
     ("preset", "kind", "ssim", "iterations"),
     [
-        ("standard", "layers", 0.1, 150),
+        ("standard", "layers", 0.1, 100),
         ("draft", "layers", 0.1, 60),
         *(("standard", kind, 1.0, 600) for kind in MANY),
         *(("draft", kind, 1.0, 150) for kind in MANY),
@@ -98,7 +98,7 @@ def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
 def test_the_kind_that_counts_is_the_last_one_given():
     text = '[representation]\nkind = "siren"'
     assert cfg.loads(text).optimizer.iterations == 600
-    assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 150
+    assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 100
     assert cfg.loads(text, overrides=["representation.kind=pixels"]).loss.ssim == 1.0
     assert cfg.loads("", preset="paper").representation.kind == "siren"
 

@@ -6,46 +6,27 @@ Nothing here prints or writes but the checkpoint; ``run.py`` does, with what thi
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
-from . import (
-    carry,
-    checkpoint,
-    config,
-    edit,
-    envmap,
-    files,
-    fit,
-    image,
-    metrics,
-    optim,
-    scene,
-    search,
-    sky,
-    target,
-)
+from . import carry, changes, config, envmap, files, fit, image, metrics, scene, search, sky, target
 from . import reach as reaches
-from .errors import NumericalError
+from .job import Interrupted, Job, Stopped, Watch
 from .layers import Layers
 from .pathtrace import PathTracer
 from .separate import Separation
 from .transport import LightTransport
 
+__all__ = ["Found", "Interrupted", "Result", "Stopped", "Watch", "at_full_resolution", "run"]
+
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
-INITIAL_SPP = 128
+INITIAL_SPP = 144
 """Samples a pixel of the initial rendering, which is far from the target."""
-
-TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
-"""Steps after which the better of two starts is chosen, and by which share of the loss it must be better."""
 
 
 @dataclass
@@ -106,33 +87,6 @@ class Found:
     free: np.ndarray | None
 
 
-class Interrupted(Exception):
-    """Ctrl-C during the edit, after the checkpoint was written; ``envmap`` is the map so far."""
-
-    def __init__(self, envmap: np.ndarray, step: int):
-        super().__init__(f"interrupted at iteration {step}")
-        self.envmap, self.step = envmap, step
-
-
-class Stopped(NumericalError):
-    """The optimisation could not go on; ``envmap`` is the last good map."""
-
-    def __init__(self, message: str, envmap: np.ndarray):
-        super().__init__(message)
-        self.envmap = envmap
-
-
-@dataclass
-class Watch:
-    """What a run tells while it works.
-
-    ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one.
-    """
-
-    stage: Callable[[str], None] = lambda text: None
-    progress: Callable[[int, int, str], None] = lambda done, total, text: None
-
-
 @dataclass
 class _Clock:
     """Wall seconds by name."""
@@ -146,6 +100,18 @@ class _Clock:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def table(self, history, total) -> dict:
+        """Return the timing of the metrics, but for what the command line adds."""
+        parts = ("target", "fit", "transport", "reach", "start", "edit", "judge")
+        steps = [row["step_ms"] for row in history]
+        return {
+            "import_s": None,
+            **{f"{part}_s": round(self.seconds.get(f"{part}_s", 0.0), 3) for part in parts},
+            "report_s": None,
+            "total_s": round(total, 3),
+            "per_iteration_ms": float(np.median(steps)) if steps else None,
+        }
 
 
 def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
@@ -317,16 +283,8 @@ def run(
             through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
             free = None  # a light may move across texels that are kept otherwise
-            asked = judged_by.picture, wanted.weight, original
-            if wanted.coverage is None:
-                starts = [search.start(representation, params, through, *asked)]
-            else:
-                begin = representation, params, through, initial, *asked
-                daring = (False, True) if (wanted.coverage < 1).any() else (False,)
-                starts = [search.start_painted(*begin, bold=bold) for bold in daring]
-                if representation.separation.lights:
-                    starts.append(search.softened(representation, params))
-    job = _Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
+            starts = _starts(representation, params, through, judged_by, original)
+    job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
     if isinstance(representation, Layers):
         with clock("start_s"):
             params, placed = job.best(starts, crop)
@@ -340,65 +298,29 @@ def run(
     with clock("judge_s"):
         watch.stage("rendering the result")
         final, judged = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
-    seconds = clock.seconds
-    iterations = len(state.history)
-    tonemap = settings.output.tonemap
-    fitted = getattr(representation, "fitted", None)
-    measured = {
-        "render": metrics.compare(final, wanted.picture, tonemap),
-        "initial": metrics.compare(initial, wanted.picture, tonemap),
-        "envmap": None
-        if wanted.envmap is None
-        else metrics.compare(edited[rows], wanted.envmap[rows], tonemap),
-        "fit": None
-        if fitted is None
-        else {
-            "log_psnr": fitted.log_psnr,
-            "peak_ratio": fitted.peak_ratio,
-            "epochs": fitted.epochs,
-            "cached": fitted.cached,
-        },
-        "timing": {
-            "import_s": None,
-            **{
-                f"{part}_s": round(seconds.get(f"{part}_s", 0.0), 3)
-                for part in ("target", "fit", "transport", "reach", "start", "edit", "judge")
-            },
-            "report_s": None,
-            "total_s": round(time.perf_counter() - begun, 3),
-            "per_iteration_ms": float(np.median([row["step_ms"] for row in state.history]))
-            if iterations
-            else None,
-        },
+    notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
+    renders = {"initial": initial, "target": wanted.picture, "edited": final}
+    maps = {"initial": original, "target": wanted.envmap, "edited": edited}
+    measured = _measure(settings, renders, maps, rows, wanted.coverage, within)
+    measured |= {
+        "fit": _of_fit(getattr(representation, "fitted", None)),
+        "timing": clock.table(state.history, time.perf_counter() - begun),
         "iterations": state.step,
         "non_finite_steps": state.bad_steps,
-        "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
-        "active_rows": [first, last],
         "transport": None,
-        "painted": None,
     }
-    if wanted.coverage is not None:
-        measured["painted"] = metrics.painted(final, wanted.picture, initial, wanted.coverage, tonemap)
-        measured["painted"]["reachable"] = None if within is None else within.share
-    if wanted.envmap is not None:
-        measured["sun_offset_texels"] = metrics.sun_offset(edited[rows], wanted.envmap[rows])
-        measured["initial_envmap"] = metrics.compare(original[rows], wanted.envmap[rows], tonemap)
-    notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     if traced:
         share = float(frozen[rows].mean())
-        measured["transport"] = {
-            **traced.summary(),
-            "predicted_error": traced.coarse_error(edited),
-            "frozen": share,
-        }
+        predicted = {"predicted_error": traced.coarse_error(edited), "frozen": share}
+        measured["transport"] = {**traced.summary(), **predicted}
         if share:
             least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
             notes.append(f"{100 * share:.2g} % of the active texels keep their value: {least}")
     measured["choices"] = notes
     return Result(
         edited,
-        {"initial": initial, "target": wanted.picture, "edited": final},
-        {"initial": original, "target": wanted.envmap, "edited": edited},
+        renders,
+        maps,
         measured,
         state.history,
         notes,
@@ -409,6 +331,17 @@ def run(
         within,
         Found(representation, params, first, free),
     )
+
+
+def _starts(layers, params, transport, wanted, original):
+    """List the starts of an edit with layers, (parameters, notes), one of which is to be taken."""
+    asked = wanted.picture, wanted.weight, original
+    if wanted.coverage is None:
+        return [search.start(layers, params, transport, *asked)]
+    begin = layers, params, transport, wanted.initial, *asked
+    daring = (False, True) if (wanted.coverage < 1).any() else (False,)
+    starts = [changes.start(*begin, bold=bold) for bold in daring]
+    return [*starts, changes.softened(layers, params)] if layers.separation.lights else starts
 
 
 def _as_seen(traced, original, wanted):
@@ -422,136 +355,31 @@ def _as_seen(traced, original, wanted):
     return np.maximum(wanted.picture + (seen - wanted.initial), 0).astype(np.float32)
 
 
+def _measure(settings, renders, maps, rows, coverage, within):
+    """Compare renderings and maps: the part of the metrics that says how good the result is."""
+    tonemap, (before, wanted, after) = settings.output.tonemap, renders.values()
+    measured = {
+        "render": metrics.compare(after, wanted, tonemap),
+        "initial": metrics.compare(before, wanted, tonemap),
+        "envmap": None,
+        "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
+        "active_rows": [rows.start, rows.stop - 1],
+        "painted": None,
+    }
+    if coverage is not None:
+        measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
+        measured["painted"]["reachable"] = None if within is None else within.share
+    if maps["target"] is not None:
+        original, true, edited = (envmap[rows] for envmap in maps.values())
+        measured["envmap"] = metrics.compare(edited, true, tonemap)
+        measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
+        measured["initial_envmap"] = metrics.compare(original, true, tonemap)
+    return measured
+
+
+def _of_fit(fitted):
+    names = "log_psnr", "peak_ratio", "epochs", "cached"
+    return None if fitted is None else {name: getattr(fitted, name) for name in names}
+
+
 _TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
-
-
-@dataclass
-class _Job:
-    """One edit in progress: loop, checkpoints, and the map that parameters stand for."""
-
-    settings: config.Config
-    lit: scene.Scene
-    original: np.ndarray
-    first: int
-    free: np.ndarray | None
-    wanted: target.Target
-    representation: object
-    renderer: object
-    folder: Path | None
-    watch: Watch
-
-    def decode(self, params) -> np.ndarray:
-        """Parameters to a whole map on the host, refusing what is not finite."""
-        crop = self.representation.decode(params).numpy()
-        rows = slice(self.first, self.first + crop.shape[0])
-        if self.free is not None:
-            crop = np.where(self.free[..., None], crop, self.original[rows])
-        if not np.isfinite(crop).all():
-            row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
-            raise NumericalError(
-                f"the edited map is not finite at row {self.first + row}, column {column}: "
-                "lower [optimizer] lr"
-            )
-        edited = self.original.copy()
-        edited[rows] = crop
-        return edited
-
-    def best(self, starts, crop):
-        """Return the start, (parameters, notes), that gets farthest in a few steps."""
-        notes = {tuple(notes) for _, notes in starts}
-        if len(notes) == 1:
-            return starts[0]
-        reached = []
-        for params, _ in starts:
-            few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
-            wanted = self.wanted.picture, self.wanted.weight
-            objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS)
-            _, state = edit.optimise(
-                self.representation,
-                params,
-                self.renderer,
-                objective,
-                self.original,
-                self.first,
-                few,
-                free=self.free,
-            )
-            reached.append(state.history[-1]["loss"])
-        least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
-        losses = ", ".join(f"{loss:.3g}" for loss in reached)
-        chosen = [
-            *starts[least][1],
-            f"start {least + 1} of {len(starts)}: losses after {TRIAL_STEPS} steps {losses}",
-        ]
-        return starts[least][0], chosen
-
-    def optimise(self, params, crop, resume):
-        """Run the loop from the start, or from the checkpoint; returns parameters and state."""
-        chosen, wanted = self.settings.optimizer, self.wanted
-        lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
-        adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), edit.State()
-        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
-        if self.folder and resume and (found := checkpoint.load(self.folder, what)):
-            state, optimiser, traced, picture = found
-            adam.load_state_dict(optimiser)
-            self.renderer.restore(traced)
-            # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
-            wanted = self.wanted = replace(wanted, picture=picture)
-        objective = edit.Objective(self.settings.loss, wanted.picture, wanted.weight, crop, chosen.iterations)
-        saved = time.perf_counter()
-
-        with _ctrl_c() as interrupt:
-
-            def after_step(state, adam):
-                nonlocal saved
-                self.watch.progress(state.step, chosen.iterations, f"loss {state.history[-1]['loss']:.4g}")
-                stop, due = interrupt.is_set(), time.perf_counter() - saved >= chosen.checkpoint_s
-                due |= state.step == chosen.iterations  # what follows may be interrupted too
-                if self.folder and (stop or due):
-                    traced = self.renderer.state()
-                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.picture)
-                    saved = time.perf_counter()
-                if stop:
-                    raise Interrupted(self.decode(adam.params), state.step)
-
-            try:
-                return edit.optimise(
-                    self.representation,
-                    params,
-                    self.renderer,
-                    objective,
-                    self.original,
-                    self.first,
-                    chosen,
-                    free=self.free,
-                    adam=adam,
-                    state=state,
-                    after_step=after_step,
-                )
-            except NumericalError as error:
-                raise Stopped(str(error), self.decode(adam.params)) from error
-
-
-@contextlib.contextmanager
-def _ctrl_c():
-    """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-
-    def handle(number, frame):
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def select_variant(settings: config.Config) -> None:
-    """Select the Mitsuba variant of a configuration; the one piece of global state."""
-    mi.set_variant(settings.variant)

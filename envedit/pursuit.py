@@ -29,17 +29,6 @@ BIRTH = 0.6
 """A light is born where it explains this share of what all others leave unexplained."""
 BIRTH_LIGHT = 0.03
 """And adds this share to the light of the picture."""
-BIRTH_BESIDE, BIRTH_ASKED = 0.3, 0.1
-"""For a painted change a light is born where it explains the first share of what is left unexplained, and the
-second of the squared change."""
-BOLD = 0.01
-"""The first of these shares where it will be tried out which start is better."""
-TAKEN = 0.3
-"""A light that loses this share of its strength where another is born has moved there."""
-CHANGE_ORDER = 0
-"""Order of the background's gains for a painted change: an extreme gain explains any small stroke."""
-BESIDE = 8.0
-"""Degrees from all others that a light of a painted change is born at least."""
 SEEN, UNWANTED = 1e-3, 1e-2
 """A light that adds less than the first share to the picture, and would explain less than the second of its
 square anywhere, stays as it is."""
@@ -102,7 +91,7 @@ def place(
     list of Place
         For the map's lights, then for the spare ones; flux 0: not there.
     """
-    search = _Pursuit(overview, picture, weight, known, background, omega, active)
+    search = Pursuit(overview, picture, weight, known, background, omega, active)
     directions, atoms = [], []
     for light in lights:
         flux = light.radiance * omega[start + light.texels][:, None]
@@ -156,65 +145,7 @@ def place(
     return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))
 
 
-def change(
-    overview: Overview,
-    difference: np.ndarray,
-    weight: np.ndarray | None,
-    known: np.ndarray,
-    background: np.ndarray,
-    omega: np.ndarray,
-    active: np.ndarray,
-    start: int,
-    lights: list[Light],
-    spare: int,
-    spare_flux: np.ndarray,
-    bold: bool = False,
-) -> list[Place]:
-    """Find which lights a painted change asks for; parameters as for :func:`place`.
-
-    ``difference`` (h, w, 3) is what was painted less what was there, 0 beside the paint: nothing has to be
-    explained that is there already, and errors of the overview are errors of the change alone. Beside a gain
-    of the background, lights that are there may become stronger or weaker, and lights are born. If one is
-    born while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``: be
-    content with :data:`BOLD` of what is left unexplained.
-    """
-    search = _Pursuit(overview, difference, weight, known, background, omega, active, CHANGE_ORDER)
-    stays = []
-    for light in lights:
-        flux = light.radiance * omega[start + light.texels][:, None]
-        cells = overview.cell_of[start + light.texels]
-        stays.append(search.atom_of(cells, flux, light.direction, light.glow)[..., 0])
-        search.explain(stays[-1])
-    own = [(light.radiance * omega[start + light.texels][:, None]).sum(axis=0) for light in lights]
-    born, added, atom = [], [], search.atoms(spare_flux, None)
-    for _ in range(spare + len(lights)):
-        score = search.scores(atom)
-        for there in [*(light.direction for light in lights), *born]:
-            score[overview.directions[search.candidates] @ there > np.cos(np.radians(BESIDE))] = 0
-        best = int(score.argmax())
-        enough = BOLD * search.left() if bold else BIRTH_BESIDE * search.left()
-        if not score[best] > max(enough, 0 if bold and not born else BIRTH_ASKED * search.asked()):
-            break
-        born.append(search.between(score, best))
-        added.append(atom[..., best])
-        search.explain(added[-1])
-    factors = search.solve([a * sign for a in stays for sign in (1, -1)] + added, signed=True)
-    grown = factors[: 2 * len(stays)].reshape(len(stays), 2, 3)
-    factor = np.clip(1 + grown[:, 0] - grown[:, 1], 0, None)
-    places, moved = [Place(None, f if born else np.ones(3)) for f in factor], []
-    for direction, strength in zip(born, factors[2 * len(stays) :], strict=True):
-        flux = strength * spare_flux
-        left = [1.0 if i in moved else factor[i].mean() for i in range(len(lights))]
-        if left and min(left) < 1 - TAKEN:
-            i = int(np.argmin(left))
-            moved.append(i)
-            places[i] = Place(direction, factor[i] + flux / np.maximum(own[i], 1e-30))
-        elif len(places) < len(lights) + spare:
-            places.append(Place(direction, np.maximum(strength, LEAST_FLUX)))
-    return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))
-
-
-class _Pursuit:
+class Pursuit:
     """The residual picture, block by block, and what explains it; channels are apart."""
 
     def __init__(self, overview, picture, weight, known, background, omega, active, order=GAIN_ORDER):

@@ -37,7 +37,7 @@ SHIPPED = ("sphere", "mirror", "matte", "statue", "pair", "mesh")
 
 QUIET_DECIBELS = 48.0
 """PSNR of a rendering that is quiet, against one without noise: beyond what an edit reaches under a sun."""
-_QUIET_PASS, _QUIET_LEAST, _QUIET_MOST = 64, 256, 1024  # samples a pixel
+_QUIET_PASS, _QUIET_LEAST, _QUIET_MOST = 64, 256, 768  # samples a pixel
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -153,7 +153,7 @@ class Scene:
 
         Passes of 64 samples a pixel are added until the error of their mean, told by how much their display
         values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at least,
-        1024 at most.
+        768 at most.
 
         Returns
         -------

@@ -19,7 +19,7 @@ import numpy as np
 from . import latlong
 from .layers import VEIL, Layers
 from .lights import DARK, SPARE, rotation_vector
-from .pursuit import FAINT, GAIN_ORDER, Place, change, not_negative, place, products
+from .pursuit import FAINT, GAIN_ORDER, Place, place, products
 from .separate import glow_at
 from .tonemap import LUMINANCE
 from .transport import LightTransport
@@ -68,7 +68,7 @@ def start(
     notes : list of str
         What was found.
     """
-    scene = _Question(layers, transport, picture, weight, envmap)
+    scene = Question(layers, transport, picture, weight, envmap)
     overview, lights = transport.overview(), layers.separation.lights
     places = place(
         overview, scene.wanted, weight, picture, scene.background, scene.omega, scene.active,
@@ -112,82 +112,19 @@ def start(
         gain = np.clip(gain, LEAST, MOST)
         name = f"gain.{level}"
         logs = np.log(gain).reshape(*layers.gain.sizes[level], 3) / layers.scales[name]
-        found[name] = _tensor(logs)
+        found[name] = tensor(logs)
         factor = factor * scene.in_cells(level, gain)
         strength = np.clip(strength, LEAST, MOST)
         total, stack = total * strength, stack * strength.T[:, None, :]
     for (i, _), s in zip(pictures, total, strict=True):
         places[i] = Place(places[i].direction, places[i].flux * s)
     turn, flux = scene.parameters(places)
-    found["turn"] = _tensor(turn / layers.scales["turn"])
-    found["flux"] = _tensor(flux / layers.scales["flux"])
+    found["turn"] = tensor(turn / layers.scales["turn"])
+    found["flux"] = tensor(flux / layers.scales["flux"])
     return found, notes
 
 
-def start_painted(
-    layers: Layers,
-    params: dict,
-    transport: LightTransport,
-    initial: np.ndarray,
-    picture: np.ndarray,
-    weight: np.ndarray | None,
-    envmap: np.ndarray,
-    bold: bool = False,
-) -> tuple[dict, list[str]]:
-    """Find where the optimisation starts for a picture that was painted on the initial rendering.
-
-    As :func:`start`, but what is looked for explains the change, ``picture - initial``, and the gain starts
-    at zero: paint need not be what any sky does. ``bold``: a light that explains little is born as well; a
-    shadow takes a light elsewhere and a darker sky together, and either alone explains next to nothing.
-    """
-    # Paint does not weigh more than the rest here: what is born must leave the rest as it is.
-    weight = None if weight is None or (weight > 0).all() else (weight > 0).astype(np.float32)
-    scene = _Question(layers, transport, initial, weight, envmap, wanted=picture - initial)
-    overview, lights = transport.overview(), layers.separation.lights
-    places = change(
-        overview, scene.wanted, weight, initial, scene.background, scene.omega, scene.active,
-        scene.start, lights, SPARE, layers.lights.flux[-1], bold,
-    )  # fmt: skip
-    notes, moved = [], {i for i, found in enumerate(places) if found.direction is not None}
-    there = [scene.light(i, Place(None, np.ones(3))) for i in range(len(lights))]
-    new = {}
-    for i in sorted(moved):
-        direction, glow = places[i].direction, lights[i].glow if i < len(lights) else None
-        if transport.capacity >= PROBES:
-            flux = layers.lights.flux[i] * places[i].flux
-            direction, _ = scene.refine(direction, flux, glow, [*there, *new.values()])
-        places[i] = Place(direction, places[i].flux)
-        new[i] = scene.light(i, places[i])
-        if i < len(lights):
-            angle = np.degrees(np.arccos(np.clip(direction @ lights[i].direction, -1, 1)))
-            notes.append(f"light {i + 1} of {len(lights)}: starts {angle:.1f} degrees from where it was")
-        else:
-            notes.append("a light is born: the paint wants one where the map has none")
-    if moved:
-        for i, factor in scene.strengths(there, new).items():
-            places[i] = Place(places[i].direction, places[i].flux * factor if i in new else factor)
-    turn, flux = scene.parameters(places)
-    found = {"turn": _tensor(turn / layers.scales["turn"]), "flux": _tensor(flux / layers.scales["flux"])}
-    return params | found, notes
-
-
-def softened(layers: Layers, params: dict) -> tuple[dict, list[str]]:
-    """Return a start with lobes in place of the strongest lights, as softer shadows want them.
-
-    A light of few texels cannot grow: its texels would part. A lobe can.
-    """
-    lights = layers.separation.lights[:SPARE]
-    places = [Place(None, np.ones(3)) for _ in layers.separation.lights]
-    spare = [Place(None, np.zeros(3))] * SPARE
-    for i, light in enumerate(lights):
-        own, other = layers.lights.flux[i], layers.lights.flux[len(places) + i]
-        places[i], spare[i] = Place(None, np.zeros(3)), Place(light.direction, own / np.maximum(other, 1e-30))
-    turn, flux = _rotations(layers.lights, places + spare)
-    found = {"turn": _tensor(turn / layers.scales["turn"]), "flux": _tensor(flux / layers.scales["flux"])}
-    return params | found, [f"{len(lights)} of the lights start as soft lobes"]
-
-
-class _Question:
+class Question:
     """What is asked: the picture less all that is fixed, and what may make it.
 
     ``picture`` tells how bright pixels are; what is wanted is explained in place of it where it is given.
@@ -201,7 +138,7 @@ class _Question:
         rest = envmap.copy()
         rest[rows] = 0
         self.known = picture
-        self.wanted = picture - transport.apply(_tensor(rest)).numpy() if wanted is None else wanted
+        self.wanted = picture - transport.apply(tensor(rest)).numpy() if wanted is None else wanted
         self.active = np.zeros(envmap.shape[:2], bool)
         self.active[rows] = True
         self.active = self.active.ravel()
@@ -213,19 +150,19 @@ class _Question:
         self.shape = envmap.shape
         self._gains = None
 
-    def _render(self, values):
+    def render(self, values):
         """Picture of a map (H * W, 3) alone, without other lamps' light."""
-        return self.transport.linear(_tensor(values.reshape(self.shape))).numpy()
+        return self.transport.linear(tensor(values.reshape(self.shape))).numpy()
 
     def refine(self, direction, flux, glow, others=()):
         """Find the direction of a light, and its flux as a factor; ``others``' pictures may be mixed in."""
         if self._gains is None:
             gains = products(self.directions.reshape(-1, 3), GAIN_ORDER)
-            self._gains = [self._render(self.background * g[:, None]).reshape(-1, 3) for g in gains.T]
+            self._gains = [self.render(self.background * g[:, None]).reshape(-1, 3) for g in gains.T]
         mixed = [*self._gains, *(other.reshape(-1, 3) for other in others)]
         if glow is not None:
             shine = glow_at(glow, self.directions @ direction).reshape(-1, 3)
-            mixed.append(self._render(self.background * shine).reshape(-1, 3))
+            mixed.append(self.render(self.background * shine).reshape(-1, 3))
         weight = None if self.weight is None else self.weight.reshape(-1, 1)
         wanted, known = self.wanted.reshape(-1, 3), self.known.reshape(-1, 3)
         last = self.rows.stop - 1
@@ -236,47 +173,22 @@ class _Question:
         kept = 1 / KEPT_FLUX < factor < KEPT_FLUX
         return direction, 1.0 if kept else float(np.clip(factor, LEAST, MOST))
 
-    def strengths(self, there, new):
-        """Factors (3,) by light, beside a gain of the background, under which their pictures make the change.
-
-        ``there``: pictures of the lights as they were; ``new``: of those that are placed anew, by number,
-        which are gone from where they were.
-        """
-        background = self._render(self.background)
-        bright = self.known.mean(axis=2)
-        scale = 1 / (bright + FAINT * max(bright.mean(), 1e-30))
-        scale *= 1 if self.weight is None else self.weight[..., 0]
-        stay = [i for i in range(len(there)) if i not in new]
-        found = {i: np.ones(3) for i in [*stay, *new]}
-        for c in range(3):
-            gone = sum((there[i][..., c] for i in range(len(there)) if i in new), 0.0)
-            spans = [background[..., c], *(there[i][..., c] for i in stay)]
-            columns = [*spans, *(-span for span in spans), *(picture[..., c] for picture in new.values())]
-            a = np.stack([(column * scale).ravel() for column in columns], axis=1)
-            x = not_negative(a, ((self.wanted[..., c] + gone) * scale).ravel())
-            grown = x[: len(spans)] - x[len(spans) : 2 * len(spans)]
-            for i, value in zip(stay, grown[1:], strict=True):
-                found[i][c] = np.clip(1 + value, LEAST, MOST)
-            for i, value in zip(new, x[2 * len(spans) :], strict=True):
-                found[i][c] = np.clip(value, LEAST, MOST)
-        return found
-
     def parameters(self, places):
         """Rotation vectors and log fluxes of lights as they are placed."""
-        return _rotations(self.layers.lights, places)
+        return rotations(self.layers.lights, places)
 
     def light(self, i, found):
         """Picture of one light as it is placed, through exact columns."""
         dark = [Place(None, np.zeros(3))] * self.layers.lights.count
         dark[i] = found
         turn, flux = self.parameters(dark)
-        size = _tensor(np.zeros((len(turn), 1)))
+        size = tensor(np.zeros((len(turn), 1)))
         core = np.zeros(self.shape, np.float32)
         core[self.rows] = self.layers.lights.core(
-            _tensor(turn), _tensor(flux), size, self.layers.shape, self.layers.rows
+            tensor(turn), tensor(flux), size, self.layers.shape, self.layers.rows
         ).numpy()
         self.transport.resolve(core + self.background.reshape(self.shape))
-        return self._render(core)
+        return self.render(core)
 
     def hats(self, level):
         """Radiance of what a gain adds, times each hat of a grid, in cells: (3, cells, nodes)."""
@@ -306,7 +218,8 @@ class _Question:
         return self.transport.overview().cell_of[self.active], self.omega[self.active]
 
 
-def _rotations(lights, places):
+def rotations(lights, places):
+    """Return rotation vectors and log fluxes, (count, 3) each, of lights as they are placed."""
     turn, flux = np.zeros((lights.count, 3)), np.full((lights.count, 3), DARK)
     for i, found in enumerate(places):
         if found.direction is not None:
@@ -315,7 +228,8 @@ def _rotations(lights, places):
     return turn, flux
 
 
-def _tensor(values):
+def tensor(values):
+    """Copy values to the device, float32."""
     return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
 
 

@@ -241,15 +241,20 @@ def test_a_light_that_stays_is_scaled_in_place(sunny):
     np.testing.assert_allclose(flux(result), flux(edited), rtol=0.03)
 
 
-def test_a_light_that_was_born_is_carried(sunny):
+@pytest.mark.parametrize("size", [0.5, 1.0, 3.0])
+def test_a_light_that_was_born_is_carried(size, sunny):
     source, working, made, params = sunny
-    new = toward(60, 60)
-    changed = sent(made, params, new, light=made.lights.count - SPARE)
-    changed["flux"][made.lights.count - SPARE] = 0.0
+    new, born = toward(60, 60), made.lights.count - SPARE
+    changed = sent(made, params, new, light=born)
+    changed["flux"][born] = 0.0
+    changed["size"][born] = np.log(size) / layers.SCALES["size"]
     result, edited = carried(made, changed, working, source)
-    there = near(source.shape[:2], new, 12), near(WORKING, new, 12)
+    there = near(source.shape[:2], new, 24), near(WORKING, new, 24)
     np.testing.assert_allclose(flux(result, there[0]), flux(edited, there[1]), rtol=0.02)
-    assert flux(result, there[0]).max() > 20 * flux(source, there[0]).max()
+    assert flux(result, there[0]).max() > 10 * flux(source, there[0]).max()
+    core = near(source.shape[:2], new, 2 * size)  # a lobe of 2 degrees: 39 % within one standard deviation
+    inside = flux(result, core) / flux(result, there[0])
+    assert 0.3 < inside.max() < 0.6
 
 
 @pytest.mark.parametrize("shape", [(64, 128), (48, 96), (101, 202), (300, 512)])

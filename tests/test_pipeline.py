@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import checkpoint, config, edit, envmap, image, latlong, pipeline, scene, target
+from envedit import checkpoint, config, edit, envmap, image, job, latlong, pipeline, scene, target
 from envedit.errors import InputError
 
 WIDTH, HEIGHT = 16, 8
@@ -517,7 +517,7 @@ def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):
 
 
 def test_a_second_ctrl_c_is_not_waited_for():
-    with pytest.raises(KeyboardInterrupt), pipeline._ctrl_c() as event:
+    with pytest.raises(KeyboardInterrupt), job.ctrl_c() as event:
         signal.raise_signal(signal.SIGINT)
         assert event.is_set()
         signal.raise_signal(signal.SIGINT)
@@ -528,7 +528,7 @@ def test_outside_the_main_thread_signals_are_left_alone():
 
     def enter():
         try:
-            with pipeline._ctrl_c() as event:
+            with job.ctrl_c() as event:
                 assert not event.is_set()
         except Exception as error:
             failures.append(error)

@@ -97,7 +97,7 @@ def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
     sunny[2, 3] = 300
     quiet, few = loaded.sampled(even, "auto", 4)
     _, many = loaded.sampled(sunny, "auto", 4)
-    assert few == 256 <= many <= 1024
+    assert few == 256 <= many <= 768
     truth = loaded.render(even, spp=4096, seed=99)
     error = np.mean((np.clip(quiet, 0, 1) ** (1 / 2.2) - np.clip(truth, 0, 1) ** (1 / 2.2)) ** 2)
     assert error < 2 * 10 ** (-scene.QUIET_DECIBELS / 10)
@@ -109,7 +109,7 @@ def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
 def test_noise_that_does_not_fall_ends_at_the_most_samples(tmp_path, monkeypatch):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     monkeypatch.setattr(scene, "QUIET_DECIBELS", 200.0)
-    assert loaded.sampled(np.ones((8, 16, 3)), "auto")[1] == 1024
+    assert loaded.sampled(np.ones((8, 16, 3)), "auto")[1] == 768
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e6])

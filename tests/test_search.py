@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import latlong, pursuit, scene, search
+from envedit import changes, latlong, pursuit, scene, search
 from envedit.layers import Layers
 from envedit.overview import Overview
 from envedit.transport import LightTransport
@@ -65,7 +65,7 @@ class Start:
             params, self.notes = search.start(layers, encoded, transport, wanted, weight, image)
         else:
             asked = initial, wanted, weight, image
-            params, self.notes = search.start_painted(layers, encoded, transport, *asked)
+            params, self.notes = changes.start(layers, encoded, transport, *asked)
             assert not any(params[name].numpy().any() for name in params if name.startswith("gain"))
         assert params.keys() == encoded.keys()
         assert all(params[name].shape == encoded[name].shape for name in params)
@@ -349,6 +349,21 @@ def test_a_painted_light_is_born_beside_those_that_stay(suns, transport):
     for i in range(found.count):
         assert degrees_apart(found.direction[i], DIRECTIONS[suns[i]]) < 0.5 * TEXEL
         np.testing.assert_allclose(found.flux[i], 1, atol=0.25)
+
+
+def test_softened_lights_keep_their_flux_and_place(transport):
+    """The loss decides whether a start with lobes in place of the lights is the better one."""
+    image = sky(SUN)
+    layers = Layers((0, HEIGHT))
+    params = layers.encode(image[:ROWS])
+    soft, notes = changes.softened(layers, params)
+    dark = soft | {"flux": mi.TensorXf(np.full((layers.lights.count, 3), -40.0, np.float32))}
+    before, after, without = (layers.decode(p).numpy() for p in (params, soft, dark))
+    lobe = after - without  # a glow goes with the light that it is of
+    np.testing.assert_allclose((lobe * OMEGA[:ROWS, None, None]).sum((0, 1)), layers.lights.flux[0], rtol=0.02)
+    assert lobe.max() < 0.6 * before.max() and len(notes) == 1
+    brightest = np.unravel_index(lobe[..., 1].argmax(), (ROWS, WIDTH))
+    assert degrees_apart(DIRECTIONS[brightest], DIRECTIONS[SUN]) < TEXEL
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5, 1.5])

@@ -27,7 +27,7 @@ ABLATION = {
     "no regulariser": ["loss.change=0"],
     "change": [],
     "luminance + L1": ["loss.change=0", "loss.luminance=[1e-5, 1e-9]", "loss.l1=[1e-5, 1e-9]"],
-    "change x 5": ["loss.change=0.1"],
+    "change 0.1": ["loss.change=0.1"],
 }
 """What the ablation sets."""
 

@@ -1,0 +1,195 @@
+"""An edit in progress: its loop with checkpoints, Ctrl-C, and which of several starts to take."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from . import checkpoint, config, edit, optim, scene, target
+from .errors import NumericalError
+
+TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
+"""Steps after which the better of two starts is chosen, and by which share of the loss it must be better."""
+
+
+class Interrupted(Exception):
+    """Ctrl-C during the edit, after the checkpoint was written; ``envmap`` is the map so far."""
+
+    def __init__(self, envmap: np.ndarray, step: int):
+        super().__init__(f"interrupted at iteration {step}")
+        self.envmap, self.step = envmap, step
+
+
+class Stopped(NumericalError):
+    """The optimisation could not go on; ``envmap`` is the last good map."""
+
+    def __init__(self, message: str, envmap: np.ndarray):
+        super().__init__(message)
+        self.envmap = envmap
+
+
+@dataclass
+class Watch:
+    """What a run tells while it works.
+
+    ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one.
+    """
+
+    stage: Callable[[str], None] = lambda text: None
+    progress: Callable[[int, int, str], None] = lambda done, total, text: None
+
+
+@dataclass
+class Job:
+    """One edit in progress.
+
+    Attributes
+    ----------
+    settings : config.Config
+        What is carried out.
+    lit : scene.Scene
+        The scene.
+    original : ndarray (H, W, 3)
+        The map.
+    first : int
+        Its first active row.
+    free : ndarray of bool (rows, W), optional
+        Active texels that may change; None: all.
+    wanted : target.Target
+        What the renderer is to make.
+    representation, renderer : object
+        As :func:`.edit.optimise` takes them.
+    folder : Path, optional
+        Of the checkpoint.
+    watch : Watch
+        Told of progress.
+    """
+
+    settings: config.Config
+    lit: scene.Scene
+    original: np.ndarray
+    first: int
+    free: np.ndarray | None
+    wanted: target.Target
+    representation: object
+    renderer: object
+    folder: Path | None
+    watch: Watch
+
+    def decode(self, params) -> np.ndarray:
+        """Parameters to a whole map on the host, refusing what is not finite."""
+        crop = self.representation.decode(params).numpy()
+        rows = slice(self.first, self.first + crop.shape[0])
+        if self.free is not None:
+            crop = np.where(self.free[..., None], crop, self.original[rows])
+        if not np.isfinite(crop).all():
+            row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
+            raise NumericalError(
+                f"the edited map is not finite at row {self.first + row}, column {column}: "
+                "lower [optimizer] lr"
+            )
+        edited = self.original.copy()
+        edited[rows] = crop
+        return edited
+
+    def best(self, starts, crop):
+        """Return the start, (parameters, notes), that gets farthest in a few steps."""
+        notes = {tuple(notes) for _, notes in starts}
+        if len(notes) == 1:
+            return starts[0]
+        reached = []
+        for params, _ in starts:
+            few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
+            wanted = self.wanted.picture, self.wanted.weight
+            objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS)
+            _, state = edit.optimise(
+                self.representation,
+                params,
+                self.renderer,
+                objective,
+                self.original,
+                self.first,
+                few,
+                free=self.free,
+            )
+            reached.append(state.history[-1]["loss"])
+        least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
+        losses = ", ".join(f"{loss:.3g}" for loss in reached)
+        chosen = [
+            *starts[least][1],
+            f"start {least + 1} of {len(starts)}: losses after {TRIAL_STEPS} steps {losses}",
+        ]
+        return starts[least][0], chosen
+
+    def optimise(self, params, crop, resume):
+        """Run the loop from the start, or from the checkpoint; returns parameters and state."""
+        chosen, wanted = self.settings.optimizer, self.wanted
+        lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
+        adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), edit.State()
+        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
+        if self.folder and resume and (found := checkpoint.load(self.folder, what)):
+            state, optimiser, traced, picture = found
+            adam.load_state_dict(optimiser)
+            self.renderer.restore(traced)
+            # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
+            wanted = self.wanted = replace(wanted, picture=picture)
+        objective = edit.Objective(self.settings.loss, wanted.picture, wanted.weight, crop, chosen.iterations)
+        saved = time.perf_counter()
+
+        with ctrl_c() as interrupt:
+
+            def after_step(state, adam):
+                nonlocal saved
+                self.watch.progress(state.step, chosen.iterations, f"loss {state.history[-1]['loss']:.4g}")
+                stop, due = interrupt.is_set(), time.perf_counter() - saved >= chosen.checkpoint_s
+                due |= state.step == chosen.iterations  # what follows may be interrupted too
+                if self.folder and (stop or due):
+                    traced = self.renderer.state()
+                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.picture)
+                    saved = time.perf_counter()
+                if stop:
+                    raise Interrupted(self.decode(adam.params), state.step)
+
+            try:
+                return edit.optimise(
+                    self.representation,
+                    params,
+                    self.renderer,
+                    objective,
+                    self.original,
+                    self.first,
+                    chosen,
+                    free=self.free,
+                    adam=adam,
+                    state=state,
+                    after_step=after_step,
+                )
+            except NumericalError as error:
+                raise Stopped(str(error), self.decode(adam.params)) from error
+
+
+@contextlib.contextmanager
+def ctrl_c():
+    """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def handle(number, frame):
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -183,9 +183,16 @@ def _verdict(metrics):
 
     parts = [f"Rendering against the target: {decibel(before)} → <strong>{decibel(after)}</strong> PSNR"]
     parts += [f"map against the true one: {decibel(true_map)}"] if true_map is not None else []
+    painted = metrics.get("painted") or {}
+    towards, elsewhere = number(painted.get("towards")), number(painted.get("elsewhere"))
+    if towards is not None:
+        parts[0] = f"<strong>{100 * towards:.0f} %</strong> of the way to the paint"
+        parts += [f"the rest changed by {elsewhere:.3f} of white"] if elsewhere is not None else []
     parts += [f"{total:.1f} s in total"] if total is not None else []
     line = f'<p class="verdict">{" · ".join(parts)}</p>'
-    if before is not None and after is not None and after < before:
+    if towards is not None and towards < 0:
+        line += '<p class="alarm">The edited rendering is further from the paint than the unedited one.</p>'
+    if towards is None and before is not None and after is not None and after < before:
         line += '<p class="alarm">The edited rendering is further from the target than the unedited one.</p>'
     return line
 

@@ -65,6 +65,7 @@ def write(path, **changes):
         "maps": {"initial": grey(1.0), "target": None, "edited": grey(2.0)},
         "influence": None,
         "frozen": None,
+        "unreachable": None,
         "warnings": [],
         "notes": ["renderer.spp = 64"],
     }
@@ -102,6 +103,18 @@ def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
     page = write(tmp_path / "r.html", metrics=metrics, notes=["path depth 5"])
     assert page.text.count("path depth 5") == 1 and "choices" not in page.text
     assert "transport entries 12345" in page.text
+
+
+def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
+    psnr = {"initial": {"psnr": 30.0}, "render": {"psnr": 25.0}}
+    painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
+    unreachable = np.full((8, 8, 3), 0.5)
+    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, unreachable=unreachable)
+    assert "81 % of the way to the paint · the rest changed by 0.012 of white" in page.text
+    assert "What was painted" in page.text and "90 % of the request is within reach" in page.text
+    assert "further from" not in page.text  # the whole picture may well be
+    worse = write(tmp_path / "w.html", metrics={"painted": painted | {"towards": -0.2}})
+    assert "The edited rendering is further from the paint than the unedited one." in worse.text
 
 
 def test_report_of_a_known_map_and_a_failed_edit(tmp_path):

@@ -26,7 +26,7 @@ settings = config.loads(
     [output]
     spp = 64
     [loss]
-    change = 0.005           # hold the sky where the paint leaves it free
+    change = 0.01            # hold the sky where the paint leaves it free
     """
 )
 

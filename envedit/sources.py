@@ -58,8 +58,8 @@ MANY_PARAMETERS: dict[str, dict[str, Any]] = {
 # Paint need not be what any sky does: the map is held where the paint leaves it free. For the paper's method,
 # luminance weighs less, so that light may be added (Sec. 6.4; a tenth: the paper gives no number).
 PAINTED: dict[str, dict[str, Any]] = {
-    "draft": {"loss": {"change": 0.002}},
-    "standard": {"loss": {"change": 0.002}},
+    "draft": {"loss": {"change": 0.01}},
+    "standard": {"loss": {"change": 0.01}},
     "paper": {"loss": {"luminance": (1e-5, 1e-9)}},
 }
 

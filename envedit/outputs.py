@@ -88,6 +88,12 @@ def _maps(settings, folder, result):
     if result.reach is not None:
         image.write_png(folder / "unreachable.png", reach.unreachable(result.reach))
     if settings.output.full:
-        full = pipeline.at_full_resolution(settings.input, result)
-        if full is not None:
-            layered.write(folder / "edited_full.exr", {"edited": full})
+        try:
+            full = pipeline.at_full_resolution(settings.input, result)
+            if full is not None:
+                layered.write(folder / "edited_full.exr", {"edited": full})
+        except MemoryError:
+            result.warnings.append(
+                f"{settings.input.envmap}: not enough memory to carry the edit to its size; "
+                "edited.exr has it at working resolution"
+            )

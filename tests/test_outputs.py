@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import config, doctor, image, latlong, run
+from envedit import config, doctor, image, latlong, pipeline, run
 
 WIDTH = 64
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
@@ -74,6 +74,16 @@ def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_
     (tmp_path / "b").mkdir()
     out = carried_out(tmp_path / "b", source(rng), "--set", "output.full=false")
     assert not (out / "edited_full.exr").exists()
+
+
+def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monkeypatch, capsys):
+    def out_of_memory(*arguments):
+        raise MemoryError
+
+    monkeypatch.setattr(pipeline, "at_full_resolution", out_of_memory)
+    out = carried_out(tmp_path, source(rng))
+    assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
+    assert "not enough memory" in capsys.readouterr().err
 
 
 def test_layers_are_the_maps_and_their_difference(tmp_path, rng):

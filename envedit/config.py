@@ -100,7 +100,9 @@ class Target(Table):
     rotate_degrees: float = _key(
         60.0, number(-360, 360), "kind envmap: turn of the input about the vertical, degrees; 0 with a file"
     )
-    mask: str = _key("", string, "image that is white where the target counts; empty: everywhere")
+    mask: str = _key(
+        "", string, "image that is white where the target counts; kind image: where it was painted"
+    )
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted")
     strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes: list of tables, see envedit.strokes")
     paint: float = _key(1.0, number(0), "kinds image, strokes: weight of all that was painted together")
@@ -197,6 +199,22 @@ class Loss(Table):
 
 
 @dataclass(frozen=True)
+class Perceptual(Table):
+    """Weights of perceptual terms, from files of the user's; without them DISTS is off and LPIPS null."""
+
+    vgg: str = _key("", string, "DISTS: VGG16 (safetensors or npz, torchvision's names)")
+    dists: str = _key("", string, "DISTS: its alpha and beta (safetensors or npz)")
+    network: str = _key("alex", choice("alex", "vgg", "squeeze"), "LPIPS: its network")
+    backbone: str = _key("", string, "LPIPS: weights of that network (safetensors or npz)")
+    heads: str = _key("", string, "LPIPS: its heads, version 0.1 (safetensors or npz)")
+
+    def _check_together(self) -> None:
+        for one, other in (("vgg", "dists"), ("backbone", "heads")):
+            if bool(getattr(self, one)) != bool(getattr(self, other)):
+                raise ConfigError(f"perceptual.{one}, perceptual.{other}: came one, wanted both or none")
+
+
+@dataclass(frozen=True)
 class Optimizer(Table):
     """The edit loop's Adam."""
 
@@ -264,6 +282,7 @@ class Config(Table):
     representation: Representation = _table_key(Representation)
     fit: Fit = _table_key(Fit)
     loss: Loss = _table_key(Loss)
+    perceptual: Perceptual = _table_key(Perceptual)
     optimizer: Optimizer = _table_key(Optimizer)
     renderer: Renderer = _table_key(Renderer)
     output: Output = _table_key(Output)

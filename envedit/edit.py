@@ -55,14 +55,16 @@ class Objective:
         The active rows of the original map.
     iterations : int
         Length of the run, over which ramps are walked.
+    dists : perceptual.Dists, optional
+        The term of that name, between display values of the map and the original; None: it is off.
     """
 
-    def __init__(self, weights: config.Loss, picture, pixel_weight, original, iterations: int):
+    def __init__(self, weights: config.Loss, picture, pixel_weight, original, iterations: int, dists=None):
         self.iterations = iterations
         self.ramps = {
             name: value if isinstance(value, tuple) else (value, value)
             for name, value in vars(weights).items()
-            if value and name != "dists"
+            if value and (name != "dists" or dists)
         }
         self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
         self._weight = (
@@ -72,6 +74,7 @@ class Objective:
         )
         self._original = dr.opaque(mi.TensorXf(np.ascontiguousarray(original, np.float32)))
         self._ssim = Ssim(self._target, self._weight)
+        self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
 
     def __call__(self, rendering, crop, step: int):
         """Weigh a rendering and the active rows of its map.
@@ -88,6 +91,8 @@ class Objective:
         for name, (start, end) in self.ramps.items():
             if name == "ssim":
                 term = self._ssim(shown)
+            elif name == "dists":
+                term = self._dists(to_display(crop))
             elif name in ("image_l1", "image_l2"):
                 term = losses.LOSSES[name](shown, self._target, self._weight)
             else:

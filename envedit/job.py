@@ -70,6 +70,8 @@ class Job:
         Of the checkpoint.
     watch : Watch
         Told of progress.
+    dists : perceptual.Dists, optional
+        As for :class:`.edit.Objective`.
     """
 
     settings: config.Config
@@ -82,6 +84,7 @@ class Job:
     renderer: object
     folder: Path | None
     watch: Watch
+    dists: object = None
 
     def decode(self, params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
@@ -108,7 +111,7 @@ class Job:
         for params, _ in starts:
             few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
             wanted = self.wanted.picture, self.wanted.weight
-            objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS)
+            objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
             _, state = edit.optimise(
                 self.representation,
                 params,
@@ -140,7 +143,8 @@ class Job:
             self.renderer.restore(traced)
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
             wanted = self.wanted = replace(wanted, picture=picture)
-        objective = edit.Objective(self.settings.loss, wanted.picture, wanted.weight, crop, chosen.iterations)
+        asked = wanted.picture, wanted.weight, crop, chosen.iterations, self.dists
+        objective = edit.Objective(self.settings.loss, *asked)
         saved = time.perf_counter()
 
         with ctrl_c() as interrupt:

@@ -91,13 +91,23 @@ def ssim(a, b, data_range: float = 1.0) -> float:
     return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
 
 
-def compare(a, b, tonemap: str = "gamma") -> dict:
+def compare(a, b, tonemap: str = "gamma", lpips=None) -> dict:
     """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.
+
+    Parameters
+    ----------
+    a, b : array (H, W, 3)
+        Linear radiance.
+    tonemap : str
+        A name of `envedit.tonemap.TONEMAPS`.
+    lpips : perceptual.Lpips, optional
+        What measures LPIPS of the display values.
 
     Returns
     -------
     dict
-        ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1, and ``lpips``, which is None here.
+        ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1, and ``lpips``, None without one, or where the
+        image is too small for its network.
 
     Raises
     ------
@@ -107,7 +117,9 @@ def compare(a, b, tonemap: str = "gamma") -> dict:
         If there is no such tonemap.
     """
     a, b = (apply_tonemap(image, tonemap) for image in _pair(a, b))
-    return {"psnr": psnr(a, b), "ssim": ssim(a, b), "mse": mse(a, b), "lpips": None}
+    small = lpips is None or min(a.shape[:2]) < lpips.backbone.least_size("max")
+    seen = None if small else float(lpips(a.astype(np.float32), b.astype(np.float32)))
+    return {"psnr": psnr(a, b), "ssim": ssim(a, b), "mse": mse(a, b), "lpips": seen}
 
 
 def painted(edited, wanted, initial, coverage, tonemap: str = "gamma") -> dict:

@@ -40,6 +40,7 @@ def write(settings: config.Config, folder: Path, result: pipeline.Result, import
         "scene": scene._find(settings.scene.file),
         "target": settings.target.file,
         "mask": settings.target.mask,
+        **{name: value for name, value in vars(settings.perceptual).items() if name != "network"},
     }
     inputs = {role: path for role, path in named.items() if Path(path).is_file()}
     facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)

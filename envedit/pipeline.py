@@ -13,7 +13,22 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import carry, changes, config, envmap, files, fit, image, metrics, scene, search, sky, target
+from . import (
+    carry,
+    changes,
+    config,
+    envmap,
+    features,
+    files,
+    fit,
+    image,
+    metrics,
+    perceptual,
+    scene,
+    search,
+    sky,
+    target,
+)
 from . import reach as reaches
 from .job import Interrupted, Job, Stopped, Watch
 from .layers import Layers
@@ -213,6 +228,11 @@ def run(
     """
     watch, clock, begun = watch or Watch(), _Clock(), time.perf_counter()
     warnings: list[str] = []
+    dists, lpips = _perceptual(settings)
+    if settings.loss.dists and dists is None:
+        warnings.append(
+            "loss.dists is off: it needs weights, [perceptual] vgg and dists; docs/architecture.md says whose"
+        )
     with clock("target_s"):
         watch.stage("loading")
         original, found = load_map(settings.input)
@@ -233,9 +253,6 @@ def run(
         initial = wanted.initial
         if initial is None:
             initial = lit.render(original, spp=few, seed=settings.seed + JUDGE_SEED)
-    if settings.loss.dists:
-        warnings.append("loss.dists is off: no backbone weights are given")
-
     crop = original[first : last + 1]
     with clock("fit_s"):
         layered = settings.representation.kind == "layers"
@@ -284,7 +301,7 @@ def run(
             representation.keep(free)
             free = None  # a light may move across texels that are kept otherwise
             starts = _starts(representation, params, through, judged_by, original)
-    job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch)
+    job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch, dists)
     if isinstance(representation, Layers):
         with clock("start_s"):
             params, placed = job.best(starts, crop)
@@ -301,7 +318,7 @@ def run(
     notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
-    measured = _measure(settings, renders, maps, rows, wanted.coverage, within)
+    measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips)
     measured |= {
         "fit": _of_fit(getattr(representation, "fitted", None)),
         "timing": clock.table(state.history, time.perf_counter() - begun),
@@ -355,12 +372,22 @@ def _as_seen(traced, original, wanted):
     return np.maximum(wanted.picture + (seen - wanted.initial), 0).astype(np.float32)
 
 
-def _measure(settings, renders, maps, rows, coverage, within):
+def _perceptual(settings):
+    """Load DISTS, where the loss asks for it, and LPIPS; None where no weights are named."""
+    named, dists, lpips = settings.perceptual, None, None
+    if settings.loss.dists and named.vgg:
+        dists = perceptual.Dists(features.Backbone.load("vgg", named.vgg), named.dists)
+    if named.backbone:
+        lpips = perceptual.Lpips(named.network, named.backbone, named.heads)
+    return dists, lpips
+
+
+def _measure(settings, renders, maps, rows, coverage, within, lpips):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
     tonemap, (before, wanted, after) = settings.output.tonemap, renders.values()
     measured = {
-        "render": metrics.compare(after, wanted, tonemap),
-        "initial": metrics.compare(before, wanted, tonemap),
+        "render": metrics.compare(after, wanted, tonemap, lpips),
+        "initial": metrics.compare(before, wanted, tonemap, lpips),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.start, rows.stop - 1],
@@ -371,9 +398,9 @@ def _measure(settings, renders, maps, rows, coverage, within):
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
         original, true, edited = (envmap[rows] for envmap in maps.values())
-        measured["envmap"] = metrics.compare(edited, true, tonemap)
+        measured["envmap"] = metrics.compare(edited, true, tonemap, lpips)
         measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
-        measured["initial_envmap"] = metrics.compare(original, true, tonemap)
+        measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)
     return measured
 
 

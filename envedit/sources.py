@@ -63,7 +63,10 @@ PAINTED: dict[str, dict[str, Any]] = {
     "paper": {"loss": {"luminance": (1e-5, 1e-9)}},
 }
 
-_PATHS = (("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"))
+_PATHS = (
+    ("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"),
+    *(("perceptual", key) for key in ("vgg", "dists", "backbone", "heads")),
+)  # fmt: skip
 
 
 def checked_layer(layer: Any, where: str, top: Fields, tables: dict[str, Fields]) -> dict[str, Any]:

@@ -259,3 +259,11 @@ def test_junk_files_raise_nothing_but_config_errors(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "junk.toml"
     path.write_bytes(data)
     only_config_errors(lambda: cfg.load(path))
+
+
+@pytest.mark.parametrize(
+    "text", ['vgg = "a.npz"', 'dists = "a.npz"', 'backbone = "a.npz"', 'heads = "a.npz"']
+)
+def test_perceptual_weights_come_in_pairs(text):
+    with pytest.raises(ConfigError, match="wanted both or none"):
+        cfg.loads(f"[perceptual]\n{text}")

@@ -4,7 +4,9 @@ import inspect
 import json
 import signal
 import threading
+import types
 
+import drjit as dr
 import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
@@ -344,6 +346,35 @@ def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp
 def test_an_asked_for_loss_that_is_off_is_told(tmp_path, rng):
     settings = settings_of(tmp_path, smooth(rng), loss={"dists": 0.6}, optimizer={"iterations": 1})
     assert any("dists" in line for line in pipeline.run(settings).warnings)
+
+
+class Stub:
+    """A measure that is the mean squared difference of display values."""
+
+    backbone = types.SimpleNamespace(least_size=lambda pooling: 5)
+
+    def against(self, reference):
+        return lambda x: dr.mean(dr.square(x.array - reference.array))
+
+    def __call__(self, a, b):
+        return float(np.mean(np.abs(a - b)))
+
+
+def test_perceptual_terms_are_used_where_their_weights_are_named(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr(pipeline, "_perceptual", lambda settings: (Stub(), Stub()))
+    short = {"optimizer": {"iterations": 3}, "loss": {"dists": 5.0, "change": 0.0}}
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), **PIXELS, **short))
+    assert all(row["dists"] >= 0 for row in found.history) and found.history[-1]["dists"] > 0
+    assert not any("dists" in line for line in found.warnings)
+    assert found.metrics["render"]["lpips"] > 0 and found.metrics["initial"]["lpips"] > 0
+    assert found.metrics["envmap"]["lpips"] is None  # 4 rows are too few for the network
+
+
+def test_weights_that_are_not_there_are_refused_before_anything_is_rendered(tmp_path, rng, monkeypatch):
+    missing = {"perceptual": {"backbone": "alexnet.npz", "heads": "heads.npz"}}
+    monkeypatch.setattr(pipeline.target, "make", None)
+    with pytest.raises(InputError, match=r"alexnet\.npz"):
+        pipeline.run(settings_of(tmp_path, sunny(rng), **missing))
 
 
 # ---- stopping and continuing -----------------------------------------------------------------------------

@@ -360,7 +360,9 @@ def test_softened_lights_keep_their_flux_and_place(transport):
     dark = soft | {"flux": mi.TensorXf(np.full((layers.lights.count, 3), -40.0, np.float32))}
     before, after, without = (layers.decode(p).numpy() for p in (params, soft, dark))
     lobe = after - without  # a glow goes with the light that it is of
-    np.testing.assert_allclose((lobe * OMEGA[:ROWS, None, None]).sum((0, 1)), layers.lights.flux[0], rtol=0.02)
+    np.testing.assert_allclose(
+        (lobe * OMEGA[:ROWS, None, None]).sum((0, 1)), layers.lights.flux[0], rtol=0.02
+    )
     assert lobe.max() < 0.6 * before.max() and len(notes) == 1
     brightest = np.unravel_index(lobe[..., 1].argmax(), (ROWS, WIDTH))
     assert degrees_apart(DIRECTIONS[brightest], DIRECTIONS[SUN]) < TEXEL

@@ -1,0 +1,176 @@
+"""Jobs: a name, a complete configuration, and the hash of all that decides what comes out."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import envedit
+from envedit import config, sources
+from envedit.errors import ConfigError, InputError
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to be made; by :func:`job` or :func:`read_jobs`.
+
+    Attributes
+    ----------
+    name : str
+        What the table calls it.
+    toml : str
+        The configuration, every key spelled out, paths absolute, without an output folder.
+    key : str
+        32 hexadecimal digits of the SHA-256 of the configuration and of the files it names.
+    """
+
+    name: str
+    toml: str
+    key: str
+
+    def folder(self, out) -> Path:
+        """Return the job's folder under ``out``."""
+        return Path(out) / self.key
+
+
+def job(name: str, toml: str | dict, base=".") -> Job:
+    """Make a job of a configuration.
+
+    Parameters
+    ----------
+    name : str
+        Any printable text.
+    toml : str or dict
+        The TOML text, or its tables.
+    base : path
+        Folder that relative paths start from.
+
+    Raises
+    ------
+    ConfigError
+        The configuration is not usable.
+    InputError
+        A file that it names cannot be read. One that does not exist is left to the run to report.
+    """
+    if not name or not name.isprintable():
+        raise ConfigError(f"job {name!r}: wanted a printable name")
+    base = Path(base).absolute()
+    make = config.loads if isinstance(toml, str) else config.from_dict
+    settings = make(toml, base, f"job {name}")
+    scene, given, files = settings.scene, dict(settings.scene.parameters), {}
+    for key, value in given.items():
+        # The run looks beside the scene, then beside the configuration, which will lie in the job's folder.
+        if file := _beside(Path(scene.file).parent, value) if os.path.isabs(scene.file) else None:
+            files[key] = _digest(file)
+        elif file := _beside(base, value):
+            given[key], files[key] = str(file), _digest(file)
+    settings = dataclasses.replace(
+        settings,
+        scene=dataclasses.replace(scene, parameters=given),
+        output=dataclasses.replace(settings.output, dir=""),
+    )
+    content = _with_contents(dataclasses.asdict(settings))
+    content["scene"] |= {"file": _scene_digest(scene.file), "parameters": given | files}
+    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
+    return Job(name, config.to_toml(settings), key)
+
+
+def read_jobs(path) -> list[Job]:
+    """Read a TOML file of jobs, or the configurations in a folder; see the package's text.
+
+    Raises
+    ------
+    ConfigError, InputError
+        A file cannot be read, or holds no jobs, or one that is not usable.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if not (files := sorted(path.glob("*.toml"))):
+            raise ConfigError(f"{path}: no configuration NAME.toml in this folder")
+        return [job(file.stem, _text(file), path) for file in files]
+    try:
+        tables = tomllib.loads(_text(path))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+    common, jobs = tables.pop("common", {}), tables.pop("jobs", {})
+    if tables:
+        raise ConfigError(f"{path}: unknown table or key {next(iter(tables))}; known: common, jobs.NAME")
+    if not isinstance(jobs, dict) or not jobs:
+        raise ConfigError(f"{path}: no job in it, wanted a table [jobs.NAME] for each")
+    if wrong := [name for name, table in ({"common": common} | jobs).items() if not isinstance(table, dict)]:
+        raise ConfigError(f"{path}: {wrong[0]}: wanted a table")
+    return [job(name, sources.overlaid(common, table), path.parent) for name, table in jobs.items()]
+
+
+def _text(path):
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+
+
+# ---- contents ----------------------------------------------------------------------------------------------
+
+
+def _beside(folder, value):
+    """Return the file in a folder that a value names; None for anything else."""
+    if not isinstance(value, str) or not value or "\0" in value:
+        return None
+    with contextlib.suppress(OSError):  # a text may be too long for a name
+        if (folder / value).is_file():
+            return folder / value
+    return None
+
+
+def _with_contents(value):
+    """Replace every absolute path of a file by the digest of its content."""
+    if isinstance(value, dict):
+        return {key: _with_contents(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_contents(item) for item in value]
+    if isinstance(value, str) and os.path.isabs(value) and (file := _beside(Path("/"), value)):
+        return _digest(file)
+    return value
+
+
+def _scene_digest(name):
+    """Digests of a scene and of all that it names; its path where there is no such file."""
+    package = Path(envedit.__file__).parent
+    shipped = [folder / f"{name}.xml" for folder in (package / "scenes", package.parent / "scenes")]
+    choice = [Path(name)] if os.path.isabs(name) else shipped
+    found = next((path for path in choice if path.is_file()), None)
+    return name if found is None else sorted(_scene_files(found, {}).values())
+
+
+def _scene_files(path, found):
+    """Digests of a scene's XML, of the files it names, and so on; those that it never uses count too."""
+    found[path] = _digest(path)
+    if path.suffix.lower() == ".xml":
+        for name in re.findall(r"""(?:value|filename)\s*=\s*["']([^"'$]+)["']""", _text(path)):
+            if (file := _beside(path.parent, name)) and file not in found:
+                _scene_files(file, found)
+    return found
+
+
+def _digest(path):
+    try:
+        about = os.stat(path)
+        return _sha256(path, about.st_size, about.st_mtime_ns)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+@functools.lru_cache(maxsize=4096)
+def _sha256(path, size, changed):  # many jobs share few maps
+    with open(path, "rb") as file:
+        return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"

@@ -25,7 +25,7 @@ EDITS = ("move_shadow", "add_reflection", "add_shadow", "warmer", "enhance_shado
 MAPS = ("sunsky", "kloofendal_48d_partly_cloudy", "sunflowers")
 ABLATION = {
     "no regulariser": ["loss.change=0"],
-    "change": [],
+    "change 0.01": [],
     "luminance + L1": ["loss.change=0", "loss.luminance=[1e-5, 1e-9]", "loss.l1=[1e-5, 1e-9]"],
     "change 0.1": ["loss.change=0.1"],
 }

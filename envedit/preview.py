@@ -63,11 +63,12 @@ def _fit(image, height, width):
     """Scale (H, W, C) to (height, width, C) in linear radiance; always a copy."""
     old_height, old_width, channels = image.shape
     image = np.array(image, np.float32)
-    if old_height != height:
-        image = _resampling(old_height, height) @ image.reshape(old_height, -1)
-        image = image.reshape(height, old_width, channels)
-    if old_width != width:
-        image = np.matmul(_resampling(old_width, width), image)
+    with np.errstate(invalid="ignore"):  # BLAS has been seen to raise the flag for finite operands
+        if old_height != height:
+            image = _resampling(old_height, height) @ image.reshape(old_height, -1)
+            image = image.reshape(height, old_width, channels)
+        if old_width != width:
+            image = np.matmul(_resampling(old_width, width), image)
     return image
 
 

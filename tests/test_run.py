@@ -21,7 +21,7 @@ import OpenEXR
 import pytest
 from helpers import BALL, SENSOR, read_png, sky, write_scene
 
-from envedit import config, doctor, image, pipeline, run
+from envedit import checkpoint, config, doctor, image, pipeline, run
 from envedit.transport import LightTransport
 
 ROOT = Path(run.__file__).parent.parent
@@ -516,14 +516,14 @@ def test_resume_in_an_empty_folder_is_a_run(tmp_path, rng):
 
 def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, optimizer={"iterations": 4, "checkpoint_s": 0.0}), tmp_path / "c_out"
-    save = pipeline.checkpoint.save
+    save = checkpoint.save
 
     def save_and_interrupt(*arguments):
         save(*arguments)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline.checkpoint, "save", save_and_interrupt)
+        patch.setattr(checkpoint, "save", save_and_interrupt)
         assert call(path, "--quiet") == 130
     said = capsys.readouterr().err
     assert "--resume" in said and len(said.splitlines()) == 1

@@ -10,8 +10,7 @@ import numpy as np
 
 from .layers import Layers
 from .lights import SPARE
-from .overview import Overview
-from .pursuit import FAINT, LEAST_FLUX, Place, Pursuit, not_negative
+from .pursuit import FAINT, LEAST_FLUX, Given, Place, Pursuit, not_negative
 from .search import LEAST, MOST, PROBES, Question, rotations, tensor
 from .separate import Light
 from .transport import LightTransport
@@ -61,11 +60,8 @@ def start(
     # Paint does not weigh more than the rest here: what is born must leave the rest as it is.
     weight = None if weight is None or (weight > 0).all() else (weight > 0).astype(np.float32)
     scene = Question(layers, transport, initial, weight, envmap, wanted=picture - initial)
-    overview, lights = transport.overview(), layers.separation.lights
-    places = place(
-        overview, scene.wanted, weight, initial, scene.background, scene.omega, scene.active,
-        scene.start, lights, SPARE, layers.lights.flux[-1], bold,
-    )  # fmt: skip
+    lights = layers.separation.lights
+    places = place(scene.given(), scene.wanted, lights, SPARE, layers.lights.flux[-1], bold)
     notes, moved = [], {i for i, found in enumerate(places) if found.direction is not None}
     there = [scene.light(i, Place(None, np.ones(3))) for i in range(len(lights))]
     new = {}
@@ -106,14 +102,8 @@ def softened(layers: Layers, params: dict) -> tuple[dict, list[str]]:
 
 
 def place(
-    overview: Overview,
+    given: Given,
     difference: np.ndarray,
-    weight: np.ndarray | None,
-    known: np.ndarray,
-    background: np.ndarray,
-    omega: np.ndarray,
-    active: np.ndarray,
-    start: int,
     lights: list[Light],
     spare: int,
     spare_flux: np.ndarray,
@@ -121,20 +111,18 @@ def place(
 ) -> list[Place]:
     """Find which lights a painted change asks for; parameters as for :func:`.pursuit.place`.
 
-    ``difference`` (h, w, 3) is what was painted less what was there, 0 beside the paint: nothing has to be
-    explained that is there already, and errors of the overview are errors of the change alone. Beside a gain
-    of the background, lights that are there may become stronger or weaker, and lights are born. If one is
-    born while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``: be
+    ``difference`` (h, w, 3) is what was painted less what was there, 0 beside the paint. Beside a gain of the
+    background, lights that are there may become stronger or weaker, and lights are born. If one is born
+    while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``: be
     content with :data:`BOLD` of what is left unexplained.
     """
-    search = Pursuit(overview, difference, weight, known, background, omega, active, CHANGE_ORDER)
+    overview, search = given.overview, Pursuit(given, difference, CHANGE_ORDER)
     stays = []
     for light in lights:
-        flux = light.radiance * omega[start + light.texels][:, None]
-        cells = overview.cell_of[start + light.texels]
-        stays.append(search.atom_of(cells, flux, light.direction, light.glow)[..., 0])
+        atom = search.atom_of(given.cells(light), given.flux(light), light.direction, light.glow)
+        stays.append(atom[..., 0])
         search.explain(stays[-1])
-    own = [(light.radiance * omega[start + light.texels][:, None]).sum(axis=0) for light in lights]
+    own = [given.flux(light).sum(axis=0) for light in lights]
     born, added, atom = [], [], search.atoms(spare_flux, None)
     for _ in range(spare + len(lights)):
         score = search.scores(atom)

@@ -46,28 +46,15 @@ class Place:
     flux: np.ndarray
 
 
-def place(
-    overview: Overview,
-    picture: np.ndarray,
-    weight: np.ndarray | None,
-    known: np.ndarray,
-    background: np.ndarray,
-    omega: np.ndarray,
-    active: np.ndarray,
-    start: int,
-    lights: list[Light],
-    spare: int,
-    spare_flux: np.ndarray,
-) -> list[Place]:
-    """Place every light.
+@dataclass(frozen=True)
+class Given:
+    """What a pursuit is given beside the picture that is to be explained.
 
-    Parameters
+    Attributes
     ----------
     overview : Overview
         T at a glance.
-    picture : ndarray (h, w, 3)
-        What is wanted, less the light of everything that cannot change.
-    weight : ndarray (h, w, 1), optional
+    weight : ndarray (h, w, 1) or None
         How much each pixel counts.
     known : ndarray (h, w, 3)
         The picture wanted as it is; tells how bright a pixel is.
@@ -79,6 +66,36 @@ def place(
         Texels that may change.
     start : int
         Texel from which those of the lights are counted.
+    """
+
+    overview: Overview
+    weight: np.ndarray | None
+    known: np.ndarray
+    background: np.ndarray
+    omega: np.ndarray
+    active: np.ndarray
+    start: int
+
+    def flux(self, light: Light) -> np.ndarray:
+        """Return the flux of a light's texels, (n, 3)."""
+        return light.radiance * self.omega[self.start + light.texels][:, None]
+
+    def cells(self, light: Light) -> np.ndarray:
+        """Return the cell that each texel of a light is in, (n,)."""
+        return self.overview.cell_of[self.start + light.texels]
+
+
+def place(
+    given: Given, picture: np.ndarray, lights: list[Light], spare: int, spare_flux: np.ndarray
+) -> list[Place]:
+    """Place every light.
+
+    Parameters
+    ----------
+    given : Given
+        What the search is given.
+    picture : ndarray (h, w, 3)
+        What is wanted, less the light of everything that cannot change.
     lights : list of Light
         The map's lights.
     spare : int
@@ -91,13 +108,12 @@ def place(
     list of Place
         For the map's lights, then for the spare ones; flux 0: not there.
     """
-    search = Pursuit(overview, picture, weight, known, background, omega, active)
+    overview, search = given.overview, Pursuit(given, picture)
     directions, atoms = [], []
     for light in lights:
-        flux = light.radiance * omega[start + light.texels][:, None]
+        flux = given.flux(light)
         atom = search.atoms(flux.sum(axis=0), light.glow)
-        cells = overview.cell_of[start + light.texels]
-        stay = search.atom_of(cells, flux, light.direction, light.glow)
+        stay = search.atom_of(given.cells(light), flux, light.direction, light.glow)
         score = search.scores(atom)
         unseen = np.abs(stay).sum() < SEEN * search.light and score.max() < UNWANTED * search.asked()
         if unseen:  # nothing is known of it, and nothing else wants it
@@ -148,17 +164,18 @@ def place(
 class Pursuit:
     """The residual picture, block by block, and what explains it; channels are apart."""
 
-    def __init__(self, overview, picture, weight, known, background, omega, active, order=GAIN_ORDER):
+    def __init__(self, given: Given, picture, order=GAIN_ORDER):
+        overview, omega = given.overview, given.omega
         self.overview = overview
-        bright = overview.to_blocks(known).mean(axis=1)
+        bright = overview.to_blocks(given.known).mean(axis=1)
         mean = bright.mean()
-        count = 1.0 if weight is None else overview.to_blocks(weight)[:, 0]
+        count = 1.0 if given.weight is None else overview.to_blocks(given.weight)[:, 0]
         self.weight = count / (bright + FAINT * mean) if mean > 0 else np.zeros(len(bright))
         wanted = overview.to_blocks(picture).T
         self.light = float(np.abs(wanted * self.weight).sum())
-        cells = overview.to_cells(background, omega)
+        cells = overview.to_cells(given.background, omega)
         self.background = np.where(np.isfinite(cells), cells, 0)
-        share = overview.to_cells(active[:, None].astype(float), omega)[:, 0]
+        share = overview.to_cells(given.active[:, None].astype(float), omega)[:, 0]
         self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
         d = overview.directions
         self.cosine = d @ d[self.candidates].T

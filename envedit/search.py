@@ -19,7 +19,7 @@ import numpy as np
 from . import latlong
 from .layers import VEIL, Layers
 from .lights import DARK, SPARE, rotation_vector
-from .pursuit import FAINT, GAIN_ORDER, Place, place, products
+from .pursuit import FAINT, GAIN_ORDER, Given, Place, place, products
 from .separate import glow_at
 from .tonemap import LUMINANCE
 from .transport import LightTransport
@@ -70,10 +70,7 @@ def start(
     """
     scene = Question(layers, transport, picture, weight, envmap)
     overview, lights = transport.overview(), layers.separation.lights
-    places = place(
-        overview, scene.wanted, weight, picture, scene.background, scene.omega, scene.active,
-        scene.start, lights, SPARE, layers.lights.flux[-1],
-    )  # fmt: skip
+    places = place(scene.given(), scene.wanted, lights, SPARE, layers.lights.flux[-1])
     notes, pictures = [], []
     factor = np.ones((len(overview.omega), 3))
     for i, (light, found) in enumerate(zip(lights, places, strict=False)):
@@ -149,6 +146,11 @@ class Question:
         self.directions = latlong.directions(*envmap.shape[:2])
         self.shape = envmap.shape
         self._gains = None
+
+    def given(self) -> Given:
+        """Return what a pursuit is given."""
+        overview, rest = self.transport.overview(), (self.background, self.omega, self.active, self.start)
+        return Given(overview, self.weight, self.known, *rest)
 
     def render(self, values):
         """Picture of a map (H * W, 3) alone, without other lamps' light."""

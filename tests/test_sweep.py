@@ -105,6 +105,8 @@ class Stub:
     def driver(self, count, *options):
         """A driver as a process of its own."""
         text = (
+            # A shell starts what runs in its background with Ctrl-C ignored, and that is inherited.
+            "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
             "import sys; from experiments.sweep import drive; from experiments.sweep.__main__ import main;"
             "drive.CONNECT = 1;"
             f"sys.exit(main(sys.argv[1:], command={self.command!r}))"

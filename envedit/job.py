@@ -112,17 +112,11 @@ class Job:
             few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
             wanted = self.wanted.picture, self.wanted.weight
             objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
-            _, state = edit.optimise(
-                self.representation,
-                params,
-                self.renderer,
-                objective,
-                self.original,
-                self.first,
-                few,
-                free=self.free,
-            )
-            reached.append(state.history[-1]["loss"])
+            try:
+                _, state = self._loop(params, objective, few)
+                reached.append(state.history[-1]["loss"])
+            except NumericalError:  # a start that goes nowhere is no reason to stop
+                reached.append(np.inf)
         least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
         losses = ", ".join(f"{loss:.3g}" for loss in reached)
         chosen = [
@@ -162,21 +156,22 @@ class Job:
                     raise Interrupted(self.decode(adam.params), state.step)
 
             try:
-                return edit.optimise(
-                    self.representation,
-                    params,
-                    self.renderer,
-                    objective,
-                    self.original,
-                    self.first,
-                    chosen,
-                    free=self.free,
-                    adam=adam,
-                    state=state,
-                    after_step=after_step,
-                )
+                return self._loop(params, objective, chosen, adam=adam, state=state, after_step=after_step)
             except NumericalError as error:
                 raise Stopped(str(error), self.decode(adam.params)) from error
+
+    def _loop(self, params, objective, chosen, **more):
+        return edit.optimise(
+            self.representation,
+            params,
+            self.renderer,
+            objective,
+            self.original,
+            self.first,
+            chosen,
+            free=self.free,
+            **more,
+        )
 
 
 @contextlib.contextmanager

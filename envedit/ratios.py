@@ -101,11 +101,9 @@ class Ratio:
         """Mean of the result over each active working texel, as :func:`.latlong.resize` makes it."""
         height, width = self.grid.shape
         sums = np.zeros((*self.changed.shape, 3))
-        done = np.zeros(len(self.changed))
         for start, fresh, size in self.grid.bands():
             made = self.band(source[start : start + size], start)[fresh - start :]
             sums += self._mean_of(made, fresh)
-            done += self.down[:, fresh : start + size].sum(axis=1)
         # Rows that reach out of the active ones: what lies there is the source's.
         for part in (range(max(self.grid.start - 1, 0), self.grid.start), range(self.grid.stop, height)):
             for row in part:

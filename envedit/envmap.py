@@ -7,6 +7,7 @@ All share one interface, so that the edit loop knows none of them:
 * ``decode(params) -> (H, W, 3)``: linear radiance, finite and not negative, differentiable in the parameters;
 * ``lr``: the learning rate that suits its parameters.
 
+``encode`` refuses what is not radiance, and what it could not give back, with an InputError.
 ``layers.Layers`` represents the edit and not the map; the others are here.
 """
 
@@ -20,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, fit
+from .health import BRIGHTEST, require_radiance
 from .layers import Layers
 
 Params = dict[str, "mi.TensorXf"]
@@ -40,6 +42,7 @@ class Pixels:
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Store the image; ``seed`` is not used."""
+        require_radiance(image, "pixels")
         return {"radiance": dr.opaque(mi.TensorXf(np.ascontiguousarray(image, np.float32)))}
 
     def decode(self, params: Params) -> mi.TensorXf:
@@ -54,6 +57,7 @@ class LogPixels:
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Store the logarithms; ``seed`` is not used."""
+        require_radiance(image, "log-pixels", brightest=BRIGHTEST)
         logs = np.log(np.asarray(image, np.float64) + fit.EPSILON)
         return {"log_radiance": dr.opaque(mi.TensorXf(logs.astype(np.float32)))}
 
@@ -85,6 +89,7 @@ class Siren:
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Fit the network, or take an earlier fit of the same image from disk."""
+        require_radiance(image, "siren", (self._rows or (0,))[0], BRIGHTEST)
         self.fitted = fit.fit(
             image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
         )

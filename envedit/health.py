@@ -1,4 +1,4 @@
-"""What is wrong with an image: texels that are not finite, negative or cut, counted, named and mended."""
+"""What is wrong with an image: texels not finite, negative or cut; counted, named, mended, refused."""
 
 import math
 from dataclasses import dataclass
@@ -10,6 +10,8 @@ from .tonemap import luminance
 
 HALF_MAX = 65504.0
 """The largest half: where many programs cut the sun."""
+BRIGHTEST = 2.0**100
+"""Radiance, 1.27e30, up to which logarithms, fluxes and sums of a map stay within single precision."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,38 @@ def health(image) -> Health:
 def any_channel(mask):
     """Return where any channel of (H, W, 3) is set; numpy's own ``any(2)`` takes five times as long."""
     return mask[..., 0] | mask[..., 1] | mask[..., 2]
+
+
+def require_radiance(image, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
+    """Refuse an image that holds anything but radiance: finite, not negative and at most ``brightest``.
+
+    Parameters
+    ----------
+    image : array (H, W, 3)
+        Linear radiance.
+    what : str
+        What the message calls it.
+    first_row : int
+        Row of its map at which the image begins; the message tells the map's rows.
+    brightest : float
+        The largest value that may be.
+
+    Raises
+    ------
+    InputError
+        With the number of texels of the first kind found, the first of them, and what to do.
+    """
+    image = np.asarray(image)
+    for bad, how, cure in (
+        (~np.isfinite(image), "not finite", "repair the map"),
+        (image < 0, "negative", "set them to 0"),
+        (image > brightest, f"brighter than {brightest:.3g}", "scale the map down"),
+    ):
+        if bad.any():
+            texels = any_channel(bad)
+            row, column = np.unravel_index(texels.argmax(), texels.shape)
+            where = f"the first at row {first_row + row}, column {column}"
+            raise InputError(f"{what}: {texels.sum()} texels are {how}, {where}: {cure}")
 
 
 def repair(image) -> tuple[np.ndarray, int]:

@@ -20,6 +20,7 @@ import numpy as np
 from .errors import ConfigError, InputError
 
 __all__ = [
+    "check_envmap_size",
     "directions",
     "from_envmap_data",
     "halo_index",
@@ -276,7 +277,7 @@ def halo_index(height: int, width: int) -> np.ndarray:
     The same layout as :func:`to_envmap_data`, for arrays that must stay on the device or be differentiated:
     ``dr.gather(type(env.array), env.array, index)``.
     """
-    _check_envmap_size(height, width)
+    check_envmap_size(height, width)
     column = np.arange(-1, width + 1) % width
     texel = np.arange(height)[:, None] * width + column
     return (3 * texel[..., None] + np.arange(3)).astype(np.uint32).ravel()
@@ -296,7 +297,7 @@ def to_envmap_data(image) -> np.ndarray:
     image = np.asarray(image, np.float32)
     if image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"to_envmap_data: a map is (H, W, 3), got shape {image.shape}")
-    _check_envmap_size(*image.shape[:2])
+    check_envmap_size(*image.shape[:2])
     return np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
 
 
@@ -313,7 +314,8 @@ def _check_size(height, width):
         raise ConfigError(f"a map needs at least one row and one column, got {width} x {height} texels")
 
 
-def _check_envmap_size(height, width):
+def check_envmap_size(height: int, width: int) -> None:
+    """Refuse a grid that Mitsuba would silently replace by a larger one, with an InputError."""
     if height < MIN_HEIGHT or width < MIN_WIDTH:
         raise InputError(
             f"an environment map of {width} x {height} texels is too small for Mitsuba: "

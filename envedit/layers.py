@@ -16,6 +16,7 @@ import numpy as np
 
 from . import latlong
 from .gain import GridGain
+from .health import BRIGHTEST, require_radiance
 from .lights import DARK, SPARE, Lights
 from .separate import Separation, separate
 
@@ -66,8 +67,15 @@ class Layers:
         self.free: np.ndarray | None = None
 
     def encode(self, image: np.ndarray, seed: int = 0) -> dict:
-        """Separate the image; ``seed`` is not used."""
+        """Separate the image; ``seed`` is not used.
+
+        Raises
+        ------
+        InputError
+            If a texel is not finite, negative, or brighter than :data:`.health.BRIGHTEST`.
+        """
         self.rows = self.rows or (0, image.shape[0])
+        require_radiance(image, "layers", self.rows[0], BRIGHTEST)
         image = np.ascontiguousarray(image, np.float32)
         self.separation = separate(image, self.rows)
         self.lights = Lights(self.separation.lights, self.rows, image.shape[1])

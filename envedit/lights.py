@@ -299,12 +299,14 @@ class _Share(dr.CustomOp):
         texels = shape[0] * shape[1]
         # Of the largest radiance that can come about, so many bits are kept.
         most = dr.max(dr.maximum(dr.maximum(flux.x, flux.y), flux.z)) * float(1 / omega.min())
+        most = dr.minimum(most, dr.largest(mi.Float))  # infinite, it would put all lights out
         scale = dr.select(most > 0, 2.0**_BITS / dr.maximum(most, 1e-25), 0)
         sums = dr.zeros(mi.Int64, texels * 3)
         _scatter(sums, row, column, half, flux, scale, *self.geometry)
         dr.eval(sums)
         lit = mi.Float(mi.Float64(sums) * dr.select(scale > 0, 1 / mi.Float64(scale), 0))
-        bad = ~dr.isfinite(dr.sum(flux.x + flux.y + flux.z + row + column + half))
+        # Summed in double precision: many bright points are no infinity.
+        bad = ~dr.isfinite(dr.sum(mi.Float64(flux.x) + flux.y + flux.z + row + column + half))
         return mi.TensorXf(dr.select(bad, dr.nan, lit), (*shape, 3))
 
     def backward(self):

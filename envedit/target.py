@@ -13,6 +13,7 @@ import numpy as np
 
 from . import config, image, latlong, painted, strokes
 from .errors import InputError
+from .health import BRIGHTEST, require_radiance
 from .scene import Scene
 
 SEED = 7_000_003
@@ -79,7 +80,8 @@ def make(
     Raises
     ------
     InputError
-        If a file cannot be read, or a picture does not fit the film.
+        If a file cannot be read, a picture does not fit the film, or the other map is brighter than
+        :data:`.health.BRIGHTEST`. A picture that is so bright is cut there, with a warning.
     """
     chosen = settings.target
     if picture is None and chosen.kind == "envmap":
@@ -99,13 +101,18 @@ def make(
             raise InputError(f"target.strokes: {'; '.join(made.warnings) or 'none of them paints anything'}")
         found = painted.Painted(made.picture, made.coverage, np.zeros(shape, bool), made.warnings)
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
+    picture, warnings = found.picture, tuple(found.warnings)
+    if over := int((picture > BRIGHTEST).any(axis=2).sum()):
+        # Squares and sums of what is more would leave single precision; on a display it is as white.
+        picture = np.minimum(picture, np.float32(BRIGHTEST))
+        warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
     untold = found.excluded & (found.coverage[..., 0] > 0)  # what was not painted has the initial value
     weight = pixel_weight(found.coverage, untold, chosen.paint, chosen.hold)
     share = 100 * float((found.coverage > 0).mean())
     source += (
         f", {share:.2g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
     )
-    return Target(found.picture, weight, None, source, found.warnings, initial, found.coverage, asked)
+    return Target(picture, weight, None, source, warnings, initial, found.coverage, asked)
 
 
 def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
@@ -132,6 +139,7 @@ def _rendered(settings, scene, envmap):
     chosen = settings.target
     if chosen.file:
         true, info = image.load_envmap(chosen.file, envmap.shape[1], settings.input.repair)
+        require_radiance(true, str(chosen.file), brightest=BRIGHTEST)
         source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
     else:
         true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()

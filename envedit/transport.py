@@ -31,6 +31,7 @@ from .columns import ExactColumns
 from .disk_cache import DiskCache
 from .errors import ConfigError
 from .grid import Grid
+from .health import require_radiance
 from .influence import determined
 from .recording import choose_bounces, choose_samples, left_out, other_light, pilot, record_all, row_mass
 from .sparse import ColourMatrix, scale_packets, to_packets
@@ -137,8 +138,10 @@ class LightTransport:
         ConfigError
             ``spp`` or ``max_depth`` is below 1.
         InputError
-            No pixel receives light from the environment, or T does not fit into ``memory_gb``.
+            No pixel receives light from the environment, T does not fit into ``memory_gb``, or the grid is
+            smaller than Mitsuba takes.
         """
+        latlong.check_envmap_size(height, width)
         memory_gb = 2.0 if memory_gb == "auto" else float(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
             if value != "auto" and not value >= 1:
@@ -403,7 +406,14 @@ class LightTransport:
         return light / total if total > 0 else np.zeros_like(light)
 
     def coarse_error(self, envmap) -> float:
-        """Predict the relative error of the coarse tier for a map, beside the columns that there are."""
+        """Predict the relative error of the coarse tier for a map, beside the columns that there are.
+
+        Raises
+        ------
+        InputError
+            If a texel is not finite or negative: no error can be told then.
+        """
+        require_radiance(envmap, "light transport")
         rest = self._exact.slot_of < 0
         return bright.error(*self._radiance(np.asarray(envmap)), self._samples, rest)
 

@@ -1,0 +1,430 @@
+"""What is done in a cell of the matrix of extremes: a map through one stage, compared with plain float64.
+
+A stage returns normally where all that it made is finite and correct, returns the names of what is not finite
+where that is seen by whoever comes next, and raises where the map is refused.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+
+from envedit import (
+    config,
+    edit,
+    envmap,
+    fit,
+    health,
+    image,
+    latlong,
+    losses,
+    metrics,
+    optim,
+    scene,
+    search,
+    ssim,
+)
+from envedit.layers import Layers
+from envedit.transport import LightTransport
+
+FILM = (8, 6)
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+STEPS = 21
+"""Of the edit loop; it stops at the 20th that is not finite in a row."""
+
+
+# ---- how a cell ends -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a cell ends in: ``done``, ``seen`` (not finite, and shown as such) or ``refused``.
+
+    ``words`` are part of the refusal's message, or what is not finite; ``says`` is a sentence for people.
+    """
+
+    kind: str
+    says: str = ""
+    error: type | None = None
+    words: str = ""
+
+
+def refused(error, words, says=""):
+    return Outcome("refused", says, error, words)
+
+
+def seen(words, says=""):
+    return Outcome("seen", says, None, words)
+
+
+DONE = Outcome("done")
+
+
+# ---- what stages share -----------------------------------------------------------------------------------
+
+
+def sky(height: int = 16, width: int = 32) -> np.ndarray:
+    """Return a smooth sky between 0.07 and 0.7."""
+    row, column = np.mgrid[:height, :width]
+    base = 0.4 + 0.3 * np.cos(2 * np.pi * (column + 0.5) / width) * np.sin(np.pi * (row + 0.5) / height)
+    return (base[..., None] * [1.0, 0.9, 0.7]).astype(np.float32)
+
+
+def close(got, wanted, relative: float, absolute: float = 0.0) -> None:
+    """Compare an array with its reference: errors at most ``relative`` of the largest reference value."""
+    got, wanted = np.asarray(got, np.float64), np.asarray(wanted, np.float64)
+    assert got.shape == wanted.shape
+    error = np.abs(got - wanted).max()
+    assert error <= relative * np.abs(wanted).max() + absolute, f"off by {error:g}"
+
+
+def single(values):
+    """Copy an array to the device, float32."""
+    return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
+
+
+@functools.cache
+def matte() -> scene.Scene:
+    """Load the shipped scene under a film of a few pixels."""
+    return scene.load("matte", *FILM)
+
+
+@functools.cache
+def transport(height: int, width: int) -> LightTransport:
+    """Trace T of the scene, with exact columns where maps of the matrix have their suns."""
+    traced = LightTransport.build(matte(), height, width, spp=16, max_depth=3)
+    if (height, width) == (16, 32):
+        traced.probe(np.array([0 * 32 + 7, 5 * 32, 7 * 32 + 20, 5 * 32 + 9]))
+    return traced
+
+
+@functools.cache
+def dense(height: int, width: int) -> np.ndarray:
+    """Return T (3, pixels, texels) float64, column by column of unit maps."""
+    traced, texels = transport(height, width), height * width
+    found = np.empty((3, FILM[0] * FILM[1], texels))
+    for texel in range(texels):
+        unit = np.zeros((height, width, 3), np.float32)
+        unit.reshape(-1, 3)[texel] = 1
+        found[:, :, texel] = traced.linear(single(unit)).numpy().reshape(-1, 3).T
+    return found
+
+
+# ---- reading, checking, writing --------------------------------------------------------------------------
+
+
+def write_plain(path, values):
+    """Write an OpenEXR file past the package."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    channels = {c: np.ascontiguousarray(values[..., i]) for i, c in enumerate("RGB")}
+    OpenEXR.File(header, channels).write(str(path))
+    return path
+
+
+def read(m, folder):
+    """Every finite value as stored, negative ones as 0 with a warning; no other texel is touched."""
+    if m.shape[1] == 4096:  # whole: files must be 2:1
+        m = np.ascontiguousarray(np.broadcast_to(m[8], (2048, 4096, 3)))
+    path = write_plain(folder / "map.exr", m)
+    wrong = ~np.isfinite(m).all(axis=2)
+    if wrong.any() and not wrong.all():  # what is refused below can be asked to be mended
+        mended, info = image.load_envmap(path, repair=True)
+        np.testing.assert_array_equal(mended[~wrong], m[~wrong])
+        near = m[4:7, 8:11].reshape(9, 3)[[0, 1, 2, 3, 5, 6, 7, 8]]
+        np.testing.assert_allclose(mended[5, 9], near.mean(axis=0, dtype=np.float64), rtol=1e-6)
+        assert info["repaired"] == 1
+    found, info = image.load_envmap(path)
+    np.testing.assert_array_equal(found, np.maximum(m, 0))
+    expected = [
+        w
+        for w, said in (
+            ("negative", (m < 0).any()),
+            ("65504, the largest half", (m == 65504).any()),
+            ("black", not (m > 0).any()),
+        )
+        if said
+    ]
+    assert len(info["warnings"]) == len(expected)
+    assert all(word in line for word, line in zip(expected, info["warnings"], strict=True))
+
+
+def check(m, folder):
+    """Counts, first places and range are those of plain numpy, and finite whatever the map."""
+    found = health.health(m)
+    wide, finite = m.astype(np.float64), np.isfinite(m)
+    for kind, mask in (
+        ("nan", np.isnan(m)),
+        ("inf", np.isinf(m)),
+        ("negative", m < 0),
+        ("saturated", m == 65504),
+    ):
+        texels = np.argwhere(mask.any(axis=2))
+        assert getattr(found, kind) == len(texels)
+        assert getattr(found, f"first_{kind}") == (tuple(texels[0]) if len(texels) else None)
+    y = wide[finite.all(axis=2)] @ LUMINANCE
+    assert (found.minimum, found.maximum) == (wide[finite].min(), wide[finite].max())
+    np.testing.assert_allclose(found.median, np.median(y), rtol=1e-12)
+    positive = y[y > 0]
+    ratio = positive.max() / positive.min() if len(positive) else 0.0
+    np.testing.assert_allclose(found.dynamic_range, ratio, rtol=1e-12)
+    assert found.ok == (finite.all() and not (m < 0).any()) and np.isfinite(found.dynamic_range)
+    assert found.summary()
+
+
+def write(m, folder):
+    """The file holds every bit; a map that is not finite reaches no file."""
+    path = folder / "out.exr"
+    path.unlink(missing_ok=True)
+    try:
+        image.write_exr(path, m)
+    finally:
+        assert path.exists() == np.isfinite(m).all()
+    pixels = OpenEXR.File(str(path)).parts[0].channels["RGB"].pixels
+    np.testing.assert_array_equal(np.asarray(pixels).view(np.uint32), m.view(np.uint32))
+
+
+# ---- functions of the map --------------------------------------------------------------------------------
+
+
+def normalise(m, folder):
+    """Eq. 1 maps to [0, 1], its ends exactly, and Eq. 2-3 back: within 2e-5 of the value and 1e-7."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        found = fit.Normalisation.of(m)
+        if not np.isfinite([found.low, found.span]).all():
+            return ["range"]
+        values = found.encode(m)
+    logs = np.log(m.astype(np.float64) + 0.01)
+    flat = np.ptp(logs) <= 1e-4
+    assert (
+        abs(values.min() - (0.5 if flat else 0)) <= 1e-4 and abs(values.max() - (0.5 if flat else 1)) <= 1e-4
+    )
+    back = found.decode(single(values)).numpy()
+    assert np.isfinite(back).all() and (back >= 0).all()
+    most = np.exp(88.0)  # declared where it is reached, by 3e38 alone
+    np.testing.assert_allclose(back, np.minimum(m, most), rtol=2e-5, atol=1e-7)
+    return None
+
+
+def fitted(m, folder):
+    """A few steps: finite weights, a map within the range that the network has, a loss that does not rise."""
+    told = []
+    recipe = config.Fit(epochs=21, lr=5e-3, awp_gamma=0.01, cache=False, polish="always")
+    network = config.Representation(hidden=12, depth=1)
+    made = envmap.Siren(network, recipe, progress=lambda done, total, loss: told.append(loss))
+    params = made.encode(m)
+    assert all(np.isfinite(value.numpy()).all() for value in params.values())
+    got = made.decode(params).numpy()
+    normal = made.fitted.normalisation
+    assert np.isfinite(got).all() and got.min() >= 0
+    assert np.log(got.max(initial=0) + 0.01) <= normal.low + normal.span + 1e-3
+    assert len(told) == 2 and np.isfinite(told).all() and told[1] <= told[0]
+
+
+def transported(m, folder):
+    """T E and T' y are float64's product with T, within 1e-5 of the light that is summed."""
+    height, width, _ = m.shape
+    traced = transport(height, width)
+    got = traced.apply(single(m)).numpy()
+    pulled = traced.adjoint(single(got)).numpy()
+    if not np.isfinite(m).all():
+        bad = ["picture"] if not np.isfinite(got).all() else []
+        return bad + (["adjoint"] if not np.isfinite(pulled).all() else [])
+    if (
+        width == 4096
+    ):  # too many columns to list: <T x, y> = <x, T' y>, and twice the map is twice the picture
+        wide = got.astype(np.float64)
+        close((wide * wide).sum(), (m * pulled.astype(np.float64)).sum(), 1e-5)
+        np.testing.assert_array_equal(traced.apply(single(2 * m)).numpy(), 2 * got)
+        return None
+    matrix, flat = dense(height, width), m.reshape(-1, 3).astype(np.float64)
+    for c in range(3):
+        close(got.reshape(-1, 3)[:, c], matrix[c] @ flat[:, c], 1e-5)
+        close(pulled.reshape(-1, 3)[:, c], matrix[c].T @ got.reshape(-1, 3)[:, c].astype(np.float64), 1e-5)
+    return None
+
+
+# ---- losses ----------------------------------------------------------------------------------------------
+
+
+def plain(name, x, y):
+    """Return value and gradient of a loss in float64; SSIM by the same code in double precision."""
+    if name in ("ssim", "log_ssim"):
+        leaf = mi.TensorXd(np.asarray(x, np.float64))
+        dr.enable_grad(leaf)
+        value = ssim.ssim_loss(leaf, mi.TensorXd(np.asarray(y, np.float64)))
+        dr.backward(value)
+        return float(value[0]), np.array(dr.grad(leaf))
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    d, n = x - y, x.size
+    if name in ("image_l1", "hdr"):
+        return np.abs(d).mean(), np.sign(d) / n
+    if name in ("image_l2", "log_mse"):
+        return np.square(d).mean(), 2 * d / n
+    if name == "luminance":
+        difference = (d @ LUMINANCE).sum()
+        return abs(difference), np.broadcast_to(np.sign(difference) * LUMINANCE, x.shape)
+    if name == "l1":
+        return np.abs(x).sum(), np.sign(x)
+    if name == "tv":
+        across, down = np.roll(x, -1, axis=1) - x, np.diff(x, axis=0, append=x[-1:])
+        slope = np.roll(np.sign(across), 1, axis=1) - np.sign(across) - np.sign(down)
+        slope[1:] += np.sign(down)[:-1]
+        return (np.abs(across) + np.abs(down)).mean(), slope / n
+    assert name == "change"
+    floor = max(0.01 * y.mean(), 1e-12)
+    distance = np.log((x + floor) / (y + floor))
+    root = np.sqrt(np.square(distance) + 0.05**2)
+    return (root - 0.05).mean(), distance / root / (x + floor) / n
+
+
+def loss_and_gradient(name, x, y):
+    """Return value and gradient of a loss of the package in float32."""
+    leaf = single(x)
+    dr.enable_grad(leaf)
+    value = losses.LOSSES[name](leaf, single(y))
+    dr.backward(value)
+    return float(value[0]), np.array(dr.grad(leaf))
+
+
+def ssim_rounding(x) -> float:
+    """Return the rounding of SSIM's gradient: a window of no contrast cancels terms of |x| / C2."""
+    return 1e-7 * float(np.abs(x).max()) / 0.03**2 / np.size(x)
+
+
+def display(m):
+    """Return the display values of a rendering through T, as the losses see them."""
+    height, width, _ = m.shape
+    if height < 3:
+        return np.asarray(edit.to_display(single(m)).numpy())
+    return edit.to_display(transport(height, width).apply(single(m))).numpy()
+
+
+def lost(m, folder):
+    """Values within 1e-5, gradients within 1e-4 of the largest; losses of what an edit or fit gives them."""
+    before = sky(*m.shape[:2])
+    with np.errstate(all="ignore"):
+        normal = fit.Normalisation.of(m if np.isfinite(m).all() and (m >= 0).all() else before)
+        logs = [normal.encode(e).astype(np.float32) for e in (m, before)]
+        given = {name: (m, before) for name in ("hdr", "luminance", "l1", "tv", "change")}
+        given |= {name: (display(m), display(before)) for name in ("image_l1", "image_l2", "ssim")}
+        given |= {name: logs for name in ("log_mse", "log_ssim")}
+        assert given.keys() == losses.LOSSES.keys()
+        seen = []
+        for name, (x, y) in given.items():
+            value, gradient = loss_and_gradient(name, x, y)
+            if not np.isfinite(value):
+                seen.append(name)
+                continue
+            wanted, slope = plain(name, x, y)
+            # 1e-8: what sqrt(d^2 + s^2) - s rounds by where few of many texels differ.
+            close(value, wanted, 1e-5, 1e-8)
+            close(gradient, slope, 1e-4, ssim_rounding(x) if "ssim" in name else 0)
+    return sorted(seen)
+
+
+# ---- optimiser and loop ----------------------------------------------------------------------------------
+
+
+def adam(m, folder):
+    """Three steps with the map as gradient: within 1e-5 of float64's; a refused step changes nothing."""
+    lr, (b1, b2), eps = 0.1, (0.9, 0.999), 1e-8
+    start = sky(*m.shape[:2])
+    one = optim.Adam({"x": single(start)}, lr)
+    p, g = start.astype(np.float64), m.astype(np.float64)
+    first, second = np.zeros(p.shape), np.zeros(p.shape)
+    for t in (1, 2, 3):
+        if not one.step({"x": single(m)}):
+            np.testing.assert_array_equal(one.params["x"].numpy(), start)
+            return ["step"]
+        first, second = b1 * first + (1 - b1) * g, b2 * second + (1 - b2) * g * g
+        p = p - lr * first / (1 - b1**t) / (np.sqrt(second / (1 - b2**t)) + eps)
+    close(one.params["x"].numpy(), p, 1e-5)
+    # Where the gradient is tiny its square underflows: the step is lr g / eps, in proportion.
+    tiny = np.abs(g) < 1e-19
+    close((one.params["x"].numpy() - start)[tiny], (p - start)[tiny], 1e-3, 1e-7) if tiny.any() else None
+    return None
+
+
+@functools.cache
+def renderer(height, width):
+    """Trace a T whose columns may change from cell to cell."""
+    return LightTransport.build(matte(), height, width, spp=16, max_depth=3, few=True)
+
+
+def edited(m, folder):
+    """Layers from the search's start towards the turned map: finite, no step lost, a lower loss.
+
+    Where the turned map is the same map, not one bit changes in the loop.
+    """
+    height, width, _ = m.shape
+    made = Layers()
+    params = made.encode(m)
+    traced = renderer(height, width)
+    turned = latlong.rotate(m, 90.0)
+    same = np.array_equal(turned, m)
+    settle(traced, m, turned)
+    wanted = traced.apply(single(turned)).numpy()
+    if not same:
+        params, _ = search.start(made, params, traced, wanted, None, m)
+    weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
+    objective = edit.Objective(weights, wanted, None, m, STEPS)
+    settings = config.Optimizer(iterations=STEPS, lr=0.01)
+    start = made.decode(params).numpy()
+    params, state = edit.optimise(made, params, traced, objective, m, 0, settings)
+    got = made.decode(params).numpy()
+    assert np.isfinite(got).all() and (got >= 0).all() and state.bad_steps == 0
+    if same:
+        np.testing.assert_array_equal(got, m)
+        assert state.history[-1]["loss"] == 0
+    else:
+        after, before = (float(objective(traced.apply(single(e)), single(e), 0)[0][0]) for e in (got, start))
+        assert after < before
+
+
+def settle(traced, *maps):
+    """Trace the columns that maps ask for: afterwards T is the same for them at every step."""
+    for m in maps:
+        traced.render(single(m), 0)
+        while traced.resolve(m):
+            pass
+
+
+# ---- metrics ---------------------------------------------------------------------------------------------
+
+
+def judged(m, folder):
+    """Every number is plain float64's to 1e-9, finite or null; a map against itself is 200 dB, 1 and 0."""
+    other = sky(*m.shape[:2])
+    same = metrics.compare(m, m)
+    assert same == {"psnr": 200.0, "ssim": 1.0, "mse": 0.0, "lpips": None}
+    assert metrics.log_psnr(m, m) == 200 and metrics.sun_offset(m, m) == 0
+    a, b = (np.clip(e.astype(np.float64), 0, 1) ** (1 / 2.2) for e in (m, other))
+    found, mse = metrics.compare(m, other), np.mean((a - b) ** 2)
+    np.testing.assert_allclose([found["mse"], found["psnr"]], [mse, -10 * np.log10(mse)], rtol=1e-6)
+    assert -1 <= found["ssim"] < 1
+    logs = [np.log(np.maximum(e.astype(np.float64), 0) + 0.01) for e in (m, other)]
+    wanted = 20 * np.log10(np.ptp(logs[1])) - 10 * np.log10(np.mean((logs[0] - logs[1]) ** 2))
+    np.testing.assert_allclose(metrics.log_psnr(m, other), wanted, rtol=1e-9)
+    y, z = m.astype(np.float64) @ LUMINANCE, other.astype(np.float64) @ LUMINANCE
+    np.testing.assert_allclose(metrics.peak_ratio(m, other), y.max() / z.max(), rtol=1e-9)
+    np.testing.assert_allclose(metrics.mean_luminance_ratio(m, other), y.mean() / z.mean(), rtol=1e-9)
+    assert metrics.peak_position(m) == np.unravel_index(y.argmax(), y.shape)
+    assert 0 <= metrics.high_frequency_energy(m) < np.inf
+
+
+STAGES = {
+    "read": read,
+    "health": check,
+    "normalise": normalise,
+    "fit": fitted,
+    "transport": transported,
+    "losses": lost,
+    "Adam": adam,
+    "edit loop": edited,
+    "write": write,
+    "metrics": judged,
+}
+"""Name of a stage -> what is done; docstrings say what is correct."""

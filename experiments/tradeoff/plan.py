@@ -1,0 +1,227 @@
+"""What is run: cells (a map in a scene), settings (what differs from the standard preset), and their jobs."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from envedit.errors import InputError
+from envedit.sources import overlaid
+from experiments.sweep import Job, job
+
+MAPS = ("overcast_soil", "wasteland_clouds", "kloofendal_48d_partly_cloudy")
+"""Overcast, in between, and sunny: peaks of 4.5, 309 and 8,963 at 256 texels across."""
+SCENES = {
+    "matte": {"file": "matte"},
+    "glossy": {"file": "sphere", "parameters": {"roughness": 0.05}},
+}
+ANGLE = 60.0
+"""Degrees by which the map is to be turned."""
+REFERENCES = 3
+"""Runs of the standard preset in each cell: before, amid and after the others, each with its own seed."""
+LONG = "paper"
+"""The group that is not run in every cell by default: a run takes about twenty minutes."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A map in a scene; ``map`` and ``scene`` are names, ``file`` is the map's."""
+
+    map: str
+    scene: str
+    file: Path
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        return f"{self.map}, {self.scene}"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is changed in the standard preset.
+
+    Attributes
+    ----------
+    name : str
+        What tables call it; "KNOB: LEVEL" for a knob.
+    group : str
+        "standard", "preset", "knob", "siren", "joint" or "paper".
+    table : dict
+        Tables and keys as in a configuration.
+    seconds : float
+        Rough guess of a run and its judgement on two cores, for the estimate at the start.
+    """
+
+    name: str
+    group: str
+    table: dict
+    seconds: float = 17.0
+
+
+def _levels(knob: str, group: str, levels: dict[str, dict], seconds: dict[str, float] | None = None):
+    return [
+        Setting(f"{knob}: {level}", group, table, (seconds or {}).get(level, 17.0))
+        for level, table in levels.items()
+    ]
+
+
+def _key(knob: str, table: str, key: str, values, **seconds) -> list[Setting]:
+    """One key at several values; ``seconds`` are of ``v`` + value."""
+    guesses = {name.removeprefix("v"): value for name, value in seconds.items()}
+    return _levels(knob, "knob", {str(v): {table: {key: v}} for v in values}, guesses)
+
+
+def knobs() -> list[Setting]:
+    """List one change at a time from the standard preset, whose own level is not repeated."""
+    return [
+        *_key("samples of T", "renderer", "spp", (16, 64, 512), v16=13, v64=14, v512=24),
+        *_key("refresh of T", "renderer", "refresh", (25,), v25=30),
+        *_levels(
+            "path tracer, spp",
+            "knob",
+            {str(n): {"renderer": {"kind": "path", "spp": n}} for n in (4, 16)},
+            {"4": 20.0, "16": 28.0},
+        ),
+        *_key("path depth", "renderer", "max_depth", (2, 8), v2=14, v8=20),
+        *_key("map width", "input", "width", (64, 128, 512), v512=28),
+        *_key("film width", "scene", "width", (64, 192), v64=12, v192=27),
+        *_key("steps", "optimizer", "iterations", (10, 30, 200), v200=21),
+        *_key("gain, cycles", "representation", "cycles", (4, 24)),
+        *_levels(
+            "samples of target and result",
+            "knob",
+            {str(n): {"target": {"spp": n}, "output": {"spp": n}} for n in (16, 64)},
+        ),
+    ]
+
+
+_SMALL_SIREN = {"representation": {"kind": "siren"}, "input": {"width": 128}}
+
+
+def siren() -> list[Setting]:
+    """List one change at a time from the standard robust SIREN, on a map of 128 texels across.
+
+    At 256 a run with its fit takes ten times as long as one with layers, whatever the knob.
+    """
+
+    def changed(name, table, seconds=36.0):
+        return Setting(name, "siren", overlaid(_SMALL_SIREN, table), seconds)
+
+    return [
+        changed("siren: as it is", {}),
+        changed("siren, hidden: 64", {"representation": {"hidden": 64}}, 28),
+        changed("siren, hidden: 256", {"representation": {"hidden": 256}}, 70),
+        changed("siren, depth: 2", {"representation": {"depth": 2}}, 32),
+        changed("siren, depth: 5", {"representation": {"depth": 5}}, 45),
+        changed("siren, fit epochs: 300", {"fit": {"epochs": 300}}, 30),
+        changed("siren, fit epochs: 2400", {"fit": {"epochs": 2400}}, 45),
+        changed("siren, AWP every: 1", {"fit": {"awp_every": 1}}, 40),
+        changed("siren, AWP every: 8", {"fit": {"awp_every": 8}}, 34),
+        changed("siren, steps: 150", {"optimizer": {"iterations": 150}}, 24),
+    ]
+
+
+FACTORS = {
+    "T": (8, 16, 32, 64, 128, 256),
+    "map": (64, 96, 128, 192, 256, 384),
+    "film": (48, 64, 96, 128, 160, 192),
+    "steps": (10, 16, 25, 40, 64, 100, 160),
+    "samples": (16, 64, 256, 1024),
+}
+"""Knobs that are changed together, and their levels: about evenly spaced in their logarithm."""
+
+
+def joint(count: int, seed: int = 0) -> list[Setting]:
+    """Draw combinations of :data:`FACTORS` by Latin hypercube sampling (McKay, Beckman and Conover 1979).
+
+    Of ``count`` combinations, each ``count``-th part of every knob's range is met once, so that all levels
+    are met about equally often, whatever the other knobs are.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = {}
+    for factor, levels in FACTORS.items():
+        u = (rng.permutation(count) + rng.random(count)) / max(count, 1)
+        drawn[factor] = [levels[int(x * len(levels))] for x in u]
+    settings = []
+    for i in range(count):
+        t, width, film, steps, samples = (drawn[factor][i] for factor in FACTORS)
+        table = {
+            "renderer": {"spp": t},
+            "input": {"width": width},
+            "scene": {"width": film},
+            "optimizer": {"iterations": steps},
+            "target": {"spp": samples},
+            "output": {"spp": samples},
+        }
+        name = f"joint {i + 1}: T {t}, map {width}, film {film}, {steps} steps, samples {samples}"
+        settings.append(Setting(name, "joint", table, 15.0))
+    return settings
+
+
+DRAFT = Setting("draft", "preset", {"preset": "draft"}, 10.0)
+PAPER = Setting("paper", LONG, {"preset": "paper"}, 1300.0)
+
+
+def settings(count: int, quick: bool = False) -> list[Setting]:
+    """List all settings but the standard preset itself and the paper's, the presets first."""
+    if quick:
+        some = {"samples of T: 16", "path tracer, spp: 4", "map width: 128", "film width: 64", "steps: 30"}
+        small = Setting("siren: draft", "siren", {"preset": "draft", **_kind("siren")}, 16.0)
+        return [DRAFT, *(s for s in knobs() if s.name in some), small, *joint(count)]
+    return [DRAFT, *knobs(), *siren(), *joint(count)]
+
+
+def _kind(name):
+    return {"representation": {"kind": name}}
+
+
+def cells(folder: Path, names=MAPS, scenes=tuple(SCENES)) -> list[Cell]:
+    """List maps times scenes, from a folder of NAME_puresky_1k.hdr or .exr, or NAME.hdr or .exr.
+
+    Raises
+    ------
+    InputError
+        If a map is not there.
+    """
+    files = {name: _file(folder, name) for name in names}
+    return [Cell(name, scene, file) for name, file in files.items() for scene in scenes]
+
+
+def _file(folder, name):
+    for form in (f"{name}_puresky_1k", name):
+        for ending in (".hdr", ".exr"):
+            if (file := Path(folder) / f"{form}{ending}").is_file():
+                return file.absolute()
+    raise InputError(f"{folder}: no map {name}_puresky_1k.hdr in it: give the folder with --maps")
+
+
+def job_of(cell: Cell, setting: Setting, session: str = "") -> Job:
+    """Make the job of a setting in a cell.
+
+    Fits and transports are not kept on disk, so that every run pays for its own; what they took stands in
+    its metrics. With a ``session``, the job is one of that session's and no other's: the standard preset is
+    measured anew beside whatever it is compared with.
+    """
+    base = {
+        "input": {"envmap": str(cell.file)},
+        "scene": SCENES[cell.scene],
+        "target": {"rotate_degrees": ANGLE},
+        "renderer": {"cache": False},
+        "fit": {"cache": False},
+    }
+    name = f"{cell.name}: {setting.name}"
+    made = job(f"{name} [{session}]" if session else name, overlaid(base, setting.table))
+    if not session:
+        return made
+    key = hashlib.sha256(f"{made.key} {session}".encode()).hexdigest()[:32]
+    return dataclasses.replace(made, key=key)
+
+
+def references(n: int) -> Setting:
+    """Return the standard preset's n-th repetition; its seed tells how far results differ by chance."""
+    return Setting(f"standard, seed {n}", "standard", {"seed": n}, 17.0)

@@ -1,0 +1,97 @@
+"""The rows of the tables: what each method sets, under the paper's settings and under ours.
+
+"paper" is the preset of that name: Sec. 6 to the letter, rendered by a path tracer with fresh samples at
+every step. "ours" is the standard preset: the stored transport, and losses on pictures beside the SSIM.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+PRESETS = {"paper": "paper", "ours": "standard"}
+"""Preset of either settings."""
+
+REGULARISERS = {"luminance": [1e-4, 1e-8], "l1": [1e-4, 1e-8], "dists": 0.6}
+"""L_reg, Eq. 10 with the weights of Sec. 6.2; DISTS is off where no weights are named."""
+NO_REGULARISERS = {"luminance": 0.0, "l1": 0.0, "dists": 0.0}
+
+PIXEL_RATES = {"pixels": 2e-4, "log-pixels": 1e-4}
+"""Learning rates of the paper's pixel rows: it gives none. The best of those that were tried, by the
+rendering (README, "Learning rates of the pixel rows")."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of a table: its title, and the tables of the configuration that make it."""
+
+    title: str
+    tables: dict
+
+    def under(self, settings: str) -> dict:
+        """Return the configuration's tables under "paper" or "ours", with the preset."""
+        tables = {"preset": PRESETS[settings], **self.tables}
+        kind = tables["representation"]["kind"]
+        if settings == "paper" and kind in PIXEL_RATES:
+            tables["optimizer"] = {"lr": PIXEL_RATES[kind]}
+        return tables
+
+
+def _siren(title, regularised, **fit):
+    loss = REGULARISERS if regularised else NO_REGULARISERS
+    return Method(title, {"representation": {"kind": "siren"}, "fit": fit, "loss": loss})
+
+
+def _plain(title, kind):
+    return Method(title, {"representation": {"kind": kind}, "loss": NO_REGULARISERS})
+
+
+METHODS = {
+    "pixels": _plain("Pixels", "pixels"),
+    "log-pixels": _plain("Log(Pixels)", "log-pixels"),
+    "siren-no-hdr": _siren("SIREN HDR w/o L_hdr", False, hdr=0.0, awp_gamma=0.0),
+    "siren": _siren("SIREN HDR", False, awp_gamma=0.0),
+    "siren-reg": _siren("SIREN HDR + L_reg", True, awp_gamma=0.0),
+    "r-siren": _siren("R-SIREN HDR", False, awp_gamma=0.01),
+    "r-siren-reg": _siren("R-SIREN HDR + L_reg", True, awp_gamma=0.01),
+    "layers": _plain("Layers (ours)", "layers"),
+}
+"""Rows of Tables 1 to 3 and of Figure 8."""
+
+ONLY_OURS = ("layers", "siren-polished", "r-siren-polished")
+"""Rows that the paper's settings do not have."""
+
+# Luminance weighs less where light may be added (Sec. 6.4, which gives no number: the paper preset's tenth).
+_PAINTED = {"luminance": [1e-5, 1e-9], "l1": [1e-4, 1e-8], "dists": 0.0, "change": 0.0}
+
+
+def _painted(title, **loss):
+    tables = {"representation": {"kind": "siren"}, "fit": {"awp_gamma": 0.01}, "loss": _PAINTED | loss}
+    return Method(title, tables)
+
+
+PAINTED = {
+    "none": _painted("R-SIREN HDR", luminance=0.0, l1=0.0),
+    "lum-l1": _painted("+ L_lum + L_l1"),
+    "lum-l1-dists": _painted("+ L_lum + L_l1 + L_dists", dists=0.6),
+    "layers": Method("Layers (ours)", {"representation": {"kind": "layers"}}),
+}
+"""Columns of Figure 9."""
+
+
+def _fit(title, **fit):
+    return Method(title, {"representation": {"kind": "siren"}, "fit": {"polish": "never", **fit}})
+
+
+# What the stock network is trained by besides its rate: the squared error over all texels.
+_STOCK = {"log_mse": 1.0, "log_ssim": 0.0, "hdr": 0.0, "awp_gamma": 0.0, "stride": 1}
+
+FITS = {
+    "stock": _fit("stock SIREN, radiance", **_STOCK),
+    "stock-scaled": _fit("stock SIREN, radiance scaled to [-1, 1]", **_STOCK),
+    "siren-no-hdr": _fit("SIREN HDR w/o L_hdr", hdr=0.0, awp_gamma=0.0),
+    "siren": _fit("SIREN HDR", awp_gamma=0.0),
+    "r-siren": _fit("R-SIREN HDR", awp_gamma=0.01),
+    "siren-polished": _fit("SIREN HDR, polished (ours)", polish="always", awp_gamma=0.0),
+    "r-siren-polished": _fit("R-SIREN HDR, polished (ours)", polish="always", awp_gamma=0.01),
+}
+"""Rows of Figures 4 and 5: networks, not edits."""

@@ -1,0 +1,159 @@
+"""One fit for Figures 4 and 5, as a job of a sweep.
+
+``python -m experiments.paper.network STORE FOLDER THREADS``: FOLDER has a config.toml; STORE says what is
+fitted, "fits": the configuration's own recipe, "stock" or "stock-scaled": a stock SIREN. Left there:
+``fit.json``, and the pictures ``original.exr``, ``fitted.exr`` and ``noisy.exr``, the network with noise on
+its weights; active rows.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit import config, fit, image, metrics, optim, siren
+from envedit.errors import EnveditError
+from envedit.files import write_atomically
+from envedit.pipeline import active_rows, load_map
+
+NOISE, NOISE_SEEDS = 1e-3, 5
+"""Standard deviation of the noise on weights and biases (Fig. 5), and how many draws are measured."""
+COMMAND = "{python}", "-m", "experiments.paper.network"
+
+
+def command(store: str) -> tuple[str, ...]:
+    """Return what a sweep calls for a fit of one kind."""
+    return (*COMMAND, store, "{folder}", "{threads}")
+
+
+def stock(
+    crop: np.ndarray, network: config.Representation, settings: config.Fit, seed: int, scaled: bool
+) -> tuple[dict, tuple[float, float]]:
+    """Train a stock SIREN: linear last layer, mean squared error of linear radiance, all texels a step.
+
+    Parameters
+    ----------
+    crop : ndarray (H, W, 3)
+        Linear radiance.
+    network, settings
+        Size and frequency; epochs, rate, its schedule and Adam's decay. Nothing else of the recipe counts.
+    seed : int
+        Of the initial weights: those of the other fits.
+    scaled : bool
+        Train on radiance mapped to [-1, 1], as Sitzmann et al. do with photographs, or as it is.
+
+    Returns
+    -------
+    params : dict
+        Weights, as of :func:`envedit.siren.init`.
+    range : (float, float)
+        (low, span): radiance is low + span * output.
+    """
+    low, high = (float(crop.min()), float(crop.max())) if scaled else (0.0, 1.0)
+    span = (high - low) / 2 or 1.0
+    low, span = (low + span, span) if scaled else (0.0, 1.0)
+    wanted = ((crop.astype(np.float64) - low) / span).astype(np.float32).reshape(-1, 3)
+    wanted = dr.opaque(mi.TensorXf(wanted))
+    x = fit.points(network, crop.shape[:2])
+    params = siren.init(seed, network.hidden, network.depth, network.omega)
+    adam = optim.Adam(params, settings.lr, (0.9, settings.beta2))
+    for epoch in range(settings.epochs):
+        z, tape = linear(adam.params, x, network.omega)
+        grads = backward(adam.params, tape, (2 / len(wanted.array)) * (z - wanted))
+        adam.step(grads, lr=fit.learning_rate(settings, settings.lr, epoch))
+    return adam.params, (low, span)
+
+
+def linear(params: siren.Params, x, omega: float):
+    """Evaluate a SIREN without its sigmoid: values (N, 3), and the tape of :func:`envedit.siren.forward`."""
+    _, tape = siren.forward(params, x, omega)
+    last = siren.layers(params) - 1
+    z = dr.matmul(tape[-1][0], params[f"{last}.weight"], Bt=True) + params[f"{last}.bias"]
+    dr.eval(z)
+    return z, tape
+
+
+def backward(params: siren.Params, tape: list, grad) -> siren.Params:
+    """Pull a gradient of :func:`linear`'s values back to the parameters."""
+    # The reverse pass of a sigmoid at 1/2 is a factor of 1/4, exactly: four times that is none.
+    half = dr.full(mi.TensorXf, 0.5, grad.shape)
+    return siren.backward(params, [*tape[:-1], (tape[-1][0], half)], 4 * grad)
+
+
+def perturbed(params: dict, seed: int) -> dict:
+    """Add N(0, :data:`NOISE`) to all weights and biases: the same to every network of one size."""
+    rng = np.random.default_rng(1000 + seed)
+    return {
+        name: mi.TensorXf((value.numpy() + rng.normal(0, NOISE, value.shape)).astype(np.float32))
+        for name, value in params.items()
+    }
+
+
+def carry_out(folder: Path, store: str) -> None:
+    """Fit, measure, and write what :func:`carry_out`'s module says."""
+    settings = config.load(folder / "config.toml")
+    mi.set_variant(settings.variant)
+    original, _ = load_map(settings.input)
+    first, last = active_rows(settings.input.rows, original.shape[0])
+    crop, network = np.ascontiguousarray(original[first : last + 1]), settings.representation
+    shape, rows = crop.shape[:2], (first, original.shape[0])
+    if store == "fits":
+        found = fit.fit(
+            crop, network, settings.fit, settings.seed, rows, folder=fit.default_folder(), progress=_tell
+        )
+        params = {name: mi.TensorXf(value) for name, value in found.params.items()}
+        seconds, x = found.seconds, fit.points(network, shape, rows)
+
+        def picture(weights):
+            return fit.evaluate(weights, found.normalisation, x, shape, network.omega).numpy()
+    else:
+        begun = time.perf_counter()
+        params, (low, span) = stock(crop, network, settings.fit, settings.seed, store == "stock-scaled")
+        dr.eval(params)
+        dr.sync_thread()
+        seconds, x = time.perf_counter() - begun, fit.points(network, shape)
+
+        def picture(weights):
+            z = linear(weights, x, network.omega)[0].numpy().reshape(*shape, 3)
+            return np.maximum(low + span * z, 0).astype(np.float32)
+
+    fitted = picture(params)
+    noisy = [picture(perturbed(params, seed)) for seed in range(NOISE_SEEDS)]
+    for name, content in (("original", crop), ("fitted", fitted), ("noisy", noisy[0])):
+        image.write_exr(folder / f"{name}.exr", content, panorama=False)
+    text = {
+        "log_psnr": metrics.log_psnr(fitted, crop),
+        "peak_ratio": metrics.peak_ratio(fitted, crop),
+        "mean_ratio": metrics.mean_luminance_ratio(fitted, crop),
+        "noisy": [metrics.log_psnr(one, crop) for one in noisy],
+        "seconds": seconds,
+        "epochs": settings.fit.epochs,
+    }
+    write_atomically(folder / "fit.json", (json.dumps(text, indent=1) + "\n").encode())
+
+
+def _tell(done, total, loss):
+    if done % 200 == 1 or done == total:
+        print(f"epoch {done} of {total}, loss {loss:.4g}", flush=True)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Carry out one job; returns the exit code."""
+    store, folder, threads = argv or sys.argv[1:]
+    dr.set_thread_count(int(threads))
+    try:
+        carry_out(Path(folder), store)
+    except EnveditError as error:
+        print(f"network: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

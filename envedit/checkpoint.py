@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,12 +20,13 @@ from .errors import InputError
 from .files import replacing
 
 NAME = "checkpoint.npz"
+_FORMAT = 2  # raise when what is stored, or what the loop makes of it, changes
 
 
 def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:
     """Hash what decides a run's result: its configuration but for the folder, scene and pixels."""
     text = "\n".join(line for line in config.to_toml(settings).splitlines() if not line.startswith("dir ="))
-    sha = hashlib.sha256(f"{text}\n{scene}".encode())
+    sha = hashlib.sha256(f"{_FORMAT}\n{text}\n{scene}".encode())
     for array in inputs:
         sha.update(np.ascontiguousarray(array).tobytes())
     return sha.hexdigest()
@@ -63,14 +63,21 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
                 }
                 for part in ("optimiser", "renderer")
             }
+        if not all(
+            isinstance(a, np.ndarray)
+            for a in (picture, *parts["optimiser"].values(), *parts["renderer"].values())
+        ):
+            raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
         state, found = State(**meta["state"]), meta["digest"]
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+    except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
+        reason = " ".join(str(error).split())[:160]
+        reason = reason if reason.isprintable() else ascii(reason)
         raise InputError(
-            f"{path}: the checkpoint cannot be read ({error}): delete it, or run without --resume"
+            f"{path}: the checkpoint cannot be read ({reason}): delete it, or run without --resume"
         ) from error
     if found != what:
         raise InputError(
-            f"{path}: belongs to another configuration or other input files: "
+            f"{path}: belongs to another configuration or other input files, or to an older envedit: "
             "run without --resume to start afresh"
         )
     return state, parts["optimiser"], parts["renderer"], picture

@@ -46,6 +46,8 @@ from .errors import ConfigError
 from .tonemap import TONEMAPS
 
 _MOST_BYTES = 1 << 20  # more than any configuration; an EXR given by mistake is not read to its end
+# a.b.c...: tomllib takes time and memory with the square of the parts, gigabytes for a file of 100 kB.
+_LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){100}""", re.ASCII)
 
 
 # ---- tables ------------------------------------------------------------------------------------------------
@@ -383,15 +385,24 @@ def loads(
         The text is not TOML, or holds an unknown key or an unusable value.
     """
     try:
-        table = tomllib.loads(text)
+        table = _parsed(text)
     except RecursionError:
         raise ConfigError(f"{name}: not TOML: nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
         row, column = text.count("\n") + 1, len(text) - (text.rfind("\n") + 1) + 1
         end = f"at line {row}, column {column}: end of document"
         reason = str(error).replace("at end of document", end)
+        if len(reason) > 200:  # it may hold a key of any length; its end says where
+            reason = f"{reason[:120]} ... {reason[-60:]}"
         raise ConfigError(f"{name}: not TOML: {reason}") from None
     return from_dict(table, base_dir, name, preset, overrides)
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    if found := _LONG_KEY.search(text):
+        row = text.count("\n", 0, found.start()) + 1
+        raise ValueError(f"a key of more than 100 parts (at line {row})")
+    return tomllib.loads(text)
 
 
 def from_dict(
@@ -451,7 +462,7 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
         raise ConfigError(f"--set {show(text)}: wanted table.key=value, such as fit.epochs=100")
     raw = raw.strip()
     try:
-        parsed = tomllib.loads(f"value = {raw}")
+        parsed = _parsed(f"value = {raw}")
     except (ValueError, RecursionError):
         return keys, raw
     # A value with a line break could smuggle in a second key.

@@ -19,6 +19,7 @@ from .tonemap import srgb_to_linear
 MAX_SIDE = 32768
 MAX_TEXELS = 2**27
 """16384 x 8192 texels: 1.6 GB as float32. A header that declares more is refused before allocation."""
+_MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of red, green, blue and white (D65), as the OpenEXR attribute orders them."""
@@ -58,8 +59,14 @@ def check_declared(name, width, height):
 
 def damaged(name, reason):
     """Return the error for a file that starts well and cannot be decoded."""
-    reason = " ".join(str(reason).split())[:160] or "no reason given"
+    reason = _shown(" ".join(str(reason).split()), 160) or "no reason given"
     return InputError(f"{name}: damaged or truncated ({reason}); export or download it again")
+
+
+def _shown(text, most=60):
+    """Return text of a file for a message: cut to ``most`` characters, without control codes."""
+    text = text[:most]
+    return text if text.isprintable() else ascii(text)[1:-1][:most]
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -81,6 +88,13 @@ def _read_exr(name, head, info, stored):
         raise InputError(
             f"{name}: its {len(parts)} parts hold more than {MAX_TEXELS} texels; save only colour"
         )
+    for part, (_, _, width, height) in zip(parts, windows, strict=True):
+        tile = part.header.get("tiles")
+        if tile is not None and tile.xSize * tile.ySize > max(width * height, _MOST_TILE):
+            raise InputError(
+                f"{name}: the header declares tiles of {tile.xSize} x {tile.ySize} texels for an image of "
+                f"{width} x {height}; the file is damaged, or has to be saved in scanlines"
+            )
     index, names = _choose_channels(name, [p.header for p in parts], info)
     header = parts[index].header
     if stored:
@@ -101,7 +115,9 @@ def _read_exr(name, head, info, stored):
         raise damaged(name, e) from None
     left, top, width, height = windows[index]
     # A part that cannot be decoded is dropped with a printed warning, and the others move up.
-    if planes is None or any(p.shape != (height, width) for p in planes):
+    # The decoder of JPEG 2000 says that a stream ended early, and fills up with what it likes.
+    early = "terminated early" in (said[0] if said else "")
+    if planes is None or early or any(p.shape != (height, width) for p in planes):
         raise damaged(name, said and said[0] or "not all of its parts could be decoded")
     display = _window(header["displayWindow"])
     if stored and len(planes) in (1, 3) and windows[index] != display:
@@ -136,17 +152,19 @@ def _choose_channels(name, headers, info):
         if colour:
             names = [layers[colour[0]][c] for c in "RGB"]
             if len(colour) > 1:
-                info["warnings"].append(f"{len(colour)} colour layers: '{colour[0] or 'R, G, B'}' was read")
+                chosen = _shown(colour[0]) or "R, G, B"
+                info["warnings"].append(f"{len(colour)} colour layers: '{chosen}' was read")
         else:
             grey = [v["Y"] for v in layers.values() if "Y" in v and not {"RY", "BY", "X", "Z"} & v.keys()]
             if not grey:
                 continue
             names = grey[:1]
-            info["warnings"].append(f"only luminance ('{names[0]}'): read as grey")
+            info["warnings"].append(f"only luminance ('{_shown(names[0])}'): read as grey")
         if any(channels[c].xSampling != 1 or channels[c].ySampling != 1 for c in names):
             raise InputError(f"{name}: subsampled channels are not supported; save R, G, B in full")
         return index, names
-    raise InputError(f"{name}: no R, G, B channels (found: {', '.join(seen[:12])}); save it as RGB")
+    found = ", ".join(_shown(channel, 30) for channel in seen[:12])
+    raise InputError(f"{name}: no R, G, B channels (found: {found}); save it as RGB")
 
 
 def _describe(header, info):
@@ -188,16 +206,17 @@ def _read_radiance(name, head, info, stored):
     if not size:
         raise damaged(name, "no Radiance resolution line")
     if (size[1], size[3]) != (b"-Y", b"+X"):
-        raise InputError(f"{name}: rows are stored as '{end[1].decode()}'; save them as '-Y H +X W'")
+        stored_as = " ".join(end[1].decode().split())
+        raise InputError(f"{name}: rows are stored as '{stored_as}'; save them as '-Y H +X W'")
     height, width = int(size[2]), int(size[4])
     check_declared(name, width, height)
-    header = dict(re.findall(r"^(\w+) *= *(.*?)\s*$", head[: end.start()].decode("latin-1"), re.M))
-    info["metadata"] = header
+    header = info["metadata"] = _radiance_header(head[: end.start()].decode("latin-1"))
     if "xyze" in header.get("FORMAT", ""):
         raise InputError(f"{name}: holds XYZ colours (32-bit_rle_xyze); save it as RGB (32-bit_rle_rgbe)")
     for key in {"EXPOSURE", "COLORCORR"} & header.keys():
-        if any(float(v) != 1 for v in re.findall(r"[-+.\deE]*\d[-+.\deE]*", header[key])):
-            info["warnings"].append(f"{key}={header[key]} in its header is not undone: values are as stored")
+        if not _all_ones(header[key]):
+            value = _shown(header[key])
+            info["warnings"].append(f"{key}={value} in its header is not undone: values are as stored")
     with open(name, "rb") as file:
         file.seek(end.end())
         # No encoding takes more than 1 + 1/127 bytes for one.
@@ -210,6 +229,23 @@ def _read_radiance(name, head, info, stored):
     scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
     scale[rgbe[..., 3] == 0] = 0
     return rgbe[..., :3] * scale[..., None]
+
+
+def _radiance_header(text):
+    """Return the ``KEY=value`` lines of a header. By hand: a pattern takes the square of a line's length."""
+    header = {}
+    for line in text.split("\n"):
+        key, equals, value = line.partition("=")
+        if equals and re.fullmatch(r"\w+", key.rstrip(" ")):
+            header[key.rstrip(" ")] = value.strip()
+    return header
+
+
+def _all_ones(text):
+    try:
+        return all(float(number) == 1 for number in text.split())
+    except ValueError:
+        return False
 
 
 def _radiance_runs(name, data, height, width):
@@ -305,6 +341,8 @@ def _jpeg_header(name, info):
                     raise InputError(f"{name}: holds {data[5]} channels (CMYK?); save it as RGB")
             elif marker[1] == 0xDB and not mean and data and not data[0] & 15:
                 wide = 2 if data[0] >> 4 else 1
+                if len(data) <= 64 * wide:
+                    raise damaged(name, "a quantisation table breaks off")
                 mean = float(np.frombuffer(data[1 : 1 + 64 * wide], f">u{wide}").mean())
             elif marker[1] == 0xE1 and data[:6] == b"Exif\0\0":
                 info["orientation"] = _orientation(data[6:])

@@ -1,8 +1,9 @@
 """The one optimisation loop: find parameters whose map renders to the target (Eq. 10, Sec. 6.2).
 
 The loop knows neither what the parameters mean nor how the picture is made: it decodes, renders, compares,
-pulls the gradient back, and lets Adam step. A step with a non-finite loss or gradient is not taken, is
-counted, and halves the learning rate.
+pulls the gradient back, and lets Adam step. Where loss or gradient is not finite no step is taken: the
+parameters go back to the last ones that had both, as the step from there may have been too long, the
+learning rate is halved, and the bad step is counted. Good steps win the learning rate back.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from .ssim import Ssim
 
 MOST_BAD_STEPS = 20
 """Non-finite steps in a row after which the loop gives up."""
+RECOVERY = 10
+"""Good steps that win back one halving of the learning rate: a rare bad sample must not end all progress."""
 READ_EVERY, READ_SECONDS = 10, 1.0
 """Losses are read back after so many steps or seconds: every read-back waits for the device."""
 
@@ -141,6 +144,40 @@ class _PlaceRows(dr.CustomOp):
         return "place rows"
 
 
+class _Slopes:
+    """Notes, on the way back, whether gradients are finite; made anew for every step.
+
+    The parameters' own do not tell: what lies in between may add gradients with atomics, which drop NaN on
+    LLVM. Mitsuba's path tracer does.
+    """
+
+    def __init__(self):
+        self.flags = []
+
+    def pass_on(self, x):
+        """Return a tensor as it is; its gradient is looked at."""
+        return dr.custom(_Slope, x, self)
+
+    def finite(self) -> bool:
+        """Say whether all gradients that came by were finite."""
+        return not any(flag[0] for flag in self.flags)
+
+
+class _Slope(dr.CustomOp):
+    def eval(self, x, slopes):
+        self.slopes = slopes
+        return mi.TensorXf(x)
+
+    def backward(self):
+        slope, flag = self.grad_out(), dr.opaque(mi.UInt32, 0)
+        dr.scatter(flag, mi.UInt32(1), mi.UInt32(0), ~dr.isfinite(slope.array))
+        self.slopes.flags.append(flag)
+        self.set_grad_in("x", slope)
+
+    def name(self):
+        return "finite gradient"
+
+
 class _Keep:
     """Put a map's own texels, (rows, W, 3), where it may not change; differentiable in the crop."""
 
@@ -195,12 +232,14 @@ def optimise(
     Returns
     -------
     params, state
-        Parameters after the last good step.
+        Parameters after the last good step, which nothing was computed from yet; ``adam.take_back()``
+        returns to those before it.
 
     Raises
     ------
     NumericalError
-        After :data:`MOST_BAD_STEPS` non-finite steps in a row.
+        After :data:`MOST_BAD_STEPS` non-finite steps in a row; ``adam`` has the last parameters whose loss
+        and gradients were finite.
     """
     lr = representation.lr if settings.lr == "auto" else settings.lr
     adam = adam or optim.Adam(params, lr, (0.9, settings.beta2))
@@ -210,21 +249,24 @@ def optimise(
     waiting, last_read = [], time.perf_counter()
     while state.step < settings.iterations:
         start = time.perf_counter()
-        leaves = adam.leaves()
+        leaves, slopes = adam.leaves(), _Slopes()
         with dr.isolate_grad():
             crop = representation.decode(leaves)
-            crop = keep(crop) if keep else crop
+            crop = slopes.pass_on(keep(crop) if keep else crop)
             rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
+            rendering = slopes.pass_on(rendering)
             total, terms = objective(rendering, crop, state.step)
             dr.backward(total)
-        dr.eval(total, terms)
+        dr.eval(total, terms, slopes.flags)
         grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
-        finite = bool(dr.isfinite(total)[0])
+        finite = bool(dr.isfinite(total)[0]) and slopes.finite()
         rate = optim.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr
         rate *= state.slowdown
         if finite and adam.step(grads, lr=rate):
             state.bad_in_a_row = 0
+            state.slowdown = min(1.0, state.slowdown * 2 ** (1 / RECOVERY))
         else:
+            adam.take_back()
             state.bad_steps += 1
             state.bad_in_a_row += 1
             state.slowdown *= 0.5

@@ -1,6 +1,7 @@
 """Files written whole or not at all, where files are kept, and C libraries that keep quiet about theirs."""
 
 import contextlib
+import ctypes
 import io
 import os
 import re
@@ -11,11 +12,14 @@ from pathlib import Path
 from .errors import EnveditError, InputError
 
 RESULTS = (
-    "edited.exr", "edited_full.exr", "edited_layers.exr", "render_initial.exr", "render_target.exr",
-    "render_edited.exr", "influence.exr", "influence.png", "unreachable.png", "preview.png", "report.html",
-    "history.csv", "config.toml", "manifest.json", "metrics.json", "checkpoint.npz",
+    "metrics.json", "edited.exr", "edited_full.exr", "edited_layers.exr", "render_initial.exr",
+    "render_target.exr", "render_edited.exr", "influence.exr", "influence.png", "unreachable.png",
+    "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "checkpoint.npz",
 )  # fmt: skip
-"""Every file that a run may leave in its folder, the last only while it runs."""
+"""Every file that a run may leave in its folder, the last only while it runs.
+
+The first says that a run is complete: whoever moves them away moves it first of all.
+"""
 
 
 @contextlib.contextmanager
@@ -73,6 +77,29 @@ def write_atomically(path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
+def tidy(folder: Path) -> None:
+    """Remove what killed processes were writing in a folder: temporary names of :data:`RESULTS`."""
+    for name in RESULTS:
+        for path in folder.glob(f".{name}.*"):
+            writer = path.name.removeprefix(f".{name}.").partition(".")[0]
+            if writer.isdecimal() and not _runs(int(writer)):
+                with contextlib.suppress(OSError):
+                    path.unlink()
+
+
+def _runs(process):
+    """Say whether another process of this number runs, as far as can be told without touching it."""
+    if process == os.getpid() or os.name != "posix":
+        return False
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        pass
+    return True
+
+
 def cache_folder(kind: str) -> Path:
     """Folder in which one kind of file is kept between runs: $XDG_CACHE_HOME/envedit/KIND or in ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "envedit" / kind
@@ -82,23 +109,33 @@ def cache_folder(kind: str) -> Path:
 def quiet_libraries():
     """Keep what C libraries print about a file off the user's terminal; yields a list that receives the text.
 
-    OpenEXR and libjpeg write to file descriptor 2 and to ``sys.stdout``, and carry on.
+    OpenEXR and libjpeg write to file descriptor 2 and to ``sys.stdout``, OpenEXR's decoder of JPEG 2000 to
+    file descriptor 1, and carry on.
     """
     said, text = [], io.StringIO()
     with contextlib.ExitStack() as stack:
-        try:
-            sys.stderr.flush()
-            kept = os.dup(2)
-        except (OSError, ValueError, AttributeError):  # no stderr to protect
-            yield said
-            return
+        _flush_c()
+        kept = {}
+        for descriptor, stream in ((1, sys.stdout), (2, sys.stderr)):
+            with contextlib.suppress(OSError, ValueError, AttributeError):  # nothing there to protect
+                stream.flush()
+                kept[descriptor] = os.dup(descriptor)
         sink = stack.enter_context(tempfile.TemporaryFile())
         stack.enter_context(contextlib.redirect_stdout(text))
-        os.dup2(sink.fileno(), 2)
+        for descriptor in kept:
+            os.dup2(sink.fileno(), descriptor)
         try:
             yield said
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            _flush_c()
+            for descriptor, copy in kept.items():
+                os.dup2(copy, descriptor)
+                os.close(copy)
             sink.seek(0)
             said.append(text.getvalue() + sink.read().decode(errors="replace"))
+
+
+def _flush_c():
+    """Have C's own streams written: what lies in their buffers belongs to what was open when it was said."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).fflush(None)

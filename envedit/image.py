@@ -14,7 +14,7 @@ import numpy as np
 from . import health, latlong
 from .decoders import FORMATS, MAX_SIDE, REC709, damaged, head_of
 from .errors import ConfigError, EnveditError, InputError, NumericalError
-from .files import quiet_libraries, replacing
+from .files import quiet_libraries, replacing, write_atomically
 
 __all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_png"]
 
@@ -261,15 +261,13 @@ def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
     codes = np.rint(np.clip(image, 0, 1) * np.float32(2**bits - 1))
     bitmap = mi.Bitmap(codes.astype({8: np.uint8, 16: np.uint16}[bits]))
 
-    def write(temporary):
-        bitmap.write(temporary)
-        if metadata:  # by hand: Mitsuba puts its own texts in quotation marks
-            with open(temporary, "r+b") as file:
-                data = file.read()
-                file.seek(_PNG_HEADER)
-                file.write(b"".join(_text_chunk(*item) for item in metadata.items()) + data[_PNG_HEADER:])
-
-    _write_whole(name, ".png", write)
+    # In memory first: Mitsuba does not tell that the last bytes of a file did not fit on the disk.
+    stream = mi.MemoryStream()
+    bitmap.write(stream, mi.Bitmap.FileFormat.PNG)
+    data = stream.raw_buffer()
+    # By hand: Mitsuba puts its own texts in quotation marks.
+    texts = b"".join(_text_chunk(*item) for item in (metadata or {}).items())
+    write_atomically(name, data[:_PNG_HEADER] + texts + data[_PNG_HEADER:])
 
 
 _PNG_HEADER = 8 + 25  # magic and IHDR

@@ -102,6 +102,15 @@ class Job:
         edited[rows] = crop
         return edited
 
+    def last_good(self, adam: optim.Adam) -> np.ndarray:
+        """Return the last map that is finite: after the last step, before it, or else the original."""
+        for _ in range(2):
+            try:
+                return self.decode(adam.params)
+            except NumericalError:
+                adam.take_back()
+        return self.original.copy()
+
     def best(self, starts, crop):
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         notes = {tuple(notes) for _, notes in starts}
@@ -114,7 +123,8 @@ class Job:
             objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
             try:
                 _, state = self._loop(params, objective, few)
-                reached.append(state.history[-1]["loss"])
+                loss = state.history[-1]["loss"]
+                reached.append(loss if np.isfinite(loss) else np.inf)
             except NumericalError:  # a start that goes nowhere is no reason to stop
                 reached.append(np.inf)
         least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
@@ -153,12 +163,23 @@ class Job:
                     checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.picture)
                     saved = time.perf_counter()
                 if stop:
-                    raise Interrupted(self.decode(adam.params), state.step)
+                    raise Interrupted(self.last_good(adam), state.step)
 
             try:
-                return self._loop(params, objective, chosen, adam=adam, state=state, after_step=after_step)
+                self._loop(params, objective, chosen, adam=adam, state=state, after_step=after_step)
+                self._look_at_the_last(adam, state)
             except NumericalError as error:
-                raise Stopped(str(error), self.decode(adam.params)) from error
+                raise Stopped(str(error), self.last_good(adam)) from error
+        return adam.params, state
+
+    def _look_at_the_last(self, adam, state):
+        """Take the last step back if it led to no map: the loop sees only what a next step starts from."""
+        try:
+            self.decode(adam.params)
+        except NumericalError:
+            state.bad_steps += 1
+            adam.take_back()
+            self.decode(adam.params)
 
     def _loop(self, params, objective, chosen, **more):
         return edit.optimise(
@@ -172,6 +193,15 @@ class Job:
             free=self.free,
             **more,
         )
+
+
+@contextlib.contextmanager
+def keeping(envmap: np.ndarray):
+    """Let numbers that fail after the loop carry the map that it found: Stopped for NumericalError."""
+    try:
+        yield
+    except NumericalError as error:
+        raise Stopped(str(error), envmap) from error
 
 
 @contextlib.contextmanager

@@ -33,7 +33,9 @@ class Adam:
     State and arithmetic have the precision of the parameters; bias corrections are double. A gradient
     below 1e-19 in single precision has a square that underflows: its v stays 0; its step is ``lr m / eps``,
     small and finite. A gradient that is not finite, or whose square is not (above 1.8e19), would leave v
-    infinite and the parameter stuck for good: such a step is refused as a whole.
+    infinite and the parameter stuck for good, and so would moments or a step that are not: such a step is
+    refused as a whole. What a step leads to is seen in the next one only: `take_back` returns to the
+    parameters before it.
 
     Parameters
     ----------
@@ -63,6 +65,7 @@ class Adam:
         # Copies in memory of Dr.Jit's own: a literal would be part of the first step's kernel, and an array
         # wrapped around numpy's memory is not aligned, which is part of a kernel too and costs a compilation.
         self.params = {name: dr.opaque(dr.detach(value)) for name, value in params.items()}
+        self._before = dict(self.params)
         self._m = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
         self._v = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
 
@@ -82,8 +85,9 @@ class Adam:
         lr : float, optional
             Learning rate of this step.
         check : bool
-            Refuse gradients that are not finite or too large to square. This waits for the step to end;
-            without it such a gradient spoils the parameters.
+            Refuse gradients that are not finite or too large to square, and steps that lead to parameters
+            or moments that are not finite. This waits for the step to end; without it such a gradient
+            spoils the parameters.
 
         Returns
         -------
@@ -119,27 +123,39 @@ class Adam:
             update = rate * m / (dr.sqrt(v) / root + self.eps)
             new[name] = _flat(p) - update, m, v
             if check:
+                # v takes up the gradient's square; an infinite one gives finite steps, of zero, for good.
+                good = dr.isfinite(v) & dr.isfinite(new[name][0])
                 index = dr.uint32_array_t(flat)
                 # A flag each: a second scatter to the same one would force an evaluation in between.
                 flag = dr.opaque(index, 0)
-                dr.scatter(flag, index(1), index(0), ~dr.isfinite(dr.square(g)))
+                dr.scatter(flag, index(1), index(0), ~good)
                 refused.append(flag)
         dr.eval(new, refused)
         if any(flag[0] for flag in refused):
             return False
+        self._before = dict(self.params)
         for name, (p, m, v) in new.items():
             shape, kind = self.params[name].shape, type(self.params[name])
             self.params[name], self._m[name], self._v[name] = (_shaped(kind, a, shape) for a in (p, m, v))
         self.t = t
         return True
 
+    def take_back(self):
+        """Return to the parameters that the last step was taken from; twice is as once.
+
+        The moments stay, as the gradients that they are means of were finite.
+        """
+        self.params = dict(self._before)
+
     def state_dict(self):
         """Return everything that a later `load_state_dict` needs, as a flat dict of numpy arrays."""
         state = {"step": np.int64(self.t)}
-        for name, value in self.params.items():
-            for key, item in (("params", value), ("m", self._m[name]), ("v", self._v[name])):
-                state[f"{key}/{name}"] = np.array(item)
+        for part, values in self._parts():
+            state |= {f"{part}/{name}": np.array(value) for name, value in values.items()}
         return state
+
+    def _parts(self):
+        return ("params", self.params), ("before", self._before), ("m", self._m), ("v", self._v)
 
     def load_state_dict(self, state):
         """Continue exactly where `state_dict` was taken.
@@ -159,8 +175,8 @@ class Adam:
                 raise InputError(f"optimiser state: {key} has shape {got}, expected {shape}.")
         for name, value in self.params.items():
             kind, shape = type(value), value.shape
-            for key, target in (("params", self.params), ("m", self._m), ("v", self._v)):
-                flat = dr.array_t(kind)(np.ascontiguousarray(found[f"{key}/{name}"]).ravel())
+            for part, target in self._parts():
+                flat = dr.array_t(kind)(np.ascontiguousarray(found[f"{part}/{name}"]).ravel())
                 target[name] = dr.opaque(_shaped(kind, flat, shape))
         self.t = int(found["step"])
 

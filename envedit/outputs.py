@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from . import checkpoint, config, files, image, layered, manifest, pipeline, preview, reach, report, scene
+from .errors import NumericalError
 
 
 def write(settings: config.Config, folder: Path, result: pipeline.Result, import_s: float) -> list[str]:
@@ -69,6 +70,7 @@ def write(settings: config.Config, folder: Path, result: pipeline.Result, import
     timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full", "report")), 3)
     lost = manifest.write_metrics(folder / "metrics.json", result.metrics)
     checkpoint.remove(folder)
+    files.tidy(folder)
     return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
 
 
@@ -97,4 +99,8 @@ def _maps(settings, folder, result):
             result.warnings.append(
                 f"{settings.input.envmap}: not enough memory to carry the edit to its size; "
                 "edited.exr has it at working resolution"
+            )
+        except NumericalError as error:
+            result.warnings.append(
+                f"edited_full.exr is not written: {error}; edited.exr has it at working resolution"
             )

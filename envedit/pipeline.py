@@ -30,7 +30,7 @@ from . import (
     target,
 )
 from . import reach as reaches
-from .job import Interrupted, Job, Stopped, Watch
+from .job import Interrupted, Job, Stopped, Watch, keeping
 from .layers import Layers
 from .pathtrace import PathTracer
 from .separate import Separation
@@ -312,13 +312,20 @@ def run(
         edited = job.decode(params)
         wanted = job.wanted if judged_by is wanted else judged_by
 
-    with clock("judge_s"):
+    with clock("judge_s"), keeping(edited):
         watch.stage("rendering the result")
         final, judged = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
     notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
-    measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips)
+    with keeping(edited):
+        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips)
+        predicted = traced.coarse_error(edited) if traced else None
+    if state.bad_steps:
+        warnings.append(
+            f"{state.bad_steps} of {state.step} iterations were not finite: they were taken back, and the "
+            "learning rate was lowered for a while"
+        )
     measured |= {
         "fit": _of_fit(getattr(representation, "fitted", None)),
         "timing": clock.table(state.history, time.perf_counter() - begun),
@@ -328,8 +335,7 @@ def run(
     }
     if traced:
         share = float(frozen[rows].mean())
-        predicted = {"predicted_error": traced.coarse_error(edited), "frozen": share}
-        measured["transport"] = {**traced.summary(), **predicted}
+        measured["transport"] = {**traced.summary(), "predicted_error": predicted, "frozen": share}
         if share:
             least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
             notes.append(f"{100 * share:.2g} % of the active texels keep their value: {least}")

@@ -24,6 +24,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -279,6 +280,8 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         for name in node.props.keys():  # noqa: SIM118 (no dict)
             node.props.mark_queried(name, False)
 
+    if dr.thread_count() < 2:  # on one, Mitsuba waits for ever for an EXR texture
+        dr.set_thread_count(2)
     built = stage.told(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
     if scene.environment() is None or scene.environment().id() != own:

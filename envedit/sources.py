@@ -97,7 +97,7 @@ def _unknown(key: Any, table: str, top: Fields, tables: dict[str, Fields]) -> st
     """Say that a key is unknown, with the nearest name: of its own table first, then of any other."""
     own = tables[table] if table else top
     text = key[:60] if isinstance(key, str) else ""
-    shown = key if re.fullmatch(r"[\w-]{1,60}", text) else show(key)
+    shown = key if text == key and re.fullmatch(r"[\w-]{1,60}", text) else show(key)
     kind = f"[{table}] has no key {shown}" if table else f"unknown table or key {shown}"
     if close := difflib.get_close_matches(text, own, 1):
         return f"{kind}; did you mean {close[0]}?"

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .checks import show
 from .errors import EnveditError, InputError
 
 MOST_HEADER = 2**24
@@ -70,7 +71,7 @@ def read(file, wanted: dict[str, tuple[int, ...]], what: str, source: str) -> di
     except EnveditError:
         raise
     except MemoryError:
-        raise
+        raise InputError(f"{name}: not enough memory to read the weights of {what}.") from None
     except Exception as e:  # what parsers make of damaged files has many names
         raise _damaged(name, getattr(e, "strerror", None) or e) from None
     for tensor, values in found.items():
@@ -119,6 +120,12 @@ def _read_npz(name, stream, wanted, what, source):
         _check_names(name, [member.removesuffix(".npy") for member in members], wanted, what, source)
         found = {}
         for tensor, shape in wanted.items():
+            # LZMA, which numpy does not write, takes the memory that its header asks for.
+            if archive.getinfo(tensor + ".npy").compress_type not in (
+                zipfile.ZIP_STORED,
+                zipfile.ZIP_DEFLATED,
+            ):
+                raise _damaged(name, f"'{tensor}' is compressed in a way that numpy does not use")
             with archive.open(tensor + ".npy") as member:
                 version = np.lib.format.read_magic(member)
                 if version not in ((1, 0), (2, 0)):
@@ -135,7 +142,8 @@ def _read_npz(name, stream, wanted, what, source):
 
 
 def _single(values, shape, order="C"):
-    with np.errstate(over="ignore"):  # what a double cannot give a single is infinite, and then refused
+    # What a double cannot give a single is infinite, and then refused; a signalling NaN is NaN, and refused.
+    with np.errstate(over="ignore", invalid="ignore"):
         return np.ascontiguousarray(values.astype(np.float32).reshape(shape, order=order))
 
 
@@ -174,7 +182,7 @@ def _check_names(name, present, wanted, what, source):
 def _check_shape(name, tensor, declared, shape, what):
     if tuple(declared) != tuple(shape):
         raise InputError(
-            f"{name}: '{tensor}' has the shape {tuple(declared)}, in {what} it is {tuple(shape)}; "
+            f"{name}: '{tensor}' has the shape {show(tuple(declared))}, in {what} it is {tuple(shape)}; "
             "the file belongs to another network."
         )
 

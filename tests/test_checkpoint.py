@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import zipfile
 
 import mitsuba as mi
 import numpy as np
@@ -172,3 +173,30 @@ def test_digest_does_not_know_the_output_folder():
     a, b = (config.loads("", folder) for folder in ("/one", "/two"))
     assert a.output.dir != b.output.dir
     assert checkpoint.digest(a, "scene", []) == checkpoint.digest(b, "scene", [])
+
+
+def test_an_entry_that_is_no_array_is_told(tmp_path):
+    checkpoint.save(tmp_path, "what", State(), {}, {}, np.zeros((2, 4, 3), np.float32))
+    path = tmp_path / checkpoint.NAME
+    with zipfile.ZipFile(path) as archive:
+        meta = archive.read("meta.npy")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.npy", meta)
+        archive.writestr("target.npy", b"")
+    with pytest.raises(InputError, match="cannot be read .an entry is no array"):
+        checkpoint.load(tmp_path, "what")
+
+
+@pytest.mark.parametrize(("offset", "value"), [(4, 255), (6, 1), (6, 32), (8, 99), (8, 8), (8, 14)])
+def test_every_kind_of_damage_to_the_archive_is_told(tmp_path, offset, value):
+    checkpoint.save(tmp_path, "what", State(), {}, {}, np.zeros((2, 4, 3), np.float32))
+    path = tmp_path / checkpoint.NAME
+    raw = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        assert archive.infolist()[0].header_offset == 0
+    raw[offset] = value
+    raw[raw.index(b"PK\x01\x02") + offset + 2] = value
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match="checkpoint.npz: the checkpoint cannot be read") as info:
+        checkpoint.load(tmp_path, "what")
+    assert len(str(info.value)) - len(str(path)) < 300

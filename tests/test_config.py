@@ -121,6 +121,30 @@ def test_a_refusal_says_where_what_and_what_to_do(text, parts):
         assert part in message
 
 
+def test_keys_of_many_parts_are_refused_before_they_are_parsed():
+    parts = "a." * 50_000  # tomllib would take minutes and gigabytes
+    forms = (f"{parts}a = 1", f"[{parts}a]", f"x = {{ {parts}a = 1 }}", f"a . 'b c' . \"d\".{parts}a = 1")
+    for text in forms:
+        assert "a.toml: not TOML: a key of more than 100 parts (at line 2)" in refused(f"\n{text}")
+    assert "did you mean" in refused("", f"input.envmp={{ {parts}a = 1 }}")  # not parsed: a string
+    points = "[0.1, 0.25], " * 2000 + "[1.0, 1.0]"
+    stroke = f"{{ type = 'light', points = [{points}], width = 0.1 }}"
+    assert (
+        len(cfg.loads(f"[target]\nkind = 'strokes'\nstrokes = [{stroke}]").target.strokes[0]["points"])
+        == 2001
+    )
+    assert cfg.loads(f"# {'a word. ' * 300}\n[input]\nenvmap = 'a.b.c/../..' # {'.' * 500}").input.envmap
+
+
+def test_a_refusal_is_short_whatever_the_file_holds():
+    long = "a" * 5000
+    assert "known: preset" in refused(f"{long} = 1")
+    assert "[fit] has no key 'aaa" in refused(f"[fit]\n{long} = 1")
+    twice = refused(f"[{long}]\n[{long}]")
+    assert "Cannot declare" in twice and twice.endswith("(at line 2, column 5002)")
+    assert "seed" in refused(f"seed = '{long}'")
+
+
 def test_an_error_names_the_override_it_came_from():
     assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: came -3, wanted")
     assert "did you mean epochs?" in refused("", "fit.epoch=3")

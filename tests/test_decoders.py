@@ -4,6 +4,7 @@ import os
 import struct
 import subprocess
 import sys
+import time
 
 import mitsuba as mi
 import numpy as np
@@ -227,3 +228,70 @@ def test_no_file_stays_open(tmp_path, rng):
     before = set(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else pytest.skip("no /proc")
     kept = [image.read(exr(tmp_path / "a.exr", **planes(rng)))]
     assert set(os.listdir("/proc/self/fd")) == before and kept
+
+
+@pytest.mark.parametrize("size", [(9, 2**22 + 8), (2**31 - 1, 8), (2**16, 2**16), (1025, 1024)])
+def test_tiles_larger_than_the_image_are_refused(tmp_path, rng, size):
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize, tiles.ySize = 8, 4
+    path = exr(tmp_path / "t.exr", {"type": OpenEXR.tiledimage, "tiles": tiles}, **planes(rng, size=(16, 32)))
+    assert image.read(path)[0].shape == (16, 32, 3)
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<2I", raw, raw.index(b"tiles\0tiledesc\0") + 19, *size)
+    path.write_bytes(raw)
+    words = "tiles of" if max(size) < 2**31 - 1 else "tiles of|damaged"  # the library refuses some itself
+    with pytest.raises(InputError, match=words):
+        image.read(path)
+
+
+def test_jpeg_2000_that_ends_early_is_damaged_and_quiet(tmp_path, capfd):
+    smooth = np.float32(np.add.outer(np.arange(16), np.arange(32)) / 64)
+    method = getattr(OpenEXR, "HTJ2K256_COMPRESSION", None)
+    if method is None:
+        pytest.skip("this OpenEXR has no JPEG 2000")
+    path = exr(tmp_path / "j.exr", {"compression": method}, **{c: smooth.copy() for c in "RGB"})
+    np.testing.assert_array_equal(image.read(path)[0][..., 0], smooth)
+    raw = path.read_bytes()
+    read = 0
+    for at in range(len(raw) - 400, len(raw), 7):  # within the stream: all that follows moves
+        path.write_bytes(raw[:at] + b"\xff\x7f\0" + raw[at:])
+        try:
+            found = image.read(path)[0]
+            read += not np.array_equal(found[..., 0], smooth)
+        except InputError as error:
+            assert "damaged" in str(error)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "line", [b"EXPOSURE=a" + b" " * 60_000 + b"b", b"EXPOSURE=" + b"e" * 60_000, b"a" * 60_000 + b" ="]
+)
+def test_a_long_line_in_a_radiance_header_takes_no_time(tmp_path, line):
+    (tmp_path / "l.hdr").write_bytes(b"#?RADIANCE\n" + line + b"\n\n-Y 4 +X 8\n" + bytes(range(128)))
+    start = time.process_time()
+    _, info = image.read(tmp_path / "l.hdr")
+    assert time.process_time() - start < 2  # with a pattern: 10 to 25 s of processor time
+    assert all(len(w) < 200 and w.isprintable() for w in info["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [("2.5EV", True), ("1-2", True), ("1 1 1", False), ("1.0", False)]
+)
+def test_odd_exposures_are_told_and_not_damage(tmp_path, value, told):
+    text = f"#?RADIANCE\nEXPOSURE = {value} \n\n-Y 4 +X 8\n"
+    (tmp_path / "e.hdr").write_bytes(text.encode() + bytes(range(128)))
+    _, info = image.read(tmp_path / "e.hdr")
+    assert info["metadata"] == {"EXPOSURE": value}
+    assert [f"EXPOSURE={value} in its header" in w for w in info["warnings"]] == [True] * told
+
+
+def test_a_jpeg_whose_table_breaks_off_is_damaged(tmp_path):
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((16, 32, 3), 188, np.uint8)).write(str(tmp_path / "a.jpg"))
+    raw = (tmp_path / "a.jpg").read_bytes()
+    at = raw.index(b"\xff\xdb")
+    for length in (3, 20, 66):  # the table's first byte only, some of it, all but one
+        (tmp_path / "b.jpg").write_bytes(raw[: at + 2] + struct.pack(">H", length) + raw[at + 4 :])
+        with pytest.raises(InputError, match="b.jpg: damaged"):
+            image.read_stored(tmp_path / "b.jpg")

@@ -7,6 +7,7 @@ import pytest
 
 from envedit import files
 from envedit.errors import InputError, NumericalError
+from envedit.files import quiet_libraries
 
 
 def test_interrupted_move_leaves_no_partial_file(tmp_path, monkeypatch):
@@ -82,3 +83,12 @@ def test_libraries_are_heard_and_kept_quiet(capfd):
     assert said == ["from Python\nfrom C, "] and capfd.readouterr() == ("", "")
     print("after", file=sys.stderr)
     assert capfd.readouterr() == ("", "after\n")
+
+
+def test_what_libraries_print_to_either_descriptor_is_kept_off(capfd):
+    with quiet_libraries() as said:
+        os.write(1, b"to one")
+        os.write(2, b"to two")
+        print("to python")
+    assert all(text in said[0] for text in ("to one", "to two", "to python"))
+    assert capfd.readouterr() == ("", "")

@@ -1,7 +1,10 @@
 """Loading and rendering scenes: against Mitsuba itself, closed forms, and files broken on purpose."""
 
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -9,6 +12,7 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
+from envedit import image as images
 from envedit import latlong, scene
 from envedit.errors import ConfigError, InputError, NumericalError
 
@@ -321,3 +325,19 @@ def test_the_committed_statue_is_the_scripts(statue, tmp_path):
     ours, theirs = (np.frombuffer(t[body : body + count], "<f4") for t in (made, committed))
     np.testing.assert_allclose(ours, theirs, atol=2e-6)
     assert made[body + count :] == committed[body + count :]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away here")
+def test_a_texture_is_read_on_one_core(tmp_path):
+    """Mitsuba's reader of EXR files waits for a second thread."""
+    images.write_exr(tmp_path / "wood.exr", np.full((4, 4, 3), 0.5, np.float32))
+    wood = '<texture type="bitmap" name="reflectance"><string name="filename" value="wood.exr"/></texture>'
+    ball = f'<shape type="sphere"><bsdf type="diffuse">{wood}</bsdf></shape>'
+    path = write_scene(tmp_path, SENSOR, ball, LIGHT)
+    code = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        f"from envedit import scene; print(scene.load({str(path)!r}).width)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.strip().isdecimal(), done.stderr

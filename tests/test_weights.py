@@ -100,6 +100,9 @@ def test_other_shapes_types_and_values_are_refused(tmp_path):
     refused(archive, "has the type int32")
     np.savez(archive, **(good | {"a.bias": np.array([1e300, 0])}))
     refused(archive, "'a.bias' holds inf at (0,)")
+    signalling = np.array([0x7FF0000000000001, 0], np.uint64).view(np.float64)
+    np.savez(archive, **(good | {"a.bias": signalling}))
+    refused(archive, "'a.bias' holds nan at (0,)")
 
 
 def test_pytorch_files_are_not_unpickled(tmp_path):
@@ -165,6 +168,15 @@ def test_hostile_safetensors_are_refused(tmp_path):
         refused(path, "damaged")
 
 
+def test_too_little_memory_is_told(tmp_path, monkeypatch):
+    def read(*_):
+        raise MemoryError
+
+    np.savez(tmp_path / "w.npz", **values())
+    monkeypatch.setattr(weights, "_read_npz", read)
+    refused(tmp_path / "w.npz", "not enough memory to read the weights of the test")
+
+
 def test_hostile_archives_are_refused(tmp_path):
     path, good = tmp_path / "w.npz", values()
 
@@ -184,6 +196,13 @@ def test_hostile_archives_are_refused(tmp_path):
     refused(archive(b"\x93NUMPY\x07\x00" + b"0" * 100), "damaged")
     refused(archive(b"no array"), "damaged")
     refused(archive(b""), "damaged")
+    long = archive(header(f"({'1, ' * 3000})"))
+    refused(long, "in the test it is (2,)")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:  # it asks for a dictionary of up to 4 GB
+        for tensor, array in good.items():
+            with file.open(f"{tensor}.npy", "w") as member:
+                np.save(member, array)
+    refused(path, "damaged", "compressed in a way that numpy does not use")
     path.write_bytes(b"PK\x03\x04" + b"\0" * 100)
     refused(path, "damaged")
     path.write_bytes(b"GIF89a" + b"\0" * 100)

@@ -159,7 +159,8 @@ def _strengths(scene, there, new):
     """
     background = scene.render(scene.background)
     bright = scene.known.mean(axis=2)
-    scale = 1 / (bright + FAINT * max(bright.mean(), 1e-30))
+    mean = bright.mean() or np.abs(scene.wanted).mean()  # of paint on black: its own
+    scale = 1 / (bright + FAINT * max(mean, 1e-30))
     scale *= 1 if scene.weight is None else scene.weight[..., 0]
     stay = [i for i in range(len(there)) if i not in new]
     found = {i: np.ones(3) for i in [*stay, *new]}

@@ -142,7 +142,11 @@ class Representation(Table):
         choice("layers", "siren", "pixels", "log-pixels"),
         "layers (lights and a smooth gain), siren (the paper's), pixels (radiance) or log-pixels",
     )
-    cycles: int = _key(12, integer(1, 256), "layers: finest detail of the gain, cycles around the horizon")
+    cycles: int | str = _key(
+        "auto",
+        or_auto(integer(1, 256)),
+        "layers: finest detail of the gain, cycles around the horizon; auto: 12, or what the picture tells",
+    )
     hidden: int = _key(128, integer(1, 4096), "siren: width of a layer")
     depth: int = _key(3, integer(0, 64), "siren: hidden sine layers after the first")
     omega: float = _key(30.0, number(0, positive=True), "siren: angular frequency of the sine layers")

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, fit
+from .gain import CYCLES
 from .health import BRIGHTEST, require_radiance
 from .layers import Layers
 
@@ -113,7 +114,8 @@ def make(settings: config.Config, folder: Path | None = None, progress=None, row
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map."""
     kind = settings.representation.kind
     if kind == "layers":
-        return Layers(rows, settings.representation.cycles)
+        cycles = settings.representation.cycles
+        return Layers(rows, CYCLES if cycles == "auto" else cycles)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":

@@ -14,6 +14,28 @@ import numpy as np
 MOST = 12.0
 """Largest log factor: e^12 is more than any sky needs, and leaves float32 room."""
 LEVELS = 3
+CYCLES = 12
+"""Cycles around the horizon that any picture may move; what is finer must be told by it."""
+
+
+DETAIL = 1.0
+"""A step of the nodes of finer grids, where they are well known."""
+
+
+def grid_size(cycles: float, share: float) -> tuple[int, int]:
+    """Return rows and columns of the grid that holds so many cycles; ``share`` as for :class:`GridGain`."""
+    columns = max(2, 2 * round(cycles))
+    return max(2, round(columns / 2 * share) + 1), columns
+
+
+def tents(size, shape) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of a grid's rows (height, rows) and columns (width, columns) at texel centres."""
+    (rows, columns), (height, width) = size, shape
+    y = (np.arange(height) + 0.5) / height * (rows - 1)
+    x = (np.arange(width) + 0.5) / width * columns
+    down = np.maximum(1 - np.abs(y[:, None] - np.arange(rows)), 0)
+    apart = np.abs(x[:, None] - np.arange(columns))
+    return down, np.maximum(1 - np.minimum(apart, columns - apart), 0)
 
 
 class GridGain:
@@ -28,18 +50,22 @@ class GridGain:
     """
 
     def __init__(self, cycles: int, share: float):
-        self.sizes = []
-        for level in range(LEVELS):
-            columns = max(2, 2 * round(cycles / 2 ** (LEVELS - 1 - level)))
-            self.sizes.append((max(2, round(columns / 2 * share) + 1), columns))
+        self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
+        self._units = [0.5**level for level in range(LEVELS)]
+
+    def refine(self, octaves) -> None:
+        """Add finer grids, :class:`.resolution.Octave`; a step of a node counts as far as it is known."""
+        for octave in octaves:
+            self.sizes.append(octave.size)
+            self._units.append(DETAIL * np.repeat(octave.known[..., None], 3, axis=2).astype(np.float32))
 
     def init(self) -> dict:
         """Return its parameters: all zero."""
         return {f"gain.{i}": np.zeros((*size, 3), np.float32) for i, size in enumerate(self.sizes)}
 
     def scales(self) -> dict:
-        """Return what a unit of each parameter is."""
-        return {f"gain.{i}": 0.5**i for i in range(LEVELS)}
+        """Return what a unit of each parameter is: a number, or an array (rows, columns, 3)."""
+        return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
 
     def hats(self, level: int, shape) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return (node, weight) of every texel of an image (rows, W) in one of the grids, four of them."""
@@ -59,16 +85,10 @@ class GridGain:
 
     def prepare(self, shape, rows=None) -> list:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
-        height, width = shape
         found = []
-        for level, (nodes, columns) in enumerate(self.sizes):
-            down, across = np.zeros((height, nodes)), np.zeros((columns, width))
-            texel = np.arange(height * width)
-            for node, weight in self.hats(level, shape):
-                # A tap's weight is that of its row times that of its column.
-                np.add.at(down, (texel // width, node // columns), weight / width)
-                np.add.at(across, (node % columns, texel % width), weight / height)
-            across = np.kron(across, np.eye(3))  # three channels, one apart from the other
+        for size in self.sizes:
+            down, across = tents(size, shape)
+            across = np.kron(across.T, np.eye(3))  # three channels, one apart from the other
             found.append([dr.opaque(mi.TensorXf(m.astype(np.float32))) for m in (down, across)])
         return found
 

@@ -15,9 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
-from .gain import GridGain
+from .gain import CYCLES, GridGain
 from .health import BRIGHTEST, require_radiance
 from .lights import DARK, SPARE, Lights
+from .resolution import Octave
 from .separate import Separation, separate
 
 VEIL = 0.2
@@ -40,7 +41,7 @@ class Layers:
     rows : (int, int)
         First row of the images in their map, and the rows of that map.
     cycles : int
-        Cycles of the gain around the horizon.
+        Cycles of the gain around the horizon, before :meth:`refine`.
 
     Attributes
     ----------
@@ -61,7 +62,7 @@ class Layers:
     lr = 0.03
     Gain = GridGain
 
-    def __init__(self, rows: tuple[int, int] | None = None, cycles: int = 12):
+    def __init__(self, rows: tuple[int, int] | None = None, cycles: int = CYCLES):
         self.rows, self._cycles = rows, cycles
         self.separation: Separation | None = None
         self.free: np.ndarray | None = None
@@ -92,6 +93,17 @@ class Layers:
         params = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
         params |= self.gain.init()
         return {name: dr.opaque(mi.TensorXf(value)) for name, value in params.items()}
+
+    def refine(self, params: dict, octaves: list[Octave]) -> dict:
+        """Give the gain finer grids and ``params``, of :meth:`encode`, what these start from: zero."""
+        self.gain.refine(octaves)
+        self.scales = {
+            name: unit if np.ndim(unit) == 0 else dr.opaque(mi.TensorXf(unit))
+            for name, unit in (SCALES | self.gain.scales()).items()
+        }
+        self._prepared = {}
+        new = {k: dr.opaque(mi.TensorXf(v)) for k, v in self.gain.init().items() if k not in params}
+        return params | new
 
     def keep(self, free: np.ndarray | None) -> None:
         """Say which texels (rows, W) may change other than by a light's moving; None: all."""

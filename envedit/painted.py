@@ -54,7 +54,8 @@ class Painted:
 
 def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
     """Render the picture to paint on, (h, w, 3): the scene under the map as it is, at [target] spp."""
-    return lit.sampled(envmap, settings.target.spp, settings.seed + SEED)[0]
+    picture, _, _ = lit.sampled(envmap, settings.target.spp, settings.seed + SEED)
+    return picture
 
 
 def check_export(file) -> None:

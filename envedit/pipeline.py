@@ -24,12 +24,15 @@ from . import (
     image,
     metrics,
     perceptual,
+    resolution,
     scene,
     search,
     sky,
     target,
+    trust,
 )
 from . import reach as reaches
+from .gain import CYCLES
 from .job import Interrupted, Job, Stopped, Watch, keeping
 from .layers import Layers
 from .pathtrace import PathTracer
@@ -40,6 +43,8 @@ __all__ = ["Found", "Interrupted", "Result", "Stopped", "Watch", "at_full_resolu
 
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
+AGAIN_SEED, AGAIN_SPP = 500_009, 32
+"""Seed and samples a pixel of the second recording of T, which tells its noise."""
 INITIAL_SPP = 144
 """Samples a pixel of the initial rendering, which is far from the target."""
 
@@ -299,8 +304,19 @@ def run(
             enough = replace(settings, renderer=replace(settings.renderer, spp="auto"))
             through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
+            second = _again(settings, lit, (height, width))
+            if settings.representation.cycles == "auto":
+                params, said = _refined(representation, params, through, second, judged_by)
+                notes.append(said)
             free = None  # a light may move across texels that are kept otherwise
             starts = _starts(representation, params, through, judged_by, original)
+            if wanted.coverage is None:
+                began = original.copy()
+                began[rows] = representation.decode(starts[0][0]).numpy()
+                wanted, said = _trusted(began, (through, second), wanted)
+                if said:
+                    judged_by, notes = wanted, [*notes, *said]
+                    starts = _starts(representation, params, through, wanted, original)
     job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch, dists)
     if isinstance(representation, Layers):
         with clock("start_s"):
@@ -314,7 +330,7 @@ def run(
 
     with clock("judge_s"), keeping(edited):
         watch.stage("rendering the result")
-        final, judged = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
+        final, judged, _ = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
     notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
@@ -354,6 +370,45 @@ def run(
         within,
         Found(representation, params, first, free),
     )
+
+
+def _again(settings, lit, shape):
+    """Record T once more, independently, with fewer samples."""
+    seed = (settings.seed + AGAIN_SEED) % 2**32
+    few = replace(settings.renderer, spp=AGAIN_SPP, refresh=0)
+    again = trace(replace(settings, seed=seed, renderer=few), lit, shape)
+    again.paths = (again.paths[0],) * len(again.paths)
+    return again
+
+
+def _trusted(envmap, recordings, wanted):
+    """Weigh a rendered target's pixels by what T and the target know of them; returns it and notes."""
+    pictures = []
+    for recording in recordings:
+        recording.resolve(envmap)
+        pictures.append(recording.apply(mi.TensorXf(envmap)).numpy())
+    known = trust.weights(*pictures, wanted.picture, wanted.noise)
+    if known is None:
+        return wanted, []
+    weight = known if wanted.weight is None else known * wanted.weight
+    weight = (weight / max(float(weight.mean()), 1e-30)).astype(np.float32)
+    share = 100 * float((known < 0.5).mean())
+    note = f"{share:.2g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
+    return replace(wanted, weight=weight), [note]
+
+
+def _refined(layers, params, transport, second, wanted):
+    """Make the gain of layers as fine as the picture tells; returns parameters and a note.
+
+    Not for paint, which need not be what any light does: detail would follow it.
+    """
+    told = []
+    if wanted.coverage is None:
+        asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
+        told = resolution.octaves(transport, second, *asked, 2 * CYCLES)
+    shares = ", ".join(f"{100 * octave.share:.2g} % of {octave.cycles} cycles" for octave in told)
+    note = f"detail that the picture tells: {shares or 'none'} beyond the {CYCLES} cycles that any may move"
+    return layers.refine(params, told), note
 
 
 def _starts(layers, params, transport, wanted, original):

@@ -168,7 +168,7 @@ class Pursuit:
         overview, omega = given.overview, given.omega
         self.overview = overview
         bright = overview.to_blocks(given.known).mean(axis=1)
-        mean = bright.mean()
+        mean = bright.mean() or np.abs(overview.to_blocks(picture)).mean()  # of paint on black: its own
         count = 1.0 if given.weight is None else overview.to_blocks(given.weight)[:, 0]
         self.weight = count / (bright + FAINT * mean) if mean > 0 else np.zeros(len(bright))
         wanted = overview.to_blocks(picture).T
@@ -275,6 +275,7 @@ def products(d: np.ndarray, order: int) -> np.ndarray:
 
 def not_negative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Solve min |a x - b| with x >= 0 (Lawson and Hanson 1974, by leaving out what turns negative)."""
+    a, b = np.float64(a), np.float64(b)
     keep = np.ones(a.shape[1], bool)
     for _ in range(a.shape[1]):
         x = np.zeros(a.shape[1])

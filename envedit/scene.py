@@ -149,7 +149,7 @@ class Scene:
             total += count / spp * self._pass(count, seed, i, max_depth)
         return self._checked(total)
 
-    def sampled(self, image, spp: int | str = "auto", seed: int = 0) -> tuple[np.ndarray, int]:
+    def sampled(self, image, spp: int | str = "auto", seed: int = 0):
         """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
 
         Passes of 64 samples a pixel are added until the error of their mean, told by how much their display
@@ -162,6 +162,8 @@ class Scene:
             Linear radiance.
         spp : int
             Samples a pixel that were taken.
+        noise : array (height, width) float64 or None
+            Standard error of display values, RMS over channels; None where samples were given.
 
         Raises
         ------
@@ -169,7 +171,7 @@ class Scene:
             As :meth:`render`.
         """
         if spp != "auto":
-            return self.render(image, spp, seed), spp
+            return self.render(image, spp, seed), spp, None
         seed = _whole("seed", seed, 0)
         self.set_envmap(image)
         count = min(self._pass_samples(), _QUIET_PASS)
@@ -179,11 +181,11 @@ class Scene:
             display = np.clip(picture, 0, 1) ** (1 / 2.2)
             total, shown, power = total + picture, shown + display, power + display**2
             n = i + 1
-            if n > 1 and n * count >= _QUIET_LEAST:
-                variance = np.maximum(power / n - (shown / n) ** 2, 0).mean() / (n - 1)
-                if variance < 10 ** (-QUIET_DECIBELS / 10):
+            if n * count >= _QUIET_LEAST:
+                variance = np.maximum(power / n - (shown / n) ** 2, 0).mean(axis=2) / max(n - 1, 1)
+                if variance.mean() < 10 ** (-QUIET_DECIBELS / 10):
                     break
-        return self._checked(total / n), n * count
+        return self._checked(total / n), n * count, np.sqrt(variance)
 
     def _pass_samples(self):
         """Most samples a pixel of one pass, a power of four.

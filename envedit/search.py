@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
+from .gain import LEVELS
 from .layers import VEIL, Layers
 from .lights import DARK, SPARE, rotation_vector
 from .pursuit import FAINT, GAIN_ORDER, Given, Place, place, products
@@ -103,7 +104,7 @@ def start(
         stack = np.stack([overview.to_blocks(p).T for _, p in pictures], axis=2)
     found = dict(params)
     total = np.ones((len(pictures), 3))
-    for level in range(len(layers.gain.sizes)):
+    for level in range(LEVELS):
         hats = scene.hats(level) * factor.T[..., None]
         gain, strength = spread(overview, scene.wanted, weight, picture, hats, stack)
         gain = np.clip(gain, LEAST, MOST)
@@ -310,7 +311,8 @@ def refine(transport, wanted, known, weight, gains, direction, flux, first, last
     height, width = transport.grid.height, transport.grid.width
     omega = latlong.lookup_solid_angles(height, width)
     bright = known.mean(axis=1)
-    scale = 1 / (bright + FAINT * bright.mean())
+    mean = bright.mean() or np.abs(wanted).mean()  # of paint on black: its own
+    scale = 1 / (bright + FAINT * max(mean, 1e-30))
     if weight is not None:
         scale = scale * weight[:, 0]
     spans, rest = [], []

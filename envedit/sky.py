@@ -85,7 +85,7 @@ def sunsky(
     row, column = latlong.texel_position(disc, height, width)
     row, column = np.rint(row).astype(int), np.rint(column).astype(int) % width
     np.add.at(image, (row, column), flux / latlong.lookup_solid_angles(height, width)[row, None])
-    return image.astype(np.float32)
+    return np.maximum(image, 0).astype(np.float32)  # the plugin's fit is negative beside a low sun
 
 
 def _on_sphere(theta, phi):

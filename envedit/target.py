@@ -43,6 +43,8 @@ class Target:
     asked : tuple of ndarray
         What the target was made from beside the configuration, for a checkpoint to know it by. Not the
         rendering that was painted on: rendered anew, it may differ in its last bits.
+    noise : ndarray (h, w) or None
+        Standard error of the picture's display values; None where it is not known.
     """
 
     picture: np.ndarray
@@ -53,6 +55,7 @@ class Target:
     initial: np.ndarray | None = None
     coverage: np.ndarray | None = None
     asked: tuple[np.ndarray, ...] = ()
+    noise: np.ndarray | None = None
 
 
 def make(
@@ -145,7 +148,8 @@ def _rendered(settings, scene, envmap):
         true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
         source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
-    picture, spp = scene.sampled(true, chosen.spp, settings.seed + SEED)
+    picture, spp, noise = scene.sampled(true, chosen.spp, settings.seed + SEED)
     weight = painted.read_mask(chosen.mask, picture.shape[:2]) if chosen.mask else None
     asked = (true,) if weight is None else (true, weight)
-    return Target(picture, weight, true, f"{source}, {spp} samples a pixel", warnings, asked=asked)
+    source += f", {spp} samples a pixel"
+    return Target(picture, weight, true, source, warnings, asked=asked, noise=noise)

@@ -27,7 +27,7 @@ def test_an_empty_file_gives_the_defaults():
     assert config == dataclasses.replace(cfg.Config(), output=config.output)
     assert config.input == cfg.Input(envmap="sunsky", width=256, rows="upper")
     assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
-    assert config.representation.kind == "layers" and config.representation.cycles == 12
+    assert config.representation.kind == "layers" and config.representation.cycles == "auto"
     assert config.loss.ssim == 0.1 and config.optimizer.iterations == 100
     assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
 
@@ -199,7 +199,7 @@ tables = given_keys(
         file=words.filter(bool),
         parameters=st.dictionaries(words, words | numbers | st.booleans() | st.integers(-9, 9), max_size=3),
     ),
-    representation=given_keys(kind=st.sampled_from(KINDS), cycles=st.integers(1, 256)),
+    representation=given_keys(kind=st.sampled_from(KINDS), cycles=st.integers(1, 256) | st.just("auto")),
     target=given_keys(file=words, mask=words, spp=st.integers(1, 4096))
     | given_keys(rotate_degrees=st.floats(-360, 360, allow_subnormal=False, width=32)),
     loss=given_keys(ssim=rates | st.tuples(rates, rates), luminance=weights, tv=weights),

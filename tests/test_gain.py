@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import gain
+from envedit.resolution import Octave
 
 SHAPES = [(1, 2), (3, 7), (5, 8), (17, 33), (32, 64)]
 GAINS = [(8, 1.0), (8, 0.5), (6, 0.3), (1, 1.0), (5, 0.1)]
@@ -181,3 +182,20 @@ def test_gradient_is_the_adjoint_of_the_hats(cycles, share, shape, rng):
         found = np.array(dr.grad(params[f"gain.{level}"])).reshape(-1, 3)
         np.testing.assert_allclose(found, expected, atol=1e-4)
         assert np.abs(expected).max() > 0.01
+
+
+def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):
+    coarse, fine = gain.GridGain(6, 0.5), gain.GridGain(6, 0.5)
+    size = gain.grid_size(12, 0.5)
+    known = np.linspace(0, 1, size[0] * size[1]).reshape(size)
+    fine.refine([Octave(size, known)])
+    assert fine.sizes == [*coarse.sizes, size] and fine.init().keys() - coarse.init().keys() == {"gain.3"}
+    assert not fine.init()["gain.3"].any()
+    unit = fine.scales()["gain.3"]
+    assert unit.shape == (*size, 3) and np.allclose(unit, gain.DETAIL * known[..., None])
+    params = {k: rng.normal(size=v.shape).astype(np.float32) for k, v in coarse.init().items()}
+    both = [
+        g.evaluate({k: mi.TensorXf(v) for k, v in (g.init() | params).items()}, g.prepare((16, 64)))
+        for g in (coarse, fine)
+    ]
+    assert np.array_equal(*(np.array(field) for field in both))

@@ -630,7 +630,7 @@ def test_the_run_renders_the_exported_picture_again():
 
     def sampled(envmap, spp, seed):
         seen.append((spp, seed))
-        return envmap, spp
+        return envmap, spp, None
 
     lit = types.SimpleNamespace(sampled=sampled)
     assert painted.initial(lit, "map", settings(spp=32)) == "map"

@@ -568,3 +568,13 @@ def test_outside_the_main_thread_signals_are_left_alone():
     thread.start()
     thread.join()
     assert failures == []
+
+
+def test_paint_on_a_black_map_is_followed(tmp_path):
+    painted = {"kind": "strokes", "strokes": STROKES}
+    black = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    settings = settings_of(
+        tmp_path, black, target=painted, input={"rows": "all"}, optimizer={"iterations": 30}
+    )
+    result = pipeline.run(settings)
+    assert result.envmap.max() > 0 and result.metrics["painted"]["towards"] > 0.5

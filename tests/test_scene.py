@@ -99,15 +99,17 @@ def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
     even = np.ones((8, 16, 3), np.float32)
     sunny = 0.05 * even
     sunny[2, 3] = 300
-    quiet, few = loaded.sampled(even, "auto", 4)
-    _, many = loaded.sampled(sunny, "auto", 4)
+    quiet, few, noise = loaded.sampled(even, "auto", 4)
+    _, many, louder = loaded.sampled(sunny, "auto", 4)
     assert few == 256 <= many <= 768
     truth = loaded.render(even, spp=4096, seed=99)
     error = np.mean((np.clip(quiet, 0, 1) ** (1 / 2.2) - np.clip(truth, 0, 1) ** (1 / 2.2)) ** 2)
     assert error < 2 * 10 ** (-scene.QUIET_DECIBELS / 10)
+    assert noise.shape == quiet.shape[:2] and error / 4 < np.mean(noise**2) < 4 * error
+    assert louder.mean() > noise.mean()
     assert np.array_equal(loaded.sampled(even, "auto", 4)[0], quiet)
-    picture, taken = loaded.sampled(even, 16, 4)
-    assert taken == 16 and np.array_equal(picture, loaded.render(even, spp=16, seed=4))
+    picture, taken, unknown = loaded.sampled(even, 16, 4)
+    assert taken == 16 and unknown is None and np.array_equal(picture, loaded.render(even, spp=16, seed=4))
 
 
 def test_noise_that_does_not_fall_ends_at_the_most_samples(tmp_path, monkeypatch):

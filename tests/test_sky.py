@@ -115,3 +115,9 @@ def test_sunsky_at_its_limits(elevation, turbidity, capfd):
     found = sky.sunsky(6, 0, elevation, turbidity)
     assert np.isfinite(found).all() and (found > 0).all()
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("elevation", "turbidity"), [(1, 3), (2, 1), (0, 5)])
+def test_sky_beside_a_low_sun_is_not_negative(elevation, turbidity):
+    """The plugin's own fit is, by up to 0.17."""
+    assert (sky.sunsky(32, 30, elevation, turbidity) >= 0).all()

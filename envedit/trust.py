@@ -1,0 +1,64 @@
+"""How far each pixel is to be trusted: less where the target or T is mostly noise.
+
+A caustic of a small sun, or its image in a facet of a mirror, falls on few of a pixel's samples. Which, is
+chance: in the target other pixels are hit than in T, and a loss that compares them pulls the map to nothing.
+Both noises are measured, that of T by a second recording, and such pixels count less.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from .edit import to_display
+
+TRUSTED = 0.007
+"""Standard error of display values, beyond what is usual in the picture, at which a pixel counts half."""
+FEWER = 1 / 8
+"""Samples of the second recording as a share of the first's, about: so much more of the noise is its own."""
+AROUND = 2
+"""Pixels to each side over which noise is told: paths that have hit nothing yet do not know theirs."""
+USUAL = 4.0
+"""Multiples of the picture's median variance that are nothing special."""
+
+
+SHOWS_LIGHT = 3.0
+"""Multiples of the target's median brightness from which on a noisy picture's pixel shows a light itself."""
+
+
+def weights(first, second, picture, noise=None) -> np.ndarray | None:
+    """Weigh pixels by what is known of them.
+
+    Parameters
+    ----------
+    first, second : ndarray (h, w, 3)
+        The same picture through T and through a second recording of :data:`FEWER` samples, linear radiance.
+    picture : ndarray (h, w, 3)
+        The target, linear radiance.
+    noise : ndarray (h, w), optional
+        Standard error of the target's display values.
+
+    Returns
+    -------
+    ndarray (h, w, 1) or None
+        s^2 / (s^2 + v), s = :data:`TRUSTED`, v the variance around a pixel beyond :data:`USUAL` times its
+        median, and 0 beside pixels over :data:`SHOWS_LIGHT`; None where no pixel is below 1/2.
+    """
+    shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
+    variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * FEWER / (1 + FEWER)
+    if noise is not None:
+        variance += np.square(noise)
+    around = _windows(variance, AROUND).mean(axis=(2, 3))
+    beyond = np.maximum(around - USUAL * np.median(around), 0)
+    trust = TRUSTED**2 / (TRUSTED**2 + beyond)
+    if trust.min() >= 0.5:
+        return None
+    brightest = _windows(picture.max(axis=2), 1).max(axis=(2, 3))
+    trust = np.where(brightest < SHOWS_LIGHT * np.median(picture), trust, 0)
+    return trust[..., None].astype(np.float32) if trust.any() else None
+
+
+def _windows(values, reach):
+    """Windows around each pixel: (h, w, 2 reach + 1, 2 reach + 1)."""
+    size = 2 * reach + 1
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="edge"), (size, size))

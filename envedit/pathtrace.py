@@ -6,6 +6,8 @@ the paper used, not for speed.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,7 +26,8 @@ class PathTracer:
     scene : Scene
         The scene; its environment map is replaced at every step.
     spp : int
-        Samples a pixel, for the picture and again for its gradient.
+        Samples a pixel, for the picture and again for its gradient; as many more as the scene's sampler
+        needs to fill its grid.
     max_depth : int
         Longest path in segments.
     seed : int
@@ -34,7 +37,7 @@ class PathTracer:
 
     def __init__(self, scene: Scene, spp: int | str = "auto", max_depth: int | str = "auto", seed: int = 0):
         self.scene = scene
-        self.spp = AUTO_SPP if spp == "auto" else spp
+        self.spp = _whole(scene, AUTO_SPP if spp == "auto" else spp)
         self.depth = AUTO_DEPTH if max_depth == "auto" else max_depth
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
@@ -66,3 +69,11 @@ class PathTracer:
 
     def restore(self, state: dict) -> None:
         """Continue from :meth:`state`."""
+
+
+def _whole(scene, spp):
+    """Round up to the counts of Mitsuba's multijitter, which else warns at every step."""
+    if scene.mi.sensors()[0].sampler().class_name() != "MultijitterSampler":
+        return spp
+    rows = math.isqrt(spp)
+    return rows * -(-spp // rows)

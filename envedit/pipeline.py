@@ -466,7 +466,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips):
 
 
 def _of_fit(fitted):
-    names = "log_psnr", "peak_ratio", "epochs", "cached"
+    names = "log_psnr", "peak_ratio", "epochs", "cached", "seconds"
     return None if fitted is None else {name: getattr(fitted, name) for name in names}
 
 

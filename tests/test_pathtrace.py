@@ -99,3 +99,13 @@ def test_map_may_be_held_on_the_device_without_gradient(matte, sky):
 def test_choices_are_named(matte):
     text = " ".join(PathTracer(matte, spp="auto", max_depth="auto").choices)
     assert "samples a pixel" in text and "path depth" in text
+
+
+@pytest.mark.parametrize("spp, taken", [(1, 1), (2, 2), (3, 3), (7, 8), (16, 16), (128, 132), (1000, 1023)])
+def test_samples_fill_the_sampler_s_grid_and_are_told(spp, taken, matte, capfd):
+    tracer = PathTracer(matte, spp=spp, max_depth=1)
+    assert tracer.spp == taken and f"{taken} samples" in tracer.choices[0]
+    if spp <= 128:
+        dr.eval(tracer.render(mi.TensorXf(np.ones((HEIGHT, WIDTH, 3), np.float32)), 0))
+        dr.sync_thread()
+    assert capfd.readouterr() == ("", ""), "Mitsuba takes them as they are"

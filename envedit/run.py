@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -56,6 +57,11 @@ def _parser():
         metavar="FILE",
         help="only write the rendering to paint on: float .exr, or 16-bit .png under [target] tonemap",
     )
+    instead.add_argument(
+        "--budget",
+        metavar="SECONDS",
+        help="choose widths, steps and samples so that the run ends in time; 30, 30s or 2m",
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
 
@@ -67,6 +73,7 @@ def _run(arguments, start):
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
     settings = config.load(arguments.config, arguments.preset, overrides)
+    allowed = None if arguments.budget is None else _seconds(arguments.budget)
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)
     folder = Path(settings.output.dir)
@@ -87,13 +94,21 @@ def _run(arguments, start):
     import_s = time.perf_counter() - start
     from .progress import Progress
 
+    said, base = [], Path(arguments.config).absolute().parent
+    if allowed is not None:
+        from . import budget
+
+        settings, note = budget.apply(settings, allowed, import_s, base)
+        said.append(note)
+        _say(arguments.quiet, note)
+
     with Progress(quiet=arguments.quiet) as progress:
         try:
             result = pipeline.run(
                 settings,
                 folder=folder,
                 resume=arguments.resume,
-                base=Path(arguments.config).absolute().parent,
+                base=base,
                 watch=pipeline.Watch(progress.stage, progress.update),
             )
         except pipeline.Interrupted as stop:
@@ -110,8 +125,20 @@ def _run(arguments, start):
         except pipeline.Stopped as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
             raise
+        result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
     return _write(settings, folder, result, import_s, arguments.quiet)
+
+
+def _seconds(text):
+    """Read --budget."""
+    from .errors import ConfigError
+
+    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
+    value = float(found[1]) * (60 if found[2].startswith("m") else 1) if found else 0
+    if not 0 < value < 1e6:
+        raise ConfigError(f"--budget: came {text!r}, wanted seconds or minutes, such as 30s or 2m")
+    return value
 
 
 def _export_initial(settings, arguments):

@@ -1,0 +1,248 @@
+"""A budget instead of knobs: settings for this machine, scene and map that end within so many seconds.
+
+Levels from coarse to fine, each with what it cost and lost on a reference machine (``experiments/tradeoff``,
+``levels``). Two renderings and one product of matrices tell how fast this machine is in this scene, and how
+noisy the scene is under this map; the finest level that is expected to end in time is taken.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import config, image, pipeline, scene
+from .errors import ConfigError
+from .scene import QUIET_DECIBELS
+
+LATE = 1.3
+"""A run may take so many times its budget; what is expected to take longer is refused."""
+_MAP, _FILM, _SPP = 64, 64, 64  # texels and pixels across, samples of the renderings that calibrate
+_SIDE, _PRODUCTS = 512, 8  # of the product of matrices
+FEWEST, MOST = 256, 768
+"""Samples a pixel between which a rendering of "auto" ends."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Settings, and what they cost on the reference machine: two cores of an AVX-512 Xeon.
+
+    Attributes
+    ----------
+    name : str
+        What the user is told.
+    map, film : int
+        Widths: texels, pixels.
+    iterations : int
+        Steps of the edit.
+    spp : int or "auto"
+        Samples a pixel of target and result.
+    traced_s : float
+        Seconds of tracing T and of the search, of a picture as wide as high.
+    numbers_s : float
+        Seconds of separation, edit and report.
+    render_db, map_db : float
+        What it loses of the standard preset's PSNR, of rendering and map: mean over three maps and two
+        scenes, all judged alike.
+    """
+
+    name: str
+    map: int
+    film: int
+    iterations: int
+    spp: int | str
+    traced_s: float
+    numbers_s: float
+    render_db: float
+    map_db: float
+
+
+LEVELS = (
+    Level("least", 64, 48, 25, 64, 1.0, 1.0, 0.0, 0.0),
+    Level("coarse", 96, 64, 40, 64, 1.0, 1.0, 0.0, 0.0),
+    Level("draft", 128, 96, 60, 256, 1.0, 1.0, 0.0, 0.0),
+    Level("standard", 256, 128, 100, "auto", 1.0, 1.0, 0.0, 0.0),
+    Level("fine", 256, 192, 200, "auto", 1.0, 1.0, 0.0, 0.0),
+    Level("finest", 256, 256, 300, 1024, 1.0, 1.0, 0.0, 0.0),
+)
+REFERENCE_RENDER = 1.0e-7
+"""Seconds a pixel and sample of Mitsuba's path tracer on the reference machine: sphere, kloofendal_48d."""
+REFERENCE_PRODUCT = 0.01
+"""Seconds of the calibrating products on the reference machine."""
+FULL = 4.4e-7
+"""Seconds a texel of the file, on the reference machine, to read, carry and write at its resolution."""
+COMPILED = 8.0
+"""Seconds of compiling all kernels over those of the calibrating rendering's, where none is on disk."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How fast this machine is.
+
+    Attributes
+    ----------
+    render : float
+        Seconds a pixel and sample.
+    machine : float
+        Time of a product of matrices over the reference machine's.
+    compile_s : float
+        Seconds that compiling will take.
+    quiet_spp : int
+        Samples that a rendering of "auto" will take.
+    """
+
+    render: float
+    machine: float
+    compile_s: float
+    quiet_spp: int
+
+
+def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Path | None = None):
+    """Choose the level for a budget.
+
+    Parameters
+    ----------
+    settings : config.Config
+        What is to be done; [input] width, [scene] width and height, [optimizer] iterations, and samples of
+        target and result are replaced.
+    budget : float
+        Seconds from the start of the program to its end.
+    elapsed : float
+        Seconds that have passed.
+    base : Path, optional
+        As for :func:`.scene.load`.
+
+    Returns
+    -------
+    settings : config.Config
+        With the level's.
+    note : str
+        What was chosen, what it is expected to take and to lose.
+
+    Raises
+    ------
+    ConfigError
+        The representation is not layers or the renderer not the stored transport, or even the coarsest level
+        would take more than :data:`LATE` times the budget.
+    EnveditError
+        Scene or map cannot be read.
+    """
+    if settings.representation.kind != "layers" or settings.renderer.kind != "transport":
+        raise ConfigError(
+            '--budget: wanted [representation] kind = "layers" and [renderer] kind = "transport", came '
+            f'"{settings.representation.kind}" and "{settings.renderer.kind}": only their times are known'
+        )
+    begun = time.perf_counter()
+    found, aspect, texels = calibrate(settings, base)
+    elapsed += time.perf_counter() - begun
+    level, expected = choose(found, budget, elapsed, aspect, texels if settings.output.full else 0)
+    chosen = replace(
+        settings,
+        input=replace(settings.input, width=level.map),
+        scene=replace(settings.scene, width=level.film, height=0),
+        optimizer=replace(settings.optimizer, iterations=level.iterations),
+        target=replace(settings.target, spp=level.spp),
+        output=replace(settings.output, spp=level.spp),
+    )
+    return chosen, (
+        f"budget of {budget:g} s: level '{level.name}', map {level.map} and picture {level.film} across, "
+        f"{level.iterations} steps, {level.spp} samples a pixel; {expected:.0f} s expected; {loss(level)}"
+    )
+
+
+def loss(level: Level) -> str:
+    """Say what a level is expected to lose."""
+    if level.name == "standard":
+        return "the standard preset"
+    parts = [
+        f"{abs(db):.1f} dB {'less' if db > 0 else 'more'} of {what}"
+        for db, what in ((level.render_db, "rendering"), (level.map_db, "map"))
+    ]
+    return " and ".join(parts) + " than the standard preset, on average"
+
+
+def expect(level: Level, found: Calibration, aspect: float = 1.0, texels: int = 0) -> float:
+    """Expect the seconds of a run after the calibration; ``aspect``: height over width of the picture."""
+    pixels = level.film**2 * aspect
+    each = found.quiet_spp if level.spp == "auto" else level.spp
+    samples = 2 * each + min(pipeline.INITIAL_SPP, each)
+    traced = level.traced_s * aspect * found.render / REFERENCE_RENDER
+    numbers = (level.numbers_s + FULL * texels) * found.machine
+    return found.render * pixels * samples + traced + numbers + found.compile_s
+
+
+def choose(found: Calibration, budget: float, elapsed: float, aspect: float = 1.0, texels: int = 0):
+    """Return the finest level that is expected to end in time, and the seconds it is expected to take.
+
+    Raises
+    ------
+    ConfigError
+        Even the coarsest takes too long.
+    """
+    times = [elapsed + expect(level, found, aspect, texels) for level in LEVELS]
+    for level, expected in reversed(list(zip(LEVELS, times, strict=True))):
+        if expected <= budget:
+            return level, expected
+    if times[0] <= LATE * budget:
+        return LEVELS[0], times[0]
+    cure = ", or set output.full=false" if texels else ""
+    raise ConfigError(
+        f"--budget {budget:g}s: cannot be kept, the coarsest settings take about {times[0]:.0f} s here: "
+        f"give at least {times[0]:.0f}s{cure}"
+    )
+
+
+def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibration, float, int]:
+    """Measure this machine in this scene under this map.
+
+    Returns
+    -------
+    Calibration
+        What was measured.
+    aspect : float
+        Height of the picture over its width.
+    texels : int
+        Of the map's file, 0 for the analytic sky.
+    """
+    texels = 0
+    if settings.input.envmap == "sunsky":
+        envmap, _ = pipeline.load_map(replace(settings.input, width=_MAP))
+    else:
+        envmap, info = image.load_envmap(settings.input.envmap, _MAP, settings.input.repair)
+        texels = info["size"][0] * info["size"][1]
+    lit = scene.load(settings.scene.file, _FILM, 0, dict(settings.scene.parameters), base)
+    times, pictures = [], []
+    for seed in range(3):
+        begun = time.perf_counter()
+        pictures.append(np.clip(lit.render(envmap, _SPP, seed), 0, 1) ** (1 / 2.2))
+        times.append(time.perf_counter() - begun)
+    warm = min(times[1:])
+    variance = float(np.var(pictures, axis=0, ddof=1).mean())
+    quiet = int(np.clip(_SPP * variance * 10 ** (QUIET_DECIBELS / 10), FEWEST, MOST))
+    pixels = lit.width * lit.height
+    found = Calibration(
+        warm / (pixels * _SPP),
+        _product_seconds() / REFERENCE_PRODUCT,
+        COMPILED * max(times[0] - 2 * warm, 0.0),
+        quiet,
+    )
+    return found, lit.height / lit.width, texels
+
+
+def _product_seconds():
+    """Seconds of a few products of matrices, the fastest of three times, without compiling."""
+    a = dr.opaque(mi.TensorXf(np.full((_SIDE, _SIDE), 1e-3, np.float32)))
+    taken = []
+    for _ in range(4):
+        dr.sync_thread()
+        begun, x = time.perf_counter(), a
+        for _ in range(_PRODUCTS):
+            x = dr.matmul(x, a)
+            dr.eval(x)
+        dr.sync_thread()
+        taken.append(time.perf_counter() - begun)
+    return min(taken[1:])

@@ -304,13 +304,13 @@ def run(
             enough = replace(settings, renderer=replace(settings.renderer, spp="auto"))
             through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
-            second = _again(settings, lit, (height, width))
-            if settings.representation.cycles == "auto":
-                params, said = _refined(representation, params, through, second, judged_by)
-                notes.append(said)
             free = None  # a light may move across texels that are kept otherwise
+            second = None if wanted.coverage is not None else _again(settings, lit, (height, width))
+            if second and settings.representation.cycles == "auto":
+                params, said = _refined(representation, params, (through, second), wanted)
+                notes.append(said)
             starts = _starts(representation, params, through, judged_by, original)
-            if wanted.coverage is None:
+            if second:
                 began = original.copy()
                 began[rows] = representation.decode(starts[0][0]).numpy()
                 wanted, said = _trusted(began, (through, second), wanted)
@@ -373,12 +373,24 @@ def run(
 
 
 def _again(settings, lit, shape):
-    """Record T once more, independently, with fewer samples."""
+    """Record T once more, independently, with fewer samples: what both agree on is no noise.
+
+    Not for paint, which need not be what any light does: detail would follow it.
+    """
     seed = (settings.seed + AGAIN_SEED) % 2**32
     few = replace(settings.renderer, spp=AGAIN_SPP, refresh=0)
     again = trace(replace(settings, seed=seed, renderer=few), lit, shape)
     again.paths = (again.paths[0],) * len(again.paths)
     return again
+
+
+def _refined(layers, params, recordings, wanted):
+    """Make the gain of layers as fine as the picture tells; returns parameters and a note."""
+    asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
+    told = resolution.octaves(*recordings, *asked, 2 * CYCLES)
+    shares = ", ".join(f"{100 * octave.share:.2g} % of {octave.cycles} cycles" for octave in told)
+    note = f"detail that the picture tells: {shares or 'none'} beyond the {CYCLES} cycles that any may move"
+    return layers.refine(params, told), note
 
 
 def _trusted(envmap, recordings, wanted):
@@ -395,20 +407,6 @@ def _trusted(envmap, recordings, wanted):
     share = 100 * float((known < 0.5).mean())
     note = f"{share:.2g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
     return replace(wanted, weight=weight), [note]
-
-
-def _refined(layers, params, transport, second, wanted):
-    """Make the gain of layers as fine as the picture tells; returns parameters and a note.
-
-    Not for paint, which need not be what any light does: detail would follow it.
-    """
-    told = []
-    if wanted.coverage is None:
-        asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
-        told = resolution.octaves(transport, second, *asked, 2 * CYCLES)
-    shares = ", ".join(f"{100 * octave.share:.2g} % of {octave.cycles} cycles" for octave in told)
-    note = f"detail that the picture tells: {shares or 'none'} beyond the {CYCLES} cycles that any may move"
-    return layers.refine(params, told), note
 
 
 def _starts(layers, params, transport, wanted, original):

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from . import latlong
 from .gain import grid_size, tents
 
 PROBES = 24
@@ -45,22 +46,18 @@ class Octave:
     known : ndarray (rows, columns)
         How well the picture tells it at each node, F^2 / (F^2 + ENOUGH^2) in [0, 1), F for a contrast of
         :data:`CONTRAST`.
+    share : float
+        How much of the active rows' solid angle it tells, in [0, 1].
     """
 
     size: tuple[int, int]
     known: np.ndarray
+    share: float
 
     @property
     def cycles(self) -> int:
         """Cycles around the horizon that it can hold."""
         return self.size[1] // 2
-
-    @property
-    def share(self) -> float:
-        """How much of the active rows' solid angle it tells, in [0, 1]."""
-        height = np.linspace(0, np.pi / 2, len(self.known))  # rows are near enough to the upper half
-        weight = np.maximum(np.sin(height), 1e-3)
-        return float((self.known.mean(axis=1) * weight).sum() / weight.sum())
 
 
 def octaves(transport, second, background, rows, picture, weight, coarsest: int) -> list[Octave]:
@@ -90,6 +87,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
     slope = display_slope(picture) / NOISE
     if weight is not None:
         slope = slope * np.sqrt(weight)
+    omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
     pulled = _pulled_back(transport, second, slope, background, rows[0])
     found, cycles = [], coarsest
     while 2 * cycles <= width:
@@ -99,12 +97,13 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
         for first, second in pulled:
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in (first, second)]
             told += _alternating(*on_nodes)
-        # A patch is as well known as its best half says: products of two estimates may be negative.
+        # Where nothing is told, a product of two estimates may well be negative.
         told = np.maximum(_smooth(told / len(pulled)), 0) * CONTRAST**2
-        octave = Octave(size, told**2 / (told**2 + ENOUGH**2))
-        if octave.share < LEAST_SHARE:
+        known = told**2 / (told**2 + ENOUGH**2)
+        share = float((known.mean(axis=1) * (around := down.T @ omega)).sum() / around.sum())
+        if share < LEAST_SHARE:
             break
-        found.append(octave)
+        found.append(Octave(size, known, share))
         cycles *= 2
     return found
 

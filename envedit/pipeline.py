@@ -305,18 +305,18 @@ def run(
             through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
             free = None  # a light may move across texels that are kept otherwise
-            second = None if wanted.coverage is not None else _again(settings, lit, (height, width))
-            if second and settings.representation.cycles == "auto":
-                params, said = _refined(representation, params, (through, second), wanted)
+            starts = None
+            if wanted.coverage is None and settings.representation.cycles == "auto":
+                recordings = through, _again(settings, lit, (height, width))
+                params, told, said = _refined(representation, params, recordings, wanted)
                 notes.append(said)
-            starts = _starts(representation, params, through, judged_by, original)
-            if second:
-                began = original.copy()
-                began[rows] = representation.decode(starts[0][0]).numpy()
-                wanted, said = _trusted(began, (through, second), wanted)
-                if said:
-                    judged_by, notes = wanted, [*notes, *said]
+                if told:  # a mirror: images of a light, and caustics
                     starts = _starts(representation, params, through, wanted, original)
+                    began = original.copy()
+                    began[rows] = representation.decode(starts[0][0]).numpy()
+                    wanted, said = _trusted(began, recordings, wanted)
+                    judged_by, notes, starts = wanted, [*notes, *said], None if said else starts
+            starts = starts or _starts(representation, params, through, judged_by, original)
     job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch, dists)
     if isinstance(representation, Layers):
         with clock("start_s"):
@@ -385,12 +385,12 @@ def _again(settings, lit, shape):
 
 
 def _refined(layers, params, recordings, wanted):
-    """Make the gain of layers as fine as the picture tells; returns parameters and a note."""
+    """Make the gain of layers as fine as the picture tells; returns parameters, octaves and a note."""
     asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
     told = resolution.octaves(*recordings, *asked, 2 * CYCLES)
     shares = ", ".join(f"{100 * octave.share:.2g} % of {octave.cycles} cycles" for octave in told)
-    note = f"detail that the picture tells: {shares or 'none'} beyond the {CYCLES} cycles that any may move"
-    return layers.refine(params, told), note
+    note = f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"
+    return layers.refine(params, told), told, note
 
 
 def _trusted(envmap, recordings, wanted):

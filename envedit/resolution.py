@@ -23,16 +23,17 @@ import numpy as np
 from . import latlong
 from .gain import grid_size, tents
 
-PROBES = 24
-"""Random z; what is averaged over them, three patterns and the nodes of a patch is within a quarter."""
+PROBES = 12
+"""Random z; what is averaged over them, three patterns and the nodes of a patch is within a third."""
 NOISE = 0.01
 """What a picture's display values are known to: its own noise and that of T together."""
 CONTRAST = 0.3
 """Log gain of detail that would matter."""
 ENOUGH = 2.0
 """The F of detail of that contrast from which on it counts as half known."""
-LEAST_SHARE = 0.02
-"""An octave is used where so much of its patches can be told, by solid angle."""
+FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
+"""How much of the sky's solid angle must be told of the first octave, for detail at all, and of a further
+one: what a glossy thing tells of half of the sky is not worth a third of a run's time."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
     Returns
     -------
     list of Octave
-        Coarse to fine; ends before the first of which less than :data:`LEAST_SHARE` is told.
+        Coarse to fine; ends before the first that is told too little (:data:`FIRST_SHARE`,
+        :data:`LEAST_SHARE`).
     """
     height, width, _ = background.shape
     slope = display_slope(picture) / NOISE
@@ -101,7 +103,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
         told = np.maximum(_smooth(told / len(pulled)), 0) * CONTRAST**2
         known = told**2 / (told**2 + ENOUGH**2)
         share = float((known.mean(axis=1) * (around := down.T @ omega)).sum() / around.sum())
-        if share < LEAST_SHARE:
+        if share < (LEAST_SHARE if found else FIRST_SHARE):
             break
         found.append(Octave(size, known, share))
         cycles *= 2

@@ -92,8 +92,9 @@ def test_pixels_that_do_not_count_tell_nothing():
 
 
 def test_a_highlight_tells_less_than_the_dark():
-    dark, bright = (told(mirror(), value=value)[-1].known.mean() for value in (0.05, 50.0))
-    assert bright < 0.1 * dark
+    dark, bright = (told(mirror(), value=value) for value in (0.05, 50.0))
+    assert len(bright) < len(dark) == 4
+    assert all(few.known.mean() <= many.known.mean() for few, many in zip(bright, dark, strict=False))
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 5e-4, 0.02, 0.5, 0.999, 2.0, 1e6])

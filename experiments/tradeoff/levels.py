@@ -76,7 +76,7 @@ def main():
             name = f"{cell.map}-{cell.scene}-{level.name}"
             found[level.name, cell] = run(cell, level, out / name), out / name
             print(name, json.dumps(parts(found[level.name, cell][0]["timing"])), flush=True)
-    judge = Judge(out)
+    judge = Judge(out, spp=512, true_spp=2048)
     lost = {key: judge(key[1], folder) for key, (_, folder) in found.items()}
     print(
         "| level | rendering s | tracing s | numbers s | total s | rendering dB | map dB |\n"

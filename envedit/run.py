@@ -125,7 +125,7 @@ def _run(arguments, start):
         except pipeline.Stopped as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
             raise
-        result.metrics["choices"] = result.notes = said + result.notes
+        result.metrics["choices"] = said + result.notes
         progress.stage("writing")
     return _write(settings, folder, result, import_s, arguments.quiet)
 

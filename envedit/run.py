@@ -125,9 +125,9 @@ def _run(arguments, start):
         except pipeline.Stopped as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
             raise
-        result.metrics["choices"] = said + result.notes
+        result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
-    return _write(settings, folder, result, import_s, arguments.quiet)
+    return _write(settings, folder, result, import_s, arguments.quiet, said)
 
 
 def _seconds(text):
@@ -211,12 +211,12 @@ def _check_same(settings, folder):
         raise InputError(f"{folder}: holds a finished run of another configuration: run without --resume")
 
 
-def _write(settings, folder, result, import_s, quiet):
+def _write(settings, folder, result, import_s, quiet, said):
     from . import outputs
 
     for line in outputs.write(settings, folder, result, import_s):
         print(f"envedit: warning: {line}", file=sys.stderr)
-    for line in result.notes:
+    for line in result.notes[len(said) :]:
         _say(quiet, line)
     _say(quiet, _verdict(result.metrics))
     _say(quiet, f"results in {folder.resolve()}")

@@ -17,6 +17,7 @@ scene has lamps besides its environment, which stay as they are.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
 import os
@@ -215,6 +216,19 @@ class Scene:
         return result
 
 
+@contextlib.contextmanager
+def _two_threads():
+    """Lend Dr.Jit a second thread: on one, Mitsuba waits for ever for an EXR texture."""
+    threads = dr.thread_count()
+    if threads < 2:
+        dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if threads < 2:
+            dr.set_thread_count(threads)
+
+
 def load(file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter") -> Scene:
     """Load a scene and make its environment emitter replaceable.
 
@@ -282,9 +296,8 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         for name in node.props.keys():  # noqa: SIM118 (no dict)
             node.props.mark_queried(name, False)
 
-    if dr.thread_count() < 2:  # on one, Mitsuba waits for ever for an EXR texture
-        dr.set_thread_count(2)
-    built = stage.told(where, mi.parser.instantiate, config, state)
+    with _two_threads():
+        built = stage.told(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
     if scene.environment() is None or scene.environment().id() != own:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")

@@ -161,7 +161,7 @@ def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
     found = measured(done[1])
     image_keys = {"psnr", "ssim", "mse", "lpips"}
     assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
-    assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached"}
+    assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached", "seconds"}
     timing = {
         "import",
         "target",

@@ -388,7 +388,7 @@ def _refined(layers, params, recordings, wanted):
     """Make the gain of layers as fine as the picture tells; returns parameters, octaves and a note."""
     asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
     told = resolution.octaves(*recordings, *asked, 2 * CYCLES)
-    shares = ", ".join(f"{100 * octave.share:.2g} % of {octave.cycles} cycles" for octave in told)
+    shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
     note = f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"
     return layers.refine(params, told), told, note
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from envedit import config, image, latlong, metrics
+from envedit import budget, config, image, latlong, metrics
 from envedit.errors import InputError
 from experiments.sweep import drive
-from experiments.tradeoff import analyse, measured, plan, plot, run
+from experiments.tradeoff import analyse, levels, measured, plan, plot, run
 from experiments.tradeoff.judge import Judge, loss_noise, without_noise
 
 # ---- what is run -------------------------------------------------------------------------------------------
@@ -616,3 +616,17 @@ def test_nothing_to_draw_is_told(tmp_path, capsys):
     assert plot.main(["--out", str(tmp_path)]) == 3
     assert "no run of the standard preset" in capsys.readouterr().err
     assert isinstance(run.parse([]), argparse.Namespace)
+
+
+@pytest.mark.parametrize("level", budget.LEVELS, ids=lambda level: level.name)
+def test_a_level_of_the_budget_is_run_as_it_says(level, tmp_path):
+    cell = plan.Cell("sky", "glossy", tmp_path / "sky.hdr")
+    found = config.from_dict(levels.settings_of(cell, level), tmp_path)
+    assert (found.input.width, found.scene.width) == (level.map, level.film)
+    assert (found.optimizer.iterations, found.target.spp, found.output.spp) == (
+        level.iterations, level.spp, level.spp,
+    )  # fmt: skip
+    assert found.scene.parameters == {"roughness": 0.05} and not found.renderer.cache
+    names = "target", "judge", "transport", "start", "fit", "edit", "report"
+    times = {f"{name}_s": 2**i for i, name in enumerate(names)}
+    assert levels.parts(times) == {"rendering": 3, "tracing": 12, "numbers": 112}

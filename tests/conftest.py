@@ -31,3 +31,13 @@ def rng():
     import numpy as np
 
     return np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def threads_stay():
+    """Refuse a test that leaves another number of threads: on one, Mitsuba waits for ever for an EXR file."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    yield
+    assert dr.thread_count() == before

@@ -3,6 +3,7 @@
 import json
 import math
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -583,7 +584,7 @@ def test_a_fit_leaves_its_numbers_and_pictures(maps, tmp_path, monkeypatch):
         folder = cell.folder(tmp_path)
         folder.mkdir(parents=True)
         (folder / "config.toml").write_text(job.toml)
-        assert network.main([cell.store, str(folder), "1"]) == 0
+        assert network.main([cell.store, str(folder), str(dr.thread_count())]) == 0
         found = json.loads((folder / "fit.json").read_text())
         assert found["epochs"] == 3 and len(found["noisy"]) == network.NOISE_SEEDS
         original, fitted, noisy = (
@@ -597,7 +598,7 @@ def test_a_fit_leaves_its_numbers_and_pictures(maps, tmp_path, monkeypatch):
         siren_of.encode(load_map(settings_of(edit).input)[0][:8])
         assert siren_of.fitted.cached and siren_of.fitted.seconds == found["seconds"]
     (tmp_path / "bad").mkdir()
-    assert network.main(["fits", str(tmp_path / "bad"), "1"]) == 2
+    assert network.main(["fits", str(tmp_path / "bad"), str(dr.thread_count())]) == 2
 
 
 def test_noise_is_the_same_for_every_network_of_one_size():

@@ -1,8 +1,8 @@
 """A budget instead of knobs: settings for this machine, scene and map that end within so many seconds.
 
 Levels from coarse to fine, each with what it cost and lost on a reference machine (``experiments/tradeoff``,
-``levels``). Two renderings and one product of matrices tell how fast this machine is in this scene, and how
-noisy the scene is under this map; the finest level that is expected to end in time is taken.
+``levels``). Three renderings and a few products of matrices tell how fast this machine is in this scene, and
+how noisy the scene is under this map; the finest level that is expected to end in time is taken.
 """
 
 from __future__ import annotations
@@ -17,14 +17,12 @@ import numpy as np
 
 from . import config, image, pipeline, scene
 from .errors import ConfigError
-from .scene import QUIET_DECIBELS
+from .scene import QUIET_DECIBELS, QUIET_LEAST, QUIET_MOST
 
 LATE = 1.3
 """A run may take so many times its budget; what is expected to take longer is refused."""
 _MAP, _FILM, _SPP = 64, 64, 64  # texels and pixels across, samples of the renderings that calibrate
 _SIDE, _PRODUCTS = 512, 8  # of the product of matrices
-FEWEST, MOST = 256, 768
-"""Samples a pixel between which a rendering of "auto" ends."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +66,8 @@ LEVELS = (
     Level("draft", 128, 96, 60, 256, 6.3, 1.4, 3.8, 0.9),
     Level("standard", 256, 128, 100, "auto", 13.2, 3.2, 0.0, 0.0),
 )
-"""The standard preset is the finest: a picture of 192 pixels with 200 steps cost 1.6 times as much and was no
-better (4.1 dB less of the rendering, 0.4 dB less of the map)."""
+"""The standard preset is the finest: a picture of 192 pixels with 200 steps cost 1.4 to 1.7 times as much and
+was no better (4.1 dB less of the rendering, 0.4 dB less of the map)."""
 REFERENCE_RENDER = 1.66e-7
 """Seconds a pixel and sample of Mitsuba's path tracer on the reference machine (a sphere)."""
 REFERENCE_PRODUCT = 0.0134
@@ -223,7 +221,7 @@ def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibr
         times.append(time.perf_counter() - begun)
     warm = min(times[1:])
     variance = float(np.var(pictures, axis=0, ddof=1).mean())
-    quiet = int(np.clip(_SPP * variance * 10 ** (QUIET_DECIBELS / 10), FEWEST, MOST))
+    quiet = int(np.clip(_SPP * variance * 10 ** (QUIET_DECIBELS / 10), QUIET_LEAST, QUIET_MOST))
     pixels = lit.width * lit.height
     found = Calibration(
         warm / (pixels * _SPP),

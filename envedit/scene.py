@@ -39,7 +39,9 @@ SHIPPED = ("sphere", "mirror", "matte", "statue", "pair", "mesh")
 
 QUIET_DECIBELS = 48.0
 """PSNR of a rendering that is quiet, against one without noise: beyond what an edit reaches under a sun."""
-_QUIET_PASS, _QUIET_LEAST, _QUIET_MOST = 64, 256, 768  # samples a pixel
+QUIET_LEAST, QUIET_MOST = 256, 768
+"""Samples a pixel between which a rendering of "auto" ends."""
+_QUIET_PASS = 64  # samples a pixel
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -177,12 +179,12 @@ class Scene:
         self.set_envmap(image)
         count = min(self._pass_samples(), _QUIET_PASS)
         total, shown, power = 0.0, 0.0, 0.0
-        for i in range(_QUIET_MOST // count):
+        for i in range(QUIET_MOST // count):
             picture = self._pass(count, seed, i, -1)
             display = np.clip(picture, 0, 1) ** (1 / 2.2)
             total, shown, power = total + picture, shown + display, power + display**2
             n = i + 1
-            if n * count >= _QUIET_LEAST:
+            if n * count >= QUIET_LEAST:
                 variance = np.maximum(power / n - (shown / n) ** 2, 0).mean(axis=2) / max(n - 1, 1)
                 if variance.mean() < 10 ** (-QUIET_DECIBELS / 10):
                     break

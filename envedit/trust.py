@@ -20,8 +20,6 @@ AROUND = 2
 """Pixels to each side over which noise is told: paths that have hit nothing yet do not know theirs."""
 USUAL = 4.0
 """Multiples of the picture's median variance that are nothing special."""
-
-
 SHOWS_LIGHT = 3.0
 """Multiples of the target's median brightness from which on a noisy picture's pixel shows a light itself."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import budget, config, image, run
+from envedit import budget, config, image, run, scene
 from envedit.budget import LEVELS, Calibration
 from envedit.errors import ConfigError
 
@@ -98,7 +98,7 @@ def test_calibration_measures_this_scene(small):
     found, aspect, texels = budget.calibrate(settings, small.parent)
     assert texels == 32 * 64 and 0.5 < aspect < 2
     assert 0 < found.render < 1e-3 and 0 < found.machine < 1e3 and found.compile_s >= 0
-    assert budget.FEWEST <= found.quiet_spp <= budget.MOST
+    assert scene.QUIET_LEAST <= found.quiet_spp <= scene.QUIET_MOST
 
 
 def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, capsys):

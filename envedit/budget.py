@@ -62,7 +62,7 @@ class Level:
 
 LEVELS = (
     Level("least", 64, 48, 25, 64, 2.1, 0.3, 9.4, 3.1),
-    Level("coarse", 96, 64, 40, 64, 3.2, 1.0, 5.6, 2.1),
+    Level("coarse", 96, 64, 40, 64, 3.2, 1.1, 5.6, 2.1),
     Level("draft", 128, 96, 60, 256, 6.3, 1.4, 3.8, 0.9),
     Level("standard", 256, 128, 100, "auto", 13.2, 3.2, 0.0, 0.0),
 )
@@ -126,8 +126,8 @@ def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Pa
     Raises
     ------
     ConfigError
-        The representation is not layers or the renderer not the stored transport, or even the coarsest level
-        would take more than :data:`LATE` times the budget.
+        The representation is not layers or the renderer not the stored transport, the target is in pixels of
+        the rendering, or even the coarsest level would take more than :data:`LATE` times the budget.
     EnveditError
         Scene or map cannot be read.
     """
@@ -136,13 +136,14 @@ def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Pa
             '--budget: wanted [representation] kind = "layers" and [renderer] kind = "transport", came '
             f'"{settings.representation.kind}" and "{settings.renderer.kind}": only their times are known'
         )
+    _check_pixels(settings.target)
     begun = time.perf_counter()
     found, aspect, texels = calibrate(settings, base)
     elapsed += time.perf_counter() - begun
     level, expected = choose(found, budget, elapsed, aspect, texels if settings.output.full else 0)
     chosen = replace(
         settings,
-        input=replace(settings.input, width=level.map),
+        input=_at_width(settings.input, level.map),
         scene=replace(settings.scene, width=level.film, height=0),
         optimizer=replace(settings.optimizer, iterations=level.iterations),
         target=replace(settings.target, spp=level.spp),
@@ -152,6 +153,26 @@ def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Pa
         f"budget of {budget:g} s: level '{level.name}', map {level.map} and picture {level.film} across, "
         f"{level.iterations} steps, {level.spp} samples a pixel; {expected:.0f} s expected; {loss(level)}"
     )
+
+
+def _at_width(settings: config.Input, width: int) -> config.Input:
+    """Return the input at another width; rows that were given as numbers are of the same part of the sky."""
+    rows = settings.rows
+    if not isinstance(rows, str):
+        first, end = rows[0] * width // settings.width, -(-(rows[1] + 1) * width // settings.width)
+        rows = first, max(first, min(end, width // 2) - 1)
+    return replace(settings, width=width, rows=rows)
+
+
+def _check_pixels(target: config.Target) -> None:
+    """Refuse what is given in pixels of a rendering whose size a budget chooses."""
+    inside = any(stroke.get("units") == "pixels" for stroke in target.strokes)
+    for key, given in (("file", target.kind == "image"), ("mask", target.mask), ("strokes", inside)):
+        if given:
+            raise ConfigError(
+                f"--budget: target.{key} is in pixels of the rendering, whose size a budget chooses: "
+                "run without --budget" + (', or give strokes units = "fraction"' if inside else "")
+            )
 
 
 def loss(level: Level) -> str:
@@ -210,7 +231,7 @@ def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibr
     """
     texels = 0
     if settings.input.envmap == "sunsky":
-        envmap, _ = pipeline.load_map(replace(settings.input, width=_MAP))
+        envmap, _ = pipeline.load_map(_at_width(settings.input, _MAP))
     else:
         envmap, info = image.load_envmap(settings.input.envmap, _MAP, settings.input.repair)
         texels = info["size"][0] * info["size"][1]

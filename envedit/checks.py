@@ -136,7 +136,7 @@ def row_range(value: Any) -> str | tuple[int, int]:
 
 
 def plain(value: Any, depth: int = 8) -> Any:
-    """Accept what the writer below can write: strings, numbers, booleans, and lists and tables of them."""
+    """Accept what :func:`.config.quote` can write: strings, numbers, booleans, lists and tables of them."""
     if isinstance(value, bool):
         return value
     if isinstance(value, str):

@@ -1,9 +1,9 @@
 r"""The configuration: TOML to frozen dataclasses, presets, overrides. The only module that knows TOML.
 
 A value comes from the last of these that gives it: the dataclass default, the preset, what the preset has for
-the kind of representation, the file, a ``--set table.key=value`` override. Each layer is checked by itself,
-so that an error names the place the value came from; what depends on two keys at once is checked when the
-dataclasses are built, however they are.
+the kinds of representation and target, the file, a ``--set table.key=value`` override. Each layer is checked
+by itself, so that an error names the place the value came from; what depends on two keys at once is checked
+when the dataclasses are built, however they are.
 Whether input files exist is not looked at here: the modules that read them say so.
 
 >>> config = loads("[fit]\nepochs = 100", preset="draft", overrides=["seed=3"])
@@ -124,6 +124,8 @@ class Target(Table):
             raise ConfigError(
                 f"target.file: came {show(self.file)}, wanted none: strokes go on the initial rendering"
             )
+        if self.kind == "strokes" and self.mask:
+            raise ConfigError(f"target.mask: came {show(self.mask)}, wanted none: strokes say where they are")
         if self.kind != "envmap" and not self.paint + self.hold:
             raise ConfigError("target.paint, target.hold: came 0 for both, wanted one above 0")
         if self.kind != "strokes" and self.strokes:
@@ -234,7 +236,9 @@ class Optimizer(Table):
         choice("cosine", "constant"),
         "course of the learning rate; cosine: to 0 at the end of the run",
     )
-    checkpoint_s: float = _key(10.0, number(0), "seconds between checkpoints; 0: after every step")
+    checkpoint_s: float = _key(
+        10.0, number(0), "seconds between checkpoints; 0: whenever losses are read back"
+    )
 
 
 @dataclass(frozen=True)

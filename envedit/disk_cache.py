@@ -62,9 +62,10 @@ class DiskCache:
         path = self._path(key)
         try:
             arrays = _read(path, _text(key))
-            os.utime(path)  # the time of last use, by which entries are dropped
         except (OSError, ValueError):
             return None
+        with contextlib.suppress(OSError):  # somebody else's folder is as good to read from
+            os.utime(path)  # the time of last use, by which entries are dropped
         return arrays
 
     def store(self, key: dict, arrays: dict[str, np.ndarray]) -> None:

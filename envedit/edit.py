@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +19,7 @@ import numpy as np
 
 from . import config, losses, optim
 from ._callable import make_callable
+from .display import to_display
 from .errors import ConfigError, NumericalError
 from .ssim import Ssim
 
@@ -27,20 +29,6 @@ RECOVERY = 10
 """Good steps that win back one halving of the learning rate: a rare bad sample must not end all progress."""
 READ_EVERY, READ_SECONDS = 10, 1.0
 """Losses are read back after so many steps or seconds: every read-back waits for the device."""
-
-
-def to_display(radiance: mi.TensorXf) -> mi.TensorXf:
-    """Map linear radiance to display values, differentiably and with a slope everywhere.
-
-    x^(1/2.2) as the metrics' tonemap, but linear below 1e-3, where the root is too steep, and
-    1 + log(x) / 2.2 above 1, where a clip would leave a highlight no way back. Continuous with its first
-    derivative at 1.
-    """
-    x = radiance.array
-    low, toe = 1e-3, 1e-3 ** (1 / 2.2)
-    middle = dr.power(dr.clip(x, low, 1), 1 / 2.2)
-    y = dr.select(x <= low, x * (toe / low), dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
-    return mi.TensorXf(y, radiance.shape)
 
 
 class Objective:
@@ -334,7 +322,9 @@ def edit(settings: config.Config | str, *, target=None, mask=None, **named):
     """
     if mask is not None and target is None:
         raise ConfigError("mask: given without a target; it says where that was painted")
-    settings = settings if isinstance(settings, config.Config) else config.load(settings)
+    if not isinstance(settings, config.Config):
+        named.setdefault("base", Path(settings).absolute().parent)
+        settings = config.load(settings)
     mi.set_variant(settings.variant)
     from .pipeline import run
 

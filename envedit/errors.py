@@ -1,7 +1,7 @@
 """What can go wrong for a user, and the exit code each kind carries.
 
 Every message is one or two lines: what, where (file, key, row and column), what to do.
-Modules raise these; only ``run.py`` turns them into text on stderr and an exit code.
+Modules raise these; only the command lines turn them into text on stderr and an exit code.
 """
 
 

@@ -5,6 +5,7 @@ import ctypes
 import io
 import os
 import re
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -20,6 +21,8 @@ RESULTS = (
 
 The first says that a run is complete: whoever moves them away moves it first of all.
 """
+EARLIER = "earlier"
+"""With a number, the folder that what an earlier run left is moved to."""
 
 
 @contextlib.contextmanager
@@ -100,9 +103,64 @@ def _runs(process):
     return True
 
 
+def prepare_folder(folder: Path, names, inputs=(), keep: bool = False, spare=()) -> None:
+    """Make a folder for results; move what an earlier run left there to ``earlier-N`` in it.
+
+    Parameters
+    ----------
+    folder : Path
+        Where results will go.
+    names : sequence of str
+        Their names; the first is moved first.
+    inputs : sequence of path
+        What the run reads, and must not be moved.
+    keep : bool
+        Leave what is there: it is to be continued.
+    spare : sequence of path
+        What is copied and not moved, if it is among the results: the run will be asked for by it again.
+
+    Raises
+    ------
+    InputError
+        An input lies where a result would go, or the folder cannot be used.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file, the results need a folder: give another with --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        old = [folder / name for name in names if (folder / name).exists()]
+        read = {os.path.realpath(path) for path in inputs}
+        if mine := [path for path in old if os.path.realpath(path) in read]:
+            raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
+        if old and not keep:
+            numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{EARLIER}-*")]
+            number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)
+            aside = folder / f"{EARLIER}-{number}"
+            aside.mkdir()
+            stay = {os.path.realpath(path) for path in spare}
+            for path in old:
+                if os.path.realpath(path) in stay:
+                    shutil.copy2(path, aside / path.name)
+                else:
+                    path.rename(aside / path.name)
+    except OSError as error:
+        reason = f"{folder}: cannot be used for the results ({error.strerror or error})"
+        raise InputError(f"{reason}: give another with --out") from error
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{folder}: cannot be written to: give another folder with --out")
+
+
 def cache_folder(kind: str) -> Path:
-    """Folder in which one kind of file is kept between runs: $XDG_CACHE_HOME/envedit/KIND or in ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "envedit" / kind
+    """Folder in which one kind of file is kept between runs: $XDG_CACHE_HOME/envedit/KIND or in ~/.cache.
+
+    In the system's folder for temporary files where the user has no home.
+    """
+    if not (base := os.environ.get("XDG_CACHE_HOME")):
+        try:
+            base = Path.home() / ".cache"
+        except RuntimeError:
+            base = tempfile.gettempdir()
+    return Path(base) / "envedit" / kind
 
 
 @contextlib.contextmanager

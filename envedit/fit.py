@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -329,8 +328,8 @@ def _load(path):
         with open(path, "rb") as file, np.load(file) as stored:
             low, span, log_psnr, peak, epochs, seconds = stored["numbers"].tolist()
             params = {k[2:]: stored[k] for k in stored.files if k.startswith("p/")}
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-        return None  # not there, or damaged: fit again
+    except Exception:  # not there, or damaged, for which zipfile, zlib and numpy have many names: fit again
+        return None
     # None is stored as NaN.
     log_psnr, peak = (None if np.isnan(number) else number for number in (log_psnr, peak))
     return Fitted(params, Normalisation(low, span), log_psnr, peak, int(epochs), seconds, True)

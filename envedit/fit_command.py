@@ -1,4 +1,4 @@
-"""The command line of the fit alone: ``python -m envedit.fit MAP [--out DIR] [--preset NAME]``."""
+"""The command line of the fit: ``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set ...]``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from . import config, doctor, fit, image, manifest, metrics, preview
-from .errors import EnveditError, InputError
+from . import config, doctor, files, fit, image, manifest, metrics, preview
+from .errors import EnveditError
 from .progress import Progress
 
 
@@ -43,10 +43,7 @@ def _run(arguments):
     crop = original[first : last + 1]
     rows = first, original.shape[0]
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}): give another with --out") from error
+    files.prepare_folder(folder, ("fit.json", "fitted.exr", "preview.png"), [arguments.map])
     with Progress() as progress:
         progress.stage(f"fitting {arguments.map}")
         fitted = fit.fit(

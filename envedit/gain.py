@@ -1,8 +1,8 @@
 """The smooth gain of the sky: a field of log factors that starts at zero.
 
-A sum of bilinear grids over the active rows, periodic in azimuth, each twice as fine as the one before and
-half as strong per step of its nodes: what a coarse grid can say is said by it. The finest has a stated number
-of cycles around the horizon; detail of the sky is scaled, never made.
+A sum of bilinear grids over the active rows, periodic in azimuth, each twice as fine as the one before. The
+three coarse ones, up to a stated number of cycles around the horizon, are each half as strong per step of
+their nodes: what a coarse grid can say is said by it. Finer ones are added where a picture tells them.
 """
 
 from __future__ import annotations

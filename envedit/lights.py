@@ -346,7 +346,8 @@ def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, f
         c = mi.Int32(dr.ceil(column - half))
         stop = mi.Int32(dr.floor(column + half))
         while c <= stop:
-            value = flux * (share * (1 - dr.abs(mi.Float(c) - column) / half) / columns * scale)
+            # The scale first: of a light of 1e-30 it is larger than a share leaves room for.
+            value = flux * scale * (share * (1 - dr.abs(mi.Float(c) - column) / half) / columns)
             place = ((r - first) * width + (c % width + width) % width) * 3
             for channel in range(3):
                 v = value[channel]

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from . import checkpoint, config, files, image, layered, manifest, pipeline, preview, reach, report, scene
-from .errors import NumericalError
+from .errors import InputError, NumericalError
 
 
 def write(settings: config.Config, folder: Path, result: pipeline.Result, import_s: float) -> list[str]:
@@ -100,7 +100,7 @@ def _maps(settings, folder, result):
                 f"{settings.input.envmap}: not enough memory to carry the edit to its size; "
                 "edited.exr has it at working resolution"
             )
-        except NumericalError as error:
+        except (InputError, NumericalError) as error:  # the file may be gone by now
             result.warnings.append(
                 f"edited_full.exr is not written: {error}; edited.exr has it at working resolution"
             )

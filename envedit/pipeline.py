@@ -15,27 +15,22 @@ import numpy as np
 
 from . import (
     carry,
-    changes,
     config,
     envmap,
     features,
-    files,
     fit,
     image,
     metrics,
     perceptual,
-    resolution,
+    renderers,
     scene,
-    search,
     sky,
+    starts,
     target,
-    trust,
 )
 from . import reach as reaches
-from .gain import CYCLES
 from .job import Interrupted, Job, Stopped, Watch, keeping
 from .layers import Layers
-from .pathtrace import PathTracer
 from .separate import Separation
 from .transport import LightTransport
 
@@ -43,8 +38,6 @@ __all__ = ["Found", "Interrupted", "Result", "Stopped", "Watch", "at_full_resolu
 
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
-AGAIN_SEED, AGAIN_SPP = 500_009, 32
-"""Seed and samples a pixel of the second recording of T, which tells its noise."""
 INITIAL_SPP = 144
 """Samples a pixel of the initial rendering, which is far from the target."""
 
@@ -168,31 +161,6 @@ def active_rows(rows, height: int) -> tuple[int, int]:
     return (0, height - 1) if rows == "all" else (rows[0], rows[1])
 
 
-def make_renderer(settings: config.Config, lit: scene.Scene, shape, progress=None):
-    """Build the renderer of a configuration for maps of the given (H, W)."""
-    chosen = settings.renderer
-    if chosen.kind == "path":
-        return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
-    return trace(settings, lit, shape, progress)
-
-
-def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> LightTransport:
-    """Trace the light transport of a configuration for maps of the given (H, W), or take it from disk."""
-    chosen = settings.renderer
-    return LightTransport.build(
-        lit,
-        *shape,
-        spp=chosen.spp,
-        max_depth=chosen.max_depth,
-        seed=settings.seed,
-        memory_gb=chosen.memory_gb,
-        refresh=0 if chosen.refresh == "auto" else chosen.refresh,
-        few=settings.representation.kind == "layers",
-        folder=files.cache_folder("transport") if chosen.cache else None,
-        progress=progress,
-    )
-
-
 def run(
     settings: config.Config,
     *,
@@ -260,8 +228,8 @@ def run(
             initial = lit.render(original, spp=few, seed=settings.seed + JUDGE_SEED)
     crop = original[first : last + 1]
     with clock("fit_s"):
-        layered = settings.representation.kind == "layers"
-        watch.stage("separating lights" if layered else f"fitting ({settings.representation.kind})")
+        kind = settings.representation.kind
+        watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
         representation = envmap.make(
             settings,
             fit.default_folder(),
@@ -275,11 +243,14 @@ def run(
             if settings.renderer.kind == "transport"
             else "preparing the path tracer"
         )
-        renderer = make_renderer(
+        renderer = renderers.make(
             settings, lit, (height, width), lambda done, total: watch.progress(done, total, "")
         )
-        # Now: a resumed run may take up a later recording, but must freeze the same texels.
         traced = renderer if isinstance(renderer, LightTransport) else None
+        recordings = None
+        if layered := isinstance(representation, Layers):
+            recordings = starts.recordings(settings, lit, (height, width), wanted, traced)
+        # Now: a resumed run may take up a later recording, but must freeze the same texels.
         rows, frozen = slice(first, last + 1), None
         if traced:
             frozen = np.zeros((height, width), bool)
@@ -295,38 +266,28 @@ def run(
             )
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
-    judged_by = wanted
+    seen = wanted
     if traced and wanted.coverage is not None:
-        wanted = replace(wanted, picture=_as_seen(traced, original, wanted))
-    if isinstance(representation, Layers):
+        seen = replace(wanted, picture=_as_seen(traced, original, wanted))
+    if layered:
         with clock("start_s"):
             watch.stage("searching for lights")
-            enough = replace(settings, renderer=replace(settings.renderer, spp="auto"))
-            through = traced or trace(enough, lit, (height, width))
             representation.keep(free)
             free = None  # a light may move across texels that are kept otherwise
-            starts = None
-            if wanted.coverage is None and settings.representation.cycles == "auto":
-                recordings = through, _again(settings, lit, (height, width))
-                params, told, said = _refined(representation, params, recordings, wanted)
-                notes.append(said)
-                if told:  # a mirror: images of a light, and caustics
-                    starts = _starts(representation, params, through, wanted, original)
-                    began = original.copy()
-                    began[rows] = representation.decode(starts[0][0]).numpy()
-                    wanted, said = _trusted(began, recordings, wanted)
-                    judged_by, notes, starts = wanted, [*notes, *said], None if said else starts
-            starts = starts or _starts(representation, params, through, judged_by, original)
-    job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch, dists)
-    if isinstance(representation, Layers):
+            ready = starts.find(representation, params, recordings, wanted, original)
+            wanted, seen = ready.wanted, ready.wanted if seen is wanted else seen
+            notes += ready.notes
+            del recordings  # the second one is not needed any more
+    job = Job(settings, lit, original, first, free, seen, representation, renderer, folder, watch, dists)
+    if layered:
         with clock("start_s"):
-            params, placed = job.best(starts, crop)
+            params, placed = job.best(ready.starts, crop)
             notes += placed
     with clock("edit_s"):
         watch.stage("editing")
         params, state = job.optimise(params, crop, resume)
         edited = job.decode(params)
-        wanted = job.wanted if judged_by is wanted else judged_by
+        wanted = job.wanted if seen is wanted else wanted
 
     with clock("judge_s"), keeping(edited):
         watch.stage("rendering the result")
@@ -370,54 +331,6 @@ def run(
         within,
         Found(representation, params, first, free),
     )
-
-
-def _again(settings, lit, shape):
-    """Record T once more, independently, with fewer samples: what both agree on is no noise.
-
-    Not for paint, which need not be what any light does: detail would follow it.
-    """
-    seed = (settings.seed + AGAIN_SEED) % 2**32
-    few = replace(settings.renderer, spp=AGAIN_SPP, refresh=0)
-    again = trace(replace(settings, seed=seed, renderer=few), lit, shape)
-    again.paths = (again.paths[0],) * len(again.paths)
-    return again
-
-
-def _refined(layers, params, recordings, wanted):
-    """Make the gain of layers as fine as the picture tells; returns parameters, octaves and a note."""
-    asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
-    told = resolution.octaves(*recordings, *asked, 2 * CYCLES)
-    shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
-    note = f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"
-    return layers.refine(params, told), told, note
-
-
-def _trusted(envmap, recordings, wanted):
-    """Weigh a rendered target's pixels by what T and the target know of them; returns it and notes."""
-    pictures = []
-    for recording in recordings:
-        recording.resolve(envmap)
-        pictures.append(recording.apply(mi.TensorXf(envmap)).numpy())
-    known = trust.weights(*pictures, wanted.picture, wanted.noise)
-    if known is None:
-        return wanted, []
-    weight = known if wanted.weight is None else known * wanted.weight
-    weight = (weight / max(float(weight.mean()), 1e-30)).astype(np.float32)
-    share = 100 * float((known < 0.5).mean())
-    note = f"{share:.2g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
-    return replace(wanted, weight=weight), [note]
-
-
-def _starts(layers, params, transport, wanted, original):
-    """List the starts of an edit with layers, (parameters, notes), one of which is to be taken."""
-    asked = wanted.picture, wanted.weight, original
-    if wanted.coverage is None:
-        return [search.start(layers, params, transport, *asked)]
-    begin = layers, params, transport, wanted.initial, *asked
-    daring = (False, True) if (wanted.coverage < 1).any() else (False,)
-    starts = [changes.start(*begin, bold=bold) for bold in daring]
-    return [*starts, changes.softened(layers, params)] if layers.separation.lights else starts
 
 
 def _as_seen(traced, original, wanted):

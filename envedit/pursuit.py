@@ -140,8 +140,8 @@ def place(
         atom = search.atoms(spare_flux, None)
     for _ in range(spare if missing else 0):
         score = search.scores(atom)
-        for light, direction in zip(lights, directions, strict=False):
-            there = light.direction if direction is None else direction
+        old = [one.direction if d is None else d for one, d in zip(lights, directions, strict=False)]
+        for there in [*old, *directions[len(lights) :]]:
             score[overview.directions[search.candidates] @ there > np.cos(np.radians(APART))] = 0
         best = int(score.argmax())
         candidate = atom[..., best]

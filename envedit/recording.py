@@ -18,7 +18,7 @@ import numpy as np
 from . import paths
 from .errors import InputError
 from .grid import Grid
-from .sparse import merge
+from .sparse import SLICE, merge
 
 MAX_BOUNCES = 8
 """Bounces that the pilot follows, and the most that an automatic path depth allows."""
@@ -272,7 +272,8 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
             f"samples, memory_gb allows {memory_gb:g}: raise [renderer] memory_gb, or lower [renderer] spp "
             "or [scene] width"
         )
-    capacity = int(min(MOST_COLUMNS, (memory_gb - coarse_gb()) * 1e9 / (16 * pixels), texels))
+    counted = (2**32 - 1) // (4 * (pixels + SLICE))  # an index into their store has 32 bits
+    capacity = int(min(MOST_COLUMNS, (memory_gb - coarse_gb()) * 1e9 / (16 * pixels), texels, counted))
     about = coarse_gb() + capacity * 16e-9 * pixels
     columns = f"up to {capacity} exact columns, about {about:.2g} of {memory_gb:g} GB"
     return spp, capacity, f"light transport: {spp} paths a pixel, {columns}"

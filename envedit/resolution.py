@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from . import latlong
+from . import display, latlong
 from .gain import grid_size, tents
 
 PROBES = 12
@@ -86,7 +86,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
         :data:`LEAST_SHARE`).
     """
     height, width, _ = background.shape
-    slope = display_slope(picture) / NOISE
+    slope = display.slope(picture) / NOISE
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
@@ -108,14 +108,6 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
         found.append(Octave(size, known, share))
         cycles *= 2
     return found
-
-
-def display_slope(radiance) -> np.ndarray:
-    """Return the slope of :func:`.edit.to_display` at linear radiance."""
-    x = np.asarray(radiance, np.float64)
-    low = 1e-3
-    middle = np.clip(x, low, 1) ** (1 / 2.2 - 1) / 2.2
-    return np.where(x <= low, low ** (1 / 2.2 - 1), np.where(x > 1, 1 / (2.2 * np.maximum(x, 1)), middle))
 
 
 def _pulled_back(transport, second, slope, background, first):

@@ -7,13 +7,10 @@ in a folder.
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import sys
 import time
 from pathlib import Path
-
-_EARLIER = "earlier"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -67,7 +64,7 @@ def _parser():
 
 
 def _run(arguments, start):
-    from . import config, doctor
+    from . import config, doctor, files
 
     overrides = list(arguments.overrides)
     if arguments.out:
@@ -78,7 +75,8 @@ def _run(arguments, start):
         return _export_initial(settings, arguments)
     folder = Path(settings.output.dir)
     named = (settings.input.envmap, settings.scene.file, settings.target.file, settings.target.mask)
-    _prepare(folder, arguments.resume, [Path(path) for path in named if path])
+    inputs = [path for path in named if path]
+    files.prepare_folder(folder, files.RESULTS, inputs, arguments.resume, [arguments.config])
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
         _check_same(settings, folder)
         _say(arguments.quiet, f"{folder}: this run is complete, there is nothing to resume")
@@ -102,6 +100,8 @@ def _run(arguments, start):
         said.append(note)
         _say(arguments.quiet, note)
 
+    # What a budget has chosen is not in the configuration that would be continued.
+    again = "" if allowed else "; continue with --resume"
     with Progress(quiet=arguments.quiet) as progress:
         try:
             result = pipeline.run(
@@ -113,21 +113,28 @@ def _run(arguments, start):
             )
         except pipeline.Interrupted as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
-            kept = f"checkpoint and edited.exr so far are in {folder}; continue with --resume"
+            kept = f"checkpoint and edited.exr so far are in {folder}{again}"
             print(f"envedit: {stop}; {kept}", file=sys.stderr)
             return 130
         except KeyboardInterrupt:
-            if not (folder / "checkpoint.npz").exists():
-                raise
-            kept = f"a checkpoint is in {folder}; continue with --resume"
-            print(f"envedit: interrupted; {kept}", file=sys.stderr)
-            return 130
+            return _interrupted(folder, again)
         except pipeline.Stopped as stop:
             image.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
             raise
         result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
-    return _write(settings, folder, result, import_s, arguments.quiet, said)
+    try:
+        return _write(settings, folder, result, import_s, arguments.quiet, said)
+    except KeyboardInterrupt:
+        return _interrupted(folder, again)
+
+
+def _interrupted(folder, again):
+    """Say what a run that was interrupted outside the loop has left; raises if that is nothing."""
+    if not (folder / "checkpoint.npz").exists():
+        raise KeyboardInterrupt
+    print(f"envedit: interrupted; a checkpoint is in {folder}{again}", file=sys.stderr)
+    return 130
 
 
 def _seconds(text):
@@ -167,32 +174,6 @@ def _export_initial(settings, arguments):
     ask = f'[target] kind = "image", file = "{file.absolute()}"'
     _say(arguments.quiet, f"{file}: {lit.width}x{lit.height}, {under}; paint on it, then set {ask}")
     return 0
-
-
-def _prepare(folder, resume, inputs):
-    """Make the output folder; move what an earlier run left there out of the way, unless it is read now."""
-    from .errors import InputError
-    from .files import RESULTS
-
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file, the results need a folder: give another with --out")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        old = [folder / name for name in RESULTS if (folder / name).exists()]
-        if mine := [path for path in old if path in inputs]:
-            raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
-        if old and not resume:
-            numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{_EARLIER}-*")]
-            number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)
-            keep = folder / f"{_EARLIER}-{number}"
-            keep.mkdir()
-            for path in old:
-                path.rename(keep / path.name)
-    except OSError as error:
-        reason = f"{folder}: cannot be used for the results ({error.strerror or error})"
-        raise InputError(f"{reason}: give another with --out") from error
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"{folder}: cannot be written to: give another folder with --out")
 
 
 def _check_same(settings, folder):

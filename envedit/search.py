@@ -340,6 +340,8 @@ def refine(transport, wanted, known, weight, gains, direction, flux, first, last
         steps = np.arange(-reach, reach + 1) * spacing
         rows = np.unique(np.clip(row + steps, first, last))
         columns = (column + steps) % width
+        between = len(np.unique(columns)) == len(columns)  # on a map of few texels the steps meet
+        columns = columns if between else np.unique(columns)
         texels = (rows[:, None] * width + columns).ravel()
         found, factor = score(texels)
         best = int(found.argmax())
@@ -347,7 +349,7 @@ def refine(transport, wanted, known, weight, gains, direction, flux, first, last
     # Between the texels around the best, by how much each explains.
     grid = found.reshape(len(rows), len(columns))
     i, j = np.unravel_index(best, grid.shape)
-    row, column = row + _vertex(grid[:, j], i), column + _vertex(grid[i], j)
+    row, column = row + _vertex(grid[:, j], i), column + (_vertex(grid[i], j) if between else 0.0)
     theta, phi = np.pi * row / (height - 1), 2 * np.pi * (column + 0.5) / width
     d = np.array([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)])
     return d, factor[best]

@@ -36,7 +36,7 @@ _MOST_WIDTH_PER_HEIGHT = 1.5
 # Words for errors
 
 
-def told(where: str, call, *arguments, **filled):
+def told(where: str, call, /, *arguments, **filled):
     """Call the parser, and say in one line what it says in many."""
     try:
         return call(*arguments, **filled)
@@ -229,7 +229,10 @@ def hash_node(digest, node) -> None:
     for key, value in node.props.items():
         digest.update(f"{key}=".encode())
         if key == "filename":
-            digest.update(hashlib.sha256(Path(value).read_bytes()).digest())
+            try:
+                digest.update(hashlib.sha256(Path(value).read_bytes()).digest())
+            except OSError as error:
+                raise InputError(f"{value}: cannot be read ({error.strerror})") from None
         else:
             _hash_value(digest, value)
 

@@ -10,27 +10,27 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .edit import to_display
+from .display import to_display
 
 TRUSTED = 0.007
 """Standard error of display values, beyond what is usual in the picture, at which a pixel counts half."""
-FEWER = 1 / 8
-"""Samples of the second recording as a share of the first's, about: so much more of the noise is its own."""
 AROUND = 2
 """Pixels to each side over which noise is told: paths that have hit nothing yet do not know theirs."""
 USUAL = 4.0
 """Multiples of the picture's median variance that are nothing special."""
 SHOWS_LIGHT = 3.0
-"""Multiples of the target's median brightness from which on a noisy picture's pixel shows a light itself."""
+"""Multiples of the target's median brightness from which on a noisy pixel shows a light itself."""
 
 
-def weights(first, second, picture, noise=None) -> np.ndarray | None:
+def weights(first, second, share: float, picture, noise=None) -> np.ndarray | None:
     """Weigh pixels by what is known of them.
 
     Parameters
     ----------
     first, second : ndarray (h, w, 3)
-        The same picture through T and through a second recording of :data:`FEWER` samples, linear radiance.
+        The same picture through T and through a second recording, linear radiance.
+    share : float
+        Samples of the second recording over the first's: so much more of the noise is its own.
     picture : ndarray (h, w, 3)
         The target, linear radiance.
     noise : ndarray (h, w), optional
@@ -40,10 +40,11 @@ def weights(first, second, picture, noise=None) -> np.ndarray | None:
     -------
     ndarray (h, w, 1) or None
         s^2 / (s^2 + v), s = :data:`TRUSTED`, v the variance around a pixel beyond :data:`USUAL` times its
-        median, and 0 beside pixels over :data:`SHOWS_LIGHT`; None where no pixel is below 1/2.
+        median, and 0 at those over or beside :data:`SHOWS_LIGHT`; None where no pixel is below 1/2, or none
+        is above 0.
     """
     shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
-    variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * FEWER / (1 + FEWER)
+    variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
     if noise is not None:
         variance += np.square(noise)
     around = _windows(variance, AROUND).mean(axis=(2, 3))
@@ -52,7 +53,8 @@ def weights(first, second, picture, noise=None) -> np.ndarray | None:
     if trust.min() >= 0.5:
         return None
     brightest = _windows(picture.max(axis=2), 1).max(axis=(2, 3))
-    trust = np.where(brightest < SHOWS_LIGHT * np.median(picture), trust, 0)
+    shows_light = (brightest >= SHOWS_LIGHT * np.median(picture)) & (beyond > 0)
+    trust = np.where(shows_light, 0, trust)
     return trust[..., None].astype(np.float32) if trust.any() else None
 
 

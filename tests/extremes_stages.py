@@ -27,6 +27,7 @@ from envedit import (
     search,
     ssim,
 )
+from envedit.display import to_display
 from envedit.layers import Layers
 from envedit.transport import LightTransport
 
@@ -298,8 +299,8 @@ def display(m):
     """Return the display values of a rendering through T, as the losses see them."""
     height, width, _ = m.shape
     if height < 3:
-        return np.asarray(edit.to_display(single(m)).numpy())
-    return edit.to_display(transport(height, width).apply(single(m))).numpy()
+        return np.asarray(to_display(single(m)).numpy())
+    return to_display(transport(height, width).apply(single(m))).numpy()
 
 
 def lost(m, folder):

@@ -19,7 +19,7 @@ from extremes_stages import (
     write_plain,
 )
 
-from envedit import config, edit, envmap, metrics, optim, painted, scene
+from envedit import config, display, edit, envmap, metrics, optim, painted, scene
 from envedit.errors import InputError, NumericalError
 from envedit.transport import LightTransport
 
@@ -59,7 +59,7 @@ def _even(value):
         found = painted.given(picture, SHAPE, initial())
         np.testing.assert_array_equal(found.picture, np.maximum(picture, 0))
         assert (found.coverage == 1).all()
-        shown = [edit.to_display(single(e)).numpy() for e in (initial(), found.picture)]
+        shown = [display.to_display(single(e)).numpy() for e in (initial(), found.picture)]
         for name in ("image_l1", "image_l2", "ssim"):
             for got, wanted in zip(loss_and_gradient(name, *shown), plain(name, *shown), strict=True):
                 close(got, wanted, 1e-5, ssim_rounding(np.maximum(*shown)) if name == "ssim" else 0)

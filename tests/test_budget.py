@@ -83,6 +83,26 @@ def test_only_what_times_are_known_of_is_budgeted(table):
         budget.apply(config.from_dict(table), 60)
 
 
+@pytest.mark.parametrize(
+    "target",
+    [
+        {"kind": "image", "file": "a.png"},
+        {"mask": "a.png"},
+        {"kind": "strokes", "strokes": [{"type": "light", "ellipse": [9, 9, 4, 4], "units": "pixels"}]},
+    ],
+)
+def test_what_is_given_in_pixels_of_the_rendering_is_not_budgeted(target):
+    with pytest.raises(ConfigError, match="--budget: target.* is in pixels of the rendering"):
+        budget.apply(config.from_dict({"target": target}), 60)
+
+
+@pytest.mark.parametrize("rows, wanted", [([0, 20], (0, 5)), ([0, 127], (0, 31)), ([127, 127], (31, 31))])
+def test_active_rows_stay_the_same_part_of_the_sky(rows, wanted):
+    given = config.Input(envmap="sunsky", width=256, rows=tuple(rows))
+    assert budget._at_width(given, 64).rows == wanted
+    assert budget._at_width(config.Input(envmap="sunsky"), 64).rows == "upper"
+
+
 @pytest.fixture
 def small(tmp_path, rng, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -104,6 +104,10 @@ def test_an_override_without_key_or_value_is_refused(text):
             "[[target.strokes]]\ntype = 'contrast'",
             ["target.strokes: came 1, wanted none", 'kind = "strokes"'],
         ),
+        (
+            "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
+            ["target.mask: came '", "m.png', wanted none"],
+        ),
         ("[target]\nkind = 'imgae'", ["target.kind: came 'imgae'", "did you mean image?"]),
         ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: came [0, 64], wanted rows below 64"]),
         ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: came 0"]),

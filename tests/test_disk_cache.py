@@ -138,6 +138,16 @@ def test_a_folder_that_cannot_be_is_no_error(tmp_path, rng):
     assert cache.load(KEY) is None and (tmp_path / "file").read_text() == "mine"
 
 
+def test_a_folder_of_somebody_else_is_read(tmp_path, rng, monkeypatch):
+    DiskCache(tmp_path).store(KEY, some(rng))
+
+    def denied(path):
+        raise PermissionError(path)
+
+    monkeypatch.setattr(os, "utime", denied)
+    assert DiskCache(tmp_path).load(KEY) is not None
+
+
 def test_a_full_disk_leaves_what_was_there(tmp_path, rng, monkeypatch):
     cache, arrays = DiskCache(tmp_path), some(rng)
     cache.store(KEY, arrays)

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import double, single
+from test_display import plain_display
 from test_siren import launched
 
 from envedit import config, edit, envmap, losses, optim
@@ -76,62 +77,6 @@ def every_step(monkeypatch):
 
 
 # ---- display values --------------------------------------------------------------------------------------
-
-
-def plain_display(x):
-    toe = 1e-3 ** (1 / 2.2)
-    middle = np.clip(x, 1e-3, 1) ** (1 / 2.2)
-    return np.where(x < 1e-3, x * toe / 1e-3, np.where(x > 1, 1 + np.log(np.maximum(x, 1)) / 2.2, middle))
-
-
-def display(x):
-    return edit.to_display(single(np.reshape(x, (1, 1, -1)))).numpy().ravel()
-
-
-def display_slope(x):
-    leaf = single(np.reshape(x, (1, 1, -1)))
-    dr.enable_grad(leaf)
-    dr.backward(dr.sum(edit.to_display(leaf).array))
-    return np.array(dr.grad(leaf)).ravel()
-
-
-def test_display_values_are_the_metrics_tonemap_in_its_middle():
-    x = np.geomspace(1e-3, 1, 200)
-    np.testing.assert_allclose(display(x), x ** (1 / 2.2), rtol=2e-6)
-
-
-def test_display_values_by_formula():
-    x = np.float32([-1, 0, 1e-30, 5e-4, 1e-3, 0.18, 1, 2, 65504, 1e6, 1e30, 3e38])
-    shown = display(x)
-    np.testing.assert_allclose(shown, plain_display(np.float64(x)), rtol=2e-6)
-    assert shown[6] == 1
-
-
-def test_display_values_rise_everywhere_without_a_jump():
-    x = [np.linspace(-1e-3, 3e-3, 400), np.linspace(0.99, 1.01, 400), np.geomspace(1.1, 1e30, 400)]
-    assert (np.diff(display(np.concatenate(x))) > 0).all()
-    for joint in (1e-3, 1.0):
-        below, above = display(joint * np.array([1 - 1e-5, 1 + 1e-5]))
-        assert 0 < above - below < 2.1e-5 * above
-
-
-def test_display_slope_is_the_finite_difference_and_meets_at_one():
-    x = np.array([-0.5, 0.0, 5e-4, 2e-3, 0.18, 0.9, 1.1, 4.0, 1e4])
-    h = 1e-6 * np.maximum(np.abs(x), 1e-3)
-    slope = (plain_display(x + h) - plain_display(x - h)) / (2 * h)
-    np.testing.assert_allclose(display_slope(x), slope, rtol=1e-4)
-    np.testing.assert_allclose(display_slope([0.999999, 1.0, 1.000001]), 1 / 2.2, rtol=1e-5)
-
-
-def test_display_slope_is_finite_and_positive_at_the_extremes():
-    slope = display_slope([0, 1e-38, 1e-30, 1e-3, 65504, 1e6, 1e30])
-    assert np.isfinite(slope).all() and (slope > 0).all()
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_not_finite_is_shown_as_not_finite(value):
-    """Otherwise the loop would take a broken rendering for a grey one."""
-    assert list(np.isfinite(display([0.5, value, 0.5]))) == [True, False, True]
 
 
 # ---- rows ------------------------------------------------------------------------------------------------

@@ -76,6 +76,15 @@ def test_caches_follow_the_desktop_standard(monkeypatch, tmp_path):
     assert files.cache_folder("transport") == tmp_path / ".cache" / "envedit" / "transport"
 
 
+def test_caches_lie_somewhere_without_a_home(monkeypatch):
+    def nobody():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(files.Path, "home", nobody)
+    assert files.cache_folder("fits").is_absolute()
+
+
 def test_libraries_are_heard_and_kept_quiet(capfd):
     with files.quiet_libraries() as said:
         os.write(2, b"from C, ")

@@ -525,7 +525,7 @@ def test_the_cache_can_be_refused(tmp_path, rng):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed", "packed", "locked"])
 def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     image = sky(rng)
     made = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
@@ -534,6 +534,10 @@ def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     if damage == "changed":
         weights = data.index(made.params["1.weight"].tobytes())
         data[weights : weights + 4] = b"\xff" * 4  # a NaN
+    if damage == "packed":  # in a way that zipfile does not know
+        data[data.index(b"PK\1\2") + 10] = 99
+    if damage == "locked":
+        data[data.index(b"PK\1\2") + 8] |= 1
     if damage == "truncated":
         data = data[: len(data) // 2]
     path.write_bytes({"empty": b"", "text": b"not a fit"}.get(damage, data))

@@ -354,6 +354,15 @@ def test_an_entry_of_a_cache_that_comes_short_is_none(tmp_path):
 # ---- the long version ------------------------------------------------------------------------------------
 
 
+def test_the_experiment_compares_metrics_without_what_a_cache_changes(tmp_path):
+    made = [{"psnr": 3.0, "timing": seconds, "fit": {"cached": seconds < 2, "seconds": seconds, "peak": 1.0},
+             "transport": None} for seconds in (1.0, 9.0)]  # fmt: skip
+    for number, metrics in enumerate(made):
+        (tmp_path / f"{number}.json").write_text(json.dumps(metrics))
+    first, second = (kills.measured(tmp_path / f"{number}.json") for number in range(2))
+    assert first == second and first["fit"] == {"peak": 1.0}
+
+
 def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
     _, reference = whole
     folder = tmp_path / "out"
@@ -380,13 +389,13 @@ def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
 
 def test_the_experiment_tells_what_differs():
     good = {
-        "kind": "siren",
-        "renderer": "path",
+        "asked": {"kind": "siren", "renderer": "path"},
         "kills": [{"after_s": 1.5, "stage": "done before", "half": []}],
     }
     good |= {"differs": [], "good": True}
     kill = {"after_s": 2.25, "stage": "editing", "step": 40, "files": 1, "temporary": 1, "half": []}
-    bad = {"kind": "layers", "renderer": "transport", "kills": [kill, kill], "differs": ["edited.exr"]}
+    asked = {"kind": "layers", "renderer": "transport"}
+    bad = {"asked": asked, "kills": [kill, kill], "differs": ["edited.exr"]}
     lines = kills.table([good, bad | {"good": False}]).splitlines()
     assert lines[2] == "| 0 | siren | path | 1.5 s | done before | none | 0 / 0 / 0 | the same bytes |"
     assert lines[3].startswith(

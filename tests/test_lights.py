@@ -587,7 +587,7 @@ def test_what_is_not_finite_is_not_dropped(name, value, rng):
     assert np.isnan(core(made, **where)).any()
 
 
-@pytest.mark.parametrize("peak", [1e-20, 1e-6, 65504.0, 1e6, 1e12])
+@pytest.mark.parametrize("peak", [1e-30, 1e-20, 1e-6, 65504.0, 1e6, 1e12])
 def test_core_of_any_exposure(peak, rng):
     light = patch(rng, 6, 46, peak=peak)
     made, expected = Lights([light], (0, H), W), image_of(light)

@@ -86,6 +86,20 @@ def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monk
     assert "not enough memory" in capsys.readouterr().err
 
 
+def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
+    full = pipeline.at_full_resolution
+
+    def gone(*arguments):
+        (tmp_path / "map.exr").unlink()
+        return full(*arguments)
+
+    monkeypatch.setattr(pipeline, "at_full_resolution", gone)
+    out = carried_out(tmp_path, source(rng))
+    assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
+    said = capsys.readouterr().err
+    assert "edited_full.exr is not written" in said and "map.exr" in said
+
+
 def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     out = carried_out(tmp_path, source(rng))
     channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()

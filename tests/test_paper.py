@@ -428,12 +428,17 @@ def test_averages_are_over_maps_and_say_how_many(maps, tmp_path):
         finish(tmp_path, made, "siren", sky, numbers=some, roughness=0.5)
         finish(tmp_path, made, "pixels", sky, numbers=SOME, roughness=0.5)
     text = tables.text("table3", tmp_path, cells_of(made))
-    heads = [line for line in text.splitlines() if line.endswith("3 maps:")]
-    assert heads == [f"Our settings, roughness {r}, 3 maps:" for r in ("0", "0.5", "1")]
+    heads = [line for line in text.splitlines() if line.startswith("Our settings")]
+    ends = ("0, 3 maps:", "0.5, 3 maps, averages over 2 of them:", "1, 3 maps:")
+    assert heads == [f"Our settings, roughness {end}" for end in ends]
     layers = row_of(text, "Layers (ours)")
     assert [row[-1] for row in layers] == ["0/3", "2/3", "0/3"]
-    assert layers[1][0] == "20.00" and layers[0][0] == "-"  # not bold: the other rows have more maps
+    assert layers[1][0] == "**20.00**" and layers[0][0] == "-"
     assert row_of(text, "Pixels")[1][0] == "**20.00** (9.51)"
+    assert row_of(text, "SIREN HDR")[1][:2] == ["11.00", "0.100"]  # dusk is not among them
+    assert row_of(text, "unedited")[1][-1] == "2/3"
+    made = [one for one in made if one[0].row != "layers"]
+    text = tables.text("table3", tmp_path, cells_of(made))
     assert row_of(text, "SIREN HDR")[1][:2] == ["11.00", "-"]  # an LPIPS of two maps of three is none
     assert row_of(text, "unedited")[1][-1] == "3/3"
 

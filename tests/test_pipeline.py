@@ -578,3 +578,11 @@ def test_paint_on_a_black_map_is_followed(tmp_path):
     )
     result = pipeline.run(settings)
     assert result.envmap.max() > 0 and result.metrics["painted"]["towards"] > 0.5
+
+
+def test_a_configuration_s_files_are_looked_for_beside_it_from_python_too(tmp_path, monkeypatch):
+    (tmp_path / "c.toml").write_text('[input]\nenvmap = "sunsky"\n')
+    monkeypatch.setattr(pipeline, "run", lambda settings, **named: named)
+    assert edit.edit(tmp_path / "c.toml")["base"] == tmp_path
+    assert edit.edit(tmp_path / "c.toml", base=tmp_path / "other")["base"] == tmp_path / "other"
+    assert "base" not in edit.edit(config.load(tmp_path / "c.toml"))

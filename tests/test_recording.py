@@ -85,3 +85,12 @@ def test_rows_share_samples_by_their_light_and_none_gets_nothing():
     assert mass[0] / sphere[0] == pytest.approx(2 * mass[1] / sphere[1])
     dark = mass[2:] / sphere[2:]
     assert dark[0] == pytest.approx(dark[1]) and dark[0] < mass[1] / sphere[1]
+
+
+@pytest.mark.parametrize("size", [64, 1024, 2048, 8192])
+def test_an_index_into_the_exact_columns_fits_into_32_bits(size):
+    class Film:
+        width = height = size
+
+    _, capacity, _ = recording.choose_samples(Film(), "auto", 256 * 128, 1e4)
+    assert 4 * (size * size + 7) * capacity < 2**32 and (capacity == 256 or size > 1024)

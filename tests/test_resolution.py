@@ -1,11 +1,8 @@
 """How fine a gain a picture can tell: a mirror's, a matte thing's, and one of noise alone."""
 
-import mitsuba as mi
 import numpy as np
-import pytest
 
 from envedit import latlong, resolution
-from envedit.edit import to_display
 from envedit.gain import grid_size
 from envedit.search import tensor
 
@@ -95,12 +92,3 @@ def test_a_highlight_tells_less_than_the_dark():
     dark, bright = (told(mirror(), value=value) for value in (0.05, 50.0))
     assert len(bright) < len(dark) == 4
     assert all(few.known.mean() <= many.known.mean() for few, many in zip(bright, dark, strict=False))
-
-
-@pytest.mark.parametrize("value", [0.0, 1e-30, 5e-4, 0.02, 0.5, 0.999, 2.0, 1e6])
-def test_slope_is_that_of_the_display(value):
-    step = max(value, 1e-3) * 1e-3
-    ends = to_display(mi.TensorXf(np.array([[[value, value + step, 0.0]]], np.float32))).numpy().ravel()
-    x = np.array([value, value + step], np.float32).astype(np.float64)
-    measured = (float(ends[1]) - float(ends[0])) / (x[1] - x[0])
-    assert resolution.display_slope(value + step / 2) == pytest.approx(measured, rel=0.02)

@@ -485,6 +485,25 @@ def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
     assert names(out / "earlier-1") == FILES | INFLUENCE
 
 
+def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path, rng, monkeypatch):
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "run", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert call(out / "config.toml", "--quiet") == 130
+    assert "metrics.json" not in names(out) and call(out / "config.toml", "--quiet") == 0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+def test_an_input_is_known_by_any_name(tmp_path, rng, capsys):
+    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    (tmp_path / "link").symlink_to(out)
+    for name in (tmp_path / "link" / "edited.exr", tmp_path / "nowhere" / ".." / "c_out" / "edited.exr"):
+        assert call(path, "--quiet", *changed(input__envmap=str(name))) == 3
+        assert "--out" in capsys.readouterr().err and (out / "edited.exr").exists()
+
+
 def test_an_input_is_not_moved_away_with_earlier_results(tmp_path, rng, capsys):
     path, out = world(tmp_path, rng), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
@@ -555,6 +574,15 @@ def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, 
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
 
 
+def test_an_interrupt_while_results_are_written_names_the_checkpoint(tmp_path, rng, capsys, monkeypatch):
+    path = world(tmp_path, rng, representation={"kind": "pixels"})
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "_write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert call(path, "--quiet") == 130
+    assert "--resume" in capsys.readouterr().err
+    assert call(path, "--quiet", "--resume") == 0 and "metrics.json" in names(tmp_path / "c_out")
+
+
 class NotANumber:
     """A renderer whose picture is NaN."""
 
@@ -568,7 +596,7 @@ class NotANumber:
 
 
 def test_an_edit_that_cannot_go_on_leaves_the_last_good_map(tmp_path, rng, capsys, monkeypatch):
-    monkeypatch.setattr(pipeline, "make_renderer", lambda *_: NotANumber())
+    monkeypatch.setattr(pipeline.renderers, "make", lambda *_: NotANumber())
     path = world(tmp_path, rng, representation={"kind": "pixels"})
     assert call(path, "--quiet", *changed(optimizer__iterations=50)) == 5
     said = capsys.readouterr().err

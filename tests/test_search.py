@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import changes, latlong, pursuit, scene, search
+from envedit import changes, grid, latlong, pursuit, scene, search
 from envedit.layers import Layers
 from envedit.overview import Overview
 from envedit.transport import LightTransport
@@ -374,3 +374,21 @@ def test_paint_that_any_gain_makes_asks_for_no_light(factor, transport):
     found = painted(transport(), image, factor * image)
     assert degrees_apart(found.direction[0], DIRECTIONS[SUN]) < 0.5 * TEXEL
     assert (found.flux[1:] < 1e-9).all() and found.notes == []
+
+
+@pytest.mark.parametrize("width", [2, 4, 8, 16])
+def test_a_light_is_refined_on_a_map_of_few_texels(width, rng):
+    """The exact columns of a map 8 wide are asked for once each: T would count one of two for ever."""
+    height = max(width // 2, 2)
+
+    class Few:
+        grid = grid.Grid(height, width, np.eye(3), np.ones(height))
+
+        def probe(self, texels):
+            assert len(np.unique(texels)) == len(texels)
+            return rng.random((len(texels), 30, 3))
+
+    wanted, known, gains = (rng.random(shape) for shape in ((30, 3), (30, 3), (4, 30, 3)))
+    asked = wanted, known, None, gains, np.array([0.6, 0.5, 0.6]), np.ones(3), 0, height - 1
+    direction, factor = search.refine(Few(), *asked)
+    assert abs(np.linalg.norm(direction) - 1) < 1e-6 and np.isfinite(factor).all() and factor.min() >= 0

@@ -1,12 +1,13 @@
 """Changes to a parsed scene, seen through the loaded scene: film, environment, stage and digest."""
 
+import os
 import re
 
 import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import scene
+from envedit import scene, stage
 from envedit.errors import ConfigError, InputError
 
 # ---- film, environment, smooth limit -----------------------------------------------------------------------
@@ -133,3 +134,15 @@ def test_digest_follows_what_the_rendering_depends_on(tmp_path):
     tent.write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
     digests += [scene.load(path).digest]
     assert len({digest, *digests}) == 1 + len(digests)
+
+
+def test_a_scene_s_parameters_may_have_any_name():
+    assert stage.told("scene.xml", dict, where="1", call="2") == {"where": "1", "call": "2"}
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="may read everything")
+def test_a_file_that_may_not_be_read_is_named(tmp_path):
+    path = write_scene(tmp_path, SENSOR, BALL, LIGHT)
+    path.chmod(0)
+    with pytest.raises(InputError, match=path.name):
+        scene.load(path)

@@ -26,7 +26,8 @@ def jobs(root: Path, out: Path, maps, overrides):
             text = (
                 f'[input]\nenvmap = "{root / "puresky" / f"{name}_puresky_1k.hdr"}"\nwidth = 256\n'
                 f'[scene]\nfile = "sphere"\nparameters = {{ roughness = 0.3 }}\n'
-                f'[target]\nrotate_degrees = 60.0\n[representation]\nkind = "{kind}"\n'
+                f"[target]\nrotate_degrees = 60.0\nspp = 2048\n[output]\nspp = 2048\n"
+                f'[representation]\nkind = "{kind}"\n'
             )
             yield name, kind, folder, text, [part for o in overrides for part in ("--set", o)]
 

@@ -24,6 +24,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from experiments import trials
+
 ROOT = Path(__file__).parents[2]
 KINDS = ("layers", "siren", "pixels", "log-pixels")
 TINY = """
@@ -133,8 +135,8 @@ def measured(path: Path) -> dict:
     """Return metrics without the times and what a cache changes."""
     found = json.loads(path.read_text())
     for part in ("fit", "transport"):
-        if found[part]:
-            found[part].pop("cached")
+        for key in ("cached", "seconds"):
+            (found[part] or {}).pop(key, None)
     return {key: value for key, value in found.items() if key != "timing"}
 
 
@@ -158,13 +160,14 @@ def trial(base: Path, number: int, kind: str, renderer: str, seed: int, override
     """Kill a run once or twice and resume it, unless that is done; returns a row of the table."""
     folder = base / f"trial-{number:02d}"
     result = folder / "result.json"
-    if result.exists():
-        return json.loads(result.read_text())
+    asked = {"kind": kind, "renderer": renderer, "seed": seed, "sets": list(overrides)}
+    if result.exists() and (known := json.loads(result.read_text())).get("asked") == asked:
+        return known
     seconds = undisturbed(base, kind, renderer, overrides)
     reference, rng = base / f"whole-{kind}-{renderer}", np.random.default_rng([seed, number])
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    out, cache, row = folder / "out", folder / "cache", {"kind": kind, "renderer": renderer, "kills": []}
+    out, cache, row = folder / "out", folder / "cache", {"asked": asked, "kills": []}
     for attempt in range(1 + number % 2):
         moment = float(rng.uniform(0, seconds))
         more = ("--resume",) if attempt else ()
@@ -195,7 +198,7 @@ def table(rows: list[dict]) -> str:
     for number, row in enumerate(rows):
         kills = row["kills"]
         lines.append([
-            str(number), row["kind"], row["renderer"],
+            str(number), row["asked"]["kind"], row["asked"]["renderer"],
             ", ".join(f"{kill['after_s']} s" for kill in kills),
             ", ".join(kill["stage"] for kill in kills),
             ", ".join(str(kill.get("step") or "none") for kill in kills),
@@ -218,7 +221,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     chosen = parser.parse_args(argv)
-    base = chosen.out.absolute()
+    base = trials.folder(chosen.out.absolute(), chosen.overrides)
     base.mkdir(parents=True, exist_ok=True)
     rows = []
     for number in tqdm(range(chosen.kills), unit="trial"):

@@ -18,6 +18,7 @@ import numpy as np
 
 from envedit import image, latlong, metrics
 from envedit.tonemap import luminance
+from experiments import trials
 
 SUNNY = 1000.0
 """Peak radiance, 256 texels wide, from which on a map is called sunny."""
@@ -159,7 +160,7 @@ def main():
     parser.add_argument("--kinds", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     given = parser.parse_args()
-    out = given.out.absolute()
+    out = trials.folder(given.out.absolute(), given.overrides)
     out.mkdir(parents=True, exist_ok=True)
     work = given.maps, given.scenes, given.angles, given.kinds
     for name, scene, angle, kind, folder, text in jobs(out, *work):

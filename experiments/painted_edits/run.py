@@ -19,6 +19,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from envedit import image, metrics
+from experiments import trials
 
 ROOT = Path(__file__).parents[2]
 EDITS = ("move_shadow", "add_reflection", "add_shadow", "warmer", "enhance_shadow", "blur_shadow")
@@ -102,7 +103,7 @@ def main():
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     given = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    out = given.out.absolute()
+    out = trials.folder(given.out.absolute(), given.overrides)
     out.mkdir(parents=True, exist_ok=True)
     lines = [HEAD]
     kinds = ABLATION if given.ablation else {"": []}

@@ -151,13 +151,14 @@ def histograms(out, cells: list[Cell]) -> Figure:
 def bars(out, cells: list[Cell]) -> Figure:
     """Draw Table 3 as bars: a panel a column, a group a roughness, black ticks for the paper's numbers."""
     rows, rough = tables.rows_of("table3", cells), sorted({cell.roughness for cell in cells})
+    shared = tables.common(out, cells)
     found = {
-        (row, r): tables.averages(out, [cell for cell in some if cell.roughness == r])[0]
+        (row, r): tables.averages(out, [cell for cell in some if cell.roughness == r and cell in shared])[0]
         for row, some in rows.items()
         for r in rough
     }
     settings = _SETTINGS[cells[0].settings]
-    maps = len({cell.map for cell in cells})
+    maps = len({cell.map for cell in shared})
     figure = Figure(figsize=(15, 6.4), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
     wide = 0.8 / len(rows)

@@ -21,8 +21,8 @@ _SETTINGS = {"paper": "the paper's settings", "ours": "our settings"}
 def text(name: str, out, cells: list[Cell]) -> str:
     """Write the tables of one table or figure: one for either settings and every roughness.
 
-    Averages are over the maps that are done in a row; their number stands last. Rows that are not complete
-    are not compared with others: the best of a column, in bold, is of those that are.
+    Averages are over the maps that are done in every row that has any, so that rows can be compared; how many
+    of a row's own are done stands last. The best of a column is in bold.
     """
     kind = KINDS[name]
     spent = measured.seconds(out, cells)  # of all: a fit may have been made for another roughness
@@ -34,9 +34,21 @@ def text(name: str, out, cells: list[Cell]) -> str:
         maps = names[0] if len(names) == 1 else f"{len(names)} maps"
         for roughness in sorted({cell.roughness for cell in some}, key=lambda r: -1 if r is None else r):
             at = "" if roughness is None else f", roughness {roughness:g}"
-            parts.append(f"{_SETTINGS[settings][0].upper()}{_SETTINGS[settings][1:]}{at}, {maps}:")
-            parts.append(build(name, out, [c for c in some if c.roughness == roughness], spent))
+            here = [c for c in some if c.roughness == roughness]
+            shared = {cell.map for cell in common(out, here)}
+            over = "" if len(shared) in (0, len(names)) else f", averages over {len(shared)} of them"
+            parts.append(f"{_SETTINGS[settings][0].upper()}{_SETTINGS[settings][1:]}{at}, {maps}{over}:")
+            parts.append(build(name, out, here, spent))
     return "\n\n".join(parts)
+
+
+def common(out, cells: list[Cell]) -> list[Cell]:
+    """Return the cells of the maps that are done in every row, or at every roughness, that has any done."""
+    ready: dict[tuple, set[str]] = {}
+    for cell in measured.done(out, cells):
+        ready.setdefault((cell.row, cell.roughness), set()).add(cell.map)
+    shared = set.intersection(*ready.values()) if ready else set()
+    return [cell for cell in cells if cell.map in shared]
 
 
 def rows_of(name: str, cells: list[Cell]) -> dict[str, list[Cell]]:
@@ -79,19 +91,19 @@ def _methods(name, out, cells, spent):
     published = PUBLISHED.get(name, {}).get(cells[0].roughness, {})
     head = [f"{'map' if image == 'envmap' else 'rendering'} {_WORDS[column]}" for image, column in COLUMNS]
     rows = rows_of(name, cells)
-    found = {row: averages(out, some) for row, some in rows.items()}
-    whole = [row for row, some in rows.items() if found[row][1] == len(some)]
+    shared = common(out, cells)
+    found = {row: averages(out, [cell for cell in some if cell in shared])[0] for row, some in rows.items()}
     best = {}
     for column in COLUMNS:
-        numbers = [found[row][0][column] for row in whole if found[row][0][column] is not None]
+        numbers = [row[column] for row in found.values() if row[column] is not None]
         best[column] = _BETTER[column[1]](numbers) if len(numbers) > 1 else None
-    lines = [_unedited(out, cells)]
+    lines = [_unedited(out, shared, len({cell.map for cell in cells}))]
     for row, some in rows.items():
-        numbers, count = found[row]
+        numbers, count = found[row], len(measured.done(out, some))
         cells_ = []
         for column in COLUMNS:
             own = _show(numbers[column], column[1])
-            bold = row in whole and numbers[column] is not None and numbers[column] == best[column]
+            bold = numbers[column] is not None and numbers[column] == best[column]
             own = f"**{own}**" if bold else own
             theirs = published.get(row, {}).get(column)
             cells_.append(own if theirs is None else f"{own} ({_show(theirs, column[1])})")
@@ -100,14 +112,14 @@ def _methods(name, out, cells, spent):
     return _markdown(["", *head, "fit, s", "rest, s", "maps"], lines)
 
 
-def _unedited(out, cells):
+def _unedited(out, cells, maps):
     """Return the row before any edit: of every map the numbers of the first run that is done."""
     first = {}
     for cell in measured.done(out, cells):
         first.setdefault(cell.map, cell)
     numbers, count = averages(out, list(first.values()), ("initial_envmap", "initial"))
     shown = [_show(numbers[column], column[1]) for column in COLUMNS]
-    return ["unedited", *shown, "-", "-", f"{count}/{len({cell.map for cell in cells})}"]
+    return ["unedited", *shown, "-", "-", f"{count}/{maps}"]
 
 
 def _fits(name, out, cells, spent):

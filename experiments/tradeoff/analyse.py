@@ -10,10 +10,11 @@ from experiments.engine.tables import table
 
 TIMES = {"time": "whole run", "again": "run again, T and fit at hand"}
 """Kinds of time: of a run from nothing but compiled kernels; of one that finds T and fit on disk."""
-ACCURACY = ("psnr", "map_psnr", "map_ssim", "sun", "noise")
 MOST_PSNR = 55.0
 """Most dB of a rendering that are told: beyond, the estimate without noise may itself be noise (57 dB for the
 true map, where the judge has most of it)."""
+UNDISTURBED = 0.85
+"""Share of its setting's usual processor time, by wall time, that a run is to have had."""
 SHARES = (2.0, 1.5, 1.0, 0.75, 0.5, 0.35)
 """Times, as multiples of the standard preset's, for which the best setting is looked up."""
 
@@ -75,6 +76,22 @@ def ratios(runs: list[dict]) -> list[dict]:
         won = ("psnr", "map_psnr", "map_ssim")
         change = {key: run[key] - statistics.median(s[key] for s in same) for key in won}
         found.append(run | {"ratio": ratio, "change": change})
+    return found
+
+
+def disturbed(runs: list[dict]) -> list[dict]:
+    """List runs that had less of the processor than others of their setting: something else ran beside them.
+
+    Processor time over wall time, of which a run had less than :data:`UNDISTURBED` of the median of its
+    setting's runs; settings of fewer than three runs are not told.
+    """
+    found = []
+    for name in dict.fromkeys(run["setting"] for run in runs):
+        some = [run for run in runs if run["setting"] == name]
+        shares = [run["cost"]["cpu_s"] / run["cost"]["wall_s"] for run in some]
+        usual = statistics.median(shares)
+        if len(some) >= 3:
+            found += [r for r, share in zip(some, shares, strict=True) if share < UNDISTURBED * usual]
     return found
 
 

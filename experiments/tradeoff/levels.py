@@ -2,16 +2,18 @@ r"""Measure the levels of ``--budget``: what each costs and loses, for the table
 
     ENVEDIT_DATA=... python -m experiments.tradeoff.levels [--out runs/levels] [--maps DIR]
 
-Three maps in two scenes, every level once, the transport traced anew, after a run that compiles kernels.
-Seconds are of the run's own stages; what is lost is judged alike for all (``judge.py``). Nothing else should
-run on the machine.
+Three maps in two scenes, every level once, the transport traced anew; a run that compiled kernels is made
+again. Seconds are of the run's own stages; what is lost is judged alike for all (``judge.py``). Nothing else
+should run on the machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +22,7 @@ import numpy as np
 
 from envedit import budget, config
 
+from . import measured
 from .judge import Judge
 from .plan import ANGLE, SCENES, cells
 
@@ -36,15 +39,22 @@ def settings_of(cell, level) -> dict:
     }
 
 
-def run(cell, level, folder: Path) -> dict:
-    """Carry out a run that is missing; returns its metrics."""
+def run(cell, level, out: Path) -> tuple[dict, Path]:
+    """Carry out a run that is missing; returns its metrics and folder, which is named by what was asked."""
+    asked = settings_of(cell, level)
+    text = config.to_toml(config.from_dict(asked, out))
+    folder = out / f"{cell.map}-{cell.scene}-{level.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
     if not (folder / "metrics.json").exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         file = folder.with_suffix(".toml")
-        file.write_text(config.to_toml(config.from_dict(settings_of(cell, level), folder.parent)))
+        file.write_text(text)
         command = [sys.executable, "-m", "envedit.run", str(file), "--out", str(folder), "--quiet"]
+        before = measured.kernels()
         subprocess.run(command, check=True)
-    return json.loads((folder / "metrics.json").read_text())
+        if measured.kernels() > before:
+            shutil.rmtree(folder)
+            subprocess.run(command, check=True)
+    return json.loads((folder / "metrics.json").read_text()), folder
 
 
 def parts(timing: dict) -> dict:
@@ -70,12 +80,10 @@ def main():
     mi.set_variant("llvm_ad_rgb")
     out, found = given.out.absolute(), {}
     work = cells(given.maps)
-    run(work[-1], budget.LEVELS[0], out / "first")  # compiles
     for level in budget.LEVELS:
         for cell in work:
-            name = f"{cell.map}-{cell.scene}-{level.name}"
-            found[level.name, cell] = run(cell, level, out / name), out / name
-            print(name, json.dumps(parts(found[level.name, cell][0]["timing"])), flush=True)
+            told, folder = found[level.name, cell] = run(cell, level, out)
+            print(folder.name, json.dumps(parts(told["timing"])), flush=True)
     judge = Judge(out, spp=512, true_spp=2048)
     lost = {key: judge(key[1], folder) for key, (_, folder) in found.items()}
     print(

@@ -93,6 +93,7 @@ def main(argv: list[str]) -> int:
         shutil.rmtree(earlier, ignore_errors=True)
     for name in DROPPED:
         (folder / name).unlink(missing_ok=True)
+    (folder / "judged.json").unlink(missing_ok=True)  # of an earlier run in this folder
     temporary = folder / "cost.json.tmp"
     temporary.write_text(json.dumps(cost | {"session": session, "threads": threads}, indent=1) + "\n")
     temporary.replace(folder / "cost.json")

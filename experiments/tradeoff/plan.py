@@ -89,9 +89,20 @@ def knobs() -> list[Setting]:
         ),
         *_key("path depth", "renderer", "max_depth", (2, 8), v2=14, v8=20),
         *_key("map width", "input", "width", (64, 128, 512), v512=28),
-        *_key("film width", "scene", "width", (64, 192), v64=12, v192=27),
+        *_levels(
+            "film width",
+            "knob",
+            {
+                "64": {"scene": {"width": 64}},
+                # "auto" gives a larger film fewer samples of T a pixel.
+                "192, T 64": {"scene": {"width": 192}},
+                "192, T 256": {"scene": {"width": 192}, "renderer": {"spp": 256}},
+            },
+            {"64": 12.0, "192, T 64": 27.0, "192, T 256": 40.0},
+        ),
         *_key("steps", "optimizer", "iterations", (10, 30, 200), v200=21),
-        *_key("gain, cycles", "representation", "cycles", (4, 24)),
+        # A number means those cycles and no finer grids, wherever the picture may tell them.
+        *_key("gain without detail, cycles", "representation", "cycles", (4, 12, 24)),
         *_levels(
             "samples of target and result",
             "knob",

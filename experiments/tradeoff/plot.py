@@ -96,8 +96,8 @@ def by_cell(compared: list[dict], bounds: list[dict], file: Path, kind: str = "t
         rows = [r for r in compared if (r["map"], r["scene"]) == (cell["map"], cell["scene"])]
         for panel, key in zip(column, WORTH, strict=True):
             points(panel, rows, key, kind, lambda r, key=key: r[key])
-            part = {"psnr": "render", "map_psnr": "map"}[key]
-            panel.axhline(cell["unedited"][part]["psnr"], color="grey", ls=":", lw=1)
+            part, name = {"psnr": ("render", "psnr_without_noise"), "map_psnr": ("map", "psnr")}[key]
+            panel.axhline(cell["unedited"][part][name], color="grey", ls=":", lw=1)
         column[0].set_title(f"{cell['map']}\n{cell['scene']}", fontsize="small")
         column[1].set_xlabel("time over the standard preset's")
     figure.savefig(file, dpi=90)
@@ -105,7 +105,10 @@ def by_cell(compared: list[dict], bounds: list[dict], file: Path, kind: str = "t
 
 
 def by_knob(rows: list[dict], file: Path, kind: str = "time") -> None:
-    """Draw a panel for each knob: rendering and map against time, a label for each level."""
+    """Draw a panel for each knob: rendering and map against time, a label for each level, no lines.
+
+    Neither time nor worth need follow a knob: larger widths come with fewer samples of T.
+    """
     import matplotlib.pyplot as plt
 
     knobs: dict[str, list[dict]] = {}
@@ -127,9 +130,8 @@ def by_knob(rows: list[dict], file: Path, kind: str = "time") -> None:
     for panel, (name, some) in zip(panels.ravel(), knobs.items(), strict=False):
         base = siren if some[0]["group"] == "siren" else [standard]
         for key, colour in (("psnr", "tab:blue"), ("map_psnr", "tab:orange")):
-            every = sorted([*some, *base], key=lambda r: r["ratio"][kind])
-            at = [(r["ratio"][kind], r["change"][key]) for r in every]
-            panel.plot(*zip(*at, strict=True), "o-", color=colour, ms=4, lw=0.8, label=WORTH[key])
+            at = [(r["ratio"][kind], r["change"][key]) for r in [*some, *base]]
+            panel.plot(*zip(*at, strict=True), "o", color=colour, ms=4, label=WORTH[key])
         for r in some:
             level = r["setting"].split(": ")[1]
             panel.annotate(f" {level}", (r["ratio"][kind], r["change"]["psnr"]), fontsize="x-small")

@@ -23,7 +23,7 @@ from envedit.files import write_atomically
 from experiments.sweep import Job, sweep
 
 from . import plan
-from .analyse import flat
+from .analyse import disturbed, flat, ratios
 from .plan import Cell, Setting
 
 COMMAND = ("{python}", "-S", str(Path(__file__).with_name("measured.py")), "{folder}", "{threads}")
@@ -154,6 +154,17 @@ def collect(given, judge=None) -> dict:
         for key, cell in cells.items()
         if key in met
     ]
+    if alone := len(runs) - len(ratios(runs)):
+        print(f"{alone} runs are left out: beside them no run of the standard preset ended", file=sys.stderr)
+    for run in disturbed(runs):
+        print(
+            f"{run['map']}, {run['scene']}: {run['setting']}: the machine did something else meanwhile: "
+            f"remove {out / run['folder']} and run again",
+            file=sys.stderr,
+        )
+    for run in runs:
+        if not run["judged"].get("full", True):
+            print(f"{run['map']}, {run['scene']}: {run['setting']}: judged by its working map: no full one")
     results = {"about": about(), "runs": runs, "cells": bounds}
     write_atomically(out / "results.json", (json.dumps(results, indent=1, allow_nan=False) + "\n").encode())
     return results
@@ -214,7 +225,8 @@ def main(argv: list[str] | None = None) -> int:
         failed = carry_out(given)
         if not given.plan:
             collect(given)
-            print(f"{given.out / 'results.json'}: draw it with python -m experiments.tradeoff.plot")
+            hint = f"python -m experiments.tradeoff.plot --out {given.out}"
+            print(f"{given.out / 'results.json'}: draw it with {hint}")
     except EnveditError as error:
         print(f"tradeoff: {error}", file=sys.stderr)
         return error.exit_code

@@ -1,0 +1,32 @@
+"""The curve through which losses see a picture: the metrics' display values, with a slope everywhere."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+LOW = 1e-3
+"""Below this the root is too steep, and the curve is linear."""
+
+
+def to_display(radiance: mi.TensorXf) -> mi.TensorXf:
+    """Map linear radiance to display values, differentiably.
+
+    x^(1/2.2) as the metrics' tonemap, but linear below :data:`LOW`, and 1 + log(x) / 2.2 above 1, where a
+    clip would leave a highlight no way back. Continuous, at 1 with its first derivative.
+    """
+    x = radiance.array
+    middle = dr.power(dr.clip(x, LOW, 1), 1 / 2.2)
+    toe = LOW ** (1 / 2.2) / LOW
+    y = dr.select(x <= LOW, x * toe, dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
+    return mi.TensorXf(y, radiance.shape)
+
+
+def slope(radiance) -> np.ndarray:
+    """Return the derivative of :func:`to_display` at linear radiance (h, w, 3)."""
+    x = mi.TensorXf(np.ascontiguousarray(radiance, np.float32))
+    with dr.isolate_grad():
+        dr.enable_grad(x)
+        dr.backward(dr.sum(to_display(x).array))
+        return dr.grad(x).numpy()

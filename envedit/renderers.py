@@ -1,0 +1,44 @@
+"""The renderer that a configuration asks for: the stored transport, or the paper's path tracer."""
+
+from __future__ import annotations
+
+from . import config, files, scene
+from .pathtrace import PathTracer
+from .transport import LightTransport
+
+
+def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> PathTracer | LightTransport:
+    """Build the renderer of a configuration for maps of the given (H, W).
+
+    Parameters
+    ----------
+    settings : config.Config
+        Whose renderer.
+    lit : scene.Scene
+        The scene.
+    shape : (int, int)
+        Rows and columns of the maps.
+    progress : callable, optional
+        Told of paths done and paths in all.
+    """
+    chosen = settings.renderer
+    if chosen.kind == "path":
+        return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
+    return trace(settings, lit, shape, progress)
+
+
+def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> LightTransport:
+    """Trace the light transport of a configuration, or take it from disk; arguments as :func:`make`."""
+    chosen = settings.renderer
+    return LightTransport.build(
+        lit,
+        *shape,
+        spp=chosen.spp,
+        max_depth=chosen.max_depth,
+        seed=settings.seed,
+        memory_gb=chosen.memory_gb,
+        refresh=0 if chosen.refresh == "auto" else chosen.refresh,
+        few=settings.representation.kind == "layers",
+        folder=files.cache_folder("transport") if chosen.cache else None,
+        progress=progress,
+    )

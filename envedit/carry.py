@@ -145,7 +145,7 @@ class _LayersAt:
         self.gain = layers.log_gain(params)
         # Of lights that stay, what their cores are multiplied by; of those that move, nothing is left.
         own = layers.lights.count - lights.SPARE
-        strength = np.where(self.flux[:own] <= lights.DARK, 0, np.exp(np.minimum(self.flux[:own], 30)))
+        strength = lights.flux_factor(self.flux[:own])
         strength = np.where(self.moved[:own, None], 0, strength)
         self.strength = to_device(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
         self.survey = layers.separation.survey
@@ -304,7 +304,7 @@ class _LayersAt:
             row, column, flux, omega = (np.repeat(v, 2, axis=0) for v in (row, column, flux / 2, omega / 2))
         d = lights.points(row, column, self.height, self.width)
         sine = np.sin(np.pi * row / max(self.height - 1, 1))
-        size = float(np.exp(np.clip(self.size[i, 0], -6, 3)))
+        size = float(lights.size_factor(self.size[i, 0]))
         self._place(i, d, flux, sine, 1.0, max(1.0, size), omega * size**2)
 
     def _place_lobe(self, i):
@@ -319,10 +319,10 @@ class _LayersAt:
         def vector(v):
             return dr.opaque(mi.Vector3f(*(float(x) for x in v)))
 
-        scale = np.where(self.flux[i] <= lights.DARK, 0, np.exp(np.minimum(self.flux[i], 30)))
+        scale = lights.flux_factor(self.flux[i])
         point = mi.Vector3f(*(to_device(mi.Float, v) for v in d.T.astype(np.float32)))
         flux = mi.Color3f(*(to_device(mi.Float, v) for v in (flux * scale).T.astype(np.float32)))
-        size = dr.exp(dr.opaque(mi.Float, float(np.clip(self.size[i, 0], -6, 3))))
+        size = dr.exp(dr.opaque(mi.Float, float(np.clip(self.size[i, 0], *lights.LOG_SIZES))))
         centre, turn = vector(self.layers.lights.centres[i]), vector(self.turn[i])
         sine = to_device(mi.Float, sine.astype(np.float32))
         places = lights.placed(point, centre, turn, size, sine, finer, self.grid.shape)

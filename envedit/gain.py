@@ -7,6 +7,8 @@ their nodes: what a coarse grid can say is said by it. Finer ones are added wher
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 MOST = 12.0
 """Largest log factor: e^12 is more than any sky needs, and leaves float32 room."""
 LEVELS = 3
+"""Coarse grids, which any picture may move."""
 CYCLES = 12
 """Cycles around the horizon that any picture may move; what is finer must be told by it."""
 
@@ -38,6 +41,30 @@ def tents(size, shape) -> tuple[np.ndarray, np.ndarray]:
     return down, np.maximum(1 - np.minimum(apart, columns - apart), 0)
 
 
+@dataclass(frozen=True)
+class Octave:
+    """One grid of detail.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Its rows and columns of nodes.
+    known : ndarray (rows, columns)
+        How well the picture tells it at each node, in [0, 1).
+    share : float
+        How much of the active rows' solid angle it tells, in [0, 1].
+    """
+
+    size: tuple[int, int]
+    known: np.ndarray
+    share: float
+
+    @property
+    def cycles(self) -> int:
+        """Cycles around the horizon that it can hold."""
+        return self.size[1] // 2
+
+
 class GridGain:
     """Log gain per channel on bilinear grids.
 
@@ -54,7 +81,7 @@ class GridGain:
         self._units = [0.5**level for level in range(LEVELS)]
 
     def refine(self, octaves) -> None:
-        """Add finer grids, :class:`.resolution.Octave`; a step of a node counts as far as it is known."""
+        """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
         for octave in octaves:
             self.sizes.append(octave.size)
             self._units.append(DETAIL * np.repeat(octave.known[..., None], 3, axis=2).astype(np.float32))
@@ -68,7 +95,10 @@ class GridGain:
         return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
 
     def hats(self, level: int, shape) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return (node, weight) of every texel of an image (rows, W) in one of the grids, four of them."""
+        """List the four nodes around every texel of an image (rows, W): (index of the node, bilinear weight).
+
+        Each is an array (rows * W,); the same map as :func:`tents` as matrices.
+        """
         (rows, columns), (height, width) = self.sizes[level], shape
         y = (np.arange(height) + 0.5) / height * (rows - 1)
         x = (np.arange(width) + 0.5) / width * columns

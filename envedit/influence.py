@@ -54,7 +54,8 @@ def determined(influence: np.ndarray, samples: np.ndarray, rows: slice, threshol
     mean = influence[rows].sum(dtype=np.float64) / (sphere[rows].sum() * width)
     found = np.empty((height, width), bool)
     for row in range(height):
-        # Of the samples in such a solid angle, steradians, so many make up the threshold's influence.
+        # At the threshold, threshold * samples / sphere samples fall on a steradian: on this many steradians,
+        # WANTED_SAMPLES.
         area = WANTED_SAMPLES / max(threshold * samples[row] / sphere[row], 1e-30)
         across_rows = math.sqrt(area) * (height - 1) / math.pi
         radius = min(max(math.ceil((across_rows - 1) / 2), LEAST_RADIUS), height)

@@ -113,13 +113,12 @@ class Job:
 
     def best(self, starts, crop):
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
-        notes = {tuple(notes) for _, notes in starts}
-        if len(notes) == 1:
+        if len(starts) == 1:
             return starts[0]
         reached = []
         for params, _ in starts:
             few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
-            wanted = self.wanted.picture, self.wanted.weight
+            wanted = self.wanted.aim, self.wanted.weight
             objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
             try:
                 _, state = self._loop(params, objective, few)
@@ -146,8 +145,8 @@ class Job:
             adam.load_state_dict(optimiser)
             self.renderer.restore(traced)
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
-            wanted = self.wanted = replace(wanted, picture=picture)
-        asked = wanted.picture, wanted.weight, crop, chosen.iterations, self.dists
+            wanted = self.wanted = wanted.aimed_at(picture)
+        asked = wanted.aim, wanted.weight, crop, chosen.iterations, self.dists
         objective = edit.Objective(self.settings.loss, *asked)
         saved = time.perf_counter()
 
@@ -160,7 +159,7 @@ class Job:
                 due |= state.step == chosen.iterations  # what follows may be interrupted too
                 if self.folder and (stop or due):
                     traced = self.renderer.state()
-                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.picture)
+                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.aim)
                     saved = time.perf_counter()
                 if stop:
                     raise Interrupted(self.last_good(adam), state.step)

@@ -4,8 +4,10 @@
 
 E_0' is the original without the cores of its lights, G_l and C_l are glow and core of light l
 (``separate.py``, ``lights.py``), with index 0 before they moved, and g is the smooth gain of the sky
-(``gain.py``). Unmoved lights and no gain give the original back, bit for bit outside the cores: there is
-nothing to fit, the sky's own detail is kept, and the map has any resolution.
+(``gain.py``); s_l, the factor of a light's flux, is in G_l. Where f = exp(g) is above 1, E f is read as
+E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`brightened`. Unmoved lights and no gain give the original
+back, bit for bit outside the cores: there is nothing to fit, the sky's own detail is kept, and the map has
+any resolution.
 """
 
 from __future__ import annotations
@@ -15,10 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
-from .gain import CYCLES, GridGain
+from .gain import CYCLES, GridGain, Octave
 from .health import BRIGHTEST, require_radiance
 from .lights import DARK, SPARE, Lights
-from .resolution import Octave
 from .separate import Separation, separate
 
 VEIL = 0.2

@@ -29,6 +29,10 @@ DARK = -30.0
 LOBE_POINTS = 512
 LOBE_DEGREES = 2.0
 """Points and radius of a lobe of size 1."""
+LOG_SIZES = (-6.0, 3.0)
+"""Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
+MOST_LOG_FLUX = 30.0
+"""Logarithms of fluxes are cut there: e^30 is 1e13."""
 _LEAST_SINE = 1e-8
 _SNAP = 2e-4  # texels; of wide maps as many as float32 rounds an azimuth by
 _SNAP_SHARE = 4e-7
@@ -120,7 +124,7 @@ class Lights:
             Linear radiance; what falls on rows that are not wanted is lost.
         """
         centre = dr.gather(mi.Vector3f, self._centre, self._which)
-        size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, -6, 3))
+        size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, *LOG_SIZES))
         turn = dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array)
         flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
         finer = shape[1] / self.width
@@ -129,7 +133,10 @@ class Lights:
         return shared_out(*places, flux, spread, shape, rows)
 
     def glow(self, turn, log_flux, d: mi.Vector3f) -> mi.Color3f:
-        """Evaluate the product of 1 + G over all lights, as they are placed, at directions ``d``."""
+        """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.
+
+        s_l is the factor of the light's flux: a glow is put out with its light.
+        """
         factor = mi.Color3f(1)
         for i, table in enumerate(self._glow):
             if table is None:
@@ -255,7 +262,17 @@ def _colour(tensor, i):
 
 
 def _exp(x):
-    return dr.select(x <= DARK, 0, dr.exp(dr.minimum(x, 30)))
+    return dr.select(x <= DARK, 0, dr.exp(dr.minimum(x, MOST_LOG_FLUX)))
+
+
+def flux_factor(log_flux: np.ndarray) -> np.ndarray:
+    """Return what a flux is multiplied by; the same on the host as :meth:`Lights.core` has it."""
+    return np.where(log_flux <= DARK, 0, np.exp(np.minimum(log_flux, MOST_LOG_FLUX)))
+
+
+def size_factor(log_size) -> np.ndarray:
+    """Return what a size is multiplied by; likewise."""
+    return np.exp(np.clip(log_size, *LOG_SIZES))
 
 
 def _sign(x):
@@ -318,6 +335,15 @@ class _Share(dr.CustomOp):
 
     def name(self):
         return "share points out"
+
+
+# Flux F at (row, column), texels apart, spreads over a tent of half-widths h and half (in columns):
+#
+#     L[r, c] += F t_r t_c / (R C omega_r),   t_r = 1 - |r - row| / h,   t_c = 1 - |c - column| / half,
+#     R = sum of t_r,   C = sum of t_c
+#
+# dt_r/drow = sign(r - row) / h and dt_c/dhalf = |c - column| / half^2; the quotient rule adds -t R'/R and
+# -t C'/C.
 
 
 @dr.syntax

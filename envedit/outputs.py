@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from . import checkpoint, config, files, image, layered, manifest, pipeline, preview, reach, report, scene
+from . import checkpoint, config, files, image, layered, manifest, pipeline, preview, reach, report
 from .errors import InputError, NumericalError
 
 
@@ -38,7 +38,7 @@ def write(settings: config.Config, folder: Path, result: pipeline.Result, import
     manifest.write_history(folder / "history.csv", result.history)
     named = {
         "envmap": settings.input.envmap,
-        "scene": scene._find(settings.scene.file),
+        "scene": result.scene or "",
         "target": settings.target.file,
         "mask": settings.target.mask,
         **{name: value for name, value in vars(settings.perceptual).items() if name != "network"},

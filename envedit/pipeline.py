@@ -65,6 +65,8 @@ class Result:
         Active texels that were kept, as this view does not determine them; None as above.
     separation : separate.Separation, optional
         Lights and background of the active rows, where the representation has them.
+    scene : Path, optional
+        The scene's file.
     reach : reach.Reach, optional
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
     found : Found, optional
@@ -81,6 +83,7 @@ class Result:
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
     separation: Separation | None = None
+    scene: Path | None = None
     reach: reaches.Reach | None = None
     found: Found | None = None
 
@@ -266,19 +269,16 @@ def run(
             )
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
-    seen = wanted
-    if traced and wanted.coverage is not None:
-        seen = replace(wanted, picture=_as_seen(traced, original, wanted))
+            wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
     if layered:
         with clock("start_s"):
             watch.stage("searching for lights")
             representation.keep(free)
-            free = None  # a light may move across texels that are kept otherwise
+            free = None  # the gain keeps to them, while a light may move across the others
             ready = starts.find(representation, params, recordings, wanted, original)
-            wanted, seen = ready.wanted, ready.wanted if seen is wanted else seen
-            notes += ready.notes
+            wanted, notes = ready.wanted, notes + ready.notes
             del recordings  # the second one is not needed any more
-    job = Job(settings, lit, original, first, free, seen, representation, renderer, folder, watch, dists)
+    job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch, dists)
     if layered:
         with clock("start_s"):
             params, placed = job.best(ready.starts, crop)
@@ -287,7 +287,7 @@ def run(
         watch.stage("editing")
         params, state = job.optimise(params, crop, resume)
         edited = job.decode(params)
-        wanted = job.wanted if seen is wanted else wanted
+        wanted = job.wanted  # a resumed run has the picture that it began with
 
     with clock("judge_s"), keeping(edited):
         watch.stage("rendering the result")
@@ -328,6 +328,7 @@ def run(
         traced.influence if traced else None,
         frozen,
         getattr(representation, "separation", None),
+        lit.path,
         within,
         Found(representation, params, first, free),
     )
@@ -356,7 +357,8 @@ def _perceptual(settings):
 
 def _measure(settings, renders, maps, rows, coverage, within, lpips):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
-    tonemap, (before, wanted, after) = settings.output.tonemap, renders.values()
+    tonemap = settings.output.tonemap
+    before, wanted, after = (renders[name] for name in ("initial", "target", "edited"))
     measured = {
         "render": metrics.compare(after, wanted, tonemap, lpips),
         "initial": metrics.compare(before, wanted, tonemap, lpips),
@@ -369,7 +371,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips):
         measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
-        original, true, edited = (envmap[rows] for envmap in maps.values())
+        original, true, edited = (maps[name][rows] for name in ("initial", "target", "edited"))
         measured["envmap"] = metrics.compare(edited, true, tonemap, lpips)
         measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
         measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)

@@ -45,8 +45,8 @@ class Ratio:
             )
         ratio = np.where(self.changed[..., None], ratio, 1.0)
         self.m = np.minimum(ratio, MODERATE)
-        taken = _around(-np.log2(np.maximum(ratio.min(axis=2), 1e-30)), np.maximum)
-        given = _around(np.log2(np.maximum(ratio.max(axis=2), 1e-30)), np.maximum)
+        taken = _most_around(-np.log2(np.maximum(ratio.min(axis=2), 1e-30)))
+        given = _most_around(np.log2(np.maximum(ratio.max(axis=2), 1e-30)))
         replaced, added = _step(taken - 1), _step(given - 1)
         self.parts = np.stack([replaced, added * (1 - replaced)], axis=2)
         self.wanted = _Linear(np.where(self.changed[..., None], self.want, self.old))
@@ -166,11 +166,11 @@ class Ratio:
         return as_image(made, size, self.grid.shape[1]).numpy()
 
 
-def _around(values, most):
-    """Least or most of a texel (rows, w) and its 8 neighbours, columns periodic."""
+def _most_around(values):
+    """Most of each texel (rows, w) and its 8 neighbours, columns periodic."""
     padded = np.pad(values, ((1, 1), (0, 0)), mode="edge")
-    down = most(most(padded[:-2], padded[1:-1]), padded[2:])
-    return most(most(np.roll(down, 1, axis=1), down), np.roll(down, -1, axis=1))
+    down = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(np.roll(down, 1, axis=1), down), np.roll(down, -1, axis=1))
 
 
 def _step(x):

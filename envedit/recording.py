@@ -81,7 +81,14 @@ def bsdf_weight(pdf: mi.Float, sampled: mi.Float) -> mi.Float:
 def contributions(
     scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: int, seed: int
 ) -> Iterator[tuple[int, mi.UInt32, mi.UInt32, mi.Color3f]]:
-    """Yield (bounce, pixel of each lane, texel, RGB weight) batches of one block of pixels, as device arrays.
+    """Yield (bounce, pixel of each lane, texel, RGB weight) of one block of pixels, as batches on the device.
+
+    T[p, j] is the radiance of pixel p per unit of radiance of texel j: a sum over the surface points of a
+    path of throughput * integral of f(w) V(w) t_j(w) dw, with t_j the bilinear tent of j, f the BSDF with its
+    cosine and V the visibility. Over the square of (u, v), dw = J du dv; a direction drawn from the tent has
+    density t_j / A_j there, A_j = integral of t_j du dv (``area``). So one sample of texel j, chosen with
+    probability P_j, adds throughput * f V J A_j / P_j, times its balance weight. A path that leaves the scene
+    counts for one of the four texels around its direction, drawn by their tents.
 
     Parameters
     ----------

@@ -15,13 +15,11 @@ through a second, independent recording of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mitsuba as mi
 import numpy as np
 
 from . import display, latlong
-from .gain import grid_size, tents
+from .gain import Octave, grid_size, tents
 
 PROBES = 12
 """Random z; what is averaged over them, three patterns and the nodes of a patch is within a third."""
@@ -30,35 +28,10 @@ NOISE = 0.01
 CONTRAST = 0.3
 """Log gain of detail that would matter."""
 ENOUGH = 2.0
-"""The F of detail of that contrast from which on it counts as half known."""
+"""The F of detail of that contrast at which it counts as half known, F^2 / (F^2 + ENOUGH^2)."""
 FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
 """How much of the sky's solid angle must be told of the first octave, for detail at all, and of a further
 one: what a glossy thing tells of half of the sky is not worth a third of a run's time."""
-
-
-@dataclass(frozen=True)
-class Octave:
-    """One grid of detail.
-
-    Attributes
-    ----------
-    size : (int, int)
-        Its rows and columns of nodes.
-    known : ndarray (rows, columns)
-        How well the picture tells it at each node, F^2 / (F^2 + ENOUGH^2) in [0, 1), F for a contrast of
-        :data:`CONTRAST`.
-    share : float
-        How much of the active rows' solid angle it tells, in [0, 1].
-    """
-
-    size: tuple[int, int]
-    known: np.ndarray
-    share: float
-
-    @property
-    def cycles(self) -> int:
-        """Cycles around the horizon that it can hold."""
-        return self.size[1] // 2
 
 
 def octaves(transport, second, background, rows, picture, weight, coarsest: int) -> list[Octave]:
@@ -96,8 +69,8 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
         size = grid_size(cycles, height / rows[1])
         down, across = tents(size, (height, width))
         told = np.zeros(size)
-        for first, second in pulled:
-            on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in (first, second)]
+        for pair in pulled:
+            on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
             told += _alternating(*on_nodes)
         # Where nothing is told, a product of two estimates may well be negative.
         told = np.maximum(_smooth(told / len(pulled)), 0) * CONTRAST**2

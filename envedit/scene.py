@@ -276,7 +276,7 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         path, where, folders = None, "scene dict", (base,)
         state = stage.told(where, mi.parser.parse_dict, config, file)
     else:
-        path = _find(file)
+        path = find(file)
         where, folders = str(path), (path.parent, base)
         filled = _check_parameters(path, parameters or {})
         state = stage.told(where, mi.parser.parse_file, config, str(path), **filled)
@@ -313,7 +313,7 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
 # Files and parameters
 
 
-def _find(file) -> Path:
+def find(file) -> Path:
     """Return the XML file meant by a path or by the bare name of a shipped scene."""
     path = Path(file)
     if path.is_file():

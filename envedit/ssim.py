@@ -139,7 +139,7 @@ class Ssim:
         return index + index // (width * channels) * ((self.shape[1] - width) * channels) + shift * channels
 
     def _moments(self, *operands):
-        """Filter along columns: mean and variance of each operand (of the difference of a pair of them)."""
+        """Filter along columns: mean and variance of the first operand and, if there are two, of x - y."""
         row, F = self.shape[1] * self.shape[2], type(self._y)
         index = dr.arange(dr.uint32_array_t(F), self.map_shape[0] * row)
         taps = [[dr.gather(F, o, index + j * row) for j in range(len(self._rows))] for o in operands]

@@ -14,12 +14,12 @@ import numpy as np
 
 from . import changes, config, renderers, resolution, scene, search, trust
 from .gain import CYCLES
-from .layers import Layers
+from .layers import SCALES, Layers
 from .target import Target
 from .transport import LightTransport
 
 AGAIN_SEED, AGAIN_SPP = 500_009, 32
-"""Seed and samples a pixel of the second recording of T, which tells its noise."""
+"""Added to the run's seed for the second recording of T, which tells its noise; its samples a pixel."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,14 @@ def recordings(
     traced : LightTransport, optional
         T, where the run renders through it.
     """
-    enough = replace(settings, renderer=replace(settings.renderer, spp="auto"))
-    found = [traced or renderers.trace(enough, lit, shape)]
+    # A path tracer's samples a pixel are not meant for T.
+    automatic = replace(settings, renderer=replace(settings.renderer, spp="auto"))
+    found = [traced or renderers.trace(automatic, lit, shape)]
     if wanted.coverage is None and settings.representation.cycles == "auto":
         few = replace(settings.renderer, spp=min(AGAIN_SPP, found[0].spp), refresh=0)
         seed = (settings.seed + AGAIN_SEED) % 2**32
         again = renderers.trace(replace(settings, seed=seed, renderer=few), lit, shape)
+        # Its columns are only compared with the first's: the fewest paths do.
         again.paths = (again.paths[0],) * len(again.paths)
         found.append(again)
     return found
@@ -133,4 +135,12 @@ def _searched(layers, params, transport, wanted, original):
     begin = layers, params, transport, wanted.initial, *asked
     daring = (False, True) if (wanted.coverage < 1).any() else (False,)
     found = [changes.start(*begin, bold=bold) for bold in daring]
-    return [*found, changes.softened(layers, params)] if layers.separation.lights else found
+    if layers.separation.lights:
+        found.append(changes.softened(layers, params))
+    return [one for i, one in enumerate(found) if not any(_same(one, other) for other in found[:i])]
+
+
+def _same(one, other):
+    """Say whether two starts turn all lights alike, to a tenth of a degree."""
+    turns = (params["turn"].numpy() * SCALES["turn"] for params, _ in (one, other))
+    return np.allclose(*turns, rtol=0, atol=np.radians(0.1))

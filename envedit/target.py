@@ -7,7 +7,7 @@ stroke is not outvoted by the many pixels around it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,9 @@ class Target:
         rendering that was painted on: rendered anew, it may differ in its last bits.
     noise : ndarray (h, w) or None
         Standard error of the picture's display values; None where it is not known.
+    compared : ndarray (h, w, 3) or None
+        What the loop compares T E with, linear radiance; None: the picture. Of paint, the picture as T sees
+        it: what was not painted is then matched exactly by the map as it is.
     """
 
     picture: np.ndarray
@@ -56,6 +59,16 @@ class Target:
     coverage: np.ndarray | None = None
     asked: tuple[np.ndarray, ...] = ()
     noise: np.ndarray | None = None
+    compared: np.ndarray | None = None
+
+    @property
+    def aim(self) -> np.ndarray:
+        """The picture that the loop compares with, (h, w, 3)."""
+        return self.picture if self.compared is None else self.compared
+
+    def aimed_at(self, picture: np.ndarray) -> Target:
+        """Return the target with another :attr:`aim`."""
+        return replace(self, **{"picture" if self.compared is None else "compared": picture})
 
 
 def make(

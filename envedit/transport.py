@@ -39,11 +39,11 @@ from .sparse import ColourMatrix, scale_packets, to_packets
 COLUMN_TOLERANCE = 0.03
 """Relative error of the coarse tier above which columns are added."""
 COLUMN_PATHS = (8, 48, 320)
-"""Paths a pixel of a column: for a bright texel, and for one that holds more than a share of the light."""
+"""Paths a pixel of a column, by its texel's share of the picture's light (:data:`COLUMN_SHARES`)."""
 FEW_PATHS, FEW_TOLERANCE = (8, 48, 48), 0.08
-"""The same two for a map with few parameters, which cannot follow the noise of a column."""
+"""Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
 COLUMN_SHARES = (0.0, 0.01, 0.1)
-"""The shares of the light from which on they hold."""
+"""Shares of the picture's light from which on a column has so many paths."""
 RESOLVE_EVERY = 10
 """Steps after which a renderer looks for texels that have grown bright."""
 LASTING_LOOKS = 5
@@ -51,7 +51,7 @@ LASTING_LOOKS = 5
 COLUMNS_A_LOOK = 32
 """Columns that a renderer traces at one look, the brightest: speckle comes and goes, and is not chased."""
 TYPICAL_PIXELS = 128 * 128
-"""Pixels from which on errors of neighbouring pixels are told together: they are independent."""
+"""Beyond so many pixels the predicted error is the picture's: those of neighbours are independent."""
 _RECORDING = 1  # raise when the same scene, grid and seed give another recording, or other arrays of it
 
 
@@ -389,6 +389,7 @@ class LightTransport:
         tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1
         tier = np.maximum(tier, 0)
         if lasting is not None:
+            # The last tier is for lights that have lasted; others stop one below.
             tier = np.minimum(tier, np.where(lasting[wanted], len(self.paths), len(self.paths) - 2))
         traced = 0
         for i in reversed(range(len(self.paths))):

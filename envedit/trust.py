@@ -30,7 +30,8 @@ def weights(first, second, share: float, picture, noise=None) -> np.ndarray | No
     first, second : ndarray (h, w, 3)
         The same picture through T and through a second recording, linear radiance.
     share : float
-        Samples of the second recording over the first's: so much more of the noise is its own.
+        Samples of the second recording over the first's, n2 / n1. As Var(d1 - d2) = v1 (1 + n1 / n2), the
+        first's variance v1 is (d1 - d2)^2 share / (1 + share).
     picture : ndarray (h, w, 3)
         The target, linear radiance.
     noise : ndarray (h, w), optional

@@ -203,7 +203,7 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
         return None, edit.State(history=[{"loss": ends[params]}])
 
     monkeypatch.setattr(job.Job, "_loop", loop)
-    wanted = types.SimpleNamespace(picture=None, weight=None)
+    wanted = types.SimpleNamespace(aim=None, weight=None)
     work = job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, job.Watch())
     for order, best in (((0, 1, 2, 3), 2), ((1, 0, 2), 2), ((3, 1, 0), 0), ((1, 3), 1), ((0, 1, 3), 0)):
         params, notes = work.best([(i, [f"start {i}"]) for i in order], None)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import gain
-from envedit.resolution import Octave
+from envedit.gain import Octave
 
 SHAPES = [(1, 2), (3, 7), (5, 8), (17, 33), (32, 64)]
 GAINS = [(8, 1.0), (8, 0.5), (6, 0.3), (1, 1.0), (5, 0.1)]

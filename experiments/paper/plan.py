@@ -212,7 +212,7 @@ def _names(question, table, key):
 
 def _check_roughness(name):
     """Refuse a scene whose roughness cannot be set."""
-    path = scene._find(name)
+    path = scene.find(name)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:

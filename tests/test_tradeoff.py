@@ -480,10 +480,27 @@ def test_ratios_are_to_the_median_of_the_same_session_and_cell():
     ]
     found = {(r["setting"], r["map"]): r for r in analyse.ratios(runs)}
     assert found["x", "a"]["ratio"] == {"time": 0.5, "again": 0.5, "memory": 0.5}
-    assert found["x", "a"]["change"] == pytest.approx({"psnr": 1.0, "map_psnr": 1.0, "map_ssim": 0.1})
+    # Results: of the standard preset with the same seed, which shares the noise of the target.
+    assert found["x", "a"]["change"] == pytest.approx({"psnr": 2.0, "map_psnr": 1.0, "map_ssim": 0.1})
     assert found["y", "a"]["ratio"]["time"] == 0.25  # a busier session
     assert ("z", "a") not in found  # nothing was measured beside it
     assert found["x", "b"]["ratio"]["time"] == 0.05 and found["x", "b"]["change"]["psnr"] == 2.0
+
+
+def test_without_the_same_seed_changes_are_from_the_median():
+    runs = [run for run in standard() if run["setting"] != analyse.PAIRED]  # 41 and 43 dB
+    assert len(runs) == 2
+    (found,) = [r for r in analyse.ratios([*runs, one("x", "knob", 5.0, 42.5)]) if r["setting"] == "x"]
+    assert found["change"]["psnr"] == 0.5
+
+
+def test_runs_that_had_less_of_the_processor_are_told():
+    def run(setting, cpu, wall):
+        return one(setting, "knob", wall, 40.0) | {"cost": {"cpu_s": cpu, "wall_s": wall}}
+
+    slow = run("x", 10.0, 10.0)
+    runs = [run("x", 16.0, 10.0), run("x", 15.0, 10.0), slow, run("y", 9.0, 10.0), run("y", 16.0, 10.0)]
+    assert analyse.disturbed(runs) == [slow]  # two runs of y do not tell which is usual
 
 
 def test_means_are_geometric_for_ratios_and_leave_out_missing_suns():

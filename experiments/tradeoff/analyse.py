@@ -8,6 +8,8 @@ from collections.abc import Iterable
 
 from experiments.engine.tables import table
 
+from .plan import references
+
 TIMES = {"time": "whole run", "again": "run again, T and fit at hand"}
 """Kinds of time: of a run from nothing but compiled kernels; of one that finds T and fit on disk."""
 MOST_PSNR = 55.0
@@ -15,6 +17,8 @@ MOST_PSNR = 55.0
 true map, where the judge has most of it)."""
 UNDISTURBED = 0.85
 """Share of its setting's usual processor time, by wall time, that a run is to have had."""
+PAIRED = references(0).name
+"""The run of the standard preset whose seed all other settings have."""
 SHARES = (2.0, 1.5, 1.0, 0.75, 0.5, 0.35)
 """Times, as multiples of the standard preset's, for which the best setting is looked up."""
 
@@ -60,9 +64,10 @@ def ratios(runs: list[dict]) -> list[dict]:
     -------
     list of dict
         The same with ``ratio``: ``time``, ``again`` and ``memory`` over the median of the standard preset's
-        runs in that session; and ``change``: ``psnr``, ``map_psnr`` and ``map_ssim`` less the median of all
-        runs of the standard preset, whose results do not depend on how busy the machine is. Runs in whose
-        session the standard preset was not measured are left out.
+        runs in that session; and ``change``: ``psnr``, ``map_psnr`` and ``map_ssim`` less those of the
+        standard preset with the same seed, :data:`PAIRED`, as the noise of the target, which both share, is
+        the largest difference under a sun (6 dB between seeds); less the median of all where that seed was
+        not run. Runs in whose session the standard preset was not measured are left out.
     """
     standard = [r for r in runs if r["group"] == "standard"]
     found = []
@@ -74,7 +79,8 @@ def ratios(runs: list[dict]) -> list[dict]:
         cost = ("time", "again", "memory")
         ratio = {key: run[key] / statistics.median(s[key] for s in beside) for key in cost}
         won = ("psnr", "map_psnr", "map_ssim")
-        change = {key: run[key] - statistics.median(s[key] for s in same) for key in won}
+        paired = [s for s in same if s["setting"] == PAIRED] or same
+        change = {key: run[key] - statistics.median(s[key] for s in paired) for key in won}
         found.append(run | {"ratio": ratio, "change": change})
     return found
 

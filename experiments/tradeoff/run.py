@@ -158,8 +158,8 @@ def collect(given, judge=None) -> dict:
         print(f"{alone} runs are left out: beside them no run of the standard preset ended", file=sys.stderr)
     for run in disturbed(runs):
         print(
-            f"{run['map']}, {run['scene']}: {run['setting']}: the machine did something else meanwhile: "
-            f"remove {out / run['folder']} and run again",
+            f"{run['map']}, {run['scene']}: {run['setting']}: had less of the processor than others of its "
+            f"setting: if something else ran beside it, remove {out / run['folder']} and run again",
             file=sys.stderr,
         )
     for run in runs:

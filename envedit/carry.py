@@ -322,7 +322,7 @@ class _LayersAt:
         scale = lights.flux_factor(self.flux[i])
         point = mi.Vector3f(*(to_device(mi.Float, v) for v in d.T.astype(np.float32)))
         flux = mi.Color3f(*(to_device(mi.Float, v) for v in (flux * scale).T.astype(np.float32)))
-        size = dr.exp(dr.opaque(mi.Float, float(np.clip(self.size[i, 0], *lights.LOG_SIZES))))
+        size = dr.opaque(mi.Float, float(lights.size_factor(self.size[i, 0])))
         centre, turn = vector(self.layers.lights.centres[i]), vector(self.turn[i])
         sine = to_device(mi.Float, sine.astype(np.float32))
         places = lights.placed(point, centre, turn, size, sine, finer, self.grid.shape)

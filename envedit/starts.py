@@ -14,7 +14,7 @@ import numpy as np
 
 from . import changes, config, renderers, resolution, scene, search, trust
 from .gain import CYCLES
-from .layers import SCALES, Layers
+from .layers import Layers
 from .target import Target
 from .transport import LightTransport
 
@@ -141,6 +141,5 @@ def _searched(layers, params, transport, wanted, original):
 
 
 def _same(one, other):
-    """Say whether two starts turn all lights alike, to a tenth of a degree."""
-    turns = (params["turn"].numpy() * SCALES["turn"] for params, _ in (one, other))
-    return np.allclose(*turns, rtol=0, atol=np.radians(0.1))
+    """Say whether two starts place the lights alike, in turn and flux, to a thousandth of their units."""
+    return all(np.allclose(*(p[name].numpy() for p, _ in (one, other)), 0, 1e-3) for name in ("turn", "flux"))

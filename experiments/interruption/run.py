@@ -160,7 +160,7 @@ def trial(base: Path, number: int, kind: str, renderer: str, seed: int, override
     """Kill a run once or twice and resume it, unless that is done; returns a row of the table."""
     folder = base / f"trial-{number:02d}"
     result = folder / "result.json"
-    asked = {"kind": kind, "renderer": renderer, "seed": seed, "sets": list(overrides)}
+    asked = {"kind": kind, "renderer": renderer, "seed": seed}
     if result.exists() and (known := json.loads(result.read_text())).get("asked") == asked:
         return known
     seconds = undisturbed(base, kind, renderer, overrides)

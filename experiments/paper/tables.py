@@ -35,10 +35,11 @@ def text(name: str, out, cells: list[Cell]) -> str:
         for roughness in sorted({cell.roughness for cell in some}, key=lambda r: -1 if r is None else r):
             at = "" if roughness is None else f", roughness {roughness:g}"
             here = [c for c in some if c.roughness == roughness]
-            shared = {cell.map for cell in common(out, here)}
-            over = "" if len(shared) in (0, len(names)) else f", averages over {len(shared)} of them"
+            shared = common(out, here)
+            count = len({cell.map for cell in shared})
+            over = "" if count in (0, len(names)) else f", averages over {count} of them"
             parts.append(f"{_SETTINGS[settings][0].upper()}{_SETTINGS[settings][1:]}{at}, {maps}{over}:")
-            parts.append(build(name, out, here, spent))
+            parts.append(build(name, out, here, shared, spent))
     return "\n\n".join(parts)
 
 
@@ -87,11 +88,10 @@ def averages(out, cells: list[Cell], which=("envmap", "render")) -> tuple[dict, 
     return found, len(reads)
 
 
-def _methods(name, out, cells, spent):
+def _methods(name, out, cells, shared, spent):
     published = PUBLISHED.get(name, {}).get(cells[0].roughness, {})
     head = [f"{'map' if image == 'envmap' else 'rendering'} {_WORDS[column]}" for image, column in COLUMNS]
     rows = rows_of(name, cells)
-    shared = common(out, cells)
     found = {row: averages(out, [cell for cell in some if cell in shared])[0] for row, some in rows.items()}
     best = {}
     for column in COLUMNS:
@@ -122,10 +122,11 @@ def _unedited(out, cells, maps):
     return ["unedited", *shown, "-", "-", f"{count}/{maps}"]
 
 
-def _fits(name, out, cells, spent):
+def _fits(name, out, cells, shared, spent):
     lines = []
     for row, some in rows_of(name, cells).items():
-        reads = [measured.numbers(out, cell) for cell in measured.done(out, some)]
+        ready = measured.done(out, some)
+        reads = [measured.numbers(out, cell) for cell in ready if cell in shared]
         values = [mean([read[key] for read in reads]) for key in ("log_psnr", "peak_ratio", "mean_ratio")]
         noisy = [mean(read["noisy"]) for read in reads]
         shown = [
@@ -138,20 +139,20 @@ def _fits(name, out, cells, spent):
                 *shown,
                 "-" if with_noise is None else f"{with_noise:.1f}",
                 _seconds([read["seconds"] for read in reads]),
-                f"{len(reads)}/{len(some)}",
+                f"{len(ready)}/{len(some)}",
             ]
         )
     head = ["", "log PSNR, dB", "peak", "mean luminance", "log PSNR with noise, dB", "s", "maps"]
     return _markdown(head, lines)
 
 
-def _paint(name, out, cells, spent):
+def _paint(name, out, cells, shared, spent):
     lines = []
     for row, some in rows_of(name, cells).items():
         ready = measured.done(out, some)
-        reads = [measured.numbers(out, cell) for cell in ready]
-        painted = [read["painted"] for read in reads]
-        against = [measured.of_paint(out, cell) for cell in ready]
+        told = [cell for cell in ready if cell in shared]
+        painted = [measured.numbers(out, cell)["painted"] for cell in told]
+        against = [measured.of_paint(out, cell) for cell in told]
         share = [mean([p[key] for p in painted]) for key in ("towards", "reachable")]
         elsewhere = mean([p["elsewhere"] for p in painted])
         ssim, sharp = (mean([a[key] for a in against]) for key in ("ssim", "sharp"))
@@ -163,7 +164,7 @@ def _paint(name, out, cells, spent):
                 "-" if ssim is None else f"{ssim:.3f}",
                 "-" if sharp is None or math.isnan(sharp) else f"{sharp:.2f}",
                 *_times(spent, some),
-                f"{len(reads)}/{len(some)}",
+                f"{len(ready)}/{len(some)}",
             ]
         )
     head = ["", "towards the paint", "reachable", "change elsewhere", "map SSIM", "high frequencies"]

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from . import config, image, pipeline, scene
+from .device import tensor
 from .errors import ConfigError
 from .scene import QUIET_DECIBELS, QUIET_LEAST, QUIET_MOST
 
@@ -256,7 +256,7 @@ def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibr
 
 def _product_seconds():
     """Seconds of a few products of matrices, the fastest of three times, without compiling."""
-    a = dr.opaque(mi.TensorXf(np.full((_SIDE, _SIDE), 1e-3, np.float32)))
+    a = tensor(np.full((_SIDE, _SIDE), 1e-3))
     taken = []
     for _ in range(4):
         dr.sync_thread()

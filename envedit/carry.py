@@ -14,9 +14,10 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong, lights
+from .device import flat
 from .errors import NumericalError
 from .layers import Layers, brightened
-from .places import Places, as_image, to_device
+from .places import Places, as_image
 from .ratios import Ratio
 from .separate import grown
 
@@ -147,7 +148,7 @@ class _LayersAt:
         own = layers.lights.count - lights.SPARE
         strength = lights.flux_factor(self.flux[:own])
         strength = np.where(self.moved[:own, None], 0, strength)
-        self.strength = to_device(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
+        self.strength = flat(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
         self.survey = layers.separation.survey
         if self.survey is not None:
             start, total = self.survey.rows
@@ -160,7 +161,7 @@ class _LayersAt:
         sin[-1] = 0.0 if self.height > 1 else 1.0
         self._theta = sin.astype(np.float32), np.cos(theta).astype(np.float32)
         phi = 2 * np.pi * (np.arange(self.width) + 0.5) / self.width
-        self._phi = [to_device(mi.Float, f(phi).astype(np.float32)) for f in (np.sin, np.cos)]
+        self._phi = [flat(mi.Float, f(phi).astype(np.float32)) for f in (np.sin, np.cos)]
         self.points: list[_Points] = []
         self.level: dict[int, np.ndarray] = {}
 
@@ -202,10 +203,10 @@ class _LayersAt:
         size = len(source)
         image = self._load(source)
         row, column = self.grid.texels(size)
-        gain = to_device(mi.Float, self.grid.along_rows(self.gain, start, size))
+        gain = flat(mi.Float, self.grid.along_rows(self.gain, start, size))
         log = self.grid.across(mi.Color3f, gain, row, column)
         if self.layers.free is not None:
-            inner = to_device(mi.Float, self.grid.inner(self.layers.free, start, size))
+            inner = flat(mi.Float, self.grid.inner(self.layers.free, start, size))
             log *= self.grid.across(mi.Float, inner, row, column, corners=True)
         factor = dr.exp(log)
         same = factor == 1
@@ -232,7 +233,7 @@ class _LayersAt:
         for light in self._reaching(start, size):
             # Points on a turned grid lie closer here and farther there: a pattern of fine stripes, otherwise.
             total, density = self._moved(light, start, size)
-            level = to_device(mi.Float, self.level[light])
+            level = flat(mi.Float, self.level[light])
             made += total / density * dr.reshape(mi.TensorXf(level), (1, 1, 3))
         return made.numpy()
 
@@ -266,12 +267,12 @@ class _LayersAt:
             self.level[light] = np.where(got > 0, wanted / np.maximum(got, 1e-300), 1).astype(np.float32)
 
     def _load(self, source):
-        return dr.unravel(mi.Color3f, to_device(mi.Float, source))
+        return dr.unravel(mi.Color3f, flat(mi.Float, source))
 
     def _directions(self, start, row, column):
         first = dr.opaque(mi.UInt32, start)
         if not hasattr(self, "_rows"):
-            self._rows = [to_device(mi.Float, t) for t in self._theta]
+            self._rows = [flat(mi.Float, t) for t in self._theta]
         sin, cos = (dr.gather(mi.Float, t, row + first) for t in self._rows)
         x, z = (dr.gather(mi.Float, t, column) for t in self._phi)
         return mi.Vector3f(sin * x, cos, -sin * z)
@@ -286,12 +287,12 @@ class _LayersAt:
         """Light that a texel of a band belongs to, or -1; how far inside it lies, 0 to 1; the core in it."""
         at, survey = self.surveyed, self.survey
         label = self.label[at.row[start : start + size]].astype(np.int32)
-        light = at.nearest(mi.Int32, to_device(mi.Int32, label), row, column)
+        light = at.nearest(mi.Int32, flat(mi.Int32, label), row, column)
         share = [
-            at.across(mi.Float, to_device(mi.Float, at.inner(mask, start, size)), row, column, corners=True)
+            at.across(mi.Float, flat(mi.Float, at.inner(mask, start, size)), row, column, corners=True)
             for mask in (self.inside, ~self.inside)
         ]
-        table = to_device(mi.Float, at.along_rows(survey.below, start, size))
+        table = flat(mi.Float, at.along_rows(survey.below, start, size))
         below = at.across(mi.Color3f, table, row, column)
         if self.layers.lights.glowing:
             still = dr.zeros(mi.TensorXf, self.turn.shape)
@@ -320,15 +321,15 @@ class _LayersAt:
             return dr.opaque(mi.Vector3f(*(float(x) for x in v)))
 
         scale = lights.flux_factor(self.flux[i])
-        point = mi.Vector3f(*(to_device(mi.Float, v) for v in d.T.astype(np.float32)))
-        flux = mi.Color3f(*(to_device(mi.Float, v) for v in (flux * scale).T.astype(np.float32)))
+        point = mi.Vector3f(*(flat(mi.Float, v) for v in d.T.astype(np.float32)))
+        flux = mi.Color3f(*(flat(mi.Float, v) for v in (flux * scale).T.astype(np.float32)))
         size = dr.opaque(mi.Float, float(lights.size_factor(self.size[i, 0])))
         centre, turn = vector(self.layers.lights.centres[i]), vector(self.turn[i])
-        sine = to_device(mi.Float, sine.astype(np.float32))
+        sine = flat(mi.Float, sine.astype(np.float32))
         places = lights.placed(point, centre, turn, size, sine, finer, self.grid.shape)
         dr.eval(places)
         row = places[0].numpy()
         first, last = int(np.floor(row.min() - half_row)), int(np.ceil(row.max() + half_row))
         if omega is not None:
-            omega = mi.Color3f(to_device(mi.Float, omega.astype(np.float32)))
+            omega = mi.Color3f(flat(mi.Float, omega.astype(np.float32)))
         self.points.append(_Points(int(i), places, flux, omega, half_row, first, last))

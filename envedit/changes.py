@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from .device import tensor
 from .layers import Layers
 from .lights import SPARE
-from .pursuit import FAINT, LEAST_FLUX, Given, Place, Pursuit, not_negative
-from .search import LEAST, MOST, PROBES, Question, rotations, tensor
+from .pursuit import LEAST_FLUX, Given, Place, Pursuit, not_negative, relative
+from .search import LEAST, MOST, PROBES, Question, rotations
 from .separate import Light
 from .transport import LightTransport
 
@@ -158,10 +159,7 @@ def _strengths(scene, there, new):
     which are gone from where they were.
     """
     background = scene.render(scene.background)
-    bright = scene.known.mean(axis=2)
-    mean = bright.mean() or np.abs(scene.wanted).mean()  # of paint on black: its own
-    scale = 1 / (bright + FAINT * max(mean, 1e-30))
-    scale *= 1 if scene.weight is None else scene.weight[..., 0]
+    scale = relative(scene.known, scene.wanted, scene.weight)
     stay = [i for i in range(len(there)) if i not in new]
     found = {i: np.ones(3) for i in [*stay, *new]}
     for c in range(3):

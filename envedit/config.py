@@ -246,7 +246,11 @@ class Renderer(Table):
     """How the rendering is computed while editing."""
 
     kind: str = _key("transport", choice("transport", "path"), "stored transport, or a path tracer")
-    spp: int | str = _key("auto", or_auto(integer(1, 1 << 20)), 'samples a pixel, or "auto"')
+    spp: int | str = _key(
+        "auto",
+        or_auto(integer(1, 1 << 20)),
+        'samples a pixel, or "auto": most where the picture tells detail',
+    )
     max_depth: int | str = _key("auto", or_auto(integer(1, 1024)), 'longest path, in segments, or "auto"')
     refresh: int | str = _key(
         0, or_auto(integer(0, 10**7)), 'steps between fresh recordings; 0: never; or "auto"'

@@ -19,6 +19,7 @@ import numpy as np
 
 from . import config, losses, optim
 from ._callable import make_callable
+from .device import tensor
 from .display import to_display
 from .errors import ConfigError, NumericalError
 from .ssim import Ssim
@@ -58,12 +59,8 @@ class Objective:
             if value and (name != "dists" or dists)
         }
         self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
-        self._weight = (
-            None
-            if pixel_weight is None
-            else dr.opaque(mi.TensorXf(np.ascontiguousarray(pixel_weight, np.float32)))
-        )
-        self._original = dr.opaque(mi.TensorXf(np.ascontiguousarray(original, np.float32)))
+        self._weight = None if pixel_weight is None else tensor(pixel_weight)
+        self._original = tensor(original)
         self._ssim = Ssim(self._target, self._weight)
         self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
 
@@ -232,7 +229,7 @@ def optimise(
     lr = representation.lr if settings.lr == "auto" else settings.lr
     adam = adam or optim.Adam(params, lr, (0.9, settings.beta2))
     state = state or State()
-    fixed = dr.opaque(mi.TensorXf(np.ascontiguousarray(envmap, np.float32)))
+    fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
     waiting, last_read = [], time.perf_counter()
     while state.step < settings.iterations:

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import config, fit
+from .device import tensor
 from .gain import CYCLES
 from .health import BRIGHTEST, require_radiance
 from .layers import Layers
@@ -44,7 +45,7 @@ class Pixels:
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Store the image; ``seed`` is not used."""
         require_radiance(image, "pixels")
-        return {"radiance": dr.opaque(mi.TensorXf(np.ascontiguousarray(image, np.float32)))}
+        return {"radiance": tensor(image)}
 
     def decode(self, params: Params) -> mi.TensorXf:
         """Return the stored radiance, clipped below at zero."""
@@ -60,7 +61,7 @@ class LogPixels:
         """Store the logarithms; ``seed`` is not used."""
         require_radiance(image, "log-pixels", brightest=BRIGHTEST)
         logs = np.log(np.asarray(image, np.float64) + fit.EPSILON)
-        return {"log_radiance": dr.opaque(mi.TensorXf(logs.astype(np.float32)))}
+        return {"log_radiance": tensor(logs)}
 
     def decode(self, params: Params) -> mi.TensorXf:
         """Return exp(x) - 0.01, not below zero; x is held under 80, as float32 would overflow in a sum."""
@@ -95,7 +96,7 @@ class Siren:
             image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
         )
         self._shape, self._points = image.shape[:2], {}
-        return {name: dr.opaque(mi.TensorXf(value)) for name, value in self.fitted.params.items()}
+        return {name: tensor(value) for name, value in self.fitted.params.items()}
 
     def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:
         """Evaluate the network at the resolution of the image, or at any other ``shape``."""

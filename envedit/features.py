@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import convolution, weights
+from .device import tensor
 from .errors import ConfigError, InputError
 
 # --------------------------------------------------------------------------------------------------------
@@ -209,7 +210,7 @@ def _as_matrix(layer, tensors):
         blocks.append(block.transpose(0, 2, 3, 1).reshape(len(block), -1))
     matrix = np.ascontiguousarray(np.concatenate(blocks), np.float32)
     bias = np.concatenate([tensors[name + ".bias"] for name in layer.names]).astype(np.float32)
-    return dr.opaque(mi.TensorXf(matrix)), dr.opaque(mi.Float(bias))
+    return tensor(matrix), dr.opaque(mi.Float(bias))
 
 
 # --------------------------------------------------------------------------------------------------------

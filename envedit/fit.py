@@ -22,6 +22,7 @@ import numpy as np
 
 from . import config, losses, metrics, optim, refit, siren, ssim
 from ._callable import make_callable
+from .device import tensor
 from .errors import InputError, NumericalError
 from .files import cache_folder, replacing
 
@@ -183,8 +184,8 @@ class Objective:
     def __init__(self, image: np.ndarray, normalisation: Normalisation, settings: config.Fit):
         self.shape = image.shape[:2]
         self.normalisation, self.settings = normalisation, settings
-        self.logs = dr.opaque(mi.TensorXf(normalisation.encode(image).astype(np.float32)))
-        self.radiance = dr.opaque(mi.TensorXf(np.ascontiguousarray(image, np.float32)))
+        self.logs = tensor(normalisation.encode(image))
+        self.radiance = tensor(image)
         self.ssim = ssim.Ssim(self.logs)
 
     def gradient(self, y: mi.TensorXf, only_ssim: bool = False):
@@ -298,7 +299,7 @@ def _grids(image, normalisation, x, settings):
             part = (slice(row, None, stride), slice(column, None, stride))
             objective = Objective(np.ascontiguousarray(image[part]), normalisation, settings)
             some = np.ascontiguousarray(x[part]).reshape(-1, x.shape[-1])
-            grids.append((objective, dr.opaque(mi.TensorXf(some))))
+            grids.append((objective, tensor(some)))
     return grids
 
 

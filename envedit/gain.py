@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .device import tensor
+
 MOST = 12.0
 """Largest log factor: e^12 is more than any sky needs, and leaves float32 room."""
 LEVELS = 3
@@ -119,7 +121,7 @@ class GridGain:
         for size in self.sizes:
             down, across = tents(size, shape)
             across = np.kron(across.T, np.eye(3))  # three channels, one apart from the other
-            found.append([dr.opaque(mi.TensorXf(m.astype(np.float32))) for m in (down, across)])
+            found.append([tensor(m) for m in (down, across)])
         return found
 
     def evaluate(self, params: dict, prepared) -> mi.Color3f:

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
+from .device import tensor
 from .gain import CYCLES, GridGain, Octave
 from .health import BRIGHTEST, require_radiance
 from .lights import DARK, SPARE, Lights
@@ -93,17 +94,17 @@ class Layers:
         flux[n - SPARE :] = DARK / SCALES["flux"]
         params = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
         params |= self.gain.init()
-        return {name: dr.opaque(mi.TensorXf(value)) for name, value in params.items()}
+        return {name: tensor(value) for name, value in params.items()}
 
     def refine(self, params: dict, octaves: list[Octave]) -> dict:
         """Give the gain finer grids and ``params``, of :meth:`encode`, what these start from: zero."""
         self.gain.refine(octaves)
         self.scales = {
-            name: unit if np.ndim(unit) == 0 else dr.opaque(mi.TensorXf(unit))
+            name: unit if np.ndim(unit) == 0 else tensor(unit)
             for name, unit in (SCALES | self.gain.scales()).items()
         }
         self._prepared = {}
-        new = {k: dr.opaque(mi.TensorXf(v)) for k, v in self.gain.init().items() if k not in params}
+        new = {k: tensor(v) for k, v in self.gain.init().items() if k not in params}
         return params | new
 
     def keep(self, free: np.ndarray | None) -> None:

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
+from .device import tensor
 from .separate import GLOW_DEGREES, Light
 
 SPARE = 2
@@ -89,7 +90,7 @@ class Lights:
         self._which = dr.opaque(mi.UInt32(np.concatenate(which).astype(np.uint32)))
         # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
         owner = np.concatenate(which)[:, None] == np.arange(self.count)
-        self._owner = dr.opaque(mi.TensorXf(owner.astype(np.float32)))
+        self._owner = tensor(owner)
         self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
         self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
         self._glow = [

@@ -246,13 +246,18 @@ def run(
             if settings.renderer.kind == "transport"
             else "preparing the path tracer"
         )
-        renderer = renderers.make(
-            settings, lit, (height, width), lambda done, total: watch.progress(done, total, "")
-        )
+
+        def count(done, total):
+            watch.progress(done, total, "")
+
+        renderer = renderers.make(settings, lit, (height, width), count)
         traced = renderer if isinstance(renderer, LightTransport) else None
-        recordings = None
         if layered := isinstance(representation, Layers):
-            recordings = starts.recordings(settings, lit, (height, width), wanted, traced)
+            recordings = starts.recordings(
+                settings, lit, (height, width), representation, wanted, traced, count
+            )
+            if traced:
+                renderer = traced = recordings.transport
         # Now: a resumed run may take up a later recording, but must freeze the same texels.
         rows, frozen = slice(first, last + 1), None
         if traced:

@@ -104,14 +104,6 @@ def _between(values, place):
     return (values[top] + (values[bottom] - values[top]) * part).astype(np.float32)
 
 
-def to_device(kind, array):
-    """Copy a numpy array to the device; done when this returns, so that the array may be reused."""
-    made = dr.opaque(kind(np.ascontiguousarray(array).ravel()))
-    dr.eval(made)
-    dr.sync_thread()
-    return made
-
-
 def as_image(colour, size, width):
     """Arrange the texels of a band as a tensor (size, width, 3)."""
     return mi.TensorXf(dr.ravel(colour), (size, width, 3))

@@ -161,17 +161,40 @@ def place(
     return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))
 
 
+def relative(known, wanted, weight=None) -> np.ndarray:
+    """Weigh pixels, or blocks of them, so that equal relative errors count alike.
+
+    That is weight / (brightness + floor).
+
+    Parameters
+    ----------
+    known, wanted : ndarray (..., 3)
+        The picture, whose channels' mean is the brightness, and what is to be explained of it. The floor is
+        :data:`FAINT` of the mean brightness; of paint on black, of the paint's own.
+    weight : ndarray (..., 1), optional
+        How much each pixel counts.
+
+    Returns
+    -------
+    ndarray (...)
+        ``weight`` itself where there is nothing at all.
+    """
+    bright = known.mean(axis=-1, dtype=np.float64)
+    mean = bright.mean() or np.abs(wanted).mean()
+    count = np.ones(bright.shape) if weight is None else weight[..., 0]
+    return count / (bright + FAINT * mean) if mean > 0 else count
+
+
 class Pursuit:
     """The residual picture, block by block, and what explains it; channels are apart."""
 
     def __init__(self, given: Given, picture, order=GAIN_ORDER):
         overview, omega = given.overview, given.omega
         self.overview = overview
-        bright = overview.to_blocks(given.known).mean(axis=1)
-        mean = bright.mean() or np.abs(overview.to_blocks(picture)).mean()  # of paint on black: its own
-        count = 1.0 if given.weight is None else overview.to_blocks(given.weight)[:, 0]
-        self.weight = count / (bright + FAINT * mean) if mean > 0 else np.zeros(len(bright))
-        wanted = overview.to_blocks(picture).T
+        blocks = overview.to_blocks(picture)
+        count = None if given.weight is None else overview.to_blocks(given.weight)
+        self.weight = relative(overview.to_blocks(given.known), blocks, count)
+        wanted = blocks.T
         self.light = float(np.abs(wanted * self.weight).sum())
         cells = overview.to_cells(given.background, omega)
         self.background = np.where(np.isfinite(cells), cells, 0)
@@ -181,7 +204,7 @@ class Pursuit:
         self.cosine = d @ d[self.candidates].T
         self.wanted = [w * self.weight for w in wanted]
         self.residual = list(self.wanted)
-        self.spans = [np.zeros((len(bright), 0)) for _ in range(3)]
+        self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
         self.allow(products(d, order))
 
     def allow(self, gains):

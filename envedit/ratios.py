@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
-from .places import Places, as_image, to_device
+from .device import flat
+from .places import Places, as_image
 
 MODERATE = 4.0
 """Largest ratio by which a texel of the source is scaled."""
@@ -137,22 +138,22 @@ class Ratio:
         near = self.grid.row[start : start + size]
 
         def smooth(values):
-            table = to_device(mi.Float, self.grid.along_rows(values, start, size))
+            table = flat(mi.Float, self.grid.along_rows(values, start, size))
             return self.grid.across(mi.Color3f, table, row, column)
 
         def nearest(values):
-            table = to_device(mi.Float, values[near].astype(np.float32))
+            table = flat(mi.Float, values[near].astype(np.float32))
             return self.grid.nearest(mi.Color3f, table, row, column)
 
-        image = dr.unravel(mi.Color3f, to_device(mi.Float, source))
+        image = dr.unravel(mi.Color3f, flat(mi.Float, source))
         made = image * smooth(self.m)
         if self.parts[near[0] : near[-1] + 1].any():
-            table = to_device(mi.Float, self.grid.along_rows(self.parts, start, size))
+            table = flat(mi.Float, self.grid.along_rows(self.parts, start, size))
             replaced, added = self.grid.across(mi.Vector2f, table, row, column)
             over = self.grid.beside(column)
 
             def linear(field):
-                mean, slope = (to_device(mi.Float, t) for t in field.along_rows(*places))
+                mean, slope = (flat(mi.Float, t) for t in field.along_rows(*places))
                 mean, slope = (self.grid.nearest(mi.Color3f, t, row, column) for t in (mean, slope))
                 return mean + slope * over
 
@@ -162,7 +163,7 @@ class Ratio:
             made = dr.maximum(made, 0)
         if self.fixed:
             made = made * nearest(self.fix[0]) + nearest(self.fix[1])
-        made = dr.select(to_device(mi.Bool, changed), made, image)
+        made = dr.select(flat(mi.Bool, changed), made, image)
         return as_image(made, size, self.grid.shape[1]).numpy()
 
 

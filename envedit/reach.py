@@ -25,11 +25,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from . import latlong, pursuit, search
+from .device import tensor
 from .errors import InputError
 from .tonemap import tonemap
 
@@ -235,7 +234,7 @@ class _Question:
             self.asked = 0.0
 
     def apply(self, envmap):
-        return self.transport.apply(_tensor(envmap)).numpy().astype(np.float64)
+        return self.transport.apply(tensor(envmap)).numpy().astype(np.float64)
 
     def distance(self, picture):
         """Mean absolute difference of display values in the painted region."""
@@ -262,10 +261,6 @@ def _shaped(name, values, shape):
     return values
 
 
-def _tensor(values):
-    return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
-
-
 def _cells(transport, shape):
     """Group the texels that change together, (H, W): cells, and single texels where T is sharp.
 
@@ -280,7 +275,7 @@ def _cells(transport, shape):
     square = np.zeros((height, width))
     for _ in range(PROBES):
         signs = rng.choice(np.float32([-1, 1]), size=(*transport.shape, 3))
-        square += (transport.adjoint(_tensor(signs)).numpy().astype(np.float64) ** 2).mean(axis=2)
+        square += (transport.adjoint(tensor(signs)).numpy().astype(np.float64) ** 2).mean(axis=2)
     total = np.bincount(flat, transport.influence.ravel().astype(np.float64))
     samples = transport.spp * np.bincount(flat, square.ravel() / PROBES) / np.maximum(total, 1e-30)
     single = (samples > SHARP)[cell]
@@ -318,11 +313,11 @@ class _Model:
         return self.render_map(self.radiance(x))
 
     def render_map(self, radiance):
-        picture = self.transport.linear(_tensor(np.where(self.active, radiance, 0)))
+        picture = self.transport.linear(tensor(np.where(self.active, radiance, 0)))
         return picture.numpy().astype(np.float64)
 
     def adjoint(self, picture):
-        light = self.transport.adjoint(_tensor(picture)).numpy() * self.active
+        light = self.transport.adjoint(tensor(picture)).numpy() * self.active
         return np.stack([self.sums(light * self.original), self.sums(light)])
 
     def sums(self, values):

@@ -29,6 +29,8 @@ LANES = 1 << 18
 PATHS = 1 << 22
 """Paths of a recording, all pixels together: more pixels need fewer each, as neighbours see the same map."""
 FEWEST_SPP, MOST_SPP = 16, 256
+AUTO_GB, COARSE_SHARE = 2.0, 0.7
+"""GB of memory that "auto" allows; share of it that samples of "auto" may fill: the rest is for columns."""
 PILOT_SPP = 16
 MOST_COLUMNS = 256
 
@@ -245,8 +247,8 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
     scene : envedit.scene.Scene
         Whose film counts.
     spp : int or "auto"
-        Paths a pixel; taken as it is if it is a number, else :data:`PATHS` over the pixels, or what leaves
-        30 % of the memory to columns.
+        Paths a pixel; taken as it is if it is a number, else :data:`PATHS` over the pixels, or
+        :func:`most_samples` if those are fewer.
     texels : int
         Texels of the map: no more columns are of use.
     memory_gb : float
@@ -265,25 +267,32 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
         If the samples alone do not fit.
     """
     pixels = scene.width * scene.height
-    wanted, spp = spp, _automatic_spp(pixels) if spp == "auto" else int(spp)
-
-    def coarse_gb():
-        # Two packed copies (T and its transpose) of 16 bytes an entry; a path leaves about 1.5 entries.
-        return pixels * spp * 1.5 * 32 / 1e9
-
-    while wanted == "auto" and coarse_gb() > 0.7 * memory_gb and spp > FEWEST_SPP:
-        spp //= 2
-    if coarse_gb() > memory_gb:
+    spp = min(_automatic_spp(pixels), most_samples(pixels, memory_gb)) if spp == "auto" else int(spp)
+    coarse_gb = _coarse_gb(pixels, spp)
+    if coarse_gb > memory_gb:
         raise InputError(
-            f"light transport needs {coarse_gb():.2g} GB for {scene.width}x{scene.height} pixels at {spp} "
+            f"light transport needs {coarse_gb:.2g} GB for {scene.width}x{scene.height} pixels at {spp} "
             f"samples, memory_gb allows {memory_gb:g}: raise [renderer] memory_gb, or lower [renderer] spp "
             "or [scene] width"
         )
     counted = (2**32 - 1) // (4 * (pixels + SLICE))  # an index into their store has 32 bits
-    capacity = int(min(MOST_COLUMNS, (memory_gb - coarse_gb()) * 1e9 / (16 * pixels), texels, counted))
-    about = coarse_gb() + capacity * 16e-9 * pixels
+    capacity = int(min(MOST_COLUMNS, (memory_gb - coarse_gb) * 1e9 / (16 * pixels), texels, counted))
+    about = coarse_gb + capacity * 16e-9 * pixels
     columns = f"up to {capacity} exact columns, about {about:.2g} of {memory_gb:g} GB"
     return spp, capacity, f"light transport: {spp} paths a pixel, {columns}"
+
+
+def most_samples(pixels: int, memory_gb: float) -> int:
+    """Return the most samples a pixel, a power of two, whose T leaves memory to columns; at most MOST_SPP."""
+    spp = MOST_SPP
+    while _coarse_gb(pixels, spp) > COARSE_SHARE * memory_gb and spp > FEWEST_SPP:
+        spp //= 2
+    return spp
+
+
+def _coarse_gb(pixels, spp):
+    """Return the GB of T and its transpose: 16 bytes an entry, and a path leaves about 1.5 entries."""
+    return pixels * spp * 1.5 * 2 * 16 / 1e9
 
 
 def _automatic_spp(pixels):

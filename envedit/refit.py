@@ -7,11 +7,11 @@ least-squares problem: 3 systems of hidden + 1 unknowns, a few milliseconds, no 
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from . import siren
+from .device import tensor
 
 RIDGE = 5e-6
 """Damping of the solution, per point."""
@@ -73,7 +73,7 @@ def last_layer(
     # A channel whose solution is not finite, or beyond the reach of two steps, stays as it was.
     after = np.where((errors(after) < errors(before))[:, None], after, before)
     solved = {f"{last}.weight": after[:, :-1], f"{last}.bias": after[:, -1]}
-    solved = {name: dr.opaque(mi.TensorXf(np.ascontiguousarray(v, np.float32))) for name, v in solved.items()}
+    solved = {name: tensor(v) for name, v in solved.items()}
     return {name: solved.get(name, value) for name, value in params.items()}
 
 

@@ -12,15 +12,14 @@ What comes out is most of the way.
 
 from __future__ import annotations
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from . import latlong
+from .device import tensor
 from .gain import LEVELS
 from .layers import VEIL, Layers
 from .lights import DARK, SPARE, rotation_vector
-from .pursuit import FAINT, GAIN_ORDER, Given, Place, place, products
+from .pursuit import GAIN_ORDER, Given, Place, place, products, relative
 from .separate import glow_at
 from .tonemap import LUMINANCE
 from .transport import LightTransport
@@ -231,11 +230,6 @@ def rotations(lights, places):
     return turn, flux
 
 
-def tensor(values):
-    """Copy values to the device, float32."""
-    return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
-
-
 def spread(overview, wanted, weight, known, hats, lights):
     """Find strengths, not negative, of overlapping hats of background and of lights that make a picture.
 
@@ -260,11 +254,9 @@ def spread(overview, wanted, weight, known, hats, lights):
     hats, lights : ndarray (n, 3), (m, 3)
         Strengths.
     """
-    count = np.ones(len(overview.matrix[0])) if weight is None else overview.to_blocks(weight)[:, 0]
     wanted = np.maximum(overview.to_blocks(wanted), 0)
-    bright = overview.to_blocks(known).mean(axis=1)
-    # Equal relative errors count alike; Lucy's own weights, counts of photons, are the pixels' brightness.
-    w = count / (bright + FAINT * max(bright.mean(), 1e-30))
+    # Lucy's own weights, counts of photons, are the pixels' brightness.
+    w = relative(overview.to_blocks(known), wanted, None if weight is None else overview.to_blocks(weight))
     n = hats.shape[2]
     found = np.ones((n + lights.shape[2], 3))
     for c in range(3):
@@ -310,11 +302,7 @@ def refine(transport, wanted, known, weight, gains, direction, flux, first, last
     """
     height, width = transport.grid.height, transport.grid.width
     omega = latlong.lookup_solid_angles(height, width)
-    bright = known.mean(axis=1)
-    mean = bright.mean() or np.abs(wanted).mean()  # of paint on black: its own
-    scale = 1 / (bright + FAINT * max(mean, 1e-30))
-    if weight is not None:
-        scale = scale * weight[:, 0]
+    scale = relative(known, wanted, weight)
     spans, rest = [], []
     for c in range(3):
         q, r = np.linalg.qr((gains[..., c] * scale).T)

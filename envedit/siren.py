@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong
+from .device import tensor
 
 Params = dict[str, "mi.TensorXf"]
 
@@ -60,8 +61,8 @@ def init(
         bound = 1.0 / fan_in if i == 0 else np.sqrt(6.0 / fan_in) / omega
         bias = 1.0 / np.sqrt(fan_in)
         weight = rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)
-        params[f"{i}.weight"] = dr.opaque(mi.TensorXf(weight))
-        params[f"{i}.bias"] = dr.opaque(mi.TensorXf(rng.uniform(-bias, bias, fan_out).astype(np.float32)))
+        params[f"{i}.weight"] = tensor(weight)
+        params[f"{i}.bias"] = tensor(rng.uniform(-bias, bias, fan_out))
     return params
 
 

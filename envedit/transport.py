@@ -33,7 +33,16 @@ from .errors import ConfigError
 from .grid import Grid
 from .health import require_radiance
 from .influence import determined
-from .recording import choose_bounces, choose_samples, left_out, other_light, pilot, record_all, row_mass
+from .recording import (
+    AUTO_GB,
+    choose_bounces,
+    choose_samples,
+    left_out,
+    other_light,
+    pilot,
+    record_all,
+    row_mass,
+)
 from .sparse import ColourMatrix, scale_packets, to_packets
 
 COLUMN_TOLERANCE = 0.03
@@ -142,7 +151,7 @@ class LightTransport:
             smaller than Mitsuba takes.
         """
         latlong.check_envmap_size(height, width)
-        memory_gb = 2.0 if memory_gb == "auto" else float(memory_gb)
+        memory_gb = AUTO_GB if memory_gb == "auto" else float(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
             if value != "auto" and not value >= 1:
                 raise ConfigError(

@@ -3,8 +3,8 @@
 import numpy as np
 
 from envedit import latlong, resolution
+from envedit.device import tensor
 from envedit.gain import grid_size
-from envedit.search import tensor
 
 WIDTH, ROWS = 64, (0, 32)
 FILM = 24

@@ -392,3 +392,20 @@ def test_a_light_is_refined_on_a_map_of_few_texels(width, rng):
     asked = wanted, known, None, gains, np.array([0.6, 0.5, 0.6]), np.ones(3), 0, height - 1
     direction, factor = search.refine(Few(), *asked)
     assert abs(np.linalg.norm(direction) - 1) < 1e-6 and np.isfinite(factor).all() and factor.min() >= 0
+
+
+@pytest.mark.parametrize("size", [1e-37, 1e-30, 1.0, 1e30])
+def test_pixels_count_by_their_brightness_and_a_floor_at_every_scale(size):
+    known = np.array([[1.0, 2, 3], [0, 0, 0], [2, 2, 2], [0, 0, 0]], np.float32) * np.float32(size)
+    weight = np.array([[1.0], [1], [0.5], [0]], np.float32)
+    mean = known[0, 1].astype(float) / 2
+    found = pursuit.relative(known, known, weight)
+    floor = 0.2 * mean
+    assert found == pytest.approx([1 / (2 * mean + floor), 1 / floor, 0.5 / (2 * mean + floor), 0], rel=1e-5)
+
+
+def test_paint_on_black_counts_by_its_own_light_and_nothing_by_nothing():
+    black, paint = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32)
+    paint[2] = -6
+    assert pursuit.relative(black, paint) == pytest.approx(1 / (0.2 * 1.5))
+    assert (pursuit.relative(black, black) == 1).all()

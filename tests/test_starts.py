@@ -1,5 +1,7 @@
 """Where an edit with layers starts: what it looks through, and what its pixels count."""
 
+from types import SimpleNamespace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -29,7 +31,8 @@ def seen(rng, spp=(256, 32)):
     first, second = (base + 0.003 * rng.normal(size=SHAPE) for _ in range(2))
     first[10:13, 20:23] += 3
     base[10:13, 20:23] += 3
-    return [Recording(picture, n) for picture, n in zip((first, second), spp, strict=True)], base
+    pair = (Recording(picture, n) for picture, n in zip((first, second), spp, strict=True))
+    return starts.Recordings(*pair), base
 
 
 def target(picture, weight=None):
@@ -61,29 +64,79 @@ def test_a_mask_around_nothing_but_noise_is_kept_as_it_is(rng):
 @pytest.mark.parametrize(
     "cycles, coverage, spp, wanted",
     [
-        ("auto", None, 256, [256, 32]),
-        ("auto", None, 16, [16, 16]),
-        (12, None, 256, [256]),
-        ("auto", MAP, 256, [256]),
+        ("auto", None, 256, (256, 32)),
+        ("auto", None, 16, (16, 16)),
+        (12, None, 256, (256, None)),
+        ("auto", MAP, 256, (256, None)),
     ],
 )
 def test_a_second_recording_is_made_where_detail_is_asked_about(cycles, coverage, spp, wanted, monkeypatch):
+    asked = tracing(monkeypatch, [])
+    found = recorded({"representation": {"cycles": cycles}}, Traced(spp), coverage)
+    second = found.second and found.second.spp
+    assert (found.transport.spp, second) == wanted and len(asked) == (second is not None)
+    assert all(0 <= seed < 2**32 and seed != 2**32 - 1 for seed, _ in asked)
+    assert bool(found.notes) == (second is not None)
+
+
+@pytest.mark.parametrize(
+    "octaves, renderer, spp, size, wanted",
+    [
+        (["one"], {}, 64, 256, 256),  # 0.8 of the 2 GB
+        (["one"], {"memory_gb": "auto"}, 64, 256, 256),
+        (["one"], {"memory_gb": 1.0}, 64, 256, 128),
+        (["one"], {}, 16, 1024, None),  # more do not fit
+        (["one"], {}, 256, 128, None),
+        (["one"], {"spp": 64}, 64, 256, None),  # what was asked for is taken
+        ([], {}, 64, 256, None),
+    ],
+)
+def test_where_detail_is_told_a_large_picture_gets_more_samples(
+    octaves, renderer, spp, size, wanted, monkeypatch
+):
+    asked, first = tracing(monkeypatch, octaves), Traced(spp)
+    found = recorded({"renderer": renderer}, first, size=size)
+    assert found.octaves == octaves and asked[0][1] == min(spp, 32)
+    if wanted is None:
+        assert found.transport is first and len(asked) == 1
+        return
+    assert found.transport.spp == wanted and asked[1:] == [(2**32 - 1, wanted)]  # the run's own seed
+    assert f"{wanted} paths a pixel in place of {spp}" in found.notes[-1]
+
+
+def test_a_path_tracer_s_recording_stays_as_it_is(monkeypatch):
+    asked = tracing(monkeypatch, ["one"])
+    found = recorded({"renderer": {"kind": "path", "spp": 16}}, None, size=256)
+    assert [spp for _, spp in asked] == ["auto", 32] and found.transport.spp == 64
+
+
+class Traced:
+    paths = (8, 48, 48)
+
+    def __init__(self, spp):
+        self.spp = spp
+
+
+def tracing(monkeypatch, octaves):
+    """Let no path be traced, and the picture tell what it is to tell; returns seeds and samples asked for."""
     asked = []
 
-    class Traced:
-        paths = (8, 48, 48)
-
-        def __init__(self, spp):
-            self.spp = spp
-
-    def trace(settings, lit, shape):
-        asked.append(settings.seed)
-        return Traced(settings.renderer.spp)
+    def trace(settings, lit, shape, progress):
+        asked.append((settings.seed, settings.renderer.spp))
+        return Traced(64 if settings.renderer.spp == "auto" else settings.renderer.spp)
 
     monkeypatch.setattr(starts.renderers, "trace", trace)
-    settings = config.from_dict({"representation": {"cycles": cycles}, "seed": 2**32 - 1})
-    picture = np.zeros(SHAPE, np.float32)
-    wished = Target(picture, None, None, "", coverage=coverage)
-    found = starts.recordings(settings, None, (8, 16), wished, Traced(spp))
-    assert [one.spp for one in found] == wanted and len(asked) == len(wanted) - 1
-    assert all(0 <= seed < 2**32 and seed != settings.seed for seed in asked)
+    monkeypatch.setattr(starts.resolution, "octaves", lambda *asked: [Told(o) for o in octaves])
+    return asked
+
+
+class Told(str):
+    cycles, share = 24, 0.9
+
+
+def recorded(tables, traced, coverage=None, size=24):
+    settings = config.from_dict({**tables, "seed": 2**32 - 1})
+    layers = SimpleNamespace(separation=SimpleNamespace(background=MAP), rows=(0, 8))
+    wished = Target(np.zeros(SHAPE, np.float32), None, None, "", coverage=coverage)
+    lit = SimpleNamespace(width=size, height=size)
+    return starts.recordings(settings, lit, (8, 16), layers, wished, traced)

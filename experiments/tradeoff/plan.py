@@ -174,6 +174,27 @@ def joint(count: int, seed: int = 0) -> list[Setting]:
     return settings
 
 
+def film_and_steps() -> list[Setting]:
+    """List smaller pictures with more steps: the two knobs that are the cheapest alone, where presets lie."""
+
+    def both(film, steps, seconds, width=None):
+        table = {"scene": {"width": film}, "optimizer": {"iterations": steps}}
+        if width:
+            table["input"] = {"width": width}
+        name = f"film {film}, {steps} steps" + (f", map {width}" if width else "")
+        return Setting(name, "joint", table, seconds)
+
+    return [
+        both(48, 200, 10.0),
+        both(64, 200, 12.0),
+        both(64, 400, 14.0),
+        both(64, 200, 12.0, width=128),
+        both(96, 100, 14.0),
+        both(96, 200, 16.0),
+        both(128, 400, 26.0),
+    ]
+
+
 DRAFT = Setting("draft", "preset", {"preset": "draft"}, 10.0)
 PAPER = Setting("paper", LONG, {"preset": "paper"}, 1300.0)
 
@@ -184,7 +205,7 @@ def settings(count: int, quick: bool = False) -> list[Setting]:
         some = {"samples of T: 16", "path tracer, spp: 4", "map width: 128", "film width: 64", "steps: 30"}
         small = Setting("siren: draft", "siren", {"preset": "draft", **_kind("siren")}, 16.0)
         return [DRAFT, *(s for s in knobs() if s.name in some), small, *joint(count)]
-    return [DRAFT, *knobs(), *siren(), *joint(count)]
+    return [DRAFT, *knobs(), *siren(), *joint(count), *film_and_steps()]
 
 
 def _kind(name):

@@ -1,0 +1,28 @@
+"""Numpy arrays to Dr.Jit's, as inputs of kernels: never as literals, each of which is a kernel of its own."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def tensor(values) -> mi.TensorXf:
+    """Copy numbers of any shape to a float32 tensor."""
+    return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
+
+
+def flat(kind, values):
+    """Copy numbers to an array of a Dr.Jit type; done when this returns, so that ``values`` may change.
+
+    Parameters
+    ----------
+    kind : type
+        ``mi.Float``, ``mi.Bool``, ``mi.Int32`` ...
+    values : ndarray
+        Of the dtype that ``kind`` has; raveled.
+    """
+    made = dr.opaque(kind(np.ascontiguousarray(values).ravel()))
+    dr.eval(made)
+    dr.sync_thread()
+    return made

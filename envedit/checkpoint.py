@@ -20,7 +20,7 @@ from .errors import InputError
 from .files import replacing
 
 NAME = "checkpoint.npz"
-_FORMAT = 2  # raise when what is stored, or what the loop makes of it, changes
+_FORMAT = 3  # raise when what is stored, or what the loop makes of it, changes
 
 
 def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:

@@ -268,7 +268,7 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
     """
     pixels = scene.width * scene.height
     spp = min(_automatic_spp(pixels), most_samples(pixels, memory_gb)) if spp == "auto" else int(spp)
-    coarse_gb = _coarse_gb(pixels, spp)
+    coarse_gb = gigabytes(pixels, spp)
     if coarse_gb > memory_gb:
         raise InputError(
             f"light transport needs {coarse_gb:.2g} GB for {scene.width}x{scene.height} pixels at {spp} "
@@ -277,22 +277,25 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
         )
     counted = (2**32 - 1) // (4 * (pixels + SLICE))  # an index into their store has 32 bits
     capacity = int(min(MOST_COLUMNS, (memory_gb - coarse_gb) * 1e9 / (16 * pixels), texels, counted))
-    about = coarse_gb + capacity * 16e-9 * pixels
+    about = gigabytes(pixels, spp, capacity)
     columns = f"up to {capacity} exact columns, about {about:.2g} of {memory_gb:g} GB"
     return spp, capacity, f"light transport: {spp} paths a pixel, {columns}"
 
 
 def most_samples(pixels: int, memory_gb: float) -> int:
-    """Return the most samples a pixel, a power of two, whose T leaves memory to columns; at most MOST_SPP."""
+    """Return the most samples a pixel, a power of two, whose T leaves memory to columns.
+
+    From :data:`FEWEST_SPP`, which may be too many, to :data:`MOST_SPP`.
+    """
     spp = MOST_SPP
-    while _coarse_gb(pixels, spp) > COARSE_SHARE * memory_gb and spp > FEWEST_SPP:
+    while gigabytes(pixels, spp) > COARSE_SHARE * memory_gb and spp > FEWEST_SPP:
         spp //= 2
     return spp
 
 
-def _coarse_gb(pixels, spp):
-    """Return the GB of T and its transpose: 16 bytes an entry, and a path leaves about 1.5 entries."""
-    return pixels * spp * 1.5 * 2 * 16 / 1e9
+def gigabytes(pixels: int, spp: int, columns: int = 0) -> float:
+    """Estimate the GB of T, its transpose and columns: 16 bytes an entry, and a path leaves about 1.5."""
+    return pixels * (spp * 1.5 * 2 + columns) * 16 / 1e9
 
 
 def _automatic_spp(pixels):

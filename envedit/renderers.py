@@ -19,7 +19,7 @@ def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Pat
     shape : (int, int)
         Rows and columns of the maps.
     progress : callable, optional
-        Told of paths done and paths in all.
+        Told of blocks of pixels done, and in all.
     """
     chosen = settings.renderer
     if chosen.kind == "path":

@@ -63,17 +63,17 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
-    pulled = _pulled_back(transport, second, slope, background, rows[0])
     found, cycles = [], coarsest
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
         down, across = tents(size, (height, width))
         told = np.zeros(size)
-        for pair in pulled:
+        # Drawn anew for each octave: of a large map all of them together would take gigabytes.
+        for pair in _pulled_back(transport, second, slope, background, rows[0]):
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
             told += _alternating(*on_nodes)
         # Where nothing is told, a product of two estimates may well be negative.
-        told = np.maximum(_smooth(told / len(pulled)), 0) * CONTRAST**2
+        told = np.maximum(_smooth(told / PROBES), 0) * CONTRAST**2
         known = told**2 / (told**2 + ENOUGH**2)
         share = float((known.mean(axis=1) * (around := down.T @ omega)).sum() / around.sum())
         if share < (LEAST_SHARE if found else FIRST_SHARE):
@@ -84,14 +84,13 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
 
 
 def _pulled_back(transport, second, slope, background, first):
-    """List pairs of J' z, (n, W, 3) each, through T and through a second recording of it."""
-    rng, pairs = np.random.default_rng(0), []
+    """Yield :data:`PROBES` pairs of J' z, (n, W, 3) each, through T and through a second recording of it."""
+    rng = np.random.default_rng(0)
     for _ in range(PROBES):
         z = mi.TensorXf((rng.choice([-1.0, 1.0], slope.shape) * slope).astype(np.float32))
         rows = slice(first, first + len(background))
         pulled = (recording.adjoint(z).numpy()[rows] for recording in (transport, second))
-        pairs.append([one.astype(np.float64) * background for one in pulled])
-    return pairs
+        yield [one.astype(np.float64) * background for one in pulled]
 
 
 def _alternating(first, second):

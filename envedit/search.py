@@ -104,6 +104,8 @@ def start(
     found = dict(params)
     total = np.ones((len(pictures), 3))
     for level in range(LEVELS):
+        if np.prod(layers.gain.sizes[level]) > len(overview.omega):
+            break  # finer than the overview can tell
         hats = scene.hats(level) * factor.T[..., None]
         gain, strength = spread(overview, scene.wanted, weight, picture, hats, stack)
         gain = np.clip(gain, LEAST, MOST)

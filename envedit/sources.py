@@ -21,12 +21,10 @@ Fields = dict[str, Any]
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "input": {"width": 128},
-        "scene": {"width": 96},
-        "target": {"spp": 256},
+        "scene": {"width": 64},
         "representation": {"hidden": 64},
         "fit": {"epochs": 500},
-        "optimizer": {"iterations": 60},
-        "output": {"spp": 256},
+        "optimizer": {"iterations": 200},
     },
     "standard": {},
     "paper": {

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field, replace
 import mitsuba as mi
 import numpy as np
 
-from . import changes, config, renderers, resolution, scene, search, trust
+from . import changes, config, recording, renderers, resolution, scene, search, trust
 from .gain import CYCLES, Octave
 from .layers import Layers
-from .recording import AUTO_GB, most_samples
 from .target import Target
 from .transport import LightTransport
 
-AGAIN_SEED, AGAIN_SPP = 500_009, 32
-"""Added to the run's seed for the second recording of T, which tells its noise; its samples a pixel."""
+AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
+"""Added to the run's seed for the second recording of T, which tells its noise; its most samples a pixel and
+exact columns."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,9 @@ def recordings(
     wanted : Target
         What the picture should be. What is painted need not be what any light does: detail would follow it.
     traced : LightTransport, optional
-        T, where the run renders through it.
+        T, where the run renders through it; of no use any more if another one is returned.
     progress : callable, optional
-        Told of paths done and paths in all.
+        Told of blocks of pixels done, and in all.
     """
 
     def trace(seed, **changed):
@@ -104,21 +104,30 @@ def recordings(
 
     # A path tracer's samples a pixel are not meant for T.
     transport = traced or trace(settings.seed, spp="auto")
-    if wanted.coverage is not None or settings.representation.cycles != "auto":
+    fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
+    if not fits or wanted.coverage is not None or settings.representation.cycles != "auto":
         return Recordings(transport)
-    second = trace((settings.seed + AGAIN_SEED) % 2**32, spp=min(AGAIN_SPP, transport.spp), refresh=0)
-    # Its columns are only compared with the first's: the fewest paths do.
-    second.paths = (second.paths[0],) * len(second.paths)
+    pixels, few = lit.width * lit.height, min(AGAIN_SPP, transport.spp)
+    second = trace(
+        (settings.seed + AGAIN_SEED) % 2**32,
+        spp=few,
+        max_depth=transport.bounces + 1,
+        memory_gb=recording.gigabytes(pixels, few, min(AGAIN_COLUMNS, transport.capacity) + 1),
+        refresh=0,
+    )
     asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
     told = resolution.octaves(transport, second, *asked, 2 * CYCLES)
     shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
     notes = [f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"]
     if told and traced and settings.renderer.spp == "auto":
         allowed = settings.renderer.memory_gb
-        most = most_samples(lit.width * lit.height, AUTO_GB if allowed == "auto" else allowed)
+        most = recording.most_samples(pixels, recording.AUTO_GB if allowed == "auto" else allowed)
         if most > transport.spp:
             notes.append(f"{most} paths a pixel in place of {transport.spp}: detail would follow their noise")
+            transport.release()
             transport = trace(settings.seed, spp=most)
+    # Columns of both are compared: their paths are in the ratio of the samples.
+    second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
     return Recordings(transport, second, told, notes)
 
 
@@ -156,9 +165,9 @@ def find(
 def _trusted(envmap, recordings, wanted):
     """Weigh a rendered target's pixels by what is known of them; returns weights, or None, and a note."""
     pictures, both = [], (recordings.transport, recordings.second)
-    for recording in both:
-        recording.resolve(envmap)
-        pictures.append(recording.apply(mi.TensorXf(envmap)).numpy())
+    for one in both:
+        one.resolve(envmap)
+        pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
     weight = trust.weights(*pictures, share, wanted.picture, wanted.noise)
     if weight is None:

@@ -29,7 +29,7 @@ class Target:
     picture : ndarray (h, w, 3)
         Linear radiance.
     weight : ndarray (h, w, 1) or None
-        How much each pixel counts, 1 on average; None: all the same.
+        How much each pixel counts; None: all the same.
     envmap : ndarray (H, W, 3) or None
         The map that makes the picture, where it is known.
     source : str

@@ -268,6 +268,10 @@ class LightTransport:
         samples = self.forward.entries * self.grid.mass.numpy() / self.grid.width
         return determined(self.influence, samples, rows, threshold)
 
+    def release(self) -> None:
+        """Let go of T's memory; nothing can be asked of it afterwards."""
+        del self.forward, self.reverse, self._exact
+
     def overview(self) -> overviews.Overview:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
         if self._overview is None:

@@ -20,6 +20,8 @@ USUAL = 4.0
 """Multiples of the picture's median variance that are nothing special."""
 SHOWS_LIGHT = 3.0
 """Multiples of the target's median brightness from which on a noisy pixel shows a light itself."""
+LIT = 0.01
+"""Multiples of the target's mean brightness from which on a pixel counts in medians: not a black backdrop."""
 
 
 def weights(first, second, share: float, picture, noise=None) -> np.ndarray | None:
@@ -41,22 +43,26 @@ def weights(first, second, share: float, picture, noise=None) -> np.ndarray | No
     -------
     ndarray (h, w, 1) or None
         s^2 / (s^2 + v), s = :data:`TRUSTED`, v the variance around a pixel beyond :data:`USUAL` times its
-        median, and 0 at those over or beside :data:`SHOWS_LIGHT`; None where no pixel is below 1/2, or none
-        is above 0.
+        median, and 0 at those over or beside :data:`SHOWS_LIGHT`; medians are over pixels that are
+        :data:`LIT`. None where no pixel is below 1/2, or none that is lit is above 0.
     """
     shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
     variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
     if noise is not None:
         variance += np.square(noise)
     around = _windows(variance, AROUND).mean(axis=(2, 3))
-    beyond = np.maximum(around - USUAL * np.median(around), 0)
+    brightness = picture.max(axis=2)
+    lit = brightness > LIT * brightness.mean(dtype=np.float64)
+    if not lit.any():
+        return None
+    beyond = np.maximum(around - USUAL * np.median(around[lit]), 0)
     trust = TRUSTED**2 / (TRUSTED**2 + beyond)
     if trust.min() >= 0.5:
         return None
-    brightest = _windows(picture.max(axis=2), 1).max(axis=(2, 3))
-    shows_light = (brightest >= SHOWS_LIGHT * np.median(picture)) & (beyond > 0)
+    brightest = _windows(brightness, 1).max(axis=(2, 3))
+    shows_light = (brightest >= SHOWS_LIGHT * np.median(picture[lit])) & (beyond > 0)
     trust = np.where(shows_light, 0, trust)
-    return trust[..., None].astype(np.float32) if trust.any() else None
+    return trust[..., None].astype(np.float32) if trust[lit].any() else None
 
 
 def _windows(values, reach):

@@ -121,6 +121,17 @@ def test_calibration_measures_this_scene(small):
     assert scene.QUIET_LEAST <= found.quiet_spp <= scene.QUIET_MOST
 
 
+def test_paint_takes_longer_to_search():
+    level = budget.LEVELS[-1]
+    more = budget.expect(level, HERE, painted=True) - budget.expect(level, HERE)
+    assert more == pytest.approx(
+        (budget.PAINTED - 1) * level.traced_s * HERE.render / budget.REFERENCE_RENDER
+    )
+    between = (budget.expect(level, HERE) + budget.expect(level, HERE, painted=True)) / 2
+    assert budget.choose(HERE, between, 0.0)[0] == level
+    assert budget.choose(HERE, between, 0.0, painted=True)[0] != level
+
+
 def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, capsys):
     tiny = dataclasses.replace(LEVELS[0], name="tiny", map=32, film=24, iterations=2, spp=16)
     monkeypatch.setattr(budget, "LEVELS", (tiny,))

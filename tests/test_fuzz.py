@@ -179,7 +179,15 @@ def test_pieces_of_a_run_add_up(tmp_path):
     assert sums["exr"].counts == {"read": 2, "refused": 2, "hung": 2} and len(sums["exr"].faults) == 2
     row = [cell.strip() for cell in run.table(sums).splitlines()[2].split("|")]
     assert row[1:7] == ["exr", "6", "2", "2 InputError", "0", "2"] and row[-2] == "2.0 MiB"
-    assert json.loads((tmp_path / "sub" / "record.json").read_text())
+    file = tmp_path / "sub" / "record.json"
+    assert json.loads(file.read_text())
+    for cases, seed, twice in [((0, 6), 0, True), ((2, 4), 0, True), ((5, 9), 0, True), ((3, 6), 0, False),
+                               ((6, 9), 0, False), ((0, 6), 1, False)]:  # fmt: skip
+        assert bool(run.counted_twice(file, "exr", range(*cases), seed)) == twice
+    assert "holds cases 3 to 5 of exr" in run.counted_twice(file, "exr", range(5, 9), 0)
+    assert not run.counted_twice(file, "hdr", range(6), 0)
+    with pytest.raises(SystemExit):
+        run.main(["--record", str(file), "--what", "exr", "--cases", "5"])
 
 
 def test_headers_are_understood_apart_from_the_readers():

@@ -69,6 +69,8 @@ def check_visible(folder, reference):
             assert file.read_bytes() == (reference / name).read_bytes(), name
         elif name == "report.html":
             assert file.read_text().rstrip().endswith("</html>")
+        elif name in ("config.toml", "history.csv"):
+            assert kills.look(folder, reference)["half"] == []
 
 
 def check_resumed(path, folder, reference):
@@ -372,6 +374,8 @@ def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
         os.truncate(folder / name, os.path.getsize(folder / name) - 9)
     (folder / checkpoint.NAME).write_bytes(b"PK\3\4 half")
     (folder / ".render_target.exr.1.exr").touch()
+    for name in ("config.toml", "history.csv", "preview.png"):
+        os.truncate(folder / name, os.path.getsize(folder / name) // 2)
     found = kills.look(folder, reference)
     assert set(found["half"]) == {
         "edited.exr",
@@ -379,11 +383,14 @@ def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
         "metrics.json",
         "influence.png",
         "checkpoint.npz",
+        "config.toml",
+        "history.csv",
+        "preview.png",
     }
     assert found["temporary"] == 1 and found["files"] == len(COMPLETE) + 1 and found["step"] is None
     shutil.copy(reference / "metrics.json", folder)
     assert set(kills.differing(folder, reference)) == {
-        "edited.exr", "influence.png", "checkpoint.npz", ".render_target.exr.1.exr",
+        "edited.exr", "influence.png", "preview.png", "checkpoint.npz", ".render_target.exr.1.exr",
     }  # fmt: skip
 
 

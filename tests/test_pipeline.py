@@ -11,7 +11,20 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import checkpoint, config, edit, envmap, image, job, latlong, pipeline, scene, target
+from envedit import (
+    checkpoint,
+    config,
+    edit,
+    envmap,
+    gain,
+    image,
+    job,
+    latlong,
+    pipeline,
+    recording,
+    scene,
+    target,
+)
 from envedit.errors import InputError
 
 WIDTH, HEIGHT = 16, 8
@@ -275,7 +288,8 @@ def test_layers_are_traced_with_few_paths(kind, few, tmp_path, rng, monkeypatch)
 
     monkeypatch.setattr(pipeline.LightTransport, "build", classmethod(noted))
     tables = {"representation": {"kind": kind}, "optimizer": {"iterations": 1}}
-    pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
+    picture = np.repeat(np.repeat(sunny(rng), 3, axis=0), 3, axis=1)
+    pipeline.run(settings_of(tmp_path, picture, input={"width": 3 * WIDTH}, **tables))
     assert asked == ([few, few] if few else [few]), "layers look at T a second time"
 
 
@@ -320,8 +334,8 @@ def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, r
     cached = [found.metrics["transport"]["cached"] for found in (first, again, other, refused)]
     assert cached == [False, True, True, False]
     assert first.envmap.tobytes() == again.envmap.tobytes() == refused.envmap.tobytes()
-    # Pilot, recording and overview.
-    assert len(list((tmp_path / "cache" / "envedit" / "transport").iterdir())) == 5, "layers record it twice"
+    # Pilot, recording and overview; on a map this narrow layers look for no detail, and record nothing else.
+    assert len(list((tmp_path / "cache" / "envedit" / "transport").iterdir())) == 3
 
 
 @pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
@@ -431,6 +445,35 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
     assert resumed.envmap.tobytes() == whole.envmap.tobytes()
     assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
     assert without_times(resumed.history) == without_times(whole.history)
+    assert without_timing(resumed.metrics) == without_timing(whole.metrics)
+
+
+def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr(recording, "PATHS", 32 * 48**2)
+    monkeypatch.setattr(recording, "MOST_SPP", 128)
+    picture = np.exp(rng.normal(0, 0.5, (32, 64, 1)) + rng.normal(0, 0.1, (32, 64, 3))).astype(np.float32)
+    settings = settings_of(
+        tmp_path,
+        picture,
+        input={"width": 64},
+        scene={"file": "mirror", "width": 48},
+        target={"rotate_degrees": 90},
+        renderer={"spp": "auto"},
+    )
+    whole = pipeline.run(settings)
+    assert whole.metrics["transport"]["samples"] == 128
+    assert "128 paths a pixel in place of 32: detail would follow their noise" in whole.notes
+    assert any(note.startswith("light transport: 128 paths a pixel") for note in whole.notes)
+    levels = [name for name in whole.found.params if name.startswith("gain.")]
+    assert len(levels) > gain.LEVELS
+    assert all(np.abs(whole.found.params[name].numpy()).max() > 0 for name in levels)
+
+    monkeypatch.setattr(edit, "READ_EVERY", 7)
+    (tmp_path / "run").mkdir()
+    with pytest.raises(pipeline.Interrupted, match="iteration 7"):
+        pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
+    resumed = pipeline.run(settings, folder=tmp_path / "run", resume=True)
+    assert resumed.envmap.tobytes() == whole.envmap.tobytes()
     assert without_timing(resumed.metrics) == without_timing(whole.metrics)
 
 

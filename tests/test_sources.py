@@ -78,7 +78,7 @@ MANY = ("siren", "pixels", "log-pixels")
     ("preset", "kind", "ssim", "iterations"),
     [
         ("standard", "layers", 0.1, 100),
-        ("draft", "layers", 0.1, 60),
+        ("draft", "layers", 0.1, 200),
         *(("standard", kind, 1.0, 600) for kind in MANY),
         *(("draft", kind, 1.0, 150) for kind in MANY),
         *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
@@ -110,7 +110,7 @@ def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
     config = cfg.loads(text, overrides=["optimizer.iterations=8", "loss.ssim=[1, 2]"])
     assert (config.optimizer.iterations, config.loss.ssim) == (8, (1, 2))
     # What neither the kind nor the file names is the preset's.
-    assert config.target.spp == 256 and config.scene.width == 96
+    assert config.input.width == 128 and config.scene.width == 64
     # A given key that has the value of another kind's default is kept.
     same = cfg.loads("[loss]\nssim = 0.1", overrides=["representation.kind=siren"])
     assert same.loss.ssim == 0.1 and same.optimizer.iterations == 600

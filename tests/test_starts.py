@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import config, starts
+from envedit import config, recording, starts
 from envedit.target import Target
 
 SHAPE = (24, 32, 3)
@@ -101,7 +101,14 @@ def test_where_detail_is_told_a_large_picture_gets_more_samples(
         assert found.transport is first and len(asked) == 1
         return
     assert found.transport.spp == wanted and asked[1:] == [(2**32 - 1, wanted)]  # the run's own seed
+    assert not first.held, "there is no memory for both"
+    assert found.second.paths == (8 * 32 // wanted, 48 * 32 // wanted, 48 * 32 // wanted)
     assert f"{wanted} paths a pixel in place of {spp}" in found.notes[-1]
+
+
+def test_no_detail_is_looked_for_that_a_small_map_cannot_hold(monkeypatch):
+    asked = tracing(monkeypatch, ["one"])
+    assert recorded({}, first := Traced(256), width=46) == starts.Recordings(first) and not asked
 
 
 def test_a_path_tracer_s_recording_stays_as_it_is(monkeypatch):
@@ -111,10 +118,13 @@ def test_a_path_tracer_s_recording_stays_as_it_is(monkeypatch):
 
 
 class Traced:
-    paths = (8, 48, 48)
+    paths, bounces, capacity, held = (8, 48, 48), 3, 256, True
 
     def __init__(self, spp):
         self.spp = spp
+
+    def release(self):
+        self.held = False
 
 
 def tracing(monkeypatch, octaves):
@@ -123,6 +133,9 @@ def tracing(monkeypatch, octaves):
 
     def trace(settings, lit, shape, progress):
         asked.append((settings.seed, settings.renderer.spp))
+        if settings.seed != 2**32 - 1:  # the second: as deep as T, and no larger than it must be
+            few = recording.gigabytes(lit.width * lit.height, settings.renderer.spp, 65)
+            assert settings.renderer.max_depth == 4 and settings.renderer.memory_gb == few
         return Traced(64 if settings.renderer.spp == "auto" else settings.renderer.spp)
 
     monkeypatch.setattr(starts.renderers, "trace", trace)
@@ -134,9 +147,9 @@ class Told(str):
     cycles, share = 24, 0.9
 
 
-def recorded(tables, traced, coverage=None, size=24):
+def recorded(tables, traced, coverage=None, size=24, width=48):
     settings = config.from_dict({**tables, "seed": 2**32 - 1})
     layers = SimpleNamespace(separation=SimpleNamespace(background=MAP), rows=(0, 8))
     wished = Target(np.zeros(SHAPE, np.float32), None, None, "", coverage=coverage)
     lit = SimpleNamespace(width=size, height=size)
-    return starts.recordings(settings, lit, (8, 16), layers, wished, traced)
+    return starts.recordings(settings, lit, (24, width), layers, wished, traced)

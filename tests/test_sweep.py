@@ -13,13 +13,14 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import config
+from envedit import checkpoint, config, edit
 from envedit.errors import ConfigError, InputError
 from experiments import sweep as package
-from experiments.sweep import COMMAND, drive, job, locks, read_jobs, run_job, sweep, table
+from experiments.sweep import COMMAND, drive, job, locks, process, read_jobs, run_job, sweep, table
 from experiments.sweep.__main__ import main
 from experiments.sweep.board import Board
 from experiments.sweep.process import Outcome
@@ -45,7 +46,11 @@ try:
         sys.exit(5)
     if (folder / "checkpoint.npz").exists():
         note("checkpoint")
-        if (folder / "checkpoint.npz").read_text() == "unusable":
+        if words := {"unusable": "the checkpoint cannot be read (why): delete it",
+                     "other": "belongs to another configuration or other input files",
+                     "full": "cannot be written (No space left on device)"}.get(
+                         (folder / "checkpoint.npz").read_text()):
+            print("envedit:", "/long" * 200 + "/checkpoint.npz:", words, file=sys.stderr)
             sys.exit(3)
     while (notes / f"hold-{seed}").exists():
         time.sleep(0.01)
@@ -248,12 +253,35 @@ def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, numbe
     assert json.loads((folder / "done.json").read_text())["resumed"] is True
 
 
-def test_a_checkpoint_that_is_no_use_is_removed_for_a_second_try(stub):
+@pytest.mark.parametrize("state", ["unusable", "other"])
+def test_a_checkpoint_that_is_no_use_is_removed_for_a_second_try(state, stub):
     one = stub.jobs(1)[0]
     one.folder(stub.out).mkdir(parents=True)
-    (one.folder(stub.out) / "checkpoint.npz").write_text("unusable")
+    (one.folder(stub.out) / "checkpoint.npz").write_text(state)
     assert stub.run(1)[0] == ["done"]
     assert stub.counts("begin", 1) == [2] and stub.counts("checkpoint", 1) == [1]
+
+
+def test_a_checkpoint_outlives_a_full_disk(stub):
+    """Any other input error ends with 3, too."""
+    one = stub.jobs(1)[0]
+    one.folder(stub.out).mkdir(parents=True)
+    (one.folder(stub.out) / "checkpoint.npz").write_text("full")
+    assert stub.run(1)[0] == ["failed"] and stub.counts("begin", 1) == [1]
+    assert (one.folder(stub.out) / "checkpoint.npz").read_text() == "full"
+    assert len(json.loads((one.folder(stub.out) / "failed.json").read_text())["error"]) < 350
+
+
+def test_what_a_checkpoint_that_is_no_use_is_told_by_is_what_envedit_says(tmp_path):
+    what = checkpoint.digest(config.from_dict({}), "", [])
+    (tmp_path / checkpoint.NAME).write_bytes(b"no archive")
+    with pytest.raises(InputError) as said:
+        checkpoint.load(tmp_path, what)
+    assert process._USELESS[0] in str(said.value)
+    checkpoint.save(tmp_path, what, edit.State(), {}, {}, np.zeros((1, 1, 3), np.float32))
+    with pytest.raises(InputError) as said:
+        checkpoint.load(tmp_path, "other")
+    assert process._USELESS[1] in str(said.value)
 
 
 def test_two_drivers_do_not_do_the_same_job(stub):

@@ -67,6 +67,17 @@ def test_what_is_bright_and_no_noise_counts_beside_what_is(rng):
     assert found[2, 2] < 0.05 and np.median(found[16:]) > 0.5
 
 
+@pytest.mark.parametrize("backdrop", [0, 1e-30, 1e-4])
+def test_a_mirror_ball_in_the_dark_is_judged_by_its_own_pixels(rng, backdrop):
+    (first, second), base = pictures(rng)
+    for picture in (first, second, base):
+        picture[:, 12:] = backdrop
+    first[2, 2] += 3
+    found = trust.weights(first, second, 1 / 8, base)
+    assert found[2, 2] < 0.05 and np.median(found[:, :12]) > 0.9
+    assert trust.weights(*pictures(rng)[0], 1 / 8, np.zeros(SHAPE)) is None
+
+
 def test_radiance_at_the_extremes_is_finite(rng):
     (first, second), base = pictures(rng)
     first[5, 5], second[6, 6], first[8, 8] = 3e38, 0, 1e-30

@@ -15,6 +15,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from envedit.files import write_atomically
+
 from . import drive
 from .readers import READERS
 
@@ -37,7 +39,7 @@ def recorded(file: Path, pieces: dict[str, tuple[range, int, drive.Tally]]) -> d
     for what, (cases, seed, tally) in pieces.items():
         record[f"{what} {seed} {cases.start} {cases.stop}"] = vars(tally)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(record, indent=1))
+    write_atomically(file, json.dumps(record, indent=1).encode())
     sums = {}
     for key, piece in sorted(record.items()):
         total = sums.setdefault(key.split()[0], drive.Tally())
@@ -46,6 +48,22 @@ def recorded(file: Path, pieces: dict[str, tuple[range, int, drive.Tally]]) -> d
         total.peak, total.beyond = max(total.peak, piece["peak"]), max(total.beyond, piece["beyond"])
         total.faults += piece["faults"]
     return sums
+
+
+def counted_twice(file: Path, what: str, cases: range, seed: int) -> str:
+    """Say which piece of a record overlaps with these cases and is not the same; empty if none is."""
+    for key in json.loads(file.read_text()) if file.exists() else {}:
+        *about, start, stop = key.split()
+        piece = range(int(start), int(stop))
+        if (
+            about == [what, str(seed)]
+            and piece != cases
+            and range(max(piece[0], cases[0]), min(piece[-1], cases[-1]) + 1)
+        ):
+            return (
+                f"{file}: holds cases {start} to {int(stop) - 1} of {what}: give another --first or --record"
+            )
+    return ""
 
 
 def main(argv=None) -> int:
@@ -63,6 +81,9 @@ def main(argv=None) -> int:
     parser.add_argument("--heap-check", default="", help="library to preload, such as libc_malloc_debug.so.0")
     chosen = parser.parse_args(argv)
     cases, tallies = range(chosen.first, chosen.first + chosen.cases), {}
+    for what in chosen.what if chosen.record and cases else ():
+        if twice := counted_twice(chosen.record, what, cases, chosen.seed):
+            parser.error(twice)
     for what in chosen.what:
         with tqdm(total=len(cases), desc=what, mininterval=1) as bar:
             tallies[what] = drive.fuzz(
@@ -70,12 +91,11 @@ def main(argv=None) -> int:
             )
         for index, outcome, error in tallies[what].faults:
             print(f"{what} {index}: {outcome}: {error[:300]}")
-    if chosen.record:
-        shown = recorded(chosen.record, {w: (cases, chosen.seed, t) for w, t in tallies.items()})
-    else:
         shown = tallies
+        if chosen.record:
+            shown = recorded(chosen.record, {what: (cases, chosen.seed, tallies[what])})
     print(table(shown))
-    return int(any(tally.faults for tally in tallies.values()))
+    return int(any(tally.faults for tally in shown.values()))
 
 
 if __name__ == "__main__":

@@ -144,8 +144,7 @@ def _reset_peak():
 
 def _since(printed):
     """Return what was written to stderr and stdout since, which are one file."""
-    os.lseek(2, printed, os.SEEK_SET)
-    return os.read(2, 500).decode(errors="replace")
+    return os.pread(2, 500, printed).decode(errors="replace")
 
 
 if __name__ == "__main__":

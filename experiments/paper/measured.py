@@ -16,9 +16,6 @@ from experiments.sweep.process import DONE
 
 from .plan import Cell
 
-# Rows that start from the same fit of the same map.
-_SAME_FIT = {"siren-reg": "siren", "r-siren-reg": "r-siren", "lum-l1": "none", "lum-l1-dists": "none"}
-
 
 def done(out, cells: list[Cell]) -> list[Cell]:
     """Pick the cells whose runs are done."""
@@ -46,25 +43,18 @@ def numbers(out, cell: Cell) -> dict | None:
 def seconds(out, cells: list[Cell]) -> dict[Cell, tuple[float | None, float]]:
     """Return the seconds of the fit, and of all the rest, of every edit that is done.
 
-    A fit that lay on disk cost its run nothing: its seconds are those that are kept with it, or of the run
-    that made it. None where there is no fit, NaN where nobody knows any more.
+    A fit that lay on disk cost its run nothing: its seconds are those that are kept with it. None where there
+    is no fit; the rest is NaN where a run was interrupted and resumed, whose time nobody took.
     """
-    found = {cell: numbers(out, cell) for cell in done(out, cells) if cell.store == "edits"}
-    made = {}
-    for cell, read in found.items():
-        about = read["fit"]
-        if about and not about["cached"]:
-            made[_of_fit(cell)] = read["timing"]["fit_s"]
-    rest = {}
-    for cell, read in found.items():
+    found = {}
+    for cell in done(out, cells):
+        if cell.store != "edits":
+            continue
+        read, ended = numbers(out, cell), json.loads((cell.folder(out) / DONE).read_bytes())
         timing, about = read["timing"], read["fit"]
-        taken = about and (about.get("seconds") or made.get(_of_fit(cell), math.nan))
-        rest[cell] = taken, timing["total_s"] - (timing["fit_s"] if about else 0)
-    return rest
-
-
-def _of_fit(cell):
-    return cell.settings, cell.map, _SAME_FIT.get(cell.row, cell.row)
+        rest = timing["total_s"] - (timing["fit_s"] if about else 0)
+        found[cell] = about and about["seconds"], math.nan if ended.get("resumed") else rest
+    return found
 
 
 def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:

@@ -133,6 +133,11 @@ def build(
                     one = job(f"{name}, {setting}: {row}, {sky}{varied}", _set(tables, question.sets))
                     store = row if row.startswith("stock") else "fits" if kind.methods is FITS else "edits"
                     made.append((Cell(setting, row, sky, roughness, store, one.key), one))
+    if not made:
+        raise ConfigError(
+            f"{name}: nothing to run: no row of --rows {' '.join(rows or kind.rows)} has settings "
+            f"{' or '.join(settings)} (layers are ours; lum-l1-dists needs perceptual.vgg)"
+        )
     return made
 
 
@@ -168,6 +173,7 @@ def _shared(name, question, file, lit, roughness, target):
     if KINDS[name].methods is FITS:
         return tables
     tables["output"] = {"report": False, "full": False}
+    tables["renderer"] = {"cache": False}  # every run pays for its transport, whichever comes first
     if name == "figure9":
         return sources.overlaid(read_edit(question.edit or "move_shadow"), tables)
     tables |= {"scene": {"file": lit}, "target": target}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 import re
 from pathlib import Path
@@ -99,14 +100,15 @@ def turned(file: Path, degrees: float, folder) -> Path:
     Returns
     -------
     Path
-        ``NAME-turned-DEGREES.exr``.
+        ``NAME-turned-DEGREES-CONTENT.exr``.
 
     Raises
     ------
     InputError
         The map cannot be read, or the file cannot be written.
     """
-    path = Path(folder).absolute() / f"{file.stem}-turned-{degrees:g}.exr"
+    content = hashlib.sha256(file.read_bytes()).hexdigest()[:8]
+    path = Path(folder).absolute() / f"{file.stem}-turned-{degrees:g}-{content}.exr"
     if not path.exists():
         original, _ = image.load_envmap(str(file))
         try:

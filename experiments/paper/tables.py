@@ -34,10 +34,12 @@ def text(name: str, out, cells: list[Cell]) -> str:
         maps = names[0] if len(names) == 1 else f"{len(names)} maps"
         for roughness in sorted({cell.roughness for cell in some}, key=lambda r: -1 if r is None else r):
             at = "" if roughness is None else f", roughness {roughness:g}"
-            here = [c for c in some if c.roughness == roughness]
+            here = [c for c in some if c.roughness == roughness and c.row in kind.rows]
             shared = common(out, here)
             count = len({cell.map for cell in shared})
             over = "" if count in (0, len(names)) else f", averages over {count} of them"
+            if not count and measured.done(out, here):
+                over = ", no map is done in every row"
             parts.append(f"{_SETTINGS[settings][0].upper()}{_SETTINGS[settings][1:]}{at}, {maps}{over}:")
             parts.append(build(name, out, here, shared, spent))
     return "\n\n".join(parts)
@@ -107,7 +109,7 @@ def _methods(name, out, cells, shared, spent):
             own = f"**{own}**" if bold else own
             theirs = published.get(row, {}).get(column)
             cells_.append(own if theirs is None else f"{own} ({_show(theirs, column[1])})")
-        title, times = KINDS[name].methods[row].title, _times(spent, some)
+        title, times = KINDS[name].methods[row].title, _times(spent, [c for c in some if c in shared])
         lines.append([title, *cells_, *times, f"{count}/{len(some)}"])
     return _markdown(["", *head, "fit, s", "rest, s", "maps"], lines)
 
@@ -163,7 +165,7 @@ def _paint(name, out, cells, shared, spent):
                 "-" if elsewhere is None else f"{elsewhere:.4f}",
                 "-" if ssim is None else f"{ssim:.3f}",
                 "-" if sharp is None or math.isnan(sharp) else f"{sharp:.2f}",
-                *_times(spent, some),
+                *_times(spent, told),
                 f"{len(ready)}/{len(some)}",
             ]
         )
@@ -176,10 +178,10 @@ def _show(value, column):
 
 
 def _times(spent, cells):
-    """Average the seconds of fits, those that are known, and of the rest."""
+    """Average the seconds of fits and of the rest, those that are known."""
     taken = [spent[cell] for cell in cells if cell in spent]
-    fits = [fit for fit, _ in taken if fit is not None and not math.isnan(fit)]
-    return _seconds(fits), _seconds([rest for _, rest in taken])
+    fits = [fit for fit, _ in taken if fit is not None]
+    return _seconds(fits), _seconds([rest for _, rest in taken if not math.isnan(rest)])
 
 
 def _seconds(values):

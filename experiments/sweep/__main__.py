@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
+import experiments.sweep
 from envedit.errors import EnveditError
 
 from . import COMMAND, read_jobs, sweep, table
@@ -14,7 +15,10 @@ from . import COMMAND, read_jobs, sweep, table
 
 def main(argv: list[str] | None = None, command: Sequence[str] = COMMAND) -> int:
     """Run the command line; returns the exit code: 0, 1 if a job is not done, 2, 3 as envedit.run, 130."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.sweep", description="Carry out many runs.")
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.sweep", description=experiments.sweep.__doc__
+    )
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("jobs", metavar="JOBS", help="TOML with tables [jobs.NAME], or a folder of NAME.toml")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder of the jobs' folders")
     parser.add_argument("--workers", type=int, metavar="N", help="jobs at a time (one for every four cores)")

@@ -31,6 +31,8 @@ GRACE = 15.0
 """Seconds that an interrupted job has for its checkpoint."""
 LONGEST = 300
 """Characters of an error that is reported."""
+_USELESS = "the checkpoint cannot be read", "belongs to another configuration"
+"""What :mod:`envedit.checkpoint` says of a checkpoint that no further try can use."""
 
 COMMAND = (
     "{python}",
@@ -102,8 +104,8 @@ def run_job(
     out : path
         Folder of all jobs.
     command : sequence of str
-        What to call, as :data:`COMMAND`. Exit code 0: done. 3 after it was started with a checkpoint: that is
-        damaged or belongs to something else, and is removed for a second try.
+        What to call, as :data:`COMMAND`. Exit code 0: done. 3 with a line that says so, after it was started
+        with a checkpoint: that is damaged or belongs to something else, and is removed for a second try.
     threads : int, optional
         Threads of the job; None: the cores of this machine over the jobs at a time of this Dask worker.
     stop : threading.Event, optional
@@ -142,7 +144,8 @@ def _run(job, folder, command, threads, stop, lock):
     argv = [functools.reduce(lambda text, key: text.replace(key, filled[key]), filled, p) for p in command]
     begun, resumed = time.monotonic(), (folder / CHECKPOINT).exists()
     ended, last = _supervise(argv, folder, threads, stop, lock)
-    if resumed and ended == InputError.exit_code and (folder / CHECKPOINT).exists():
+    useless = ended == InputError.exit_code and any(words in last for words in _USELESS)
+    if resumed and useless and (folder / CHECKPOINT).exists():
         (folder / CHECKPOINT).unlink()
         ended, last = _supervise(argv, folder, threads, stop, lock)
     seconds = round(time.monotonic() - begun, 1)
@@ -155,7 +158,7 @@ def _run(job, folder, command, threads, stop, lock):
         _write(folder / DONE, about)
         return Outcome(job, "done", seconds)
     how = f"killed by signal {-ended} ({signal.strsignal(-ended)})" if ended < 0 else f"exit code {ended}"
-    error = f"{how}: {last}" if last else how
+    error = f"{how}: {last[:LONGEST]}" if last else how
     _write(folder / FAILED, about | {"code": ended, "error": error})
     return Outcome(job, "failed", seconds, error)
 
@@ -187,7 +190,7 @@ def _supervise(argv, folder, threads, stop, lock):
                 process.wait()
             process.stderr.close()
     lines = [line.strip() for line in tail.decode(errors="replace").splitlines() if line.strip()]
-    return ended, lines[-1][:LONGEST] if lines else ""
+    return ended, lines[-1] if lines else ""
 
 
 def _watch(process, log, stop, lock):

@@ -66,8 +66,9 @@ def ratios(runs: list[dict]) -> list[dict]:
         The same with ``ratio``: ``time``, ``again`` and ``memory`` over the median of the standard preset's
         runs in that session; and ``change``: ``psnr``, ``map_psnr`` and ``map_ssim`` less those of the
         standard preset with the same seed, :data:`PAIRED`, as the noise of the target, which both share, is
-        the largest difference under a sun (6 dB between seeds); less the median of all where that seed was
-        not run. Runs in whose session the standard preset was not measured are left out.
+        the largest difference under a sun (6 dB between seeds); of the same session, or of the last before
+        it that has this seed, as the program may have changed in between; less the median of all where that
+        seed was not run. Runs in whose session the standard preset was not measured are left out.
     """
     standard = [r for r in runs if r["group"] == "standard"]
     found = []
@@ -79,7 +80,7 @@ def ratios(runs: list[dict]) -> list[dict]:
         cost = ("time", "again", "memory")
         ratio = {key: run[key] / statistics.median(s[key] for s in beside) for key in cost}
         won = ("psnr", "map_psnr", "map_ssim")
-        paired = [s for s in same if s["setting"] == PAIRED] or same
+        paired = _last([s for s in same if s["setting"] == PAIRED and s["session"] <= run["session"]]) or same
         change = {key: run[key] - statistics.median(s[key] for s in paired) for key in won}
         found.append(run | {"ratio": ratio, "change": change})
     return found
@@ -99,6 +100,11 @@ def disturbed(runs: list[dict]) -> list[dict]:
         if len(some) >= 3:
             found += [r for r, share in zip(some, shares, strict=True) if share < UNDISTURBED * usual]
     return found
+
+
+def _last(runs):
+    """Pick the runs of the last session among them."""
+    return [run for run in runs if run["session"] == max(other["session"] for other in runs)]
 
 
 def _cell(run):
@@ -267,7 +273,7 @@ def presets(compared: list[dict]) -> str:
     for cell in dict.fromkeys(_cell(r) for r in wanted):
         here = [r for r in wanted if _cell(r) == cell]
         for name in ("draft", "standard", "paper"):
-            some = [r for r in here if r["setting"].split(",")[0] == name]
+            some = _last([r for r in here if r["setting"].split(",")[0] == name])
             if not some:
                 continue
             middle = {k: statistics.median(r[k] for r in some) for k in ("time", "again", "memory", "psnr")}

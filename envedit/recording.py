@@ -282,6 +282,11 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
     return spp, capacity, f"light transport: {spp} paths a pixel, {columns}"
 
 
+def allowed(memory_gb: float | str) -> float:
+    """Return the GB that a setting allows."""
+    return AUTO_GB if memory_gb == "auto" else float(memory_gb)
+
+
 def most_samples(pixels: int, memory_gb: float) -> int:
     """Return the most samples a pixel, a power of two, whose T leaves memory to columns.
 

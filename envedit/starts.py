@@ -120,8 +120,7 @@ def recordings(
     shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
     notes = [f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"]
     if told and traced and settings.renderer.spp == "auto":
-        allowed = settings.renderer.memory_gb
-        most = recording.most_samples(pixels, recording.AUTO_GB if allowed == "auto" else allowed)
+        most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:
             notes.append(f"{most} paths a pixel in place of {transport.spp}: detail would follow their noise")
             transport.release()

@@ -34,7 +34,7 @@ from .grid import Grid
 from .health import require_radiance
 from .influence import determined
 from .recording import (
-    AUTO_GB,
+    allowed,
     choose_bounces,
     choose_samples,
     left_out,
@@ -151,7 +151,7 @@ class LightTransport:
             smaller than Mitsuba takes.
         """
         latlong.check_envmap_size(height, width)
-        memory_gb = AUTO_GB if memory_gb == "auto" else float(memory_gb)
+        memory_gb = allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
             if value != "auto" and not value >= 1:
                 raise ConfigError(

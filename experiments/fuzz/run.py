@@ -55,14 +55,10 @@ def counted_twice(file: Path, what: str, cases: range, seed: int) -> str:
     for key in json.loads(file.read_text()) if file.exists() else {}:
         *about, start, stop = key.split()
         piece = range(int(start), int(stop))
-        if (
-            about == [what, str(seed)]
-            and piece != cases
-            and range(max(piece[0], cases[0]), min(piece[-1], cases[-1]) + 1)
-        ):
-            return (
-                f"{file}: holds cases {start} to {int(stop) - 1} of {what}: give another --first or --record"
-            )
+        meet = piece.start < cases.stop and cases.start < piece.stop
+        if about == [what, str(seed)] and meet and piece != cases:
+            last = piece.stop - 1
+            return f"{file}: holds cases {start} to {last} of {what}: give another --first or --record"
     return ""
 
 
@@ -81,7 +77,7 @@ def main(argv=None) -> int:
     parser.add_argument("--heap-check", default="", help="library to preload, such as libc_malloc_debug.so.0")
     chosen = parser.parse_args(argv)
     cases, tallies = range(chosen.first, chosen.first + chosen.cases), {}
-    for what in chosen.what if chosen.record and cases else ():
+    for what in chosen.what if chosen.record else ():
         if twice := counted_twice(chosen.record, what, cases, chosen.seed):
             parser.error(twice)
     for what in chosen.what:

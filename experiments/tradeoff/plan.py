@@ -177,18 +177,14 @@ def joint(count: int, seed: int = 0) -> list[Setting]:
 def film_and_steps() -> list[Setting]:
     """List smaller pictures with more steps: the two knobs that are the cheapest alone, where presets lie."""
 
-    def both(film, steps, seconds, width=None):
+    def both(film, steps, seconds):
         table = {"scene": {"width": film}, "optimizer": {"iterations": steps}}
-        if width:
-            table["input"] = {"width": width}
-        name = f"film {film}, {steps} steps" + (f", map {width}" if width else "")
-        return Setting(name, "joint", table, seconds)
+        return Setting(f"film {film}, {steps} steps", "joint", table, seconds)
 
     return [
         both(48, 200, 10.0),
         both(64, 200, 12.0),
         both(64, 400, 14.0),
-        both(64, 200, 12.0, width=128),
         both(96, 100, 14.0),
         both(96, 200, 16.0),
         both(128, 400, 26.0),

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 import envedit
-from envedit import config, painted, pipeline, scene
+from envedit import config, inputs, painted
 
 mi.set_variant("llvm_ad_rgb")
 settings = config.loads(
@@ -31,8 +31,8 @@ settings = config.loads(
 )
 
 # %% The rendering under the map as it is: what there is to paint on.
-sky, _ = pipeline.load_map(settings.input)
-lit = scene.load("sphere", 64)
+sky, _ = inputs.load_map(settings.input)
+lit = inputs.load_scene(settings.scene)
 initial = painted.initial(lit, sky, settings)
 print(f"initial rendering {initial.shape}, mean radiance {initial.mean():.3f}")
 

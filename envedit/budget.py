@@ -14,10 +14,11 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from . import config, image, pipeline, scene
+from . import config, image, inputs, pipeline
 from .device import tensor
 from .errors import ConfigError
 from .scene import QUIET_DECIBELS, QUIET_LEAST, QUIET_MOST
+from .tonemap import tonemap
 
 LATE = 1.3
 """A run may take so many times its budget; what is expected to take longer is refused."""
@@ -83,6 +84,25 @@ estimate, which one run bore out (12 s expected, 13 s taken)."""
 
 
 @dataclass(frozen=True)
+class Work:
+    """What is to be done, as far as time asks.
+
+    Attributes
+    ----------
+    aspect : float
+        Height of the picture over its width.
+    texels : int
+        Of the file that the edit is carried to; 0: none.
+    painted : bool
+        The target is painted on the rendering.
+    """
+
+    aspect: float = 1.0
+    texels: int = 0
+    painted: bool = False
+
+
+@dataclass(frozen=True)
 class Calibration:
     """How fast this machine is.
 
@@ -141,10 +161,9 @@ def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Pa
         )
     _check_pixels(settings.target)
     begun = time.perf_counter()
-    found, aspect, texels = calibrate(settings, base)
+    found, work = calibrate(settings, base)
     elapsed += time.perf_counter() - begun
-    painted = settings.target.kind != "envmap"
-    level, expected = choose(found, budget, elapsed, aspect, texels if settings.output.full else 0, painted)
+    level, expected = choose(found, budget, elapsed, work)
     chosen = replace(
         settings,
         input=_at_width(settings.input, level.map),
@@ -190,74 +209,50 @@ def loss(level: Level) -> str:
     return " and ".join(parts) + " than the standard preset, on average"
 
 
-def expect(level: Level, found: Calibration, aspect=1.0, texels: int = 0, painted: bool = False) -> float:
-    """Expect the seconds of a run after the calibration.
-
-    Parameters
-    ----------
-    aspect : float
-        Height of the picture over its width.
-    texels : int
-        Of the file that the edit is carried to; 0: none.
-    painted : bool
-        The target is painted on the rendering.
-    """
-    pixels = level.film**2 * aspect
+def expect(level: Level, found: Calibration, work: Work) -> float:
+    """Expect the seconds of a run after the calibration."""
+    pixels = level.film**2 * work.aspect
     each = found.quiet_spp if level.spp == "auto" else level.spp
     samples = 2 * each + min(pipeline.INITIAL_SPP, each)
-    traced = level.traced_s * aspect * found.render / REFERENCE_RENDER * (PAINTED if painted else 1)
-    numbers = (level.numbers_s + FULL * texels) * found.machine
+    traced = level.traced_s * work.aspect * found.render / REFERENCE_RENDER * (PAINTED if work.painted else 1)
+    numbers = (level.numbers_s + FULL * work.texels) * found.machine
     return found.render * pixels * samples + traced + numbers + found.compile_s
 
 
-def choose(
-    found: Calibration, budget: float, elapsed: float, aspect=1.0, texels: int = 0, painted: bool = False
-) -> tuple[Level, float]:
+def choose(found: Calibration, budget: float, elapsed: float, work: Work) -> tuple[Level, float]:
     """Return the finest level that is expected to end in time, and the seconds it is expected to take.
-
-    Arguments as of :func:`apply` and :func:`expect`.
 
     Raises
     ------
     ConfigError
         Even the coarsest takes too long.
     """
-    times = [elapsed + expect(level, found, aspect, texels, painted) for level in LEVELS]
+    times = [elapsed + expect(level, found, work) for level in LEVELS]
     for level, expected in reversed(list(zip(LEVELS, times, strict=True))):
         if expected <= budget:
             return level, expected
     if times[0] <= LATE * budget:
         return LEVELS[0], times[0]
-    cure = ", or set output.full=false" if texels else ""
+    cure = ", or set output.full=false" if work.texels else ""
     raise ConfigError(
         f"--budget {budget:g}s: cannot be kept, the coarsest settings take about {times[0]:.0f} s here: "
         f"give at least {times[0]:.0f}s{cure}"
     )
 
 
-def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibration, float, int]:
-    """Measure this machine in this scene under this map.
-
-    Returns
-    -------
-    Calibration
-        What was measured.
-    aspect : float
-        Height of the picture over its width.
-    texels : int
-        Of the map's file, 0 for the analytic sky.
-    """
+def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibration, Work]:
+    """Measure this machine in this scene under this map."""
     texels = 0
     if settings.input.envmap == "sunsky":
-        envmap, _ = pipeline.load_map(_at_width(settings.input, _MAP))
+        envmap, _ = inputs.load_map(_at_width(settings.input, _MAP))
     else:
         envmap, info = image.load_envmap(settings.input.envmap, _MAP, settings.input.repair)
         texels = info["size"][0] * info["size"][1]
-    lit = scene.load(settings.scene.file, _FILM, 0, dict(settings.scene.parameters), base)
+    lit = inputs.load_scene(replace(settings.scene, width=_FILM, height=0), base)
     times, pictures = [], []
     for seed in range(3):
         begun = time.perf_counter()
-        pictures.append(np.clip(lit.render(envmap, _SPP, seed), 0, 1) ** (1 / 2.2))
+        pictures.append(tonemap(lit.render(envmap, _SPP, seed)))
         times.append(time.perf_counter() - begun)
     warm = min(times[1:])
     variance = float(np.var(pictures, axis=0, ddof=1).mean())
@@ -269,7 +264,8 @@ def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibr
         COMPILED * max(times[0] - 2 * warm, 0.0),
         quiet,
     )
-    return found, lit.height / lit.width, texels
+    texels = texels if settings.output.full else 0
+    return found, Work(lit.height / lit.width, texels, settings.target.kind != "envmap")
 
 
 def _product_seconds():

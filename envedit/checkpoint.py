@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from . import config
-from .edit import State
 from .errors import InputError
 from .files import replacing
+from .loop import State
 
 NAME = "checkpoint.npz"
 _FORMAT = 3  # raise when what is stored, or what the loop makes of it, changes

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from . import config, doctor, files, fit, image, manifest, metrics, preview
+from . import config, doctor, files, fit, image, inputs, manifest, metrics, preview
 from .errors import EnveditError
 from .progress import Progress
 
@@ -36,10 +36,8 @@ def _run(arguments):
     settings = config.loads("", Path.cwd(), "command line", arguments.preset, chosen)
     doctor.ensure(settings.variant)
     mi.set_variant(settings.variant)
-    from .pipeline import active_rows, load_map
-
-    original, warnings = load_map(settings.input)
-    first, last = active_rows(settings.input.rows, original.shape[0])
+    original, warnings = inputs.load_map(settings.input)
+    first, last = inputs.active_rows(settings.input.rows, original.shape[0])
     crop = original[first : last + 1]
     rows = first, original.shape[0]
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")

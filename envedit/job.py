@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import checkpoint, config, edit, optim, scene, target
+from . import checkpoint, config, loop, optim, scene, target
 from .errors import NumericalError
 
 TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
@@ -65,13 +65,13 @@ class Job:
     wanted : target.Target
         What the renderer is to make.
     representation, renderer : object
-        As :func:`.edit.optimise` takes them.
+        As :func:`.loop.optimise` takes them.
     folder : Path, optional
         Of the checkpoint.
     watch : Watch
         Told of progress.
     dists : perceptual.Dists, optional
-        As for :class:`.edit.Objective`.
+        As for :class:`.loop.Objective`.
     """
 
     settings: config.Config
@@ -119,7 +119,7 @@ class Job:
         for params, _ in starts:
             few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
             wanted = self.wanted.aim, self.wanted.weight
-            objective = edit.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
+            objective = loop.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
             try:
                 _, state = self._loop(params, objective, few)
                 loss = state.history[-1]["loss"]
@@ -138,7 +138,7 @@ class Job:
         """Run the loop from the start, or from the checkpoint; returns parameters and state."""
         chosen, wanted = self.settings.optimizer, self.wanted
         lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
-        adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), edit.State()
+        adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), loop.State()
         what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, optimiser, traced, picture = found
@@ -147,7 +147,7 @@ class Job:
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
             wanted = self.wanted = wanted.aimed_at(picture)
         asked = wanted.aim, wanted.weight, crop, chosen.iterations, self.dists
-        objective = edit.Objective(self.settings.loss, *asked)
+        objective = loop.Objective(self.settings.loss, *asked)
         saved = time.perf_counter()
 
         with ctrl_c() as interrupt:
@@ -181,7 +181,7 @@ class Job:
             self.decode(adam.params)
 
     def _loop(self, params, objective, chosen, **more):
-        return edit.optimise(
+        return loop.optimise(
             self.representation,
             params,
             self.renderer,

@@ -20,11 +20,10 @@ from . import (
     features,
     fit,
     image,
+    inputs,
     metrics,
     perceptual,
     renderers,
-    scene,
-    sky,
     starts,
     target,
 )
@@ -130,14 +129,6 @@ class _Clock:
         }
 
 
-def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
-    """Load the map of a configuration at working width; returns it with warnings."""
-    if settings.envmap == "sunsky":
-        return sky.sunsky(settings.width, settings.azimuth, settings.elevation, settings.turbidity), []
-    picture, info = image.load_envmap(settings.envmap, settings.width, settings.repair)
-    return picture, list(info["warnings"])
-
-
 def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
     """Carry a result to the resolution of its input's file; None where that has no more texels.
 
@@ -152,16 +143,9 @@ def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | N
     if source.shape[1] <= settings.width:
         return None
     found, before = result.found, result.maps["initial"]
-    first, last = active_rows(settings.rows, before.shape[0])
+    first, last = inputs.active_rows(settings.rows, before.shape[0])
     rows = first, last - first + 1
     return carry.carry(found.representation, found.params, before, result.envmap, source, rows, found.free)
-
-
-def active_rows(rows, height: int) -> tuple[int, int]:
-    """Return the first and last row that may change; "upper": above the horizon (paper, Sec. 5.1)."""
-    if rows == "upper":
-        return 0, (height + 1) // 2 - 1
-    return (0, height - 1) if rows == "all" else (rows[0], rows[1])
 
 
 def run(
@@ -211,17 +195,11 @@ def run(
         )
     with clock("target_s"):
         watch.stage("loading")
-        original, found = load_map(settings.input)
+        original, found = inputs.load_map(settings.input)
         warnings += found
         height, width, _ = original.shape
-        first, last = active_rows(settings.input.rows, height)
-        lit = scene.load(
-            settings.scene.file,
-            settings.scene.width,
-            settings.scene.height,
-            dict(settings.scene.parameters),
-            base,
-        )
+        first, last = inputs.active_rows(settings.input.rows, height)
+        lit = inputs.load_scene(settings.scene, base)
         watch.stage("rendering the target")
         wanted = target.make(settings, lit, original, picture, mask)
         warnings += wanted.warnings

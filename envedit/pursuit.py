@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .overview import Overview
+from .overview import CELLS, Overview
 from .separate import Light, glow_at
 
 STAY = 0.98
@@ -36,6 +36,9 @@ UNEXPLAINED = 0.003
 """Share of the squared picture that must be left unexplained before a light can be born."""
 FAINT = 0.2
 """Pixels count by 1 / (brightness + this share of the mean brightness)."""
+NEAR, NEARLY = 1.6, 0.8
+"""A light lies between cells at most so many cells from the best one, diagonal neighbours among them, that
+explain more than this share of what it does."""
 
 
 @dataclass(frozen=True)
@@ -253,8 +256,8 @@ class Pursuit:
     def between(self, score, best):
         """Direction of the best cell, drawn towards neighbours that explain nearly as much."""
         d = self.overview.directions[self.candidates]
-        near = d @ d[best] > np.cos(np.radians(1.6 * 360 / 64))
-        weight = np.maximum(score[near] - 0.8 * score[best], 0) ** 2
+        near = d @ d[best] > np.cos(np.radians(NEAR * 360 / CELLS))
+        weight = np.maximum(score[near] - NEARLY * score[best], 0) ** 2
         middle = (d[near] * weight[:, None]).sum(axis=0)
         return middle / np.linalg.norm(middle)
 

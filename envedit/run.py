@@ -158,15 +158,14 @@ def _export_initial(settings, arguments):
 
     mi.set_variant(settings.variant)
     mi.set_log_level(mi.LogLevel.Error)
-    from . import painted, pipeline, scene
+    from . import inputs, painted
     from .progress import Progress
 
     painted.check_export(file)
     with Progress(quiet=arguments.quiet) as progress:
         progress.stage("rendering the picture to paint on")
-        envmap, warnings = pipeline.load_map(settings.input)
-        size, base = (settings.scene.width, settings.scene.height), Path(arguments.config).absolute().parent
-        lit = scene.load(settings.scene.file, *size, dict(settings.scene.parameters), base)
+        envmap, warnings = inputs.load_map(settings.input)
+        lit = inputs.load_scene(settings.scene, Path(arguments.config).absolute().parent)
         warnings += painted.export(file, painted.initial(lit, envmap, settings), settings)
     for line in warnings:
         print(f"envedit: warning: {line}", file=sys.stderr)

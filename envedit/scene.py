@@ -7,7 +7,7 @@ that is not used cannot get in the way:
 - the environment emitter, whatever its kind, becomes an ``envmap`` with the same orientation whose texels
   are set by :meth:`Scene.set_envmap`;
 - the film gets the asked size and float32 RGB; its reconstruction filter stays the author's;
-- a rough BSDF whose alpha is zero becomes its smooth sibling, the exact limit, where Mitsuba would clamp;
+- a rough BSDF whose alpha is at most 1e-4, which Mitsuba would clamp, becomes its limit, the smooth one;
 - a shape with the properties ``fit_height`` (and ``fit_up``, one of x, y, z with or without a minus) is
   centred on the y axis, set on the plane y = 0 and scaled to that height, or to 1.5 times it in width.
 
@@ -31,6 +31,7 @@ import numpy as np
 
 from . import latlong, stage
 from .errors import ConfigError, InputError, NumericalError
+from .tonemap import tonemap
 
 __all__ = ["SHIPPED", "Scene", "load"]
 
@@ -181,7 +182,7 @@ class Scene:
         total, shown, power = 0.0, 0.0, 0.0
         for i in range(QUIET_MOST // count):
             picture = self._pass(count, seed, i, -1)
-            display = np.clip(picture, 0, 1) ** (1 / 2.2)
+            display = tonemap(picture)
             total, shown, power = total + picture, shown + display, power + display**2
             n = i + 1
             if n * count >= QUIET_LEAST:

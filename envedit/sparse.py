@@ -95,7 +95,7 @@ class ColourMatrix:
         real = (rows >= 0) & packed[:, :3].any(axis=1)
         return rows[real], packed[real, 3].copy().view(np.uint32), packed[real, :3]
 
-    def apply(self, x: mi.Float) -> mi.Float:
+    def apply(self, x: mi.Float) -> mi.Color3f:
         """Multiply with a vector of colours.
 
         Parameters

@@ -153,7 +153,7 @@ def find_files(state, where: str, folders) -> None:
 
 
 def smooth_limit(state, node) -> None:
-    """Turn a rough BSDF of roughness zero into the smooth one; refuse a negative roughness."""
+    """Turn a rough BSDF whose alpha is at most 1e-4 into the smooth one; refuse a negative roughness."""
     props = node.props
     if node.type != mi.ObjectType.BSDF or props.plugin_name() not in _SMOOTH:
         return

@@ -14,12 +14,12 @@ import OpenEXR
 
 from envedit import (
     config,
-    edit,
     envmap,
     fit,
     health,
     image,
     latlong,
+    loop,
     losses,
     metrics,
     optim,
@@ -371,10 +371,10 @@ def edited(m, folder):
     if not same:
         params, _ = search.start(made, params, traced, wanted, None, m)
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
-    objective = edit.Objective(weights, wanted, None, m, STEPS)
+    objective = loop.Objective(weights, wanted, None, m, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.01)
     start = made.decode(params).numpy()
-    params, state = edit.optimise(made, params, traced, objective, m, 0, settings)
+    params, state = loop.optimise(made, params, traced, objective, m, 0, settings)
     got = made.decode(params).numpy()
     assert np.isfinite(got).all() and (got >= 0).all() and state.bad_steps == 0
     if same:

@@ -19,7 +19,7 @@ from extremes_stages import (
     write_plain,
 )
 
-from envedit import config, display, edit, envmap, metrics, optim, painted, scene
+from envedit import config, display, envmap, loop, metrics, optim, painted, scene
 from envedit.errors import InputError, NumericalError
 from envedit.transport import LightTransport
 
@@ -37,10 +37,10 @@ def initial():
 def follow(picture, weight=None):
     """Edit the logarithms of the map towards a picture; the loss falls, and all stays finite."""
     made, before = envmap.LogPixels(), sky()
-    objective = edit.Objective(config.Loss(image_l2=1.0), picture, weight, before, STEPS)
+    objective = loop.Objective(config.Loss(image_l2=1.0), picture, weight, before, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.02)
     traced = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3)
-    params, state = edit.optimise(made, made.encode(before), traced, objective, before, 0, settings)
+    params, state = loop.optimise(made, made.encode(before), traced, objective, before, 0, settings)
     got = made.decode(params).numpy()
     assert np.isfinite(got).all() and (got >= 0).all() and state.bad_steps == 0
     assert state.history[-1]["loss"] < state.history[0]["loss"]
@@ -96,10 +96,10 @@ def _unchecked(value):
         params = made.encode(before)
         start = {name: array.numpy() for name, array in params.items()}
         traced, held = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3), optim.Adam(params, 0.02)
-        objective = edit.Objective(config.Loss(), picture, None, before, 21)
+        objective = loop.Objective(config.Loss(), picture, None, before, 21)
         settings = config.Optimizer(iterations=21, lr=0.02)  # it stops at the 20th bad step
         try:
-            edit.optimise(made, params, traced, objective, before, 0, settings, adam=held)
+            loop.optimise(made, params, traced, objective, before, 0, settings, adam=held)
         finally:
             for name, array in start.items():
                 np.testing.assert_array_equal(held.params[name].numpy(), array)
@@ -119,9 +119,9 @@ def _equal_in_the_loop(folder):
     start = made.decode(params).numpy()
     settle(traced, start)
     picture = traced.apply(single(start)).numpy()
-    objective = edit.Objective(config.Loss(image_l2=1.0), picture, None, before, STEPS)
+    objective = loop.Objective(config.Loss(image_l2=1.0), picture, None, before, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.02)
-    params, state = edit.optimise(made, params, traced, objective, before, 0, settings)
+    params, state = loop.optimise(made, params, traced, objective, before, 0, settings)
     np.testing.assert_array_equal(made.decode(params).numpy(), start)
     assert state.history[-1]["loss"] == 0
     assert metrics.compare(picture, picture) == {"psnr": 200.0, "ssim": 1.0, "mse": 0.0, "lpips": None}

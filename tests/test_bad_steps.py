@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_edit import arrays, case, every_step, same  # noqa: F401 (a fixture)
+from test_loop import arrays, case, every_step, same  # noqa: F401 (a fixture)
 from test_pipeline import own_cache, settings_of, sunny  # noqa: F401 (a fixture)
 from test_run import call, changed, isolated, measured, names, pixels, world  # noqa: F401 (a fixture)
 
-from envedit import config, edit, envmap, job, losses, manifest, optim, pipeline
+from envedit import config, envmap, job, loop, losses, manifest, optim, pipeline, scene
 from envedit.errors import NumericalError
 
 TERMS = ("ssim", "luminance", "l1", "tv", "image_l1", "image_l2")
@@ -64,7 +64,7 @@ def spoiled(stage, calls, value, monkeypatch):
     arguments, _ = case(np.random.default_rng(1), weights=weights, iterations=40)
     representation, params, renderer, objective, original, *rest = arguments
     picture = objective._target.numpy()
-    objective = edit.Objective(weights, picture, None, original[:3], 40, FakeDists())
+    objective = loop.Objective(weights, picture, None, original[:3], 40, FakeDists())
     assert objective.ramps.keys() == {*TERMS, "dists"}
     where, how = stage.removeprefix("slope of "), "slope" if stage.startswith("slope") else "value"
     if where == "map":
@@ -91,7 +91,7 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):  # noqa: F811
     arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
     seen.append(arrays(arguments[1]))
-    params, state = edit.optimise(*arguments, after_step=lambda _, adam: seen.append(arrays(adam.params)))
+    params, state = loop.optimise(*arguments, after_step=lambda _, adam: seen.append(arrays(adam.params)))
     assert (state.step, state.bad_steps, state.bad_in_a_row) == (40, 3, 0)
     assert same(seen[6], seen[4]) and same(seen[7], seen[4]) and same(seen[13], seen[11])
     rates = [row["lr"] for row in state.history]
@@ -107,13 +107,13 @@ def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypat
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stage, monkeypatch):
     arguments = spoiled(stage, range(5, 1000), math.nan, monkeypatch)
-    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[-1].beta2)), edit.State()
+    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[-1].beta2)), loop.State()
     with pytest.raises(NumericalError, match="iteration 24: 20 steps in a row") as info:
-        edit.optimise(*arguments, adam=adam, state=state)
+        loop.optimise(*arguments, adam=adam, state=state)
     assert info.value.exit_code == 5 and state.bad_steps == 20 and len(state.history) == 24
     monkeypatch.undo()
     good = spoiled("map", (), 0, monkeypatch)
-    expected, _ = edit.optimise(*good[:-1], config.Optimizer(iterations=4, lr=0.02, schedule="constant"))
+    expected, _ = loop.optimise(*good[:-1], config.Optimizer(iterations=4, lr=0.02, schedule="constant"))
     assert same(arrays(adam.params), arrays(expected))
 
 
@@ -122,7 +122,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
 def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):  # noqa: F811
     """One bad element, as a faulty memory makes it. An infinite v alone would give steps of zero for ever."""
     arguments, _ = case(np.random.default_rng(0), iterations=60)
-    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), edit.State()
+    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), loop.State()
 
     def spoil(state, adam):
         if state.step == 5:
@@ -132,7 +132,7 @@ def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step)
             moments["log_radiance"] = dr.opaque(mi.TensorXf(bad))
 
     with pytest.raises(NumericalError, match="iteration 24"):
-        edit.optimise(*arguments, adam=adam, state=state, after_step=spoil)
+        loop.optimise(*arguments, adam=adam, state=state, after_step=spoil)
     assert state.bad_steps == 20
     assert all(np.isfinite(values).all() for values in arrays(adam.params).values())
 
@@ -180,8 +180,8 @@ def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
     _, _, renderer, objective, original, first, _ = arguments
     steep = Steep()
     settings = config.Optimizer(iterations=80, lr=2000.0, schedule="cosine")
-    adam, state = optim.Adam(steep.encode(original[:3]), 2000.0, (0.9, settings.beta2)), edit.State()
-    params, state = edit.optimise(
+    adam, state = optim.Adam(steep.encode(original[:3]), 2000.0, (0.9, settings.beta2)), loop.State()
+    params, state = loop.optimise(
         steep, adam.params, renderer, objective, original, first, settings, adam=adam, state=state
     )
     assert 4 <= state.bad_steps < 40 and state.step == 80
@@ -195,14 +195,14 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     """Neither is one that stops, nor the first by default if it is they."""
     lost = object()
     ends = {0: 1.0, 1: math.nan, 2: 0.5, 3: lost}
-    monkeypatch.setattr(edit, "Objective", lambda *_: None)
+    monkeypatch.setattr(loop, "Objective", lambda *_: None)
 
-    def loop(self, params, *_):
+    def ended(self, params, *_):
         if ends[params] is lost:
             raise NumericalError("it stopped")
-        return None, edit.State(history=[{"loss": ends[params]}])
+        return None, loop.State(history=[{"loss": ends[params]}])
 
-    monkeypatch.setattr(job.Job, "_loop", loop)
+    monkeypatch.setattr(job.Job, "_loop", ended)
     wanted = types.SimpleNamespace(aim=None, weight=None)
     work = job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, job.Watch())
     for order, best in (((0, 1, 2, 3), 2), ((1, 0, 2), 2), ((3, 1, 0), 0), ((1, 3), 1), ((0, 1, 3), 0)):
@@ -257,12 +257,12 @@ def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypat
 
 def test_the_path_tracer_hides_no_bad_slope(tmp_path, rng, monkeypatch):
     """It adds gradients with atomics, which drop NaN on LLVM: the parameters' gradients are all finite."""
-    weigh = edit.Objective.__call__
+    weigh = loop.Objective.__call__
 
     def with_hole(self, rendering, crop, step):
         return weigh(self, dr.custom(Hole, rendering, math.nan) if step == 2 else rendering, crop, step)
 
-    monkeypatch.setattr(edit.Objective, "__call__", with_hole)
+    monkeypatch.setattr(loop.Objective, "__call__", with_hole)
     tables = PIXELS | {"renderer": {"kind": "path", "spp": 4, "max_depth": 3}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
     assert found.metrics["non_finite_steps"] == 1 and np.isfinite(found.envmap).all()
@@ -312,13 +312,13 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
     def fails(*arguments, **keys):
         raise NumericalError(f"{stage}: not finite at row 1, column 2")
 
-    sampled = pipeline.scene.Scene.sampled
+    sampled = scene.Scene.sampled
 
     def judged_fails(self, envmap, spp, seed):
         return fails() if seed == pipeline.JUDGE_SEED + 1 else sampled(self, envmap, spp, seed)
 
     if stage == "judged rendering":
-        monkeypatch.setattr(pipeline.scene.Scene, "sampled", judged_fails)
+        monkeypatch.setattr(scene.Scene, "sampled", judged_fails)
     elif stage == "metrics":
         monkeypatch.setattr(pipeline.metrics, "compare", fails)
     else:

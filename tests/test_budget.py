@@ -7,15 +7,16 @@ import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
 from envedit import budget, config, image, run, scene
-from envedit.budget import LEVELS, Calibration
+from envedit.budget import LEVELS, Calibration, Work
 from envedit.errors import ConfigError
 
 HERE = Calibration(budget.REFERENCE_RENDER, 1.0, 0.0, 512)
 """The reference machine."""
+SQUARE, PAINTED, LARGE = Work(), Work(painted=True), Work(texels=2**25)
 
 
 def test_levels_grow_dearer_from_the_coarsest_to_the_finest():
-    times = [budget.expect(level, HERE) for level in LEVELS]
+    times = [budget.expect(level, HERE, SQUARE) for level in LEVELS]
     assert times == sorted(times) and times[0] > 0
     assert [level.name for level in LEVELS].count("standard") == 1
 
@@ -32,20 +33,20 @@ def test_the_standard_level_is_the_standard_preset_and_draft_s_the_draft():
 @pytest.mark.parametrize("elapsed", [0.0, 2.0])
 def test_the_finest_level_in_time_is_taken(elapsed):
     for i, level in enumerate(LEVELS):
-        wanted = elapsed + budget.expect(level, HERE)
-        taken, expected = budget.choose(HERE, wanted + 0.01, elapsed)
+        wanted = elapsed + budget.expect(level, HERE, SQUARE)
+        taken, expected = budget.choose(HERE, wanted + 0.01, elapsed, SQUARE)
         assert taken == level and expected == pytest.approx(wanted)
         if i:
-            assert budget.choose(HERE, wanted - 0.01, elapsed)[0] == LEVELS[i - 1]
+            assert budget.choose(HERE, wanted - 0.01, elapsed, SQUARE)[0] == LEVELS[i - 1]
 
 
 def test_a_little_late_is_allowed_and_more_is_refused():
-    least = budget.expect(LEVELS[0], HERE)
-    assert budget.choose(HERE, least / budget.LATE + 0.01, 0)[0] == LEVELS[0]
+    least = budget.expect(LEVELS[0], HERE, SQUARE)
+    assert budget.choose(HERE, least / budget.LATE + 0.01, 0, SQUARE)[0] == LEVELS[0]
     with pytest.raises(ConfigError, match=rf"cannot be kept.* about {least:.0f} s here: give at least"):
-        budget.choose(HERE, least / budget.LATE - 0.1, 0)
+        budget.choose(HERE, least / budget.LATE - 0.1, 0, SQUARE)
     with pytest.raises(ConfigError, match="or set output.full=false"):
-        budget.choose(HERE, 1.0, 0, texels=2**25)
+        budget.choose(HERE, 1.0, 0, LARGE)
 
 
 @pytest.mark.parametrize(
@@ -60,8 +61,8 @@ def test_a_little_late_is_allowed_and_more_is_refused():
 def test_a_slower_machine_is_expected_to_take_longer(slower):
     other = dataclasses.replace(HERE, **slower)
     standard = next(level for level in LEVELS if level.name == "standard")
-    assert budget.expect(standard, other) > 1.05 * budget.expect(standard, HERE)
-    assert budget.expect(standard, HERE, texels=2**25) > budget.expect(standard, HERE) + 5
+    assert budget.expect(standard, other, SQUARE) > 1.05 * budget.expect(standard, HERE, SQUARE)
+    assert budget.expect(standard, HERE, LARGE) > budget.expect(standard, HERE, SQUARE) + 5
 
 
 @pytest.mark.parametrize(
@@ -115,21 +116,21 @@ def small(tmp_path, rng, monkeypatch):
 
 def test_calibration_measures_this_scene(small):
     settings = config.load(small)
-    found, aspect, texels = budget.calibrate(settings, small.parent)
-    assert texels == 32 * 64 and 0.5 < aspect < 2
+    found, work = budget.calibrate(settings, small.parent)
+    assert work.texels == 32 * 64 and 0.5 < work.aspect < 2 and not work.painted
     assert 0 < found.render < 1e-3 and 0 < found.machine < 1e3 and found.compile_s >= 0
     assert scene.QUIET_LEAST <= found.quiet_spp <= scene.QUIET_MOST
 
 
 def test_paint_takes_longer_to_search():
     level = budget.LEVELS[-1]
-    more = budget.expect(level, HERE, painted=True) - budget.expect(level, HERE)
+    more = budget.expect(level, HERE, PAINTED) - budget.expect(level, HERE, SQUARE)
     assert more == pytest.approx(
         (budget.PAINTED - 1) * level.traced_s * HERE.render / budget.REFERENCE_RENDER
     )
-    between = (budget.expect(level, HERE) + budget.expect(level, HERE, painted=True)) / 2
-    assert budget.choose(HERE, between, 0.0)[0] == level
-    assert budget.choose(HERE, between, 0.0, painted=True)[0] != level
+    between = (budget.expect(level, HERE, SQUARE) + budget.expect(level, HERE, PAINTED)) / 2
+    assert budget.choose(HERE, between, 0.0, SQUARE)[0] == level
+    assert budget.choose(HERE, between, 0.0, PAINTED)[0] != level
 
 
 def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, capsys):

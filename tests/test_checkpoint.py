@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from envedit import checkpoint, config, optim
-from envedit.edit import State
 from envedit.errors import InputError
+from envedit.loop import State
 
 PICTURE = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
 

@@ -21,7 +21,7 @@ import pytest
 from test_determinism import differing, pictures
 from test_run import FILES, INFLUENCE, ROOT, call, isolated, names, small_world, world  # noqa: F401 (a fixture)
 
-from envedit import checkpoint, disk_cache, edit, files, image, layered, manifest, pipeline, preview
+from envedit import checkpoint, disk_cache, files, image, layered, loop, manifest, pipeline, preview, scene
 from envedit.errors import InputError
 from envedit.progress import Progress
 from experiments.interruption import run as kills
@@ -40,7 +40,7 @@ class Killed(BaseException):
 @pytest.fixture(autouse=True)
 def steady(monkeypatch):
     """Let checkpoints come by the count of steps alone."""
-    monkeypatch.setattr(edit, "READ_SECONDS", 1e9)
+    monkeypatch.setattr(loop, "READ_SECONDS", 1e9)
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +245,7 @@ def test_a_disk_that_is_full_at_any_file_is_told_and_costs_no_work(tmp_path, who
             for file in [*folder.iterdir()]:
                 file.unlink()
             with monkeypatch.context() as patch:  # so that what follows has a checkpoint of the last step
-                patch.setattr(pipeline.scene.Scene, "sampled", stopping(pipeline.scene.Scene.sampled))
+                patch.setattr(scene.Scene, "sampled", stopping(scene.Scene.sampled))
                 assert call(path, "--quiet", "--out", folder) == 130
             continue
         assert checkpoint.NAME in names(folder)
@@ -310,7 +310,7 @@ def largest_file(size):
 
 PICTURE = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
 ROWS = [{"iteration": i, "loss": 1 / (i + 1)} for i in range(50)]
-STATE = edit.State(3, history=ROWS)
+STATE = loop.State(3, history=ROWS)
 RESULT = {"renders": {"initial": PICTURE, "target": PICTURE, "edited": PICTURE}, "maps": {"initial": PICTURE}}
 WRITERS = {
     "edited.exr": lambda path: image.write_exr(path, PICTURE),

@@ -12,7 +12,7 @@ import pytest
 from envedit import config, envmap, fit, image, latlong, layered, siren
 from envedit.errors import ConfigError, InputError
 from envedit.files import write_atomically
-from envedit.pipeline import load_map
+from envedit.inputs import load_map
 from experiments.paper import measured, network, plan, plot, run, sheets, skies, tables
 from experiments.paper.kinds import KINDS
 from experiments.paper.methods import METHODS

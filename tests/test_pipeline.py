@@ -18,8 +18,10 @@ from envedit import (
     envmap,
     gain,
     image,
+    inputs,
     job,
     latlong,
+    loop,
     pipeline,
     recording,
     scene,
@@ -151,7 +153,7 @@ def test_a_better_map_is_found_for_the_target(tmp_path, rng):
 )
 def test_active_rows(rows, height, active):
     """Row r looks up by 90 - 180 r / (H - 1) degrees: the upper half ends at the last row not below 0."""
-    first, last = pipeline.active_rows(rows, height)
+    first, last = inputs.active_rows(rows, height)
     assert (first, last) == active
     if rows == "upper":
         elevation = 90 - 180 * np.arange(height) / (height - 1)
@@ -161,12 +163,12 @@ def test_active_rows(rows, height, active):
 def test_the_upper_rows_are_those_above_the_horizon():
     for height in (3, 8, 65, 128):
         up = latlong.directions(height, 2 * height)[..., 1]
-        last = pipeline.active_rows("upper", height)[1]
+        last = inputs.active_rows("upper", height)[1]
         assert (up[: last + 1] > -1e-6).all() and (up[last + 1 :] < 0).all()
 
 
 def test_the_sky_is_made_at_the_working_width():
-    picture, warnings = pipeline.load_map(config.Input(envmap="sunsky", width=32))
+    picture, warnings = inputs.load_map(config.Input(envmap="sunsky", width=32))
     assert picture.shape == (16, 32, 3) and warnings == []
 
 
@@ -424,8 +426,8 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
     whole = pipeline.run(settings)
     assert (whole.envmap != picture).any()
 
-    monkeypatch.setattr(edit, "READ_EVERY", 7)
-    monkeypatch.setattr(edit, "READ_SECONDS", 1e9)
+    monkeypatch.setattr(loop, "READ_EVERY", 7)
+    monkeypatch.setattr(loop, "READ_SECONDS", 1e9)
     folder = tmp_path / "run"
     folder.mkdir()
     for step in (7, 14, 20):
@@ -468,7 +470,7 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
     assert len(levels) > gain.LEVELS
     assert all(np.abs(whole.found.params[name].numpy()).max() > 0 for name in levels)
 
-    monkeypatch.setattr(edit, "READ_EVERY", 7)
+    monkeypatch.setattr(loop, "READ_EVERY", 7)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted, match="iteration 7"):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -481,7 +483,7 @@ def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path
     """Mitsuba adds the gradients of a texel in any order: its runs agree but for the last bits."""
     settings = settings_of(tmp_path, smooth(rng), renderer={"kind": "path", "spp": 4, "max_depth": 3})
     whole = pipeline.run(settings)
-    monkeypatch.setattr(edit, "READ_EVERY", 7)
+    monkeypatch.setattr(loop, "READ_EVERY", 7)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -563,7 +565,7 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
     """
     settings = settings_of(tmp_path, sunny(rng), **PIXELS)
     whole = pipeline.run(settings)
-    monkeypatch.setattr(edit, "READ_EVERY", 7)
+    monkeypatch.setattr(loop, "READ_EVERY", 7)
     folder = tmp_path / "run"
     folder.mkdir()
     with pytest.raises(pipeline.Interrupted):
@@ -625,7 +627,7 @@ def test_paint_on_a_black_map_is_followed(tmp_path):
 
 def test_a_configuration_s_files_are_looked_for_beside_it_from_python_too(tmp_path, monkeypatch):
     (tmp_path / "c.toml").write_text('[input]\nenvmap = "sunsky"\n')
-    monkeypatch.setattr(pipeline, "run", lambda settings, **named: named)
+    monkeypatch.setattr(edit, "run", lambda settings, **named: named)
     assert edit.edit(tmp_path / "c.toml")["base"] == tmp_path
     assert edit.edit(tmp_path / "c.toml", base=tmp_path / "other")["base"] == tmp_path / "other"
     assert "base" not in edit.edit(config.load(tmp_path / "c.toml"))

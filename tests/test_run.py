@@ -21,7 +21,7 @@ import OpenEXR
 import pytest
 from helpers import BALL, SENSOR, read_png, sky, write_scene
 
-from envedit import checkpoint, config, doctor, image, pipeline, run
+from envedit import checkpoint, config, doctor, image, pipeline, run, scene
 from envedit.transport import LightTransport
 
 ROOT = Path(run.__file__).parent.parent
@@ -400,13 +400,13 @@ def one_sun(row, column):
 
 
 def test_the_initial_rendering_has_few_samples(tmp_path, rng, monkeypatch):
-    seen, render = [], pipeline.scene.Scene.render
+    seen, render = [], scene.Scene.render
 
     def noted(self, envmap, spp, *rest, **keys):
         seen.append(spp)
         return render(self, envmap, spp, *rest, **keys)
 
-    monkeypatch.setattr(pipeline.scene.Scene, "render", noted)
+    monkeypatch.setattr(scene.Scene, "render", noted)
     monkeypatch.setattr(pipeline, "INITIAL_SPP", 8)
     for spp, few in ((16, 8), (8, 8), (1, 1)):
         seen.clear()

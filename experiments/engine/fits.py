@@ -19,8 +19,8 @@ import numpy as np
 from envedit import config, fit, metrics
 from envedit.errors import EnveditError
 from envedit.files import write_atomically
+from envedit.inputs import active_rows, load_map
 from envedit.manifest import manifest
-from envedit.pipeline import active_rows, load_map
 
 from . import maps, tables
 

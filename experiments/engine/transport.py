@@ -162,7 +162,7 @@ def from_disk(lit, height: int, width: int, spp, repeats: int = 3) -> dict | Non
 
 
 def build(lit, height: int, width: int, spp, folder: Path | None = None):
-    """Build T as the standard preset does, kept in ``folder`` or nowhere; returns it with the seconds."""
+    """Build T as for SIREN and pixels, kept in ``folder`` or nowhere; returns it with the seconds."""
     start = time.perf_counter()
     built = LightTransport.build(lit, height, width, spp=spp, memory_gb=2.0, folder=folder)
     dr.sync_thread()

@@ -4,6 +4,7 @@ r"""Turn real maps by 60 degrees, three representations, one scene: compute what
         [--out runs/first_edit] [--maps NAME ...] [--set table.key=value ...]
 
 Every run is ``python -m envedit.run`` with its own folder; one that is done (it has metrics.json) is skipped.
+Runs under ``--set`` lie in a folder of their own.
 """
 
 import argparse
@@ -12,6 +13,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+
+from .. import trials
 
 MAPS = ("kloofendal_48d_partly_cloudy", "autumn_field", "wasteland_clouds", "overcast_soil")
 KINDS = ("siren", "pixels", "log-pixels")
@@ -77,20 +80,21 @@ def main():
     root = os.environ.get("ENVEDIT_DATA")
     if not root:
         sys.exit("ENVEDIT_DATA is not set: point it at a folder with puresky/NAME_puresky_1k.hdr")
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    out = trials.folder(arguments.out.absolute(), arguments.overrides)
+    out.mkdir(parents=True, exist_ok=True)
     for name, kind, folder, text, overrides in jobs(
-        Path(root).absolute(), arguments.out.absolute(), arguments.maps, arguments.overrides
+        Path(root).absolute(), out, arguments.maps, arguments.overrides
     ):
         if (folder / "metrics.json").exists():
             continue
-        config = arguments.out / f"{name}-{kind}.toml"
+        config = out / f"{name}-{kind}.toml"
         config.write_text(text)
         print(f"{name}, {NAMES[kind]}", flush=True)
         subprocess.run(
             [sys.executable, "-m", "envedit.run", str(config), "--out", str(folder), *overrides], check=False
         )
-    text = table(arguments.out, arguments.maps)
-    (arguments.out / "table.md").write_text(text + "\n")
+    text = table(out, arguments.maps)
+    (out / "table.md").write_text(text + "\n")
     print(text)
 
 

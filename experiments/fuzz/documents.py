@@ -53,7 +53,7 @@ VALUES = (
 
 
 def toml_files() -> dict[str, bytes]:
-    """Return whole configurations: by hand, and every key of every preset and kind spelled out."""
+    """Return whole configurations: by hand, and presets and kinds with every key spelled out."""
     from envedit import config
 
     files = {"written.toml": WRITTEN.encode()}
@@ -69,7 +69,7 @@ def toml_files() -> dict[str, bytes]:
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     """Return a damaged copy of a configuration.
 
-    A third has its bytes damaged like any file, the others one to four of: values of other types, sizes and
+    A third has its bytes damaged like any file, the others one to three of: values of other types, sizes and
     kinds, keys and values swapped, keys renamed, lines and tables doubled, removed and moved, deep nesting,
     numbers and names of thousands of characters, NUL, and bytes that are no UTF-8.
     """

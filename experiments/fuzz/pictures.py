@@ -228,9 +228,9 @@ def weight_files() -> dict[str, bytes]:
 
 def checkpoint_files(folder: Path) -> dict[str, bytes]:
     """Write a checkpoint as a run does."""
-    from envedit import checkpoint, edit
+    from envedit import checkpoint, loop
 
-    state = edit.State(2, history=[{"iteration": 0, "loss": 0.5}, {"iteration": 1, "loss": 0.25}])
+    state = loop.State(2, history=[{"iteration": 0, "loss": 0.5}, {"iteration": 1, "loss": 0.25}])
     optimiser = {"step": np.int64(2), "params/gain": radiance()[:4, :8, 0]}
     checkpoint.save(folder, "what", state, optimiser, {"columns": np.arange(5)}, radiance()[:8])
     return {checkpoint.NAME: (folder / checkpoint.NAME).read_bytes()}

@@ -14,10 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import config, edit, files, latlong, metrics, scene, search, siren
+from envedit import config, files, latlong, loop, metrics, scene, search, siren
 from envedit.gain import GridGain
+from envedit.inputs import load_map
 from envedit.layers import Layers
-from envedit.pipeline import load_map
 from envedit.transport import LightTransport
 
 from .run import SCENES, maps
@@ -85,9 +85,9 @@ def one(lit, transport, original, true, picture, gain, from_search):
     params = layers.encode(crop)
     params |= {k: v for k, v in begun.items() if from_search or not k.startswith("gain")}
     chosen = config.Optimizer(iterations=ITERATIONS)
-    objective = edit.Objective(config.Loss(), picture, None, crop, ITERATIONS)
+    objective = loop.Objective(config.Loss(), picture, None, crop, ITERATIONS)
     start = time.perf_counter()
-    params, _ = edit.optimise(layers, params, transport, objective, original, 0, chosen)
+    params, _ = loop.optimise(layers, params, transport, objective, original, 0, chosen)
     ms = 1000 * (time.perf_counter() - start) / ITERATIONS
     edited = original.copy()
     edited[: height // 2] = layers.decode(params).numpy()

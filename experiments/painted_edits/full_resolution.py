@@ -15,7 +15,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import carry, config, image, latlong, layered, metrics, pipeline, scene
+from envedit import carry, config, image, inputs, latlong, layered, metrics, pipeline, scene
 
 from .run import file_of
 
@@ -59,7 +59,7 @@ def main():
     start = time.perf_counter()
     source, _ = image.load_envmap(str(file))
     read = time.perf_counter() - start
-    first, last = pipeline.active_rows(settings.input.rows, result.envmap.shape[0])
+    first, last = inputs.active_rows(settings.input.rows, result.envmap.shape[0])
     found, rows = result.found, (first, last - first + 1)
     original, edited = result.maps["initial"], result.envmap
     start = time.perf_counter()

@@ -20,7 +20,7 @@ import numpy as np
 from envedit import config, fit, image, metrics, optim, siren
 from envedit.errors import EnveditError
 from envedit.files import write_atomically
-from envedit.pipeline import active_rows, load_map
+from envedit.inputs import active_rows, load_map
 
 NOISE, NOISE_SEEDS = 1e-3, 5
 """Standard deviation of the noise on weights and biases (Fig. 5), and how many draws are measured."""

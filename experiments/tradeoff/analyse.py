@@ -33,10 +33,9 @@ def flat(cost: dict, judged: dict) -> dict:
     -------
     dict
         ``time`` and ``again`` in seconds: the latter less what fit and tracing took (a run that finds them on
-        disk takes a tenth of a second to load them, which is left out; the T in which layers are searched for
-        under a path tracer counts); ``memory`` in bytes; ``psnr`` of the rendering, without the judge's noise
-        and at most :data:`MOST_PSNR`, and ``map_psnr``, in dB; ``map_ssim``; ``sun`` in degrees and ``noise``
-        of the loss, or None.
+        disk takes a tenth of a second to load them, which is left out); ``memory`` in bytes; ``psnr`` of the
+        rendering, without the judge's noise and at most :data:`MOST_PSNR`, and ``map_psnr``, in dB;
+        ``map_ssim``; ``sun`` in degrees and ``noise`` of the loss, or None.
     """
     timing = judged["timing"]
     ready = timing["fit_s"] + timing["transport_s"]

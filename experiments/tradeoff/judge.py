@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import image, latlong, metrics, pipeline, scene
+from envedit import image, inputs, latlong, metrics, scene
 from envedit.files import write_atomically
 from envedit.tonemap import luminance, tonemap
 
@@ -147,7 +147,7 @@ class Judge:
         return latlong.resize(envmap, self.width // 2, self.width)
 
     def _rows(self):
-        first, last = pipeline.active_rows("upper", self.width // 2)
+        first, last = inputs.active_rows("upper", self.width // 2)
         return slice(first, last + 1)
 
     def _halves(self, cell, envmap, spp, seed):

@@ -167,7 +167,7 @@ def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Pa
     chosen = replace(
         settings,
         input=_at_width(settings.input, level.map),
-        scene=replace(settings.scene, width=level.film, height=0),
+        scene=_film_at(settings.scene, level.film),
         optimizer=replace(settings.optimizer, iterations=level.iterations),
         target=replace(settings.target, spp=level.spp),
         output=replace(settings.output, spp=level.spp),
@@ -185,6 +185,12 @@ def _at_width(settings: config.Input, width: int) -> config.Input:
         first, end = rows[0] * width // settings.width, -(-(rows[1] + 1) * width // settings.width)
         rows = first, max(first, min(end, width // 2) - 1)
     return replace(settings, width=width, rows=rows)
+
+
+def _film_at(settings: config.Scene, width: int) -> config.Scene:
+    """Return the scene at another width; a height that was given keeps its ratio."""
+    height = settings.height and max(1, round(width * settings.height / settings.width))
+    return replace(settings, width=width, height=height)
 
 
 def _check_pixels(target: config.Target) -> None:
@@ -248,7 +254,7 @@ def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibr
     else:
         envmap, info = image.load_envmap(settings.input.envmap, _MAP, settings.input.repair)
         texels = info["size"][0] * info["size"][1]
-    lit = inputs.load_scene(replace(settings.scene, width=_FILM, height=0), base)
+    lit = inputs.load_scene(_film_at(settings.scene, _FILM), base)
     times, pictures = [], []
     for seed in range(3):
         begun = time.perf_counter()

@@ -189,7 +189,8 @@ class _LayersAt:
             flux = np.float64(radiance) * omega[row][:, None]
             soft = flux * share[:, None]
             # What is soft at its border for the eye's sake still is all of the light.
-            flux = soft * (flux.sum(axis=0) / np.maximum(soft.sum(axis=0), 1e-30))
+            kept = soft.sum(axis=0)
+            flux = soft * np.divide(flux.sum(axis=0), kept, out=np.ones(3), where=kept > 0)
             for k in range(0, len(row), POINTS_AT_ONCE):
                 part = slice(k, k + POINTS_AT_ONCE)
                 self._place_texels(i, row[part], column[part], flux[part], omega[row[part]])

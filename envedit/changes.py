@@ -146,7 +146,8 @@ def place(
         if left and min(left) < 1 - TAKEN:
             i = int(np.argmin(left))
             moved.append(i)
-            places[i] = Place(direction, factor[i] + flux / np.maximum(own[i], 1e-30))
+            more = np.divide(flux, own[i], out=np.zeros(3), where=own[i] > 0)  # no factor colours a light
+            places[i] = Place(direction, factor[i] + more)
         elif len(places) < len(lights) + spare:
             places.append(Place(direction, np.maximum(strength, LEAST_FLUX)))
     return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))

@@ -57,12 +57,18 @@ class ExactColumns:
         self._store = dr.zeros(mi.Float, _slices(self.pixels) * max(capacity, 1) * SLICE * 4)
         self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
         self._count = dr.opaque(mi.UInt32, 0)
+        self._lost = dr.opaque(mi.UInt32, 0)
         dr.make_opaque(self._store, self._texel_of, self.mask)
 
     @property
     def bytes(self) -> int:
         """Bytes of the store."""
         return 4 * len(self._store)
+
+    @property
+    def lost(self) -> int:
+        """Contributions that were not finite, and were left out."""
+        return int(self._lost[0])
 
     @property
     def room(self) -> int:
@@ -119,6 +125,7 @@ class ExactColumns:
                     direction, jacobian = grid.direction(*place_in_map, u)
                     value = connect(self.scene.mi, event, direction, jacobian, uniform / jacobian)
                     value *= dr.opaque(mi.Float, float(areas[row])) * jacobian / mi.Float(per_pixel)
+                    value = self._finite(value, True)
                     target = first_of_pixel + dr.opaque(mi.UInt32, int(self.slot_of[texel])) * SLICE
                     for c in range(3):
                         dr.scatter_add(self._store, dr.block_sum(value[c], count), target * 4 + c)
@@ -167,8 +174,9 @@ class ExactColumns:
         targets, values = [], []
         for texel, share in taps:
             slot = dr.gather(mi.Int32, slot_of, texel)
-            value, target = event.throughput * (weight * share), place + mi.UInt32(slot) * SLICE
             wanted = event.active & (slot >= 0) & (weight * share > 0)
+            value = self._finite(event.throughput * (weight * share), wanted)
+            target = place + mi.UInt32(slot) * SLICE
             # Else what is left to compute, and so the kernel, depends on who was hit.
             dr.eval(value, target, wanted)
             keep = np.flatnonzero(wanted.numpy()).astype(np.uint32)
@@ -187,6 +195,12 @@ class ExactColumns:
         for c in range(3):
             dr.scatter_add(self._store, _on_device(mi.Float, value[:, c]), place + c, real)
         dr.eval(self._store)
+
+    def _finite(self, value, active):
+        """Leave out, and count, what is not finite: one sample must not cost the picture."""
+        finite = dr.all(dr.isfinite(value))
+        dr.scatter_add(self._lost, dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0), active & ~finite)
+        return dr.select(finite, value, 0)
 
     def _clear(self, slots):
         """Set the columns in ``slots`` to zero."""

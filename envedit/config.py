@@ -37,12 +37,11 @@ from .checks import (
     row_range,
     show,
     string,
-    stroke_list,
-    target_kind,
     weight,
 )
 from .checks import key as _key
 from .errors import ConfigError
+from .stroke_keys import stroke_list
 from .tonemap import TONEMAPS
 
 _MOST_BYTES = 1 << 20  # more than any configuration; an EXR given by mistake is not read to its end
@@ -97,7 +96,9 @@ class Scene(Table):
 class Target(Table):
     """What the rendering should look like."""
 
-    kind: str = _key("envmap", target_kind, "given by: another map, a painted image, or strokes")
+    kind: str = _key(
+        "envmap", choice("envmap", "image", "strokes"), "given by: another map, a painted image, or strokes"
+    )
     file: str = _key("", string, "kind envmap: the other map; kind image: the painted rendering")
     rotate_degrees: float = _key(
         60.0, number(-360, 360), "kind envmap: turn of the input about the vertical, degrees; 0 with a file"

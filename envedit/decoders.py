@@ -19,6 +19,7 @@ from .tonemap import srgb_to_linear
 MAX_SIDE = 32768
 MAX_TEXELS = 2**27
 """16384 x 8192 texels: 1.6 GB as float32. A header that declares more is refused before allocation."""
+_MOST_VALUES = 4 * MAX_TEXELS  # over all channels: colour and alpha of the largest
 _MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -88,6 +89,10 @@ def _read_exr(name, head, info, stored):
         raise InputError(
             f"{name}: its {len(parts)} parts hold more than {MAX_TEXELS} texels; save only colour"
         )
+    counts = [len(p.header["channels"]) for p in parts]  # and every channel
+    if sum(w * h * n for (_, _, w, h), n in zip(windows, counts, strict=True)) > _MOST_VALUES:
+        many = f"its {sum(counts)} channels hold more than {_MOST_VALUES} values"
+        raise InputError(f"{name}: {many}; save only colour")
     for part, (_, _, width, height) in zip(parts, windows, strict=True):
         tile = part.header.get("tiles")
         if tile is not None and tile.xSize * tile.ySize > max(width * height, _MOST_TILE):

@@ -4,6 +4,8 @@ Every message is one or two lines: what, where (file, key, row and column), what
 Modules raise these; only the command lines turn them into text on stderr and an exit code.
 """
 
+import contextlib
+
 
 class EnveditError(ValueError):
     """Base of every error whose cause a user can mend."""
@@ -33,3 +35,20 @@ class NumericalError(EnveditError):
     """The optimisation could not proceed: non-finite and not recoverable (exit code 5)."""
 
     exit_code = 5
+
+
+@contextlib.contextmanager
+def unwrapped():
+    """Raise what a user is to be told of, and Ctrl-C, as they are; also a decorator.
+
+    Dr.Jit raises RuntimeError from whatever is raised inside its operations and loops.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        cause = error
+        while cause and not isinstance(cause, (EnveditError, KeyboardInterrupt)):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from None

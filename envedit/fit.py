@@ -147,6 +147,8 @@ def fit(
         wanted = normalisation.encode(image).reshape(-1, 3)
         params = refit.last_layer(params, x, network.omega, wanted, image.reshape(-1, 3), settings.light)
     got = evaluate(params, normalisation, x, image.shape[:2], network.omega).numpy()
+    if not np.isfinite(got).all():  # its last steps were refused, but too few of them to stop
+        raise NumericalError("the fit ended with a network that is not finite; lower [fit] lr")
     fitted = Fitted(
         {k: v.numpy() for k, v in params.items()},
         normalisation,

@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from . import config, doctor, files, fit, image, inputs, manifest, metrics, preview
-from .errors import EnveditError
+from .errors import EnveditError, unwrapped
 from .progress import Progress
 
 
@@ -22,7 +22,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
     arguments = parser.parse_args(argv)
     try:
-        return _run(arguments)
+        with unwrapped():
+            return _run(arguments)
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
@@ -37,11 +38,17 @@ def _run(arguments):
     doctor.ensure(settings.variant)
     mi.set_variant(settings.variant)
     original, warnings = inputs.load_map(settings.input)
+    folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
+    with files.alone(folder):
+        files.prepare_folder(folder, ("fit.json", "fitted.exr", "preview.png"), [arguments.map])
+        return _fit(arguments, settings, original, warnings, folder)
+
+
+def _fit(arguments, settings, original, warnings, folder):
+    """Fit, and leave the results in a folder."""
     first, last = inputs.active_rows(settings.input.rows, original.shape[0])
     crop = original[first : last + 1]
     rows = first, original.shape[0]
-    folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
-    files.prepare_folder(folder, ("fit.json", "fitted.exr", "preview.png"), [arguments.map])
     with Progress() as progress:
         progress.stage(f"fitting {arguments.map}")
         fitted = fit.fit(
@@ -58,7 +65,8 @@ def _run(arguments):
     shape = crop.shape[:2]
     x = fit.points(network, shape, rows)
     got = fit.evaluate(params, fitted.normalisation, x, shape, network.omega).numpy()
-    image.write_exr(folder / "fitted.exr", got, {"source": arguments.map, "rows": f"{first} to {last}"})
+    about = {"source": arguments.map, "rows": f"{first} to {last}"}
+    image.write_exr(folder / "fitted.exr", got, about, panorama=len(got) == len(original))
     preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
     numbers = {
         "log_psnr": fitted.log_psnr,

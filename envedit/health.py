@@ -18,9 +18,10 @@ BRIGHTEST = 2.0**100
 class Health:
     """What is in an image: texels of each kind, the first (row, column) of them, and the range of luminance.
 
-    A texel counts if any of its channels does. ``minimum`` and ``maximum`` are over finite channel values;
-    ``median`` is of finite luminance; ``dynamic_range`` is the largest over the smallest positive luminance,
-    0.0 without any. Everything is finite, an image without finite values has 0.0.
+    A texel counts if any of its channels does, as negative only if all of them are finite. ``minimum`` and
+    ``maximum`` are over finite channel values; ``median`` is of finite luminance; ``dynamic_range`` is the
+    largest over the smallest positive luminance, 0.0 without any. Everything is finite, an image without
+    finite values has 0.0.
     """
 
     texels: int
@@ -66,12 +67,14 @@ def health(image) -> Health:
         "negative": any_channel(image < 0),
         "saturated": any_channel(image == HALF_MAX),
     }
+    clean = bool(finite.all())  # then nothing has to be copied
+    if not clean:
+        masks["negative"] &= ~any_channel(~finite)
     fields = {}
     for kind, mask in masks.items():
         fields[kind] = int(mask.sum())
         first = np.unravel_index(mask.argmax(), mask.shape)
         fields[f"first_{kind}"] = (int(first[0]), int(first[1])) if fields[kind] else None
-    clean = bool(finite.all())  # then nothing has to be copied
     values = image if clean else image[finite]
     y = luminance(image if clean else image[~any_channel(~finite)])
     positive = y[y > 0]

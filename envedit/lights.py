@@ -27,6 +27,8 @@ SPARE = 2
 """Lights beside the map's own, dark until one is needed: lobes, without a glow."""
 DARK = -30.0
 """Logarithm of the flux of a light that is not there."""
+FAINTEST = 1e-3
+"""Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
 LOBE_POINTS = 512
 LOBE_DEGREES = 2.0
 """Points and radius of a lobe of size 1."""
@@ -61,7 +63,8 @@ class Lights:
     centres : ndarray (count, 3)
         Directions of unmoved lights; spare ones are at the zenith.
     flux : ndarray (count, 3)
-        Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, or 1.
+        Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, at least
+        :data:`FAINTEST` of it in every channel, or 1.
     """
 
     def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
@@ -77,6 +80,7 @@ class Lights:
             sines.append(np.sin(np.pi * row / max(total - 1, 1)))
         own = np.array([f.sum(axis=0) for f in fluxes]).reshape(-1, 3)
         spare = own.mean(axis=0) if len(own) else np.ones(3)
+        spare = np.maximum(spare, FAINTEST * spare.max())
         for i in range(SPARE):
             d, weight, spacing = lobe()
             directions.append(d)

@@ -157,6 +157,16 @@ def _envedit_version():
     return getattr(envedit, "__version__", None)
 
 
+def changed(file) -> list[str]:
+    """Return the inputs that a manifest names and that hold something else now; none without a manifest."""
+    try:
+        listed = json.loads(Path(file).read_text(encoding="utf-8"))["inputs"].values()
+        known = {entry["path"]: entry["sha256"] for entry in listed}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return []
+    return [path for path, digest in known.items() if _digest(path)["sha256"] not in (digest, None)]
+
+
 def _digest(path):
     try:
         with open(path, "rb") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def write(settings: config.Config, folder: Path, result: pipeline.Result, import
         "mask": settings.target.mask,
         **{name: value for name, value in vars(settings.perceptual).items() if name != "network"},
     }
-    inputs = {role: path for role, path in named.items() if Path(path).is_file()}
+    inputs = {role: path for role, path in named.items() if os.path.isfile(path)}
     facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)
     manifest.write_manifest(folder / "manifest.json", facts)
     timing["import_s"] = round(import_s, 3)
@@ -79,7 +80,9 @@ def _maps(settings, folder, result):
     source = {"source": settings.input.envmap}
     image.write_exr(folder / "edited.exr", result.envmap, source)
     for name, picture in result.renders.items():
-        image.write_exr(folder / f"render_{name}.exr", picture, {"source": settings.scene.file})
+        image.write_exr(
+            folder / f"render_{name}.exr", picture, {"source": settings.scene.file}, panorama=False
+        )
     initial = result.maps["initial"]
     layers = {"edited": result.envmap, "initial": initial, "difference": result.envmap - initial}
     if result.influence is not None:

@@ -73,7 +73,7 @@ def check_export(file) -> None:
         raise ConfigError(f"--export-initial: came {str(file)!r}, wanted a name that ends in .exr or .png")
     if os.path.lexists(file):
         raise InputError(f"{file}: exists and is not overwritten: name another file, or move it away")
-    if not file.parent.is_dir():
+    if not os.path.isdir(file.parent):
         raise InputError(f"{file}: cannot be written (its folder does not exist)")
 
 
@@ -120,7 +120,7 @@ def export(file, picture: np.ndarray, settings: config.Config) -> list[str]:
     if share < 0.001:
         return []
     return [
-        f"{file}: {100 * share:.2g} % of the pixels are clipped under the '{name}' tonemap, and tell nothing "
+        f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and tell nothing "
         'when they come back: export an .exr, or set [target] tonemap = "log"'
     ]
 

@@ -12,10 +12,12 @@ import drjit as dr
 import mitsuba as mi
 
 from . import latlong
+from .errors import ConfigError
 from .scene import Scene
 
 AUTO_SPP = 16
 AUTO_DEPTH = 6
+_MOST_SAMPLES = 2**32 - 1  # of a wavefront of Mitsuba's
 
 
 class PathTracer:
@@ -33,11 +35,21 @@ class PathTracer:
     seed : int
         Base seed; every step draws two seeds of its own from it, one for the picture and one for the
         gradient.
+
+    Raises
+    ------
+    ConfigError
+        There are more samples than Mitsuba can trace at once.
     """
 
     def __init__(self, scene: Scene, spp: int | str = "auto", max_depth: int | str = "auto", seed: int = 0):
         self.scene = scene
         self.spp = _whole(scene, AUTO_SPP if spp == "auto" else spp)
+        if self.spp * scene.width * scene.height > _MOST_SAMPLES:
+            raise ConfigError(
+                f"renderer.spp: {self.spp} samples of {scene.width}x{scene.height} pixels are more than one "
+                f"rendering can hold, {_MOST_SAMPLES}: lower [renderer] spp or [scene] width"
+            )
         self.depth = AUTO_DEPTH if max_depth == "auto" else max_depth
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]

@@ -28,6 +28,7 @@ from . import (
     target,
 )
 from . import reach as reaches
+from .errors import unwrapped
 from .job import Interrupted, Job, Stopped, Watch, keeping
 from .layers import Layers
 from .separate import Separation
@@ -148,6 +149,7 @@ def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | N
     return carry.carry(found.representation, found.params, before, result.envmap, source, rows, found.free)
 
 
+@unwrapped()
 def run(
     settings: config.Config,
     *,
@@ -200,6 +202,7 @@ def run(
         height, width, _ = original.shape
         first, last = inputs.active_rows(settings.input.rows, height)
         lit = inputs.load_scene(settings.scene, base)
+        renderers.check(settings, lit, (height, width))
         watch.stage("rendering the target")
         wanted = target.make(settings, lit, original, picture, mask)
         warnings += wanted.warnings
@@ -298,7 +301,7 @@ def run(
         measured["transport"] = {**traced.summary(), "predicted_error": predicted, "frozen": share}
         if share:
             least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
-            notes.append(f"{100 * share:.2g} % of the active texels keep their value: {least}")
+            notes.append(f"{100 * share:.3g} % of the active texels keep their value: {least}")
     measured["choices"] = notes
     return Result(
         edited,

@@ -147,7 +147,7 @@ class Ratio:
 
         image = dr.unravel(mi.Color3f, flat(mi.Float, source))
         made = image * smooth(self.m)
-        if self.parts[near[0] : near[-1] + 1].any():
+        if self.parts[max(near[0] - 1, 0) : near[-1] + 2].any():  # rows between which is interpolated
             table = flat(mi.Float, self.grid.along_rows(self.parts, start, size))
             replaced, added = self.grid.across(mi.Vector2f, table, row, column)
             over = self.grid.beside(column)

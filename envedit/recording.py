@@ -326,7 +326,10 @@ def row_mass(sphere: np.ndarray, by_row: np.ndarray) -> np.ndarray:
 
 
 def other_light(scene, max_depth: int, seed: int) -> np.ndarray | None:
-    """Render all light that does not come from the environment, (h, w, 3); None where there is none."""
+    """Render all light that does not come from the environment, (h, w, 3); None where there is none.
+
+    ``max_depth``: -1 for paths of any length.
+    """
     if len(scene.mi.emitters()) <= 1:
         return None
     return scene.render(np.zeros((4, 8, 3), np.float32), spp=1024, seed=seed, max_depth=max_depth)

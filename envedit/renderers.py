@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import config, files, scene
+from . import config, files, recording, scene
 from .pathtrace import PathTracer
 from .transport import LightTransport
 
@@ -25,6 +25,13 @@ def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Pat
     if chosen.kind == "path":
         return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
     return trace(settings, lit, shape, progress)
+
+
+def check(settings: config.Config, lit: scene.Scene, shape) -> None:
+    """Refuse, before anything is rendered, what :func:`make` will refuse: T that does not fit into memory."""
+    chosen = settings.renderer
+    if chosen.kind == "transport":
+        recording.choose_samples(lit, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
 
 
 def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> LightTransport:

@@ -16,11 +16,12 @@ from pathlib import Path
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     start = time.perf_counter()
-    from .errors import EnveditError
+    from .errors import EnveditError, unwrapped
 
     arguments = _parser().parse_args(argv)
     try:
-        return _run(arguments, start)
+        with unwrapped():
+            return _run(arguments, start)
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
@@ -64,7 +65,7 @@ def _parser():
 
 
 def _run(arguments, start):
-    from . import config, doctor, files
+    from . import config, files
 
     overrides = list(arguments.overrides)
     if arguments.out:
@@ -74,6 +75,14 @@ def _run(arguments, start):
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)
     folder = Path(settings.output.dir)
+    with files.alone(folder):
+        return _edit(settings, arguments, folder, allowed, start)
+
+
+def _edit(settings, arguments, folder, allowed, start):
+    """Carry out an edit and leave its results in a folder."""
+    from . import doctor, files
+
     named = (settings.input.envmap, settings.scene.file, settings.target.file, settings.target.mask)
     inputs = [path for path in named if path]
     files.prepare_folder(folder, files.RESULTS, inputs, arguments.resume, [arguments.config])
@@ -179,7 +188,7 @@ def _check_same(settings, folder):
     """Refuse to call the run in a folder complete when it was asked for something else."""
     from dataclasses import replace
 
-    from . import config
+    from . import config, manifest
     from .errors import ConfigError, InputError
 
     try:
@@ -189,6 +198,8 @@ def _check_same(settings, folder):
         same = False
     if not same:
         raise InputError(f"{folder}: holds a finished run of another configuration: run without --resume")
+    if changed := manifest.changed(folder / "manifest.json"):
+        raise InputError(f"{changed[0]}: has changed since the run in {folder}: run without --resume")
 
 
 def _write(settings, folder, result, import_s, quiet, said):

@@ -278,7 +278,7 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         state = stage.told(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
-        where, folders = str(path), (path.parent, base)
+        where, folders = str(path), (path.parent, base, *_search_paths(path))
         filled = _check_parameters(path, parameters or {})
         state = stage.told(where, mi.parser.parse_file, config, str(path), **filled)
     stage.told(where, mi.parser.transform_all, config, state)
@@ -317,7 +317,7 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
 def find(file) -> Path:
     """Return the XML file meant by a path or by the bare name of a shipped scene."""
     path = Path(file)
-    if path.is_file():
+    if os.path.isfile(path):  # False, and no error, in a folder that may not be entered
         return path.absolute()
     name = path.name.removesuffix(".xml")
     bare = path.name == str(file)
@@ -328,7 +328,7 @@ def find(file) -> Path:
             if (folder / f"{name}.xml").is_file():
                 return folder / f"{name}.xml"
         raise InputError(f"scene {name}: {name}.xml is missing from this installation; install envedit again")
-    if path.is_dir():
+    if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, wanted a Mitsuba XML file")
     close = difflib.get_close_matches(name, SHIPPED, 1) if bare else []
     wanted = f"wanted a Mitsuba XML file or one of {', '.join(SHIPPED)}"
@@ -385,6 +385,13 @@ def _names(path: Path, seen: set) -> tuple[set, set]:
                 more = _names(included, seen)
                 used, defaults = used | more[0], defaults | more[1]
     return used, defaults
+
+
+def _search_paths(path: Path) -> list[Path]:
+    """Return the folders of ``<path value="...">`` in an XML file, in which files are looked for too."""
+    text = re.sub(r"<!--.*?-->", "", path.read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
+    tags = "".join(re.findall(r"<path\b[^>]*>", text))
+    return [path.parent / value for value in re.findall(r"\bvalue\s*=\s*[\"']([^\"'$]+)[\"']", tags)]
 
 
 def _whole(name: str, value, low: int) -> int:

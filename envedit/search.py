@@ -74,7 +74,7 @@ def start(
     notes, pictures = [], []
     factor = np.ones((len(overview.omega), 3))
     for i, (light, found) in enumerate(zip(lights, places, strict=False)):
-        name = f"light {i + 1} of {len(lights)} ({100 * light.share:.2g} % of the map's)"
+        name = f"light {i + 1} of {len(lights)} ({100 * light.share:.3g} % of the map's)"
         if not found.flux.max() > 0:
             notes.append(f"{name}: the picture does not want it")
             continue

@@ -202,7 +202,8 @@ class _Small:
         lum = np.where(mask, self.image @ LUMINANCE, 0)
         flux = np.where(lum > 0.1 * lum.max(), lum * self.omega, 0)
         centre = (self.directions * flux[..., None]).sum(axis=(0, 1))
-        return centre / max(np.linalg.norm(centre), 1e-30)
+        size = np.linalg.norm(centre)
+        return centre / size if size else centre
 
     def at(self, values, height, width):
         """Values of the nearest texels at the image's own resolution."""

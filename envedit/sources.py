@@ -138,7 +138,7 @@ def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, An
                 )
             if given.get("rotate_degrees"):
                 target["file"] = ""
-            elif given.get("file"):
+            elif "file" in given:
                 target["file"] = given["file"]
     return target
 

@@ -7,6 +7,7 @@ errors call the scene. What is changed and why is told in :mod:`envedit.scene`.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     node, plugin = found[0], found[0].props.plugin_name()
     matrix = np.eye(4)
     if plugin != "constant" and "to_world" in node.props:
-        matrix = np.array(node.props["to_world"].matrix, np.float64).reshape(4, 4)
+        matrix = _matrix(node.props["to_world"], place_of(state, node, where))
     rotation = matrix[:3, :3]
     proper = np.isfinite(rotation).all() and np.linalg.det(rotation) > 0
     if not proper or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
@@ -103,11 +104,14 @@ def set_film(state, where: str, width: int, height: int) -> None:
     if not films or films[0].props.plugin_name() != "hdrfilm":
         raise InputError(f'{place_of(state, sensors[0], where)}: the sensor needs a <film type="hdrfilm">')
     film = films[0].props
-    own = [int(film.get("width", 768)), int(film.get("height", 576))]  # Mitsuba's defaults
+    own = [film.get("width", 768), film.get("height", 576)]  # Mitsuba's defaults
+    if not all(isinstance(n, int) and n > 0 for n in own):
+        place = place_of(state, films[0], where)
+        raise InputError(f"{place}: the film is {own[0]} x {own[1]}, wanted whole numbers above 0")
     if width or height:
         if any(str(name).startswith("crop_") for name, _ in film.items()):
             raise ConfigError(
-                f"scene.width: the film of {where} is cropped; remove the crop or leave width and height"
+                f"scene.width: the film of {where} is cropped and takes no other size; remove the crop"
             )
         if not height:
             height = max(1, round(width * own[1] / own[0]))
@@ -142,7 +146,7 @@ def find_files(state, where: str, folders) -> None:
     for node in state.nodes:
         if "filename" not in node.props or not isinstance(name := node.props["filename"], str):
             continue
-        found = [f / name for f in folders if (f / name).is_file()]
+        found = [f / name for f in folders if os.path.isfile(f / name)]
         if not found:
             kind = str(node.type).rpartition(".")[2].lower()
             raise InputError(
@@ -175,11 +179,11 @@ def fit_to_stage(state, node) -> None:
     if node.type != mi.ObjectType.Shape or "fit_height" not in props:
         return
     where = place_of(state, node, "scene")
-    target, up = float(props["fit_height"]), str(props.get("fit_up", "y")).lower()
+    target, up = props["fit_height"], str(props.get("fit_up", "y")).lower()
     for key in ("fit_height", "fit_up"):
         if key in props:
             del props[key]
-    if not (np.isfinite(target) and target > 0):
+    if not (isinstance(target, int | float) and np.isfinite(target) and target > 0):
         raise ConfigError(f"{where}: fit_height is {target}, wanted a positive number")
     if up.removeprefix("-") not in _AXES:
         raise ConfigError(f"{where}: the up axis is {up!r}, wanted x, y, z, -x, -y or -z")
@@ -193,7 +197,7 @@ def fit_to_stage(state, node) -> None:
     transform = np.eye(4)
     transform[:3, :3] = _upright(up)
     if "to_world" in props:
-        transform = np.array(props["to_world"].matrix, np.float64).reshape(4, 4) @ transform
+        transform = _matrix(props["to_world"], where) @ transform
     props["to_world"] = mi.ScalarTransform4d(transform)
     probe = {k: v for k, v in props.items() if not isinstance(v, mi.Properties.ResolvedReference)}
     box = told(where, mi.load_dict, {"type": props.plugin_name(), **probe}).bbox()
@@ -206,6 +210,13 @@ def fit_to_stage(state, node) -> None:
     place[:3, :3] *= scale
     place[:3, 3] = -scale * np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     props["to_world"] = mi.ScalarTransform4d(place @ transform)
+
+
+def _matrix(transform, where: str) -> np.ndarray:
+    """Return a transformation's matrix (4, 4)."""
+    if not hasattr(transform, "matrix"):
+        raise InputError(f"{where}: to_world is {str(transform)[:60]!r}, wanted a <transform>")
+    return np.array(transform.matrix, np.float64).reshape(4, 4)
 
 
 def _upright(up: str) -> np.ndarray:

@@ -172,7 +172,7 @@ def _trusted(envmap, recordings, wanted):
     if weight is None:
         return None, ""
     noisy = 100 * float((weight < 0.5).mean())
-    said = f"{noisy:.2g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
+    said = f"{noisy:.3g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
     weight = weight if wanted.weight is None else weight * wanted.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
         return None, ""

@@ -1,7 +1,7 @@
 """Strokes: what an artist paints on a rendering, written down as numbers.
 
 A stroke is a dict (in TOML an inline table, or ``[[target.strokes]]``) with a ``type``, a shape and what
-belongs to the type; the keys, their defaults and their ranges are :data:`envedit.checks.STROKES`.
+belongs to the type; the keys, their defaults and their ranges are :data:`envedit.stroke_keys.STROKES`.
 
 Shapes, one a stroke; none is the whole image and goes with temperature, contrast and blur:
 
@@ -38,8 +38,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .checks import stroke_list
 from .errors import InputError
+from .stroke_keys import stroke_list
 from .tonemap import inverse_tonemap, luminance, tonemap
 
 __all__ = ["Painted", "coverage", "paint"]
@@ -174,7 +174,7 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
     Parameters
     ----------
     stroke : dict
-        With every key, as :func:`envedit.checks.stroke_list` returns it.
+        With every key, as :func:`envedit.stroke_keys.stroke_list` returns it.
     height, width : int
         Size of the picture in pixels.
     """

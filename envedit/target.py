@@ -126,7 +126,7 @@ def make(
     weight = pixel_weight(found.coverage, untold, chosen.paint, chosen.hold)
     share = 100 * float((found.coverage > 0).mean())
     source += (
-        f", {share:.2g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
+        f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
     )
     return Target(picture, weight, None, source, warnings, initial, found.coverage, asked)
 

@@ -179,19 +179,22 @@ class LightTransport:
             transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
         transport.depth_error = left_out(light["by_bounce"], bounces)
         rows = hashlib.sha256(mass.tobytes()).hexdigest()
-        key = origin | {"part": "recording", "samples": spp, "bounces": bounces, "rows": rows}
+        lamps = -1 if max_depth == "auto" else bounces + 1  # what is constant need not be cut
+        key = origin | {
+            "part": "recording", "samples": spp, "bounces": bounces, "lamps": lamps, "rows": rows
+        }  # fmt: skip
         transport._stored = cache, key | {"part": "overview"}
         found = cache.load(key)
         if found is None:
-            transport._trace(progress)
+            transport._trace(lamps, progress)
             cache.store(key, transport._recording())
         else:
             transport._take(found)
         return transport
 
-    def _trace(self, progress=None):
-        """Trace the first recording, and the light of other lamps."""
-        offset = other_light(self.scene, self.bounces + 1, self._base_seed)
+    def _trace(self, lamps, progress=None):
+        """Trace the first recording, and the light of other lamps up to a path depth."""
+        offset = other_light(self.scene, lamps, self._base_seed)
         self._offset = dr.opaque(mi.Float, 0) if offset is None else dr.opaque(mi.Float(offset.ravel()))
         self._record(progress)
 
@@ -236,9 +239,10 @@ class LightTransport:
     @property
     def choices(self) -> list[str]:
         """What was chosen automatically with the measurement that decided, and what was left out of T."""
-        if not self._lost:
+        count = self._lost + self._exact.lost
+        if not count:
             return list(self._choices)
-        lost = f"light transport: {self._lost} contributions of camera paths were not finite and are left out"
+        lost = f"light transport: {count} contributions of camera paths were not finite and are left out"
         return [*self._choices, lost]
 
     @property

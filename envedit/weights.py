@@ -56,7 +56,7 @@ def read(file, wanted: dict[str, tuple[int, ...]], what: str, source: str) -> di
     """
     name = os.fsdecode(file)
     try:
-        if not Path(name).is_file():  # opening a pipe would wait for ever
+        if not os.path.isfile(name):  # opening a pipe would wait for ever
             raise InputError(f"{name}: no such file. It should hold the weights of {what}: {source}")
         with open(name, "rb") as stream:
             head = stream.read(16)

@@ -341,6 +341,18 @@ def test_means_are_those_of_the_edited_map(edit, rng):
     assert np.abs(small(source) - edited).max() > 0.1  # negative control
 
 
+@pytest.mark.parametrize("row", range(8, 12))
+def test_bands_do_not_show_beside_a_lamp_that_is_put_out(row, monkeypatch):
+    source = sky(256, 512)
+    working = small(source)
+    edited = working * np.float32(1.01)
+    edited[row, 30] = 1e-3 * working[row, 30]
+    whole = ratio(working, edited, source)
+    for rows in (1, 5):
+        monkeypatch.setattr(places, "BAND_TEXELS", rows * 512)
+        np.testing.assert_allclose(ratio(working, edited, source), whole, rtol=1e-5)
+
+
 def test_equal_working_texels_are_the_source_bit_for_bit(rng):
     source = sky(256, 512)
     working = small(source)

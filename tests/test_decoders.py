@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 from helpers import SCANLINE, exr, planes, stacked
 
-from envedit import image
+from envedit import decoders, image
 from envedit.errors import InputError
 
 
@@ -42,6 +42,18 @@ def test_exr_mixed_types_layers_and_parts(tmp_path, rng):
     colour = OpenEXR.Part(dict(SCANLINE), dict(p), "colour")
     OpenEXR.File([part, colour]).write(str(tmp_path / "p.exr"))
     np.testing.assert_array_equal(image.read(tmp_path / "p.exr")[0], stacked(p))
+
+
+def test_exr_of_many_channels_is_refused_before_it_is_decoded(tmp_path, rng, monkeypatch):
+    """The library decodes all of them, whichever are asked for."""
+    path = exr(
+        tmp_path / "many.exr", **planes(rng), **{f"aov{i}": np.zeros((4, 8), np.float32) for i in range(9)}
+    )
+    monkeypatch.setattr(decoders, "_MOST_VALUES", 12 * 32)
+    assert image.read(path)[0].shape == (4, 8, 3)
+    monkeypatch.setattr(decoders, "_MOST_VALUES", 12 * 32 - 1)
+    with pytest.raises(InputError, match="its 12 channels hold more than 383 values; save only colour"):
+        image.read(path)
 
 
 def test_exr_luminance_is_grey(tmp_path, rng):

@@ -101,3 +101,47 @@ def test_what_libraries_print_to_either_descriptor_is_kept_off(capfd):
         print("to python")
     assert all(text in said[0] for text in ("to one", "to two", "to python"))
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_folder_is_worked_in_by_one_at_a_time(tmp_path):
+    folder = tmp_path / "new" / "results"
+    with files.alone(folder):
+        with pytest.raises(InputError, match="another run works in it"), files.alone(folder):
+            pass
+        with files.alone(tmp_path):
+            pass
+    with files.alone(folder):
+        assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["file", "file/inside", "x" * 300])
+def test_a_folder_that_cannot_be_is_an_input_error(tmp_path, name):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(InputError, match="--out"), files.alone(tmp_path / name):
+        pass
+
+
+def test_what_no_checkpoint_protects_is_kept_even_by_a_resumed_run(tmp_path):
+    names = ("metrics.json", "edited.exr", "config.toml", "checkpoint.npz")
+
+    def prepare():
+        files.prepare_folder(tmp_path, names, keep=True, spare=[tmp_path / "config.toml"])
+        return sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+
+    (tmp_path / "config.toml").write_text("mine")
+    assert prepare() == prepare() == ["config.toml", "earlier-1/config.toml"]
+    (tmp_path / "edited.exr").write_text("of a run whose metrics.json was moved already")
+    assert prepare() == [
+        "config.toml",
+        "earlier-1/config.toml",
+        "earlier-2/config.toml",
+        "earlier-2/edited.exr",
+    ]
+    for name in ("checkpoint.npz", "metrics.json"):
+        (tmp_path / "config.toml").write_text(f"resolved {name}")
+        (tmp_path / name).write_text("")
+        (tmp_path / "edited.exr").write_text("so far")
+        before = len(list(tmp_path.rglob("*")))
+        prepare()
+        assert len(list(tmp_path.rglob("*"))) == before and (tmp_path / "edited.exr").exists()
+        (tmp_path / name).unlink()

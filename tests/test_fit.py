@@ -11,7 +11,7 @@ from helpers import plain_ssim_loss
 from test_siren import launched
 
 from envedit import config, fit, metrics, optim, siren, ssim
-from envedit.errors import InputError
+from envedit.errors import InputError, NumericalError
 
 NETWORK = config.Representation(hidden=12, depth=1, coordinates="sphere")
 QUICK = config.Fit(epochs=4, lr=5e-3, awp_gamma=0.0)
@@ -604,6 +604,11 @@ def test_default_folder_follows_the_desktop_standard(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert fit.default_folder() == tmp_path / ".cache" / "envedit" / "fits"
+
+
+def test_a_fit_that_ends_in_nan_is_refused_as_what_it_is(rng):
+    with pytest.raises(NumericalError, match=r"not finite; lower \[fit\] lr"):
+        fit.fit(sky(rng), NETWORK, config.Fit(epochs=4, lr=1e37, awp_gamma=0.0))
 
 
 def test_an_image_that_is_not_finite_is_refused(rng):

@@ -22,6 +22,15 @@ def test_health():
     assert "2 NaN (first at row 1, column 2)" in h.summary() and "\n" not in h.summary()
 
 
+def test_a_texel_that_is_repaired_does_not_count_as_negative():
+    values = np.ones((4, 8, 3), np.float32)
+    values[1, 2] = -np.inf
+    values[2, 3] = (np.nan, -1, 2)
+    values[3, 4] = (1, -1, 2)
+    h = health.health(values)
+    assert (h.inf, h.nan, h.negative, h.first_negative) == (1, 1, 1, (3, 4))
+
+
 @pytest.mark.parametrize("value", [0.0, 1e-30, 1e6, 3e38, np.nan, -np.inf])
 def test_health_is_finite(value):
     h = health.health(np.full((1, 1, 3), value, np.float32))

@@ -1,5 +1,6 @@
 """Lights on the sphere against plain numpy in float64; derivatives also by the fundamental theorem."""
 
+import dataclasses
 import math
 
 import drjit as dr
@@ -330,6 +331,16 @@ def test_dark_light_gives_nothing_beside_a_bright_one(rng):
     got = core(made, flux=[[0.0] * 3, [DARK] * 3])
     assert got[:10].any() and not got[12:].any()
     assert core(made, flux=[[0.0] * 3, [-10.0] * 3])[12:].any()  # negative control
+
+
+def test_a_spare_light_can_have_a_colour_that_no_light_has(rng):
+    light = patch(rng, 4, 10)
+    made = Lights([dataclasses.replace(light, radiance=light.radiance * [1, 0, 0])], (0, H), W)
+    assert (made.flux[0] > 0).tolist() == [True, False, False]
+    turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
+    flux[1] = np.log(made.flux[1, 0] / made.flux[1])
+    got = flux_of(core(made, single(turn), single(flux), single(size), shape=(64, 128)))
+    np.testing.assert_allclose(got, made.flux[0, 0], rtol=1e-4)
 
 
 def test_spare_lights_are_lobes_with_the_mean_flux(rng):

@@ -7,6 +7,7 @@ import pytest
 from test_paths import disagreement
 
 from envedit import scene
+from envedit.errors import ConfigError
 from envedit.pathtrace import PathTracer
 from envedit.transport import LightTransport
 
@@ -109,3 +110,10 @@ def test_samples_fill_the_sampler_s_grid_and_are_told(spp, taken, matte, capfd):
         dr.eval(tracer.render(mi.TensorXf(np.ones((HEIGHT, WIDTH, 3), np.float32)), 0))
         dr.sync_thread()
     assert capfd.readouterr() == ("", ""), "Mitsuba takes them as they are"
+
+
+def test_more_samples_than_mitsuba_holds_are_refused(matte):
+    most = (2**32 - 1) // (24 * 24)
+    assert PathTracer(matte, spp=2**16).spp == 2**16
+    with pytest.raises(ConfigError, match="more than one rendering can hold"):
+        PathTracer(matte, spp=most + 1)

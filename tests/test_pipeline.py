@@ -615,6 +615,13 @@ def test_outside_the_main_thread_signals_are_left_alone():
     assert failures == []
 
 
+def test_a_transport_that_does_not_fit_is_refused_before_anything_is_rendered(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr(target, "make", lambda *_: 1 / 0)
+    settings = settings_of(tmp_path, smooth(rng), renderer={"spp": 4096, "memory_gb": 0.01})
+    with pytest.raises(InputError, match="memory_gb allows 0.01"):
+        pipeline.run(settings)
+
+
 def test_paint_on_a_black_map_is_followed(tmp_path):
     painted = {"kind": "strokes", "strokes": STROKES}
     black = np.zeros((HEIGHT, WIDTH, 3), np.float32)

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import recording, scene
+from envedit import columns, recording, scene
 from envedit.errors import InputError
 from envedit.grid import Grid
 from envedit.transport import LightTransport
@@ -94,3 +94,45 @@ def test_an_index_into_the_exact_columns_fits_into_32_bits(size):
 
     _, capacity, _ = recording.choose_samples(Film(), "auto", 256 * 128, 1e4)
     assert 4 * (size * size + 7) * capacity < 2**32 and (capacity == 256 or size > 1024)
+
+
+def test_exact_columns_leave_out_and_count_what_is_not_finite(monkeypatch):
+    s, sky = scene.load("matte", 8, 8), np.ones((4, 8, 3), np.float32)
+    sky[1, 3] = 300
+    clean, spoiled = (LightTransport.build(s, 4, 8, spp=4, max_depth=2, memory_gb=0.1) for _ in range(2))
+    clean.resolve(sky, tolerance=0)
+    real, calls = columns.connect, []
+
+    def connect(*arguments):
+        calls.append(value := real(*arguments))
+        middle = dr.width(value) // 2
+        return dr.select(dr.arange(mi.UInt32, dr.width(value)) == middle, NAN, value)
+
+    monkeypatch.setattr(columns, "connect", connect)
+    spoiled.resolve(sky, tolerance=0)
+    assert len(spoiled.columns) == len(clean.columns) > 0
+    (said,) = [line for line in spoiled.choices if "not finite" in line]
+    assert said.startswith(f"light transport: {len(calls)} contributions")
+    wanted, got = (t.apply(mi.TensorXf(sky)).numpy() for t in (clean, spoiled))
+    assert np.isfinite(got).all() and (got != wanted).any()
+    np.testing.assert_allclose(got.sum(), wanted.sum(), rtol=0.2)
+
+
+def test_light_of_lamps_is_cut_only_where_a_path_depth_is_asked_for():
+    eye = mi.ScalarTransform4d().look_at([0, 2, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    s = scene.load(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "to_world": eye, "film": film},
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4d().rotate([1, 0, 0], -90)},
+            "ball": {"type": "sphere", "radius": 0.5},
+            "lamp": {"type": "point", "position": [0, 2, 2]},
+            "sky": {"type": "constant"},
+        }
+    )
+    black = dr.zeros(mi.TensorXf, (4, 8, 3))
+    for asked, depth in (("auto", -1), (2, 2)):
+        t = LightTransport.build(s, 4, 8, spp=4, max_depth=asked, memory_gb=0.1, seed=3)
+        np.testing.assert_array_equal(t.apply(black).numpy(), recording.other_light(s, depth, 3))
+    assert recording.other_light(s, -1, 3).sum() > 1.01 * recording.other_light(s, 2, 3).sum()

@@ -21,7 +21,7 @@ import OpenEXR
 import pytest
 from helpers import BALL, SENSOR, read_png, sky, write_scene
 
-from envedit import checkpoint, config, doctor, image, pipeline, run, scene
+from envedit import checkpoint, config, doctor, image, loop, pipeline, run, scene
 from envedit.transport import LightTransport
 
 ROOT = Path(run.__file__).parent.parent
@@ -526,6 +526,37 @@ def test_a_finished_run_has_nothing_to_resume(done, capsys):
     assert call(path, "--resume", *changed(optimizer__iterations=9)) == 3
     assert "another configuration" in capsys.readouterr().err
     assert content(folder) == before
+
+
+def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, capsys):
+    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
+    before = content(out)
+    named = Path(config.load(path).input.envmap)
+    image.write_exr(named, 2 * image.read(named)[0])
+    assert call(path, "--resume", *changed(optimizer__iterations=1)) == 3
+    said = capsys.readouterr().err
+    assert said.startswith(f"envedit: {named}: has changed since") and len(said.splitlines()) == 1
+    named.unlink()
+    assert call(path, "--resume", *changed(optimizer__iterations=1)) == 0
+    assert content(out) == before
+
+
+def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(tmp_path, rng):
+    path = world(tmp_path, rng)
+    written = path.read_bytes()
+    path = path.rename(tmp_path / "config.toml")
+    assert call(path, "--resume", "--quiet", "--out", tmp_path, *changed(optimizer__iterations=1)) == 0
+    assert path.read_bytes() != written and (tmp_path / "earlier-1" / "config.toml").read_bytes() == written
+
+
+def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch):
+    def press(self, crop, original, start):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop._PlaceRows, "eval", press)
+    assert call(world(tmp_path, rng), "--quiet") == 130
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_resume_in_an_empty_folder_is_a_run(tmp_path, rng):

@@ -148,6 +148,10 @@ def test_a_target_file_means_no_rotation_and_the_last_source_wins():
     assert turned.file == "" and turned.rotate_degrees == 5
     other = cfg.loads("[target]\nrotate_degrees = 5", base_dir="/d", overrides=["target.file=b.exr"]).target
     assert other.file == "/d/b.exr" and other.rotate_degrees == 0
+    for kind in ("envmap", "image"):
+        text = f"[target]\nkind = '{kind}'\nfile = 'b.exr'"
+        cleared = cfg.loads(text, overrides=["target.kind=envmap", "target.file="]).target
+        assert cleared.file == "" and cleared.rotate_degrees == 60
     painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5").target
     assert painted.file == "/b.exr"
 

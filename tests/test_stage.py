@@ -32,6 +32,40 @@ def test_a_cropped_film_keeps_its_crop_and_refuses_a_size(tmp_path):
         scene.load(path, width=8)
 
 
+@pytest.mark.parametrize("key", ["width", "height"])
+@pytest.mark.parametrize("value", ['<integer name="KEY" value="0"/>', '<string name="KEY" value="big"/>'])
+def test_a_film_without_a_size_is_refused(tmp_path, key, value):
+    number = f'<integer name="{key}" value="{16 if key == "width" else 12}"/>'
+    path = write_scene(tmp_path, SENSOR.replace(number, value.replace("KEY", key)), BALL, LIGHT)
+    with pytest.raises(InputError, match="the film is .*, wanted whole numbers above 0"):
+        scene.load(path, width=8)
+
+
+def test_text_where_a_transform_or_a_number_should_be_is_refused(tmp_path):
+    light = '<emitter type="envmap"><string name="to_world" value="up"/></emitter>'
+    with pytest.raises(InputError, match="to_world is 'up', wanted a <transform>"):
+        scene.load(write_scene(tmp_path, SENSOR, BALL, light))
+    ball = BALL.replace("<bsdf", '<string name="fit_height" value="tall"/><bsdf', 1)
+    with pytest.raises(ConfigError, match="fit_height is tall, wanted a positive number"):
+        scene.load(write_scene(tmp_path, SENSOR, ball, LIGHT))
+
+
+def test_files_are_looked_for_where_the_scene_says(tmp_path):
+    (tmp_path / "assets").mkdir()
+    box_obj(tmp_path / "assets" / "box.obj", (1, 1, 1))
+    mesh = '<shape type="obj"><string name="filename" value="box.obj"/></shape>'
+    with pytest.raises(InputError, match="missing file"):
+        scene.load(write_scene(tmp_path, SENSOR, mesh, LIGHT))
+    loaded = scene.load(write_scene(tmp_path, '<path value="assets"/>', SENSOR, mesh, LIGHT))
+    assert loaded.render(np.ones((3, 6, 3)), spp=1).shape == (12, 16, 3)
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + "/a.xml"])
+def test_a_name_that_no_file_has_is_refused(name):
+    with pytest.raises(InputError, match="no such file"):
+        scene.load(name)
+
+
 def test_the_environment_keeps_its_up_axis(tmp_path):
     matrix = '<transform name="to_world"><rotate x="1" angle="-90"/></transform>'
     upright = scene.load(write_scene(tmp_path, SENSOR, BALL, '<emitter type="sunsky"/>'))

@@ -9,8 +9,8 @@ from helpers import grey, refused
 
 from envedit import config as cfg
 from envedit import strokes
-from envedit.checks import STROKES, stroke_list
 from envedit.errors import ConfigError, InputError
+from envedit.stroke_keys import STROKES, stroke_list
 from envedit.tonemap import TONEMAPS, inverse_tonemap, luminance, tonemap
 
 EDITS = Path(__file__).parent.parent / "scenes" / "edits"

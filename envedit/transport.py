@@ -179,7 +179,8 @@ class LightTransport:
             transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
         transport.depth_error = left_out(light["by_bounce"], bounces)
         rows = hashlib.sha256(mass.tobytes()).hexdigest()
-        lamps = -1 if max_depth == "auto" else bounces + 1  # what is constant need not be cut
+        # The light of other lamps is constant: it need not be cut where no path depth is asked for.
+        lamps = (-1 if max_depth == "auto" else bounces + 1) if len(scene.mi.emitters()) > 1 else 0
         key = origin | {
             "part": "recording", "samples": spp, "bounces": bounces, "lamps": lamps, "rows": rows
         }  # fmt: skip

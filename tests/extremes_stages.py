@@ -159,7 +159,7 @@ def check(m, folder):
     for kind, mask in (
         ("nan", np.isnan(m)),
         ("inf", np.isinf(m)),
-        ("negative", m < 0),
+        ("negative", (m < 0) & finite.all(axis=2, keepdims=True)),
         ("saturated", m == 65504),
     ):
         texels = np.argwhere(mask.any(axis=2))

@@ -291,7 +291,7 @@ def test_what_is_done_is_skipped_and_failures_are_told(maps, tmp_path, monkeypat
     notes = tmp_path / "notes"
     stub = (
         "import pathlib, sys, tomllib; folder = pathlib.Path(sys.argv[1]);"
-        "kind = tomllib.loads((folder / 'config.toml').read_text())['representation']['kind'];"
+        "kind = tomllib.loads((folder / 'job.toml').read_text())['representation']['kind'];"
         f"open({str(notes)!r}, 'a').write(kind + chr(10));"
         f"good = kind != 'pixels' or pathlib.Path({str(tmp_path / 'good')!r}).exists();"
         "sys.exit(0 if good else 'no good')"
@@ -596,7 +596,7 @@ def test_a_fit_leaves_its_numbers_and_pictures(maps, tmp_path, monkeypatch):
     for cell, job in made[:2]:
         folder = cell.folder(tmp_path)
         folder.mkdir(parents=True)
-        (folder / "config.toml").write_text(job.toml)
+        (folder / "job.toml").write_text(job.toml)
         assert network.main([cell.store, str(folder), str(dr.thread_count())]) == 0
         found = json.loads((folder / "fit.json").read_text())
         assert found["epochs"] == 3 and len(found["noisy"]) == network.NOISE_SEEDS

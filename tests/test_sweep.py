@@ -32,7 +32,7 @@ STUB = '''
 import os, pathlib, sys, time, tomllib
 
 folder, notes = map(pathlib.Path, sys.argv[1:3])
-seed = tomllib.loads((folder / "config.toml").read_text())["seed"]
+seed = tomllib.loads((folder / "job.toml").read_text())["seed"]
 
 def note(what):
     file = os.open(notes / "notes", os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -159,9 +159,9 @@ def test_jobs_are_done_once_and_leave_their_folders(stub):
     assert states == ["done"] * 3
     for seed, one in enumerate(jobs):
         folder = one.folder(stub.out)
-        assert files(folder) == ["config.toml", "done.json", "log.txt", "result"]
+        assert files(folder) == ["done.json", "job.toml", "log.txt", "result"]
         assert (folder / "result").read_text() == str(seed)
-        assert config.load(folder / "config.toml").seed == seed
+        assert config.load(folder / "job.toml").seed == seed
         assert (folder / "log.txt").read_text().splitlines()[1:] == ["out"]
         about = json.loads((folder / "done.json").read_text())
         assert about["name"] == f"job {seed}" and about["seconds"] >= 0 and about["resumed"] is False
@@ -192,7 +192,7 @@ def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub):
     assert stub.counts("begin", 5) == [1, 2, 2, 1, 1]
     assert stub.counts("end", 5) == [1] * 5
     assert "5 jobs: 1 skipped, 4 done" in said
-    assert files(jobs[1].folder(stub.out)) == ["config.toml", "done.json", "log.txt", "result"]
+    assert files(jobs[1].folder(stub.out)) == ["done.json", "job.toml", "log.txt", "result"]
 
 
 def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
@@ -246,7 +246,7 @@ def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, numbe
     assert driver.returncode == 130 and "run again to continue" in said and "Traceback" not in said
     assert stub.counts("interrupted", 2) == [1, 0] and stub.counts("begin", 2) == [1, 0]
     folder = stub.jobs(2)[0].folder(stub.out)
-    assert files(folder) == ["checkpoint.npz", "config.toml", "log.txt"]
+    assert files(folder) == ["checkpoint.npz", "job.toml", "log.txt"]
     stub.free()
     assert stub.run(2)[0] == ["done", "done"]
     assert stub.counts("checkpoint", 2) == [1, 0]
@@ -323,7 +323,7 @@ def test_a_job_whose_lock_was_taken_away_is_ended(stub, monkeypatch):
     lock.unlink()
     thread.join()
     assert found[0].state == "held" and dead(pid)
-    assert files(one.folder(stub.out)) == ["config.toml", "log.txt"]
+    assert files(one.folder(stub.out)) == ["job.toml", "log.txt"]
 
 
 def test_jobs_of_the_same_content_run_once(stub):
@@ -405,7 +405,7 @@ def test_drjit_takes_the_number_of_threads(stub):
     one = stub.jobs(1)[0]
     error = run_job(one, stub.out, stub.command, threads=5).error
     folder = one.folder(stub.out)
-    assert error == f"exit code 1: 5 ['{folder}/config.toml', '--out', '{folder}', '--resume']"
+    assert error == f"exit code 1: 5 ['{folder}/job.toml', '--out', '{folder}', '--resume']"
 
 
 # ---- jobs --------------------------------------------------------------------------------------------------
@@ -699,7 +699,7 @@ def test_a_real_run_is_made(tmp_path):
     (outcome,) = sweep([one], tmp_path, threads=1, stream=said)
     assert outcome.state == "done", (one.folder(tmp_path) / "log.txt").read_text()
     left = files(one.folder(tmp_path))
-    assert {"metrics.json", "edited.exr", "config.toml", "done.json", "log.txt"} <= set(left)
+    assert {"metrics.json", "edited.exr", "config.toml", "job.toml", "done.json", "log.txt"} <= set(left)
     assert not [name for name in left if name.startswith(("earlier", "lock", "checkpoint"))]
     # done.json is lost: the run itself knows that it is complete.
     (one.folder(tmp_path) / "done.json").unlink()

@@ -136,10 +136,13 @@ def test_a_mesh_is_known_by_its_content(tmp_path):
     assert not build(tmp_path, load()).cached
 
 
-def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lit, tmp_path):
+@pytest.mark.parametrize("lamp", [True, False])
+def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp_path):
+    """But under a lamp, whose light is cut only where a depth is asked for."""
+    lit = scene.load(write_scene(tmp_path, SENSOR, BALL, GROUND, *([LAMP] if lamp else []), LIGHT))
     depth = build(tmp_path, lit).bounces + 1
     asked = build(tmp_path, lit, max_depth=depth)
-    assert asked.cached and len(asked.choices) == 1
+    assert asked.cached == (not lamp) and len(asked.choices) == 1
     assert 0 < asked.depth_error <= recording.DEPTH_TOLERANCE < build(tmp_path, lit, max_depth=2).depth_error
 
 

@@ -1,6 +1,6 @@
 """One fit for Figures 4 and 5, as a job of a sweep.
 
-``python -m experiments.paper.network STORE FOLDER THREADS``: FOLDER has a config.toml; STORE says what is
+``python -m experiments.paper.network STORE FOLDER THREADS``: FOLDER has a job.toml; STORE says what is
 fitted, "fits": the configuration's own recipe, "stock" or "stock-scaled": a stock SIREN. Left there:
 ``fit.json``, and the pictures ``original.exr``, ``fitted.exr`` and ``noisy.exr``, the network with noise on
 its weights; active rows.
@@ -97,7 +97,7 @@ def perturbed(params: dict, seed: int) -> dict:
 
 def carry_out(folder: Path, store: str) -> None:
     """Fit, measure, and write what :func:`carry_out`'s module says."""
-    settings = config.load(folder / "config.toml")
+    settings = config.load(folder / "job.toml")
     mi.set_variant(settings.variant)
     original, _ = load_map(settings.input)
     first, last = active_rows(settings.input.rows, original.shape[0])

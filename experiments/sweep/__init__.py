@@ -2,7 +2,7 @@
 
 A job is a name and a complete configuration. Its folder is ``OUT/<hash>``, the hash being that of the
 resolved configuration with the contents of the files it names: the same work is found again wherever its
-files lie and however it is called. In the folder: ``config.toml``, what the run leaves, ``log.txt``, and
+files lie and however it is called. In the folder: ``job.toml``, what the run leaves, ``log.txt``, and
 ``done.json``, written last.
 
 JOBS is a TOML file with a table for each job, ``[jobs.NAME]``, laid over ``[common]``; or a folder of

@@ -24,7 +24,7 @@ from envedit.files import write_atomically
 from .jobs import Job
 from .locks import Lock
 
-DONE, FAILED, CONFIG, LOG, CHECKPOINT = "done.json", "failed.json", "config.toml", "log.txt", "checkpoint.npz"
+DONE, FAILED, CONFIG, LOG, CHECKPOINT = "done.json", "failed.json", "job.toml", "log.txt", "checkpoint.npz"
 POLL = 0.1
 """Seconds between looks at a process."""
 GRACE = 15.0
@@ -41,7 +41,7 @@ COMMAND = (
     "import sys, drjit; drjit.set_thread_count(int(sys.argv.pop(1)));"
     "from envedit.run import main; sys.exit(main())",
     "{threads}",
-    "{folder}/config.toml",
+    "{folder}/job.toml",
     "--out",
     "{folder}",
     "--resume",

@@ -102,7 +102,7 @@ class Grid:
         """
         d = self.to_world.T @ direction
         x = dr.atan2(d.x, -d.z) * dr.inv_two_pi * self.width - 0.5
-        y = dr.safe_acos(d.y) * dr.inv_pi * (self.height - 1)
+        y = self._row(d)
         column = dr.floor(x)
         row = dr.clip(dr.floor(y), 0, max(self.height - 2, 0))
         fx, fy = x - column, y - row
@@ -119,6 +119,13 @@ class Grid:
         ]
         jacobian = 2 * dr.pi * dr.pi * dr.safe_sqrt(1 - d.y * d.y)
         return taps, y, jacobian
+
+    def _row(self, d):
+        return dr.safe_acos(d.y) * dr.inv_pi * (self.height - 1)
+
+    def row_of(self, direction: mi.Vector3f) -> mi.Float:
+        """Return the fractional row, 0 ... H - 1, of a world direction."""
+        return self._row(self.to_world.T @ direction)
 
     def locate_one(self, direction: mi.Vector3f, u: mi.Point2f):
         """Draw one of the four texels around a direction by its weight; returns texel, position, jacobian."""

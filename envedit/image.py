@@ -253,21 +253,26 @@ def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
     NumericalError, InputError
         As :func:`write_exr`.
     """
-    import mitsuba as mi
-
     name = os.fsdecode(path)
     image = np.asarray(image)
     image = _checked(name, np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image)
     codes = np.rint(np.clip(image, 0, 1) * np.float32(2**bits - 1))
-    bitmap = mi.Bitmap(codes.astype({8: np.uint8, 16: np.uint16}[bits]))
-
-    # In memory first: Mitsuba does not tell that the last bytes of a file did not fit on the disk.
-    stream = mi.MemoryStream()
-    bitmap.write(stream, mi.Bitmap.FileFormat.PNG)
-    data = stream.raw_buffer()
+    data = png(codes.astype({8: np.uint8, 16: np.uint16}[bits]))
     # By hand: Mitsuba puts its own texts in quotation marks.
     texts = b"".join(_text_chunk(*item) for item in (metadata or {}).items())
     write_atomically(name, data[:_PNG_HEADER] + texts + data[_PNG_HEADER:])
+
+
+def png(codes) -> bytes:
+    """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG.
+
+    In memory: Mitsuba does not tell that the last bytes of a file did not fit on the disk.
+    """
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(codes)).write(stream, mi.Bitmap.FileFormat.PNG)
+    return stream.raw_buffer()
 
 
 _PNG_HEADER = 8 + 25  # magic and IHDR

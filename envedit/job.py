@@ -137,8 +137,7 @@ class Job:
     def optimise(self, params, crop, resume):
         """Run the loop from the start, or from the checkpoint; returns parameters and state."""
         chosen, wanted = self.settings.optimizer, self.wanted
-        lr = self.representation.lr if chosen.lr == "auto" else chosen.lr
-        adam, state = optim.Adam(params, lr, (0.9, chosen.beta2)), loop.State()
+        adam, state = loop.adam_for(self.representation, params, chosen), loop.State()
         what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, optimiser, traced, picture = found

@@ -58,6 +58,12 @@ def directions(height: int, width: int) -> np.ndarray:
     return d
 
 
+def on_sphere(theta, phi) -> np.ndarray:
+    """Return directions (..., 3) in the emitter's frame at a colatitude and an azimuth of the map, 2 pi u."""
+    sin = np.sin(theta)
+    return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta), -sin * np.cos(phi)), axis=-1)
+
+
 def texel_position(d, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the fractional (row, column) at which Mitsuba looks up directions.
 

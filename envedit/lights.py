@@ -209,7 +209,7 @@ def points(row: np.ndarray, column: np.ndarray, total: int, width: int) -> np.nd
     """Return the directions (n, 3) of texels; those of the poles' rows each keep their azimuth."""
     theta = np.pi * np.clip(row, _OFF_POLE, total - 1 - _OFF_POLE) / max(total - 1, 1)
     phi = 2 * np.pi * (column + 0.5) / width
-    return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
+    return latlong.on_sphere(theta, phi)
 
 
 def rotate(v: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:

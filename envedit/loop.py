@@ -172,6 +172,12 @@ class _Keep:
         return mi.TensorXf(dr.select(self._free, crop.array, self._original), crop.shape)
 
 
+def adam_for(representation, params, settings: config.Optimizer) -> optim.Adam:
+    """Make the optimiser that a configuration asks for; the rate "auto" is the representation's."""
+    lr = representation.lr if settings.lr == "auto" else settings.lr
+    return optim.Adam(params, lr, (0.9, settings.beta2))
+
+
 def optimise(
     representation,
     params,
@@ -224,9 +230,7 @@ def optimise(
         After :data:`MOST_BAD_STEPS` non-finite steps in a row; ``adam`` has the last parameters whose loss
         and gradients were finite.
     """
-    lr = representation.lr if settings.lr == "auto" else settings.lr
-    adam = adam or optim.Adam(params, lr, (0.9, settings.beta2))
-    state = state or State()
+    adam, state = adam or adam_for(representation, params, settings), state or State()
     fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
     waiting, last_read = [], time.perf_counter()
@@ -243,8 +247,9 @@ def optimise(
         dr.eval(total, terms, slopes.flags)
         grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
         finite = bool(dr.isfinite(total)[0]) and slopes.finite()
-        rate = optim.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr
-        rate *= state.slowdown
+        rate = adam.lr * state.slowdown
+        if settings.schedule == "cosine":
+            rate = optim.cosine(adam.lr, state.step, settings.iterations) * state.slowdown
         if finite and adam.step(grads, lr=rate):
             state.bad_in_a_row = 0
             state.slowdown = min(1.0, state.slowdown * 2 ** (1 / RECOVERY))

@@ -3,12 +3,12 @@
 For display only; nothing here feeds back into an edit.
 """
 
-import mitsuba as mi
 import numpy as np
 
 from .curves import round_up
 from .errors import InputError
 from .files import write_atomically
+from .image import png
 from .influence import per_solid_angle
 from .tonemap import luminance
 from .tonemap import tonemap as apply_tonemap
@@ -99,13 +99,6 @@ def _text(label, width, scale):
     bits = np.kron(bits, np.ones((scale, scale), bool))[:, :width]
     mask[:, : bits.shape[1]] = bits
     return mask
-
-
-def png(pixels) -> bytes:
-    """Encode (H, W, 3) uint8, already tonemapped, as PNG."""
-    stream = mi.MemoryStream()
-    mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, mi.Bitmap.FileFormat.PNG)
-    return stream.raw_buffer()
 
 
 # ----------------------------------------------------------------------------------------------------------

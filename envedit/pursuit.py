@@ -189,7 +189,17 @@ def relative(known, wanted, weight=None) -> np.ndarray:
 
 
 class Pursuit:
-    """The residual picture, block by block, and what explains it; channels are apart."""
+    """The residual picture, block by block, and what explains it; channels are apart.
+
+    Parameters
+    ----------
+    given : Given
+        What a pursuit is given.
+    picture : ndarray (h, w, 3)
+        What is to be explained, linear radiance.
+    order : int
+        Of the gains that the background may take on.
+    """
 
     def __init__(self, given: Given, picture, order=GAIN_ORDER):
         overview, omega = given.overview, given.omega
@@ -211,7 +221,7 @@ class Pursuit:
         self.allow(products(d, order))
 
     def allow(self, gains):
-        """Let the background take on any mixture of gains (cells, n)."""
+        """Let the background take on any mixture of gains, (cells, n)."""
         for c in range(3):
             span = self.overview.matrix[c] @ (self.background[:, c : c + 1] * gains) * self.weight[:, None]
             q, r = np.linalg.qr(self._off(c, self._off(c, span)))
@@ -223,7 +233,10 @@ class Pursuit:
         return x - self.spans[c] @ (self.spans[c].T @ x)
 
     def atoms(self, flux, glow):
-        """Pictures of a light in each candidate cell: (3, blocks, candidates), weighted."""
+        """Pictures of a light of ``flux`` (3,) in each candidate cell: (3, blocks, candidates), weighted.
+
+        ``glow`` as of :class:`.separate.Light`; it comes along.
+        """
         matrix = self.overview.matrix
         unit = flux[:, None] / self.overview.omega[self.candidates]
         found, shine = [], None if glow is None else glow_at(glow, self.cosine)
@@ -235,7 +248,7 @@ class Pursuit:
         return np.stack(found)
 
     def atom_of(self, cells, flux, centre, glow):
-        """Picture of a light with flux in given cells: (3, blocks, 1), weighted."""
+        """Picture, (3, blocks, 1), of a light with flux (n, 3) in cells (n,) and its glow around a centre."""
         found, shine = [], None if glow is None else glow_at(glow, self.overview.directions @ centre)
         for c in range(3):
             light = np.bincount(cells, flux[:, c], len(self.overview.omega)) / self.overview.omega
@@ -245,7 +258,7 @@ class Pursuit:
         return np.stack(found)[..., None]
 
     def scores(self, atoms):
-        """Squared residual that each atom explains, summed over channels."""
+        """Squared residual that each atom, (3, blocks, n), explains, summed over channels: (n,)."""
         score = 0.0
         for c in range(3):
             atom = self._off(c, atoms[c])

@@ -29,10 +29,13 @@ LANES = 1 << 18
 PATHS = 1 << 22
 """Paths of a recording, all pixels together: more pixels need fewer each, as neighbours see the same map."""
 FEWEST_SPP, MOST_SPP = 16, 256
+"""Paths a pixel between which "auto" chooses."""
 AUTO_GB, COARSE_SHARE = 2.0, 0.7
 """GB of memory that "auto" allows; share of it that samples of "auto" may fill: the rest is for columns."""
 PILOT_SPP = 16
+"""Paths a pixel of the pilot, whose sums over rows and bounces are of the whole picture."""
 MOST_COLUMNS = 256
+"""Exact columns at most: an edit with so many ends where one with 768 does, in two thirds of the time."""
 
 
 class Recorded(NamedTuple):
@@ -119,8 +122,8 @@ def contributions(
             yield event.bounce, pixel, texel, dr.select(event.active, event.throughput * (weight / spp), 0)
         else:
             texel, direction, probability, area, jacobian = grid.choose(u)
-            row = dr.safe_acos((grid.to_world.T @ direction).y) * dr.inv_pi * (grid.height - 1)
-            value = connect(scene, event, direction, jacobian, grid.density_at(row) / jacobian)
+            density = grid.density_at(grid.row_of(direction)) / jacobian
+            value = connect(scene, event, direction, jacobian, density)
             yield event.bounce, pixel, texel, value * (area * jacobian / (probability * spp))
 
 

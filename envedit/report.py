@@ -11,6 +11,7 @@ import numpy as np
 
 from .curves import curves_svg, escape, number
 from .files import write_atomically
+from .image import png
 from .latlong import solid_angles
 from .manifest import plain
 from .preview import (
@@ -21,7 +22,6 @@ from .preview import (
     display,
     fit_finite,
     influence_image,
-    png,
 )
 from .tonemap import luminance
 

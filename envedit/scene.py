@@ -160,6 +160,15 @@ class Scene:
         values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at least,
         768 at most.
 
+        Parameters
+        ----------
+        image : array (H, W, 3)
+            The map, linear radiance.
+        spp : int or "auto"
+            Samples a pixel.
+        seed : int
+            Of every random choice.
+
         Returns
         -------
         picture : array (height, width, 3) float32

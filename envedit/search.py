@@ -126,7 +126,20 @@ def start(
 class Question:
     """What is asked: the picture less all that is fixed, and what may make it.
 
-    ``picture`` tells how bright pixels are; what is wanted is explained in place of it where it is given.
+    Parameters
+    ----------
+    layers : Layers
+        Of the map.
+    transport : LightTransport
+        T.
+    picture : ndarray (h, w, 3)
+        What is asked for, linear radiance, where there is no ``wanted``; tells how bright pixels are.
+    weight : ndarray (h, w, 1) or None
+        How much each pixel counts.
+    envmap : ndarray (H, W, 3)
+        The original map.
+    wanted : ndarray (h, w, 3), optional
+        What is to be explained in place of the picture less the light of what is fixed.
     """
 
     def __init__(self, layers, transport, picture, weight, envmap, wanted=None):
@@ -155,7 +168,7 @@ class Question:
         return Given(overview, self.weight, self.known, *rest)
 
     def render(self, values):
-        """Picture of a map (H * W, 3) alone, without other lamps' light."""
+        """Picture (h, w, 3) of a map (H * W, 3) alone, without other lamps' light."""
         return self.transport.linear(tensor(values.reshape(self.shape))).numpy()
 
     def refine(self, direction, flux, glow, others=()):
@@ -341,8 +354,7 @@ def refine(transport, wanted, known, weight, gains, direction, flux, first, last
     i, j = np.unravel_index(best, grid.shape)
     row, column = row + _vertex(grid[:, j], i), column + (_vertex(grid[i], j) if between else 0.0)
     theta, phi = np.pi * row / (height - 1), 2 * np.pi * (column + 0.5) / width
-    d = np.array([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)])
-    return d, factor[best]
+    return latlong.on_sphere(theta, phi), factor[best]
 
 
 def _vertex(values, i):

@@ -72,7 +72,7 @@ def sunsky(
             raise ConfigError(f"sunsky: {key} must be from {low:g} to {high:g}, got {value}")
     height = width // 2
     # The plugin is black for a sun in the horizon itself, to float32: one hundredth of a degree is above it.
-    sun_direction = _on_sphere(math.radians(90 - max(elevation, 0.01)), math.radians(azimuth % 360.0))
+    sun_direction = latlong.on_sphere(math.radians(90 - max(elevation, 0.01)), math.radians(azimuth % 360.0))
     common = {"turbidity": turbidity, "albedo": ground_albedo, "sun_direction": _z_up(sun_direction)}
     sky = _sunsky_emitter(sun_scale=0.0, sky_scale=sky_scale, **common)
     sun = _sunsky_emitter(sun_scale=sun_scale, sky_scale=0.0, **common)
@@ -86,12 +86,6 @@ def sunsky(
     row, column = np.rint(row).astype(int), np.rint(column).astype(int) % width
     np.add.at(image, (row, column), flux / latlong.lookup_solid_angles(height, width)[row, None])
     return np.maximum(image, 0).astype(np.float32)  # the plugin's fit is negative beside a low sun
-
-
-def _on_sphere(theta, phi):
-    """Return directions (..., 3) at a colatitude and at a map azimuth 2 pi u."""
-    sin = np.sin(theta)
-    return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta), -sin * np.cos(phi)), axis=-1)
 
 
 def _z_up(d):
@@ -137,7 +131,7 @@ def _sky_irradiance(sky):
     """Return the sky's horizontal irradiance (3,): pi times its mean over cosine-distributed directions."""
     i = (np.arange(256) + 0.5) / 256
     theta, phi = np.meshgrid(np.arcsin(np.sqrt(i)), 2 * np.pi * i, indexing="ij")
-    return math.pi * sky(_on_sphere(theta, phi).reshape(-1, 3)).mean(0)
+    return math.pi * sky(latlong.on_sphere(theta, phi).reshape(-1, 3)).mean(0)
 
 
 def _average(sky, height, width, ground):
@@ -152,7 +146,7 @@ def _average(sky, height, width, ground):
         rows = slice(top, min(top + chunk, height))
         low, high = edges[rows], edges[rows.start + 1 : rows.stop + 1]
         y = low[:, None] + (high - low)[:, None] * part  # even in y is even in solid angle
-        d = _on_sphere(np.arccos(y).reshape(-1, 1), phi)
+        d = latlong.on_sphere(np.arccos(y).reshape(-1, 1), phi)
         value = sky(d.reshape(-1, 3)).reshape(d.shape)
         value = np.where(d[..., 1:2] > 0, value, ground)
         image[rows] = value.reshape(len(low), n, width, n, 3).mean((1, 3))

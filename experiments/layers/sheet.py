@@ -11,7 +11,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import image, latlong, preview
+from envedit import image, latlong
 from envedit.tonemap import tonemap
 
 from .run import NAMES, SCENES, maps
@@ -53,7 +53,7 @@ def main():
             if rows:
                 pixels = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)
                 path = given.to / f"{scene}_{angle}.png"
-                path.write_bytes(preview.png(pixels))
+                path.write_bytes(image.png(pixels))
                 print(path)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import image, preview
+from envedit import image
 from envedit.tonemap import tonemap
 
 from .run import EDITS, MAPS, layers
@@ -43,7 +43,7 @@ def main():
         if rows:
             pixels = (np.clip(np.concatenate(rows), 0, 1) * 255 + 0.5).astype(np.uint8)
             path = given.to / f"{name}.png"
-            path.write_bytes(preview.png(pixels))
+            path.write_bytes(image.png(pixels))
             print(path)
 
 

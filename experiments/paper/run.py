@@ -12,12 +12,10 @@ was interrupted continues, and tables share the runs they have in common.
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 
-from envedit.errors import EnveditError
-from experiments.sweep import COMMAND, Outcome, sweep, table
+from experiments.sweep import COMMAND, Outcome, options, sweep, table
 
 from . import kinds, network, plan
 
@@ -39,9 +37,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--target", default="", metavar="MAP", help="figure8: the true map")
     made.add_argument("--edit", default="", help="figure9: an edit of scenes/edits (move_shadow)")
     made.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
-    made.add_argument("--workers", type=int, metavar="N", help="runs at a time (one for every four cores)")
-    made.add_argument("--threads", type=int, metavar="N", help="threads of a run (its share of the cores)")
-    made.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
+    options.add(made)
     made.add_argument("--out", type=Path, default=OUT)
     made.add_argument(
         "--dry-run", action="store_true", help="list the runs and what is done; compute nothing"
@@ -81,30 +77,15 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0, 1 if a run is not done, 2, 3 as envedit.run, 130."""
     asked = parser()
     given = asked.parse_args(argv)
-    for option in ("workers", "threads"):
-        if (value := getattr(given, option)) is not None and value < 1:
-            asked.error(f"--{option}: came {value}, wanted 1 or more")
-    if given.workers and given.scheduler:
-        asked.error("--workers, --scheduler: came both; a cluster's workers are started beside it")
+    options.check(asked, given)
 
-    def interrupt(number, frame):
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)  # a batch system's way to say that time is up
-    try:
+    def tell():
         outcomes = carry_out(given)
-    except EnveditError as error:
-        print(f"paper: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("paper: interrupted; run again to continue", file=sys.stderr)
-        return 130
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    print(table(outcomes))
-    missing = [one for one in outcomes if one.state not in ("done", "skipped", "missing")]
-    print(f"python -m experiments.paper.plot {given.name} --out {given.out}")
-    return 1 if missing else 0
+        print(table(outcomes))
+        print(f"python -m experiments.paper.plot {given.name} --out {given.out}")
+        return 1 if any(one.state not in ("done", "skipped", "missing") for one in outcomes) else 0
+
+    return options.exit_code("paper", tell)
 
 
 if __name__ == "__main__":

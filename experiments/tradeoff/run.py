@@ -20,7 +20,7 @@ from pathlib import Path
 
 from envedit.errors import EnveditError, InputError
 from envedit.files import write_atomically
-from experiments.sweep import Job, sweep
+from experiments.sweep import Job, options, sweep
 
 from . import plan
 from .analyse import disturbed, flat, ratios
@@ -217,7 +217,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns 0, 1 if a run failed, or the exit code of a user's error."""
     given = parse(argv)
-    try:
+
+    def tell():
         if given.maps is None:
             if not (root := os.environ.get("ENVEDIT_DATA")):
                 raise InputError("no maps: name their folder with --maps, or set ENVEDIT_DATA")
@@ -227,13 +228,9 @@ def main(argv: list[str] | None = None) -> int:
             collect(given)
             hint = f"python -m experiments.tradeoff.plot --out {given.out}"
             print(f"{given.out / 'results.json'}: draw it with {hint}")
-    except EnveditError as error:
-        print(f"tradeoff: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("tradeoff: interrupted; run again to continue", file=sys.stderr)
-        return 130
-    return 1 if failed else 0
+        return 1 if failed else 0
+
+    return options.exit_code("tradeoff", tell)
 
 
 if __name__ == "__main__":

@@ -229,7 +229,7 @@ def test_a_run_is_envedits_command_line(tmp_path):
     assert whole[1:] == [
         "-m",
         "envedit.run",
-        str(tmp_path / "config.toml"),
+        str(tmp_path / "job.toml"),
         "--out",
         str(tmp_path),
         "--quiet",
@@ -249,7 +249,7 @@ folder, threads, session = pathlib.Path(sys.argv[1]), *sys.argv[2:]
 notes = pathlib.Path(__file__).parent
 with open(notes / "notes", "a") as file:
     file.write(folder.name + "\\n")
-if (notes / "fail").exists() and "spp = 16" in (folder / "config.toml").read_text():
+if (notes / "fail").exists() and "spp = 16" in (folder / "job.toml").read_text():
     print("broken", file=sys.stderr)
     sys.exit(5)
 cost = {"wall_s": 2.0, "cpu_s": 3.0, "peak_bytes": 10**9, "compiled": 0, "session": session}
@@ -263,7 +263,7 @@ class FakeJudge:
     def __call__(self, cell, folder):
         if (folder / "unusable").exists():
             raise InputError("edited.exr: cannot be read")
-        text = (folder / "config.toml").read_text()
+        text = (folder / "job.toml").read_text()
         width = int(re.search(r"width = (\d+)", text)[1])
         return judgement(psnr=30 + width / 64)
 

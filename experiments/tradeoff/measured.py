@@ -33,7 +33,7 @@ def command(folder: Path, threads: int) -> list[str]:
     """Return the command of a run: ``python -m envedit.run``, on some of the cores if not on all of them."""
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     start = ["-m", "envedit.run"] if threads >= here else ["-c", _THREADS, str(threads)]
-    return [sys.executable, *start, str(folder / "config.toml"), "--out", str(folder), "--quiet"]
+    return [sys.executable, *start, str(folder / "job.toml"), "--out", str(folder), "--quiet"]
 
 
 def measure(argv: list[str]) -> tuple[int, dict]:

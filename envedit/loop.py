@@ -173,9 +173,13 @@ class _Keep:
 
 
 def adam_for(representation, params, settings: config.Optimizer) -> optim.Adam:
-    """Make the optimiser that a configuration asks for; the rate "auto" is the representation's."""
-    lr = representation.lr if settings.lr == "auto" else settings.lr
-    return optim.Adam(params, lr, (0.9, settings.beta2))
+    """Make the optimiser that a configuration asks for."""
+    return optim.Adam(params, _rate(representation, settings), (0.9, settings.beta2))
+
+
+def _rate(representation, settings):
+    """Learning rate at the start; "auto" is the representation's own."""
+    return representation.lr if settings.lr == "auto" else settings.lr
 
 
 def optimise(
@@ -231,6 +235,7 @@ def optimise(
         and gradients were finite.
     """
     adam, state = adam or adam_for(representation, params, settings), state or State()
+    lr = _rate(representation, settings)
     fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
     waiting, last_read = [], time.perf_counter()
@@ -247,9 +252,8 @@ def optimise(
         dr.eval(total, terms, slopes.flags)
         grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
         finite = bool(dr.isfinite(total)[0]) and slopes.finite()
-        rate = adam.lr * state.slowdown
-        if settings.schedule == "cosine":
-            rate = optim.cosine(adam.lr, state.step, settings.iterations) * state.slowdown
+        rate = optim.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr
+        rate *= state.slowdown
         if finite and adam.step(grads, lr=rate):
             state.bad_in_a_row = 0
             state.slowdown = min(1.0, state.slowdown * 2 ** (1 / RECOVERY))

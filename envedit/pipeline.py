@@ -264,7 +264,19 @@ def run(
             ready = starts.find(representation, params, recordings, wanted, original)
             wanted, notes = ready.wanted, notes + ready.notes
             del recordings  # the second one is not needed any more
-    job = Job(settings, lit, original, first, free, wanted, representation, renderer, folder, watch, dists)
+    job = Job(
+        settings=settings,
+        lit=lit,
+        original=original,
+        first=first,
+        free=free,
+        wanted=wanted,
+        representation=representation,
+        renderer=renderer,
+        folder=folder,
+        watch=watch,
+        dists=dists,
+    )
     if layered:
         with clock("start_s"):
             params, placed = job.best(ready.starts, crop)
@@ -304,19 +316,19 @@ def run(
             notes.append(f"{100 * share:.3g} % of the active texels keep their value: {least}")
     measured["choices"] = notes
     return Result(
-        edited,
-        renders,
-        maps,
-        measured,
-        state.history,
-        notes,
-        warnings,
-        traced.influence if traced else None,
-        frozen,
-        getattr(representation, "separation", None),
-        lit.path,
-        within,
-        Found(representation, params, first, free),
+        envmap=edited,
+        renders=renders,
+        maps=maps,
+        metrics=measured,
+        history=state.history,
+        notes=notes,
+        warnings=warnings,
+        influence=traced.influence if traced else None,
+        frozen=frozen,
+        separation=getattr(representation, "separation", None),
+        scene=lit.path,
+        reach=within,
+        found=Found(representation, params, first, free),
     )
 
 

@@ -249,8 +249,8 @@ class _Question:
         low = np.clip(np.minimum(picture, self.target), 0, 1)
         # What is above 1 is shown as 1: the slope falls with the distance.
         high = np.maximum(np.maximum(np.minimum(self.target, 1), picture), low + TOE)
-        slope = (tonemap(high) - tonemap(low)) / (high - low)
-        flat = (low >= 1) | (tonemap(high) <= tonemap(low))
+        rise = tonemap(high) - tonemap(low)
+        slope, flat = rise / (high - low), (low >= 1) | (rise <= 0)
         return self.weight * np.where(flat, 1 / 2.2, slope) ** 2
 
 

@@ -378,11 +378,7 @@ def _check_parameters(path: Path, parameters: dict) -> dict[str, str]:
 def _names(path: Path, seen: set) -> tuple[set, set]:
     """Return the ``$names`` used in an XML file and those with a default, included files too."""
     seen.add(path)
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"scene {path}: {error.strerror or error}") from None
-    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    text = _without_comments(path)
     used = set(re.findall(r"\$\{?([A-Za-z_]\w*)", text))
     defaults = set()
     for tag in re.findall(r"<default\b[^>]*>", text):
@@ -396,10 +392,18 @@ def _names(path: Path, seen: set) -> tuple[set, set]:
     return used, defaults
 
 
+def _without_comments(path: Path) -> str:
+    """Return the text of an XML file."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"scene {path}: {error.strerror or error}") from None
+    return re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+
+
 def _search_paths(path: Path) -> list[Path]:
     """Return the folders of ``<path value="...">`` in an XML file, in which files are looked for too."""
-    text = re.sub(r"<!--.*?-->", "", path.read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
-    tags = "".join(re.findall(r"<path\b[^>]*>", text))
+    tags = "".join(re.findall(r"<path\b[^>]*>", _without_comments(path)))
     return [path.parent / value for value in re.findall(r"\bvalue\s*=\s*[\"']([^\"'$]+)[\"']", tags)]
 
 

@@ -41,7 +41,7 @@ COMMAND = (
     "import sys, drjit; drjit.set_thread_count(int(sys.argv.pop(1)));"
     "from envedit.run import main; sys.exit(main())",
     "{threads}",
-    "{folder}/job.toml",
+    f"{{folder}}/{CONFIG}",
     "--out",
     "{folder}",
     "--resume",

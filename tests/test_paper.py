@@ -13,6 +13,7 @@ from envedit import config, envmap, fit, image, latlong, layered, siren
 from envedit.errors import ConfigError, InputError
 from envedit.files import write_atomically
 from envedit.inputs import load_map
+from experiments import puresky
 from experiments.paper import measured, network, plan, plot, run, sheets, skies, tables
 from experiments.paper.kinds import KINDS
 from experiments.paper.methods import METHODS
@@ -186,7 +187,7 @@ def test_figure_8_has_another_map_for_its_target_turned_where_there_is_one(maps,
     assert found.file == str(tmp_path / "maps" / f"dawn_puresky_1k-turned-90-{content('dawn')}.exr")
     assert found.rotate_degrees == 0
     np.testing.assert_array_equal(image.read(found.file)[0], np.roll(sky, -4, axis=1))
-    with pytest.raises(ConfigError, match="no map dusky; did you mean dusk"):
+    with pytest.raises(ConfigError, match="--target: no map dusky; did you mean dusk"):
         target(target="dusky")
     with pytest.raises(ConfigError, match="--angle"):
         build("table1", Question(target="dusk"), maps=maps)
@@ -243,13 +244,13 @@ def test_maps_are_found_by_name_the_smallest_file_of_each(tmp_path, monkeypatch)
     folder.mkdir()
     for name in names:
         (folder / name).touch()
-    found = skies.find(folder)
+    found = puresky.find(folder)
     assert {name: path.name for name, path in found.items()} == {
         "a_b": "a_b_puresky_2k.hdr",
         "b": "b_puresky_1k.hdr",
     }
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
-    assert skies.find() == found
+    assert puresky.find() == found
     assert list(skies.choose(found, None, True)) == ["a_b", "b"]
     assert list(skies.choose(found, None, False)) == ["a_b"]
     assert list(skies.choose({"z": 1, skies.DEFAULT: 2}, None, False)) == [skies.DEFAULT]
@@ -259,12 +260,16 @@ def test_maps_are_found_by_name_the_smallest_file_of_each(tmp_path, monkeypatch)
 
 def test_without_maps_an_error_says_where_they_come_from(tmp_path, monkeypatch):
     monkeypatch.delenv("ENVEDIT_DATA", raising=False)
-    with pytest.raises(ConfigError, match="set ENVEDIT_DATA; python -m experiments.download_puresky"):
-        skies.find()
+    with pytest.raises(ConfigError, match="^no maps: set ENVEDIT_DATA .* experiments.download_puresky"):
+        puresky.find()
+    with pytest.raises(ConfigError, match="^no maps: give --maps DIR, or set ENVEDIT_DATA"):
+        build("table1", Question())
+    with pytest.raises(SystemExit, match="^envedit: no maps: set ENVEDIT_DATA"):
+        puresky.of_script()
     with pytest.raises(InputError, match="nowhere: no such folder of maps"):
-        skies.find(tmp_path / "nowhere")
+        puresky.find(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no map NAME_puresky_1k"):
-        skies.find(tmp_path)
+        puresky.find(tmp_path)
     assert build("figure9", Question())  # needs none
 
 

@@ -8,7 +8,6 @@ Every call is added to fits.json in the output folder, so that an ablation is a 
 
 import argparse
 import json
-import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +20,7 @@ from envedit.errors import EnveditError
 from envedit.files import write_atomically
 from envedit.inputs import active_rows, load_map
 from envedit.manifest import manifest
+from experiments import puresky
 
 from . import maps, tables
 
@@ -134,8 +134,7 @@ def main():
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     parser.add_argument("--out", type=Path, default=Path("runs/engine"))
     arguments = parser.parse_args()
-    if not os.environ.get("ENVEDIT_DATA"):
-        sys.exit("ENVEDIT_DATA is not set: point it at a folder with puresky/NAME_puresky_1k.hdr")
+    puresky.of_script(arguments.maps)  # says what is missing before anything is made
     arguments.out.mkdir(parents=True, exist_ok=True)
     mi.set_variant("llvm_ad_rgb")
     try:

@@ -1,15 +1,14 @@
 """Maps that the engine is measured with: real ones where they are, an analytic sky, one bright texel."""
 
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from envedit import image, sky
+from experiments import puresky
 
 SUNNY = "kloofendal_48d_partly_cloudy"
-_ENDING = "_puresky_1k.hdr"
 MESH = ("bunny_watertight.ply", {"up": "z"})
 """File in the data's ``meshes`` folder, and the parameters of the scene ``mesh`` that set it upright."""
 
@@ -28,14 +27,8 @@ def mesh() -> dict | None:
 
 def skies(names=None) -> dict[str, Path]:
     """Return the PureSky maps by name, all of them or those asked for; empty without data."""
-    folder = data()
-    known = {
-        file.name.removesuffix(_ENDING).removesuffix(".hdr"): file
-        for file in sorted((folder / "puresky").glob("*.hdr") if folder else ())
-    }
-    if names and (odd := sorted(set(names) - known.keys())):
-        sys.exit(f"no map {', '.join(odd)} under ENVEDIT_DATA/puresky; known: {', '.join(known) or 'none'}")
-    return {name: known[name] for name in names} if names else known
+    there = (folder := data()) and (folder / "puresky").is_dir()
+    return puresky.of_script(names) if there else {}
 
 
 def sunny(width: int, real: bool = True) -> tuple[str, np.ndarray]:

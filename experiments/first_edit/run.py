@@ -9,25 +9,24 @@ Runs under ``--set`` lie in a folder of their own.
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
-from .. import trials
+from experiments import puresky, trials
 
 MAPS = ("kloofendal_48d_partly_cloudy", "autumn_field", "wasteland_clouds", "overcast_soil")
 KINDS = ("siren", "pixels", "log-pixels")
 NAMES = {"siren": "R-SIREN", "pixels": "Pixels", "log-pixels": "Log(pixels)"}
 
 
-def jobs(root: Path, out: Path, maps, overrides):
+def jobs(out: Path, maps: dict[str, Path], overrides):
     """Yield (map, representation, folder, command line) of every run."""
-    for name in maps:
+    for name, file in maps.items():
         for kind in KINDS:
             folder = out / f"{name}-{kind}"
             text = (
-                f'[input]\nenvmap = "{root / "puresky" / f"{name}_puresky_1k.hdr"}"\nwidth = 256\n'
+                f'[input]\nenvmap = "{file}"\nwidth = 256\n'
                 f'[scene]\nfile = "sphere"\nparameters = {{ roughness = 0.3 }}\n'
                 f"[target]\nrotate_degrees = 60.0\nspp = 2048\n[output]\nspp = 2048\n"
                 f'[representation]\nkind = "{kind}"\n'
@@ -77,14 +76,10 @@ def main():
     parser.add_argument("--maps", nargs="+", default=MAPS)
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     arguments = parser.parse_args()
-    root = os.environ.get("ENVEDIT_DATA")
-    if not root:
-        sys.exit("ENVEDIT_DATA is not set: point it at a folder with puresky/NAME_puresky_1k.hdr")
+    maps = puresky.of_script(arguments.maps)
     out = trials.folder(arguments.out.absolute(), arguments.overrides)
     out.mkdir(parents=True, exist_ok=True)
-    for name, kind, folder, text, overrides in jobs(
-        Path(root).absolute(), out, arguments.maps, arguments.overrides
-    ):
+    for name, kind, folder, text, overrides in jobs(out, maps, arguments.overrides):
         if (folder / "metrics.json").exists():
             continue
         config = out / f"{name}-{kind}.toml"
@@ -93,7 +88,7 @@ def main():
         subprocess.run(
             [sys.executable, "-m", "envedit.run", str(config), "--out", str(folder), *overrides], check=False
         )
-    text = table(out, arguments.maps)
+    text = table(out, maps)
     (out / "table.md").write_text(text + "\n")
     print(text)
 

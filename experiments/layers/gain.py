@@ -19,8 +19,9 @@ from envedit.gain import GridGain
 from envedit.inputs import load_map
 from envedit.layers import Layers
 from envedit.transport import LightTransport
+from experiments import puresky
 
-from .run import SCENES, maps
+from .run import SCENES
 
 ITERATIONS = 150
 AMPLITUDE = 6.0
@@ -113,7 +114,7 @@ def main():
     folder = files.cache_folder("transport")
     transport = LightTransport.build(lit, 128, 256, few=True, folder=folder)
     print("| gain | map | rendering PSNR | map PSNR | sharp | ms a step |\n|---|---|---|---|---|---|")
-    for name, file in maps(given.maps).items():
+    for name, file in puresky.of_script(given.maps).items():
         original, _ = load_map(config.Input(envmap=str(file), width=256))
         true = np.ascontiguousarray(latlong.rotate(original, given.angle), np.float32)
         picture = lit.render(true, spp=2048, seed=7)

@@ -9,7 +9,6 @@ Every run is ``python -m envedit.run`` with its own folder; one that is done (it
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 
 from envedit import image, latlong, metrics
 from envedit.tonemap import luminance
-from experiments import trials
+from experiments import puresky, trials
 
 SUNNY = 1000.0
 """Peak radiance, 256 texels wide, from which on a map is called sunny."""
@@ -28,21 +27,11 @@ NAMES = {"layers": "layers", "siren": "R-SIREN"}
 SCENES = {"sphere": "parameters = { roughness = 0.3 }\n", "statue": ""}
 
 
-def maps(names=None) -> dict[str, Path]:
-    """List the PureSky maps of ENVEDIT_DATA by name, all or some."""
-    root = os.environ.get("ENVEDIT_DATA")
-    if not root:
-        sys.exit("ENVEDIT_DATA is not set: point it at a folder with puresky/NAME_puresky_1k.hdr")
-    files = sorted((Path(root).absolute() / "puresky").glob("*_puresky_1k.hdr"))
-    found = {file.name.removesuffix("_puresky_1k.hdr"): file for file in files}
-    return {name: found[name] for name in names} if names else found
-
-
 def jobs(out: Path, names, scenes, angles, kinds):
     """Yield (map, scene, angle, kind, folder, configuration) of every run."""
     for scene in scenes:
         for angle in angles:
-            for name, file in maps(names).items():
+            for name, file in puresky.of_script(names).items():
                 for kind in kinds:
                     text = (
                         f'[input]\nenvmap = "{file}"\nwidth = 256\n[scene]\nfile = "{scene}"\n'
@@ -136,7 +125,7 @@ def summary(kind, found) -> list[str]:
 
 def table(out: Path, names, scenes, angles, kinds) -> str:
     """Return all that has ended as Markdown: the summary first, then a table for each scene and angle."""
-    files, parts, every = maps(names), [], {kind: [] for kind in kinds}
+    files, parts, every = puresky.of_script(names), [], {kind: [] for kind in kinds}
     for scene in scenes:
         for angle in angles:
             rows = []

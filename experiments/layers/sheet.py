@@ -13,8 +13,9 @@ import numpy as np
 
 from envedit import image, latlong
 from envedit.tonemap import tonemap
+from experiments import puresky
 
-from .run import NAMES, SCENES, maps
+from .run import NAMES, SCENES
 
 
 def row(out: Path, name, file, scene, angle, kinds):
@@ -48,7 +49,7 @@ def main():
     for scene in SCENES:
         for angle in (60, 140):
             kinds = [k for k in NAMES if any(given.out.glob(f"*-{scene}-{angle}-{k}/metrics.json"))]
-            rows = [row(given.out, n, f, scene, angle, kinds) for n, f in maps().items()]
+            rows = [row(given.out, n, f, scene, angle, kinds) for n, f in puresky.of_script().items()]
             rows = [r for r in rows if r is not None]
             if rows:
                 pixels = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)

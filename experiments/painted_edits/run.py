@@ -11,7 +11,6 @@ used. ``python -m experiments.painted_edits.sheet`` draws the contact sheet.
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +18,8 @@ from pathlib import Path
 import mitsuba as mi
 
 from envedit import image, metrics
-from experiments import trials
+from envedit.errors import EnveditError
+from experiments import puresky, trials
 
 ROOT = Path(__file__).parents[2]
 EDITS = ("move_shadow", "add_reflection", "add_shadow", "warmer", "enhance_shadow", "blur_shadow")
@@ -37,9 +37,11 @@ def file_of(name: str) -> str | None:
     """Return what [input] envmap is for a map, None where the data are not there."""
     if name == "sunsky":
         return name
-    root = os.environ.get("ENVEDIT_DATA")
-    file = Path(root or "").absolute() / "puresky" / f"{name}_puresky_1k.hdr"
-    return str(file) if root and file.exists() else None
+    try:
+        file = puresky.find().get(name)
+    except EnveditError:
+        return None
+    return str(file) if file else None
 
 
 def carry_out(folder: Path, edit: str, envmap: str, overrides) -> dict | None:

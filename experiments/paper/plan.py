@@ -16,6 +16,7 @@ from pathlib import Path
 from envedit import config, scene, sources
 from envedit.errors import ConfigError, InputError
 from envedit.files import write_atomically
+from experiments import puresky
 from experiments.sweep import Job, job
 
 from . import skies
@@ -93,7 +94,7 @@ def build(
     settings : sequence of str
         "paper", "ours" or both.
     maps : path, optional
-        Folder of maps; see :func:`skies.find`.
+        Folder of maps; see :func:`experiments.puresky.find`.
     only : sequence of str, optional
         Names of maps; see :func:`skies.choose`.
     rows : sequence of str, optional
@@ -145,15 +146,19 @@ def resolved(name: str, question: Question, maps=None, only=None) -> Question:
     """Name the true map of Figure 8 where the question does not, so that plans know it; see :func:`build`."""
     if name == "figure8" and not question.target:
         chosen = _maps(name, KINDS[name], maps, only)
-        if skies.OTHER in skies.find(maps) and skies.OTHER not in chosen:
+        if skies.OTHER in _known(maps) and skies.OTHER not in chosen:
             return replace(question, target=skies.OTHER)
     return question
+
+
+def _known(folder):
+    return puresky.find(folder, "--maps")
 
 
 def _maps(name, kind, folder, only):
     if name == "figure9" and (only is None or list(only) == [SUNSKY]):
         return {SUNSKY: SUNSKY}
-    return skies.choose(skies.find(folder), only, kind.several)
+    return skies.choose(_known(folder), only, kind.several)
 
 
 def _target(name, question, folder, to):
@@ -161,9 +166,8 @@ def _target(name, question, folder, to):
     if other := question.target:
         if name != "figure8":
             raise ConfigError(f"--target: came {other}, but {name} turns its map: give --angle")
-        known = skies.find(folder)
-        if skies.choose(known, [other], False):
-            return {"file": str(skies.turned(known[other], question.angle, to))}
+        file = puresky.pick(_known(folder), [other], "--target")[other]
+        return {"file": str(skies.turned(file, question.angle, to))}
     return {"rotate_degrees": question.angle}
 
 

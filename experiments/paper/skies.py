@@ -1,56 +1,18 @@
-"""The PureSky maps that the tables are made over: those that a folder holds."""
+"""Which PureSky maps a table is made over, and a turned one."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import os
-import re
 from pathlib import Path
 
 from envedit import image, latlong
-from envedit.errors import ConfigError, InputError
+from envedit.errors import InputError
+from experiments import puresky
 
 DEFAULT = "kloofendal_48d_partly_cloudy"
 """The map of a table that the paper made with one; it does not name its own."""
 OTHER = "autumn_field"
 """The true map of Figure 8, turned: "a different environment map in a different light orientation"."""
-
-_NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
-_HOW = "python -m experiments.download_puresky DIR fetches them"
-
-
-def find(folder=None) -> dict[str, Path]:
-    """List the maps of a folder by name.
-
-    Parameters
-    ----------
-    folder : path, optional
-        With files NAME_puresky_1k.hdr (or .exr, or of another resolution: of several the smallest is taken);
-        None: the folder ``puresky`` of ENVEDIT_DATA.
-
-    Raises
-    ------
-    ConfigError
-        No folder is given and ENVEDIT_DATA is not set.
-    InputError
-        It is no folder, or holds no map.
-    """
-    if folder is None:
-        if not (root := os.environ.get("ENVEDIT_DATA")):
-            raise ConfigError(f"--maps: give a folder with NAME_puresky_1k.hdr, or set ENVEDIT_DATA; {_HOW}")
-        folder = Path(root) / "puresky"
-    folder = Path(folder).absolute()
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of maps; {_HOW}")
-    matches = [match for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))]
-    matches.sort(key=lambda m: (m["name"], int(m["size"]), m["kind"] != "hdr"))
-    if not matches:
-        raise InputError(f"{folder}: no map NAME_puresky_1k.hdr or .exr in it; {_HOW}")
-    found: dict[str, Path] = {}
-    for match in matches:
-        found.setdefault(match["name"], folder / match[0])
-    return found
 
 
 def choose(found: dict[str, Path], names, several: bool) -> dict[str, Path]:
@@ -59,7 +21,7 @@ def choose(found: dict[str, Path], names, several: bool) -> dict[str, Path]:
     Parameters
     ----------
     found : dict
-        As of :func:`find`.
+        As of :func:`experiments.puresky.find`.
     names : sequence of str or None
         Which; ``["all"]``: every one; None: every one where ``several``, else :data:`DEFAULT`, or the first
         where that is not there.
@@ -75,12 +37,7 @@ def choose(found: dict[str, Path], names, several: bool) -> dict[str, Path]:
         names = ["all"] if several else [DEFAULT if DEFAULT in found else next(iter(found))]
     if list(names) == ["all"]:
         return found
-    for name in names:
-        if name not in found:
-            close = difflib.get_close_matches(name, found, 1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(found)}"
-            raise ConfigError(f"--only: no map {name}; {hint}")
-    return {name: found[name] for name in dict.fromkeys(names)}
+    return puresky.pick(found, names, "--only")
 
 
 def turned(file: Path, degrees: float, folder) -> Path:

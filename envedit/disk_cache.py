@@ -87,6 +87,12 @@ class DiskCache:
                     file.write(array.reshape(-1).view(np.uint8))
                     file.write(bytes(_padded(array.nbytes) - array.nbytes))
 
+    def remove(self, key: dict) -> None:
+        """Delete what is stored under a key, if anything is."""
+        if self.folder is not None:
+            with contextlib.suppress(OSError):
+                self._path(key).unlink(missing_ok=True)
+
     def _path(self, key):
         return self.folder / f"{hashlib.sha256(_text(key).encode()).hexdigest()[:32]}.arrays"
 

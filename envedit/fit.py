@@ -23,14 +23,18 @@ import numpy as np
 from . import config, losses, metrics, optim, refit, siren, ssim
 from ._callable import make_callable
 from .device import tensor
+from .disk_cache import DiskCache
 from .errors import InputError, NumericalError
-from .files import cache_folder, replacing
+from .files import cache_folder
 
 EPSILON = 0.01
 """Added to radiance inside the logarithm (paper, below Eq. 3)."""
 MOST_REFUSED = 20
 """Non-finite steps after which a fit gives up."""
+SAVED_EVERY = 30.0
+"""Seconds of training after which it is kept on disk, so that a killed fit goes on from there."""
 _RECIPE = 4  # raise when the same settings give another fit
+_NUMBERS, _ABOUT = ("log_psnr", "peak_ratio", "epochs", "seconds"), "about"
 
 
 @dataclass(frozen=True)
@@ -112,14 +116,14 @@ def fit(
     rows : (int, int), optional
         First row of the image in its map, and the rows of that map; None: the image is a whole map.
     folder : Path, optional
-        Where fits are kept under a hash of image and settings; None: nowhere.
+        Where fits are kept under a hash of image and settings, half-made ones too; None: nowhere.
     progress : callable, optional
         Called with (epoch, epochs, loss) now and then.
 
     Returns
     -------
     Fitted
-        Read from ``folder`` if the same fit was made before.
+        Read from ``folder`` if the same fit was made before, or continued if it was begun.
 
     Raises
     ------
@@ -136,13 +140,13 @@ def fit(
         raise InputError(
             f"fit: the texel at row {row}, column {column} is not finite or is negative: repair it"
         )
-    path = folder / f"{_key(image, network, settings, seed, rows)}.npz" if folder and settings.cache else None
-    if path and (found := _load(path)):
-        return found
-    start = time.perf_counter()
+    cache, key = DiskCache(folder if settings.cache else None), _key(image, network, settings, seed, rows)
+    if found := cache.load(key):
+        return _read(found)
+    start, begun = time.perf_counter(), _Begun(cache, key)
     normalisation = Normalisation.of(image, settings.headroom)
     x = points(network, image.shape[:2], rows)
-    params = _train(image, normalisation, x, network, settings, seed, progress)
+    params = _train(image, normalisation, x, network, settings, seed, begun, progress)
     if settings.light:
         wanted = normalisation.encode(image).reshape(-1, 3)
         params = refit.last_layer(params, x, network.omega, wanted, image.reshape(-1, 3), settings.light)
@@ -155,11 +159,11 @@ def fit(
         metrics.log_psnr(got, image),
         metrics.peak_ratio(got, image),
         settings.epochs,
-        time.perf_counter() - start,
+        begun.seconds + time.perf_counter() - start,
         False,
     )
-    if path:
-        _store(path, fitted)
+    cache.store(key, _stored(fitted))
+    begun.forget()
     return fitted
 
 
@@ -253,16 +257,18 @@ def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
     return optim.constant(base, epoch)
 
 
-def _train(image, normalisation, x, network, settings, seed, progress):
+def _train(image, normalisation, x, network, settings, seed, begun, progress):
     params = siren.init(seed, network.hidden, network.depth, network.omega, inputs=x.shape[1])
     grids = _grids(image, normalisation, x, settings)
     rng, order = np.random.default_rng(seed), []
     adam = optim.Adam(params, settings.lr, (0.9, settings.beta2))
     perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
-    refused = 0
+    first, refused = begun.restore(adam)
     for epoch in range(settings.epochs):
         order = order or list(rng.permutation(len(grids)))
         objective, x = grids[order.pop()]
+        if epoch < first:  # only the order of the grids is gone through again
+            continue
         params = adam.params
         if perturbation and epoch < settings.awp_until * settings.epochs:
             if epoch % settings.awp_every == 0:
@@ -283,7 +289,40 @@ def _train(image, normalisation, x, network, settings, seed, progress):
                 )
         if progress and (epoch % 20 == 0 or epoch == settings.epochs - 1):
             progress(epoch + 1, settings.epochs, float(loss[0]))
+        if (epoch + 1) % settings.awp_every == 0:  # the next epoch looks for its own direction
+            begun.keep(adam, epoch + 1, refused)
     return adam.params
+
+
+class _Begun:
+    """Training that is not over, on disk: a killed fit goes on from there to the same weights."""
+
+    def __init__(self, cache: DiskCache, key: dict):
+        self._cache, self._key = cache, key | {"training": True}
+        self._started = self._saved = time.perf_counter()
+        self.seconds = 0.0
+        """Of training in earlier processes."""
+
+    def restore(self, adam: optim.Adam) -> tuple[int, int]:
+        """Bring the optimiser to where it was; returns epochs done and steps refused."""
+        if not (found := self._cache.load(self._key)):
+            return 0, 0
+        found = dict(found)
+        epoch, refused, self.seconds = found.pop(_ABOUT).tolist()
+        adam.load_state_dict(found)
+        return int(epoch), int(refused)
+
+    def keep(self, adam: optim.Adam, epoch: int, refused: int) -> None:
+        """Write the state after ``epoch`` epochs, where that is due."""
+        if (now := time.perf_counter()) - self._saved < SAVED_EVERY:
+            return
+        about = np.array([epoch, refused, self.seconds + now - self._started])
+        self._cache.store(self._key, adam.state_dict() | {_ABOUT: about})
+        self._saved = time.perf_counter()
+
+    def forget(self) -> None:
+        """Delete what a fit that is made does not need."""
+        self._cache.remove(self._key)
 
 
 def _grids(image, normalisation, x, settings):
@@ -314,46 +353,28 @@ def default_folder() -> Path:
 
 
 def _key(image, network, settings, seed, rows):
-    what = {
+    return {
         "network": [network.hidden, network.depth, network.omega, network.coordinates],
         "rows": rows or (0, image.shape[0]),
         "seed": seed,
         "recipe": _RECIPE,
-        "shape": image.shape,
-        **{k: v for k, v in asdict(settings).items() if k not in ("cache", "polish")},
+        "image": [image.shape, hashlib.sha256(image.tobytes()).hexdigest()],
+        "settings": {k: v for k, v in asdict(settings).items() if k not in ("cache", "polish")},
     }
-    return hashlib.sha256(repr(sorted(what.items())).encode() + image.tobytes()).hexdigest()[:32]
 
 
-def _load(path):
-    try:
-        # Opened here: np.load leaves a file open that is no archive.
-        with open(path, "rb") as file, np.load(file) as stored:
-            low, span, log_psnr, peak, epochs, seconds = stored["numbers"].tolist()
-            params = {k[2:]: stored[k] for k in stored.files if k.startswith("p/")}
-    except Exception:  # not there, or damaged, for which zipfile, zlib and numpy have many names: fit again
-        return None
-    # None is stored as NaN.
-    log_psnr, peak = (None if np.isnan(number) else number for number in (log_psnr, peak))
+def _stored(fitted: Fitted) -> dict[str, np.ndarray]:
+    """Put a fit into arrays; None becomes NaN."""
+    about, range_ = [getattr(fitted, name) for name in _NUMBERS], fitted.normalisation
+    return fitted.params | {_ABOUT: np.array([range_.low, range_.span, *about], np.float64)}
+
+
+def _read(arrays: dict[str, np.ndarray]) -> Fitted:
+    """Make a fit of :func:`_stored`'s arrays."""
+    params = {name: np.array(value) for name, value in arrays.items()}  # copies: these are mapped files
+    low, span, *numbers = params.pop(_ABOUT).tolist()
+    log_psnr, peak, epochs, seconds = (None if np.isnan(number) else number for number in numbers)
     return Fitted(params, Normalisation(low, span), log_psnr, peak, int(epochs), seconds, True)
-
-
-def _store(path, fitted):
-    numbers = [
-        fitted.normalisation.low,
-        fitted.normalisation.span,
-        fitted.log_psnr,
-        fitted.peak_ratio,
-        fitted.epochs,
-        fitted.seconds,
-    ]
-    weights = {f"p/{name}": value for name, value in fitted.params.items()}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, numbers=np.array(numbers, np.float64), **weights)
-    except (OSError, InputError):
-        pass  # a cache that cannot be written costs time, not the result
 
 
 make_callable(__name__, fit)

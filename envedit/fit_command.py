@@ -28,7 +28,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("envedit: interrupted; nothing was written", file=sys.stderr)
+        goes_on = "running it again goes on where the fit was last kept"
+        print(f"envedit: interrupted; no results were written ({goes_on})", file=sys.stderr)
         return 130
 
 

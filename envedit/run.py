@@ -26,7 +26,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("envedit: interrupted; there is no checkpoint to resume from", file=sys.stderr)
+        goes_on = "a fit under way goes on where it was last kept"
+        print(f"envedit: interrupted; there is no checkpoint to resume from ({goes_on})", file=sys.stderr)
         return 130
 
 

@@ -525,7 +525,7 @@ def test_the_cache_can_be_refused(tmp_path, rng):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed", "packed", "locked"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed"])
 def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     image = sky(rng)
     made = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
@@ -534,10 +534,6 @@ def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     if damage == "changed":
         weights = data.index(made.params["1.weight"].tobytes())
         data[weights : weights + 4] = b"\xff" * 4  # a NaN
-    if damage == "packed":  # in a way that zipfile does not know
-        data[data.index(b"PK\1\2") + 10] = 99
-    if damage == "locked":
-        data[data.index(b"PK\1\2") + 8] |= 1
     if damage == "truncated":
         data = data[: len(data) // 2]
     path.write_bytes({"empty": b"", "text": b"not a fit"}.get(damage, data))
@@ -596,6 +592,56 @@ def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path, rng):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     assert not fit.fit(sky(rng), NETWORK, QUICK, folder=blocked / "fits").cached
+
+
+class Killed(Exception):
+    pass
+
+
+def killed_at(epoch, told=None):
+    """Make a progress function that ends a fit as if it were killed; it is called after every 20 epochs."""
+
+    def progress(done, total, loss):
+        if told is not None:
+            told.append(done)
+        if done >= epoch:
+            raise Killed
+
+    return progress
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.01])
+@pytest.mark.parametrize("begun", ["whole", "damaged", "none"])
+def test_a_killed_fit_goes_on_to_the_same_weights(tmp_path, monkeypatch, gamma, begun, rng):
+    settings = config.Fit(epochs=60, lr=5e-3, awp_gamma=gamma, awp_every=3, stride=2, awp_until=0.9)
+    image = sky(rng, 24, 48)
+    undisturbed = fit.fit(image, NETWORK, settings)
+    monkeypatch.setattr(fit, "SAVED_EVERY", math.inf if begun == "none" else 0.0)
+    with pytest.raises(Killed):
+        fit.fit(image, NETWORK, settings, folder=tmp_path, progress=killed_at(41))
+    if begun == "none":
+        assert not list(tmp_path.iterdir())
+    if begun == "damaged":
+        (path,) = tmp_path.iterdir()
+        path.write_bytes(path.read_bytes()[:-100])
+    epochs = []
+    continued = fit.fit(image, NETWORK, settings, folder=tmp_path, progress=killed_at(math.inf, epochs))
+    # The progress of epoch 41 came before its state would have been kept: 39 were, a multiple of 3.
+    assert epochs == ([41, 60] if begun == "whole" else [1, 21, 41, 60])
+    assert not continued.cached and same(continued.params, undisturbed.params)
+    assert facts(continued) == facts(undisturbed)
+    assert len(list(tmp_path.iterdir())) == 1 and fit.fit(image, NETWORK, settings, folder=tmp_path).cached
+
+
+def test_seconds_of_a_killed_fit_count(tmp_path, monkeypatch, rng):
+    ticks = iter(range(0, 10**6, 100))
+    monkeypatch.setattr(fit.time, "perf_counter", lambda: float(next(ticks)))
+    image, settings = sky(rng), dataclasses.replace(QUICK, epochs=40)
+    undisturbed = fit.fit(image, NETWORK, settings, folder=tmp_path / "one")
+    with pytest.raises(Killed):
+        fit.fit(image, NETWORK, settings, folder=tmp_path / "two", progress=killed_at(21))
+    continued = fit.fit(image, NETWORK, settings, folder=tmp_path / "two")
+    assert undisturbed.seconds > 40 * 100 and abs(continued.seconds - undisturbed.seconds) <= 400
 
 
 def test_default_folder_follows_the_desktop_standard(monkeypatch, tmp_path):

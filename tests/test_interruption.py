@@ -124,8 +124,7 @@ def test_a_run_killed_while_it_writes_any_file_is_resumed_to_the_same_bytes(tmp_
         number += 1
     assert set(killed) >= COMPLETE and killed.count(checkpoint.NAME) == 3
     caches = [name for name in killed if name not in files.RESULTS]
-    assert sum(name.endswith(".npz") for name in caches) == 1  # the fit
-    assert sum(name.endswith(".arrays") for name in caches) >= 2  # the transport
+    assert sum(name.endswith(".arrays") for name in caches) >= 3  # the fit, the transport
 
 
 def test_a_run_killed_after_its_last_file_is_resumed_too(tmp_path, whole, monkeypatch):

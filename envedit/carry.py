@@ -15,7 +15,7 @@ import numpy as np
 
 from . import latlong, lights
 from .device import flat
-from .errors import NumericalError
+from .errors import NumericalError, place_of
 from .layers import Layers, brightened
 from .places import Places, as_image
 from .ratios import Ratio
@@ -106,11 +106,9 @@ def carry(
         made = work.band(source[band], start)
         if free is not None:
             made = np.where(free[grid.row[band]][:, grid.column][..., None], made, source[band])
-        if not (good := np.isfinite(made).all(axis=2)).all():
-            row, column = np.argwhere(~good)[0]
+        if (bad := ~np.isfinite(made)).any():
             raise NumericalError(
-                f"the edit at full resolution is not finite at row {start + row}, column {column}: "
-                f"{', '.join(f'{v:g}' for v in made[row, column])}; lower [optimizer] lr"
+                f"the edit at full resolution is not finite at {place_of(bad, start)}; lower [optimizer] lr"
             )
         result[fresh : start + size] = made[fresh - start :]
     return result

@@ -37,6 +37,13 @@ class NumericalError(EnveditError):
     exit_code = 5
 
 
+def place_of(bad, first_row: int = 0) -> str:
+    """Name the first True of a mask (H, W) or (H, W, C), whose row 0 is ``first_row``: "row 3, column 7"."""
+    texels = bad.reshape(*bad.shape[:2], -1).any(axis=2)
+    row, column = divmod(int(texels.argmax()), texels.shape[1])
+    return f"row {first_row + row}, column {column}"
+
+
 @contextlib.contextmanager
 def unwrapped():
     """Raise what a user is to be told of, and Ctrl-C, as they are; also a decorator.

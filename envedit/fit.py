@@ -24,7 +24,7 @@ from . import config, losses, metrics, optim, refit, siren, ssim
 from ._callable import make_callable
 from .device import tensor
 from .disk_cache import DiskCache
-from .errors import InputError, NumericalError
+from .errors import InputError, NumericalError, place_of
 from .files import cache_folder
 
 EPSILON = 0.01
@@ -136,10 +136,7 @@ def fit(
     settings = unpolished(settings) if settings.polish == "never" else settings
     image = np.ascontiguousarray(image, np.float32)
     if not (good := np.isfinite(image) & (image >= 0)).all():
-        row, column = np.argwhere(~good.all(axis=2))[0]
-        raise InputError(
-            f"fit: the texel at row {row}, column {column} is not finite or is negative: repair it"
-        )
+        raise InputError(f"fit: the texel at {place_of(~good)} is not finite or is negative: repair it")
     cache, key = DiskCache(folder if settings.cache else None), _key(image, network, settings, seed, rows)
     if found := cache.load(key):
         return _read(found)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from . import checkpoint, config, loop, optim, scene, target
-from .errors import NumericalError
+from .errors import NumericalError, place_of
 
 TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
 """Steps after which the better of two starts is chosen, and by which share of the loss it must be better."""
@@ -92,12 +92,9 @@ class Job:
         rows = slice(self.first, self.first + crop.shape[0])
         if self.free is not None:
             crop = np.where(self.free[..., None], crop, self.original[rows])
-        if not np.isfinite(crop).all():
-            row, column = np.argwhere(~np.isfinite(crop).all(axis=2))[0]
-            raise NumericalError(
-                f"the edited map is not finite at row {self.first + row}, column {column}: "
-                "lower [optimizer] lr"
-            )
+        if (bad := ~np.isfinite(crop)).any():
+            where = place_of(bad, self.first)
+            raise NumericalError(f"the edited map is not finite at {where}: lower [optimizer] lr")
         edited = self.original.copy()
         edited[rows] = crop
         return edited

@@ -8,7 +8,7 @@ import os
 import numpy as np
 
 from .decoders import REC709
-from .errors import ConfigError, NumericalError
+from .errors import ConfigError, NumericalError, place_of
 from .files import quiet_libraries, replacing
 
 DEFAULT = "edited"
@@ -82,11 +82,10 @@ def _finite(name, layer, values):
         values = values.astype(np.float32, copy=False)
     bad = ~np.isfinite(values)
     if bad.any():
-        bad = bad if bad.ndim == 2 else bad.any(axis=2)
-        row, column = (int(i) for i in np.argwhere(bad)[0])
+        count = (bad if bad.ndim == 2 else bad.any(axis=2)).sum()
         raise NumericalError(
-            f"{name}: not written: {bad.sum()} texels of layer '{layer}' are not finite, "
-            f"the first at row {row}, column {column}"
+            f"{name}: not written: {count} texels of layer '{layer}' are not finite, "
+            f"the first at {place_of(bad)}"
         )
     return values
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from envedit.errors import ConfigError, InputError
+from envedit.errors import ConfigError, InputError, place_of
 from envedit.tonemap import luminance
 from envedit.tonemap import tonemap as apply_tonemap
 
@@ -25,8 +25,7 @@ def _checked(image, name):
         raise InputError(f"{name}: expected an image of shape (H, W, 3), got {image.shape}.")
     bad = ~np.isfinite(image).all(axis=2)
     if bad.any():
-        row, column = np.argwhere(bad)[0]
-        where = f"the first at row {row}, column {column}"
+        where = f"the first at {place_of(bad)}"
         raise InputError(f"{name}: {bad.sum()} texel(s) are not finite, {where}; repair the image first.")
     return image
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from . import config, image
-from .errors import ConfigError, InputError
+from .errors import ConfigError, InputError, place_of
 from .recognise import differs
 from .scene import Scene
 from .tonemap import TONEMAPS, inverse_tonemap, tonemap
@@ -291,9 +291,8 @@ def _check_size(file, size, shape):
 
 
 def _check_finite(file, pixels, advice):
-    if not (good := np.isfinite(pixels).all(axis=2)).all():
-        row, column = np.argwhere(~good)[0]
-        raise InputError(f"{file}: pixel at row {row}, column {column} is not finite: {advice}")
+    if (bad := ~np.isfinite(pixels)).any():
+        raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
 
 
 def _tonemap_of(file, info, declared, warnings):
@@ -328,8 +327,7 @@ def _planes(file, pixels, warnings):
         values = values.repeat(3, axis=2)
         warnings.append(f"{file}: read as grey")
     if (negative := (values < 0).any(axis=2)).any():
-        row, column = np.argwhere(negative)[0]
-        where = f"the first at row {row}, column {column}"
+        where = f"the first at {place_of(negative)}"
         warnings.append(f"{file}: {negative.sum()} pixels are negative, {where}: set to 0")
     return np.maximum(values, 0), alpha, top
 

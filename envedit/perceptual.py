@@ -19,7 +19,7 @@ import numpy as np
 
 from . import weights
 from .convolution import Divisor
-from .errors import ConfigError, InputError
+from .errors import ConfigError, InputError, place_of
 from .features import Backbone, title
 from .ssim import check_image
 
@@ -402,8 +402,7 @@ def _single(image, name):
     _check(image, name)
     bad = ~np.isfinite(image).all(axis=2)
     if bad.any():
-        row, column = np.argwhere(bad)[0]
-        where = f"the first at row {row}, column {column}"
+        where = f"the first at {place_of(bad)}"
         raise InputError(f"{name}: {bad.sum()} pixel(s) are not finite, {where}; repair the image first.")
     return mi.TensorXf(image)
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from . import latlong, pursuit, search
 from .device import tensor
-from .errors import InputError
+from .errors import InputError, place_of
 from .tonemap import tonemap
 
 CELLS = 64
@@ -214,11 +214,8 @@ class _Question:
         self.active[rows or slice(None)] = True if free is None else free
         shape = transport.shape
         self.target = _shaped("target", target, (*shape, 3))
-        if not np.isfinite(self.target).all():
-            row, column = np.argwhere(~np.isfinite(self.target).all(axis=2))[0]
-            raise InputError(
-                f"target: pixel at row {row}, column {column} is not finite: repair it before painting"
-            )
+        if (bad := ~np.isfinite(self.target)).any():
+            raise InputError(f"target: pixel at {place_of(bad)} is not finite: repair it before painting")
         self.weight = np.ones((*shape, 1)) if weight is None else _shaped("weight", weight, (*shape, 1))
         counts = (self.weight[..., 0] > 0).astype(np.float64)
         self.painted = counts if painted is None else _shaped("painted", painted, shape)

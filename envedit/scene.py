@@ -30,7 +30,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import latlong, stage
-from .errors import ConfigError, InputError, NumericalError
+from .errors import ConfigError, InputError, NumericalError, place_of
 from .tonemap import tonemap
 
 __all__ = ["SHIPPED", "Scene", "load"]
@@ -219,11 +219,10 @@ class Scene:
         """Round to float32, refusing what is not finite."""
         with np.errstate(over="ignore"):
             result = total.astype(np.float32)
-        if not (finite := np.isfinite(result).all(axis=2)).all():
-            row, column = np.argwhere(~finite)[0]
+        if (bad := ~np.isfinite(result).all(axis=2)).any():
             raise NumericalError(
-                f"rendering of {self.path or 'the scene'}: {np.sum(~finite)} pixels are not finite, "
-                f"the first at row {row}, column {column}; look for broken materials or too much light"
+                f"rendering of {self.path or 'the scene'}: {bad.sum()} pixels are not finite, "
+                f"the first at {place_of(bad)}; look for broken materials or too much light"
             )
         return result
 

@@ -38,7 +38,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, place_of
 from .stroke_keys import stroke_list
 from .tonemap import inverse_tonemap, luminance, tonemap
 
@@ -125,9 +125,8 @@ def _checked(picture):
         )
     with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
         image = image.astype(np.float32)
-    if not (finite := np.isfinite(image).all(axis=2)).all():
-        row, column = np.argwhere(~finite)[0]
-        raise InputError(f"picture to paint on: pixel at row {row}, column {column} is not finite: repair it")
+    if (bad := ~np.isfinite(image)).any():
+        raise InputError(f"picture to paint on: pixel at {place_of(bad)} is not finite: repair it")
     return image
 
 

@@ -1,10 +1,11 @@
-"""What is raised inside Dr.Jit's operations comes out as it is."""
+"""What is raised inside Dr.Jit's operations comes out as it is; places are named."""
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
-from envedit.errors import InputError, NumericalError, unwrapped
+from envedit.errors import InputError, NumericalError, place_of, unwrapped
 
 
 class Raising(dr.CustomOp):
@@ -42,3 +43,10 @@ def test_other_errors_stay_what_they_are():
         assert raised.value.__cause__ is error
     with pytest.raises(ZeroDivisionError), unwrapped():
         raise ZeroDivisionError
+
+
+def test_a_place_is_the_first_in_reading_order():
+    bad = np.zeros((4, 5, 3), bool)
+    bad[2, 1, 0] = bad[1, 3, 2] = bad[3, 0] = True
+    assert place_of(bad) == place_of(bad.any(axis=2)) == "row 1, column 3"
+    assert place_of(bad[2:], first_row=2) == "row 2, column 1"

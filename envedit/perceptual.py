@@ -21,7 +21,7 @@ from . import weights
 from .convolution import Divisor
 from .errors import ConfigError, InputError, place_of
 from .features import Backbone, title
-from .ssim import check_image
+from .ssim import KnownGradient, check_image
 
 DISTS_SOURCE = "https://github.com/dingkeyan93/DISTS, DISTS_pytorch/weights.pt"
 LPIPS_SOURCE = "https://github.com/richzhang/PerceptualSimilarity, lpips/weights/v0.1/{}.pth"
@@ -61,24 +61,7 @@ class _Measure:
             )
         if not dr.grad_enabled(x):
             return self._evaluate(dr.detach(x.array), False)[0]
-        return dr.custom(_Known, x.array, self)
-
-
-class _Known(dr.CustomOp):
-    """A measure as one node of the AD graph: the gradient is known as soon as the value is."""
-
-    def eval(self, x, measure):
-        value, self.gradient = measure._evaluate(dr.detach(x), True)
-        return value
-
-    def forward(self):
-        self.set_grad_out(dr.sum(self.gradient * self.grad_in("x")))
-
-    def backward(self):
-        self.set_grad_in("x", self.gradient * self.grad_out())
-
-    def name(self):
-        return "perceptual measure"
+        return dr.custom(KnownGradient, x.array, self)
 
 
 # --------------------------------------------------------------------------------------------------------

@@ -110,7 +110,7 @@ class Ssim:
         self._check(x)
         if not dr.grad_enabled(x):
             return self._evaluate(x.array, False)[0]
-        return dr.custom(_SsimOp, x.array, self)
+        return dr.custom(KnownGradient, x.array, self)
 
     def map(self, x):
         """Return the SSIM of every window, ``(H - 10, W - 10, C)`` from 11 x 11 texels on; no gradient."""
@@ -200,12 +200,15 @@ class Ssim:
         return _scatter_filter(self._rows, fields, index, 0, step, height * step)
 
 
-class _SsimOp(dr.CustomOp):
-    """The SSIM loss as one node of the AD graph: the gradient is known as soon as the value is."""
+class KnownGradient(dr.CustomOp):
+    """A measure of a flat array as one node of the AD graph: its gradient is known as soon as its value is.
 
-    def eval(self, x, ssim):
-        loss, self.gradient = ssim._evaluate(x, True)
-        return loss
+    ``measure._evaluate(x, True)`` returns both.
+    """
+
+    def eval(self, x, measure):
+        value, self.gradient = measure._evaluate(dr.detach(x), True)
+        return value
 
     def forward(self):
         self.set_grad_out(dr.sum(self.gradient * self.grad_in("x")))
@@ -214,7 +217,7 @@ class _SsimOp(dr.CustomOp):
         self.set_grad_in("x", self.gradient * self.grad_out())
 
     def name(self):
-        return "SSIM"
+        return "measure"
 
 
 def _gaussian(length, size=WINDOW, sigma=1.5):

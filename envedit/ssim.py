@@ -207,16 +207,20 @@ class KnownGradient(dr.CustomOp):
     """
 
     def eval(self, x, measure):
+        """Return the value; keep the gradient."""
         value, self.gradient = measure._evaluate(dr.detach(x), True)
         return value
 
     def forward(self):
+        """Multiply the tangent by the gradient and add up."""
         self.set_grad_out(dr.sum(self.gradient * self.grad_in("x")))
 
     def backward(self):
+        """Scale the gradient by the loss's."""
         self.set_grad_in("x", self.gradient * self.grad_out())
 
     def name(self):
+        """Name the node in Dr.Jit's graphs."""
         return "measure"
 
 

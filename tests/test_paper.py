@@ -14,7 +14,7 @@ from envedit.errors import ConfigError, InputError
 from envedit.files import write_atomically
 from envedit.inputs import load_map
 from experiments import puresky
-from experiments.paper import measured, network, plan, plot, run, sheets, skies, tables
+from experiments.paper import ceiling, measured, network, plan, plot, run, sheets, skies, tables
 from experiments.paper.kinds import KINDS
 from experiments.paper.methods import METHODS
 from experiments.paper.plan import Question, build
@@ -636,3 +636,27 @@ def test_titles_are_words():
         "Log(Pixels)",
         "R-SIREN HDR + L_reg",
     }
+
+
+# ---- what the true map itself scores -----------------------------------------------------------------------
+
+
+def test_the_ceiling_is_the_noise_of_two_renderings(tmp_path, capsys):
+    sun = np.full((8, 16, 3), 0.2, np.float32)
+    sun[2, 5] = 2000.0
+    for name, content in (("clear", sun), ("grey", np.full((8, 16, 3), 0.4, np.float32)), ("night", 0 * sun)):
+        image.write_exr(tmp_path / f"{name}_puresky_1k.exr", content)
+    few = ["--maps", str(tmp_path), "--width", "16", "--roughness", "0", "1"]
+    assert ceiling.main([*few, "--only", "clear", "grey"]) == 0
+    head, _, clear, grey, mean = capsys.readouterr().out.splitlines()
+    assert head == "| map | roughness 0 | roughness 1 |" and mean.startswith("| **mean of 2** |")
+    psnr = {
+        line: [float(cell.split("/")[0]) for cell in line.split("|")[2:4]] for line in (clear, grey, mean)
+    }
+    assert all(20 < value < 80 for values in psnr.values() for value in values)
+    assert psnr[clear][0] < psnr[grey][0]  # caustics of the sun
+    np.testing.assert_allclose(psnr[mean], np.mean([psnr[clear], psnr[grey]], axis=0), atol=0.011)
+    assert ceiling.main([*few, "--only", "night"]) == 0
+    assert "| night | 200.00 / 1.000 | 200.00 / 1.000 |" in capsys.readouterr().out
+    assert ceiling.main([*few, "--only", "claer"]) == 2
+    assert capsys.readouterr().err == "envedit: --only: no map claer; did you mean clear?\n"

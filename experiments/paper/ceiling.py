@@ -1,0 +1,80 @@
+r"""What the true map itself scores in Table 3: two renderings of it, as target and result are rendered.
+
+    python -m experiments.paper.ceiling [--maps DIR] [--only NAME ...] [--scene statue] [--width 128] \
+        [--angle 60] [--roughness 0 0.5 1]
+
+No edit can be expected to score more than the noise of its judge allows: one that does shows a picture that
+is smoother than the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import mitsuba as mi
+import numpy as np
+
+from envedit import config, doctor, inputs, latlong, metrics, scene
+from envedit.errors import EnveditError, unwrapped
+from envedit.pipeline import JUDGE_SEED
+from envedit.target import SEED
+from experiments import puresky
+
+from .kinds import ROUGHNESS
+
+
+def twice(lit: scene.Scene, true: np.ndarray) -> dict:
+    """Render a map with the target's and with the result's samples, and compare: ``metrics.compare``."""
+    target, result = (lit.sampled(true, "auto", seed)[0] for seed in (SEED, JUDGE_SEED + 1))
+    return metrics.compare(result, target)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Render and print; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.paper.ceiling", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--maps", metavar="DIR", help="folder of NAME_puresky_1k.hdr ($ENVEDIT_DATA/puresky)")
+    parser.add_argument("--only", nargs="+", metavar="MAP", help="some maps")
+    parser.add_argument("--scene", default="statue")
+    parser.add_argument("--width", type=int, default=128, help="pixels across")
+    parser.add_argument("--angle", type=float, default=60.0, help="turn of the true map to the left, degrees")
+    parser.add_argument("--roughness", type=float, nargs="+", default=ROUGHNESS)
+    given = parser.parse_args(argv)
+    try:
+        with unwrapped():
+            print(table(given))
+    except EnveditError as error:
+        print(f"envedit: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def table(given: argparse.Namespace) -> str:
+    """Return PSNR and SSIM as Markdown: a line a map, a column a roughness, the averages last."""
+    found = puresky.find(given.maps, "--maps")
+    files = puresky.pick(found, given.only, "--only") if given.only else found
+    doctor.ensure(config.Config().variant)
+    mi.set_variant(config.Config().variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    lit = [scene.load(given.scene, given.width, 0, {"roughness": r}, None) for r in given.roughness]
+    lines = ["| map | " + " | ".join(f"roughness {r:g}" for r in given.roughness) + " |"]
+    lines.append("|---" * (1 + len(lit)) + "|")
+    scores = []
+    for name, file in files.items():
+        original, _ = inputs.load_map(config.Input(envmap=str(file)))
+        true = np.ascontiguousarray(latlong.rotate(original, given.angle), np.float32)
+        row = [twice(one, true) for one in lit]
+        scores.append([(score["psnr"], score["ssim"]) for score in row])
+        lines.append(_line(name, scores[-1]))
+        print(lines[-1], file=sys.stderr, flush=True)
+    return "\n".join([*lines, _line(f"**mean of {len(scores)}**", np.mean(scores, axis=0))])
+
+
+def _line(name, scores):
+    return f"| {name} | " + " | ".join(f"{psnr:.2f} / {ssim:.3f}" for psnr, ssim in scores) + " |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

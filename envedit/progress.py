@@ -24,7 +24,7 @@ class Progress:
     def __init__(self, quiet: bool = False, stream=None):
         self.quiet, self.stream = quiet, stream or sys.stderr
         self._bar = None
-        self._stage, self._begun, self._last_line = "", time.monotonic(), 0.0
+        self._stage, self._first, self._last_line = "", None, 0.0
         self._terminal = self.stream.isatty()
 
     def __enter__(self):
@@ -36,27 +36,36 @@ class Progress:
     def stage(self, text: str) -> None:
         """Begin a stage."""
         self._close()
-        self._stage, self._begun, self._last_line = text, time.monotonic(), time.monotonic()
+        self._stage, self._first, self._last_line = text, None, time.monotonic()
         if not self.quiet and not self._terminal:
             print(text, file=self.stream, flush=True)
 
     def update(self, done: int, total: int, text: str = "") -> None:
-        """Tell that ``done`` of ``total`` parts of the stage are done."""
+        """Tell that ``done`` of ``total`` parts of the stage are done.
+
+        Speed is counted from the first call of the stage: what resumes was not done in no time.
+        """
         if self.quiet:
             return
         if self._terminal:
             if self._bar is None:
                 self._bar = tqdm(
-                    total=total, desc=self._stage, file=self.stream, leave=False, dynamic_ncols=True
+                    total=total,
+                    initial=done,
+                    desc=self._stage,
+                    file=self.stream,
+                    leave=False,
+                    dynamic_ncols=True,
                 )
             self._bar.set_postfix_str(text, refresh=False)
             self._bar.update(done - self._bar.n)
-        elif time.monotonic() - self._last_line >= LINE_SECONDS:
-            self._last_line = time.monotonic()
-            rate = done / max(self._last_line - self._begun, 1e-9)
-            print(
-                f"{self._stage}: {done}/{total}, {rate:.3g}/s {text}".rstrip(), file=self.stream, flush=True
-            )
+            return
+        now = time.monotonic()
+        self._first = self._first or (done, now)
+        if now - self._last_line >= LINE_SECONDS:
+            self._last_line, (before, since) = now, self._first
+            speed = f", {(done - before) / (now - since):.3g}/s" if now > since else ""
+            print(f"{self._stage}: {done}/{total}{speed} {text}".rstrip(), file=self.stream, flush=True)
 
     def _close(self):
         if self._bar is not None:

@@ -4,6 +4,7 @@ import io
 import re
 
 import pytest
+from tqdm import tqdm
 
 from envedit import progress
 from envedit.progress import Progress
@@ -42,7 +43,24 @@ def test_a_line_in_a_log_holds_no_control_characters_or_blanks_at_its_end(clock)
         shown.stage("tracing")
         clock[0] += 6
         shown.update(3, 7)
-    assert stream.getvalue() == "tracing\ntracing: 3/7, 0.5/s\n"
+        clock[0] += 8
+        shown.update(7, 7)
+    assert stream.getvalue() == "tracing\ntracing: 3/7\ntracing: 7/7, 0.5/s\n"
+
+
+@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
+def test_what_was_done_before_is_not_taken_for_speed(kind, clock, monkeypatch):
+    stream, begun = kind(), []
+    monkeypatch.setattr(progress, "tqdm", lambda **given: begun.append(given) or tqdm(**given))
+    with Progress(stream=stream) as shown:
+        shown.stage("fitting")
+        shown.update(500, 1000)
+        clock[0] += 6
+        shown.update(530, 1000)
+    if kind is Terminal:
+        assert begun[0]["initial"] == 500 and "500/1000" in stream.getvalue()
+    else:
+        assert stream.getvalue() == "fitting\nfitting: 530/1000, 5/s\n"
 
 
 def test_an_update_at_once_does_not_divide_by_zero(clock, monkeypatch):

@@ -140,7 +140,7 @@ def fit(
     cache, key = DiskCache(folder if settings.cache else None), _key(image, network, settings, seed, rows)
     if found := cache.load(key):
         return _read(found)
-    start, begun = time.perf_counter(), _Begun(cache, key)
+    begun = _Begun(cache, key)
     normalisation = Normalisation.of(image, settings.headroom)
     x = points(network, image.shape[:2], rows)
     params = _train(image, normalisation, x, network, settings, seed, begun, progress)
@@ -156,7 +156,7 @@ def fit(
         metrics.log_psnr(got, image),
         metrics.peak_ratio(got, image),
         settings.epochs,
-        begun.seconds + time.perf_counter() - start,
+        begun.seconds(),
         False,
     )
     cache.store(key, _stored(fitted))
@@ -297,23 +297,26 @@ class _Begun:
     def __init__(self, cache: DiskCache, key: dict):
         self._cache, self._key = cache, key | {"training": True}
         self._started = self._saved = time.perf_counter()
-        self.seconds = 0.0
-        """Of training in earlier processes."""
+        self._earlier = 0.0
+
+    def seconds(self) -> float:
+        """Return the seconds since the fit was begun, those of earlier processes included."""
+        return self._earlier + time.perf_counter() - self._started
 
     def restore(self, adam: optim.Adam) -> tuple[int, int]:
         """Bring the optimiser to where it was; returns epochs done and steps refused."""
         if not (found := self._cache.load(self._key)):
             return 0, 0
         found = dict(found)
-        epoch, refused, self.seconds = found.pop(_ABOUT).tolist()
+        epoch, refused, self._earlier = found.pop(_ABOUT).tolist()
         adam.load_state_dict(found)
         return int(epoch), int(refused)
 
     def keep(self, adam: optim.Adam, epoch: int, refused: int) -> None:
         """Write the state after ``epoch`` epochs, where that is due."""
-        if (now := time.perf_counter()) - self._saved < SAVED_EVERY:
+        if time.perf_counter() - self._saved < SAVED_EVERY:
             return
-        about = np.array([epoch, refused, self.seconds + now - self._started])
+        about = np.array([epoch, refused, self.seconds()])
         self._cache.store(self._key, adam.state_dict() | {_ABOUT: about})
         self._saved = time.perf_counter()
 

@@ -392,7 +392,7 @@ def _names(path: Path, seen: set) -> tuple[set, set]:
 
 
 def _without_comments(path: Path) -> str:
-    """Return the text of an XML file."""
+    """Return the text of an XML file without its comments."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 
 import mitsuba as mi
 import numpy as np
@@ -44,32 +45,33 @@ def main(argv: list[str] | None = None) -> int:
     given = parser.parse_args(argv)
     try:
         with unwrapped():
-            print(table(given))
+            for line in table(given):
+                print(line, flush=True)
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
     return 0
 
 
-def table(given: argparse.Namespace) -> str:
-    """Return PSNR and SSIM as Markdown: a line a map, a column a roughness, the averages last."""
+def table(given: argparse.Namespace) -> Iterator[str]:
+    """Yield PSNR and SSIM as Markdown: a line a map, a column a roughness, the averages last."""
     found = puresky.find(given.maps, "--maps")
     files = puresky.pick(found, given.only, "--only") if given.only else found
-    doctor.ensure(config.Config().variant)
-    mi.set_variant(config.Config().variant)
+    variant = config.Config().variant
+    doctor.ensure(variant)
+    mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
     lit = [scene.load(given.scene, given.width, 0, {"roughness": r}, None) for r in given.roughness]
-    lines = ["| map | " + " | ".join(f"roughness {r:g}" for r in given.roughness) + " |"]
-    lines.append("|---" * (1 + len(lit)) + "|")
+    yield "| map | " + " | ".join(f"roughness {r:g}" for r in given.roughness) + " |"
+    yield "|---" * (1 + len(lit)) + "|"
     scores = []
     for name, file in files.items():
         original, _ = inputs.load_map(config.Input(envmap=str(file)))
         true = np.ascontiguousarray(latlong.rotate(original, given.angle), np.float32)
         row = [twice(one, true) for one in lit]
         scores.append([(score["psnr"], score["ssim"]) for score in row])
-        lines.append(_line(name, scores[-1]))
-        print(lines[-1], file=sys.stderr, flush=True)
-    return "\n".join([*lines, _line(f"**mean of {len(scores)}**", np.mean(scores, axis=0))])
+        yield _line(name, scores[-1])
+    yield _line(f"**mean of {len(scores)}**", np.mean(scores, axis=0))
 
 
 def _line(name, scores):

@@ -177,6 +177,9 @@ def bars(out, cells: list[Cell]) -> Figure:
         panel.set_xticks(range(len(rough)), [f"{r:g}" for r in rough], fontsize=8)
         panel.tick_params(axis="y", labelsize=7)
         panel.grid(axis="y", alpha=0.3)
+        if not panel.lines and all(averages[column] is None for averages in found.values()):
+            panel.set_yticks([])  # those of a panel without numbers would look like numbers
+            panel.text(0.5, 0.5, "not measured", transform=panel.transAxes, ha="center", fontsize=8)
     title = f"Table 3 by roughness, {settings}, {maps} maps; black: the paper's numbers, over 44 maps"
     figure.suptitle(title, fontsize=10)
     handles, labels = panels[0].get_legend_handles_labels()

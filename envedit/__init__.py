@@ -5,14 +5,25 @@
 that ``import envedit`` is quick and works without LLVM.
 """
 
-import importlib
-
 __version__ = "0.1.0"
+__all__ = ["Config", "LightTransport", "Result", "edit", "fit"]
+
+_PUBLIC = {
+    "Config": "envedit.config",
+    "LightTransport": "envedit.transport.light_transport",
+    "Result": "envedit.results",
+    "edit": "envedit.api",
+    "fit": "envedit.api",
+}
 
 
 def __getattr__(name):
-    if name in ("edit", "fit"):
-        return importlib.import_module(f".{name}", __name__)
-    if name == "LightTransport":
-        return importlib.import_module(".transport", __name__).LightTransport
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__():
+    return sorted([*__all__, "__version__"])

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from . import config, image, scene, sky
+from envedit import config
+from envedit.images import analytic_sky, images
+from envedit.scene import scene
 
 
 def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
@@ -22,11 +24,13 @@ def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
     Raises
     ------
     InputError
-        As of :func:`.image.load_envmap`.
+        As of :func:`.images.load_envmap`.
     """
     if settings.envmap == "sunsky":
-        return sky.sunsky(settings.width, settings.azimuth, settings.elevation, settings.turbidity), []
-    envmap, info = image.load_envmap(settings.envmap, settings.width, settings.repair)
+        return analytic_sky.sunsky(
+            settings.width, settings.azimuth, settings.elevation, settings.turbidity
+        ), []
+    envmap, info = images.load_envmap(settings.envmap, settings.width, settings.repair)
     return envmap, list(info["warnings"])
 
 

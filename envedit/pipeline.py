@@ -13,94 +13,23 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import (
-    carry,
-    config,
-    envmap,
-    features,
-    fit,
-    image,
-    inputs,
-    metrics,
-    perceptual,
-    renderers,
-    starts,
-    target,
-)
-from . import reach as reaches
-from .errors import unwrapped
-from .job import Interrupted, Job, Stopped, Watch, keeping
-from .layers import Layers
-from .separate import Separation
-from .transport import LightTransport
+from envedit import config, inputs, renderers, representations
+from envedit.core.errors import unwrapped
+from envedit.losses import metrics
+from envedit.losses.perceptual import backbones, distances
+from envedit.representations.siren import fit
+from envedit.results import Found, Result
+from envedit.solve import feasibility as reaches
+from envedit.solve import initialization
+from envedit.solve.edit_job import Interrupted, Job, Stopped, Watch, keeping
+from envedit.targets import target
 
-__all__ = ["Found", "Interrupted", "Result", "Stopped", "Watch", "at_full_resolution", "run"]
+__all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
 INITIAL_SPP = 144
 """Samples a pixel of the initial rendering, which is far from the target."""
-
-
-@dataclass
-class Result:
-    """What a run found.
-
-    Attributes
-    ----------
-    envmap : ndarray (H, W, 3)
-        The edited map; rows outside the active ones are the original's, bit for bit, and so are frozen texels
-        but where layers move a light or its glow across them.
-    renders, maps : dict
-        ``initial``, ``target``, ``edited``; linear radiance. ``maps["target"]`` is None where it is unknown.
-    metrics : dict
-        As in metrics.json.
-    history : list of dict
-        A row an iteration.
-    notes, warnings : list of str
-        What was chosen automatically; what the user should know.
-    influence : ndarray (H, W), optional
-        T' 1, how much each texel adds to the picture; None where the renderer does not know.
-    frozen : ndarray of bool (H, W), optional
-        Active texels that were kept, as this view does not determine them; None as above.
-    separation : separate.Separation, optional
-        Lights and background of the active rows, where the representation has them.
-    scene : Path, optional
-        The scene's file.
-    reach : reach.Reach, optional
-        How much of a painted request any light can do; None where T is not at hand or nothing was painted.
-    found : Found, optional
-        What the map was decoded from, for :func:`at_full_resolution`.
-    """
-
-    envmap: np.ndarray
-    renders: dict
-    maps: dict
-    metrics: dict
-    history: list
-    notes: list[str]
-    warnings: list[str]
-    influence: np.ndarray | None = None
-    frozen: np.ndarray | None = None
-    separation: Separation | None = None
-    scene: Path | None = None
-    reach: reaches.Reach | None = None
-    found: Found | None = None
-
-    @property
-    def render(self) -> np.ndarray:
-        """The rendering under the edited map, by Mitsuba with fresh samples."""
-        return self.renders["edited"]
-
-
-@dataclass(frozen=True)
-class Found:
-    """A representation of the active rows with its parameters; ``free`` as for :func:`.carry.carry`."""
-
-    representation: object
-    params: dict
-    first_row: int
-    free: np.ndarray | None
 
 
 @dataclass
@@ -128,25 +57,6 @@ class _Clock:
             "total_s": round(total, 3),
             "per_iteration_ms": float(np.median(steps)) if steps else None,
         }
-
-
-def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
-    """Carry a result to the resolution of its input's file; None where that has no more texels.
-
-    Raises
-    ------
-    InputError, NumericalError
-        If the file cannot be read any more, or the carried map is not finite.
-    """
-    if settings.envmap == "sunsky":
-        return None
-    source, _ = image.load_envmap(settings.envmap, None, settings.repair)
-    if source.shape[1] <= settings.width:
-        return None
-    found, before = result.found, result.maps["initial"]
-    first, last = inputs.active_rows(settings.rows, before.shape[0])
-    rows = first, last - first + 1
-    return carry.carry(found.representation, found.params, before, result.envmap, source, rows, found.free)
 
 
 @unwrapped()
@@ -214,7 +124,7 @@ def run(
     with clock("fit_s"):
         kind = settings.representation.kind
         watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
-        representation = envmap.make(
+        representation = representations.make(
             settings,
             fit.default_folder(),
             lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"),
@@ -232,9 +142,9 @@ def run(
             watch.progress(done, total, "")
 
         renderer = renderers.make(settings, lit, (height, width), count)
-        traced = renderer if isinstance(renderer, LightTransport) else None
-        if layered := isinstance(representation, Layers):
-            recordings = starts.recordings(
+        traced = renderer.transport
+        if representation.models_edit:
+            recordings = initialization.recordings(
                 settings, lit, (height, width), representation, wanted, traced, count
             )
             if traced:
@@ -256,12 +166,12 @@ def run(
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
             wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
-    if layered:
+    if representation.models_edit:
         with clock("start_s"):
             watch.stage("searching for lights")
             representation.keep(free)
             free = None  # the gain keeps to them, while a light may move across the others
-            ready = starts.find(representation, params, recordings, wanted, original)
+            ready = initialization.find(representation, params, recordings, wanted, original)
             wanted, notes = ready.wanted, notes + ready.notes
             del recordings  # the second one is not needed any more
     job = Job(
@@ -277,7 +187,7 @@ def run(
         watch=watch,
         dists=dists,
     )
-    if layered:
+    if representation.models_edit:
         with clock("start_s"):
             params, placed = job.best(ready.starts, crop)
             notes += placed
@@ -302,7 +212,7 @@ def run(
             "learning rate was lowered for a while"
         )
     measured |= {
-        "fit": _of_fit(getattr(representation, "fitted", None)),
+        "fit": _of_fit(representation.fitted),
         "timing": clock.table(state.history, time.perf_counter() - begun),
         "iterations": state.step,
         "non_finite_steps": state.bad_steps,
@@ -325,7 +235,7 @@ def run(
         warnings=warnings,
         influence=traced.influence if traced else None,
         frozen=frozen,
-        separation=getattr(representation, "separation", None),
+        separation=representation.separation,
         scene=lit.path,
         reach=within,
         found=Found(representation, params, first, free),
@@ -347,9 +257,9 @@ def _perceptual(settings):
     """Load DISTS, where the loss asks for it, and LPIPS; None where no weights are named."""
     named, dists, lpips = settings.perceptual, None, None
     if settings.loss.dists and named.vgg:
-        dists = perceptual.Dists(features.Backbone.load("vgg", named.vgg), named.dists)
+        dists = distances.Dists(backbones.Backbone.load("vgg", named.vgg), named.dists)
     if named.backbone:
-        lpips = perceptual.Lpips(named.network, named.backbone, named.heads)
+        lpips = distances.Lpips(named.network, named.backbone, named.heads)
     return dists, lpips
 
 

@@ -2,12 +2,43 @@
 
 from __future__ import annotations
 
-from . import config, files, recording, scene
-from .pathtrace import PathTracer
-from .transport import LightTransport
+from typing import Protocol
+
+import mitsuba as mi
+
+from envedit import config
+from envedit.core import array_cache
+from envedit.scene import scene
+from envedit.scene.path_tracer import PathTracer
+from envedit.transport import recording
+from envedit.transport.light_transport import LightTransport
 
 
-def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> PathTracer | LightTransport:
+class Renderer(Protocol):
+    """What the edit loop renders with.
+
+    Attributes
+    ----------
+    choices : list of str
+        What was chosen automatically.
+    transport : LightTransport or None
+        The stored T that it renders through, where there is one.
+    """
+
+    choices: list[str]
+    transport: LightTransport | None
+
+    def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
+        """Render (H, W, 3) linear radiance to (h, w, 3), differentiable in the map."""
+
+    def state(self) -> dict:
+        """Return what a checkpoint must hold."""
+
+    def restore(self, state: dict) -> None:
+        """Continue from :meth:`state`."""
+
+
+def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Renderer:
     """Build the renderer of a configuration for maps of the given (H, W).
 
     Parameters
@@ -46,6 +77,6 @@ def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Li
         memory_gb=chosen.memory_gb,
         refresh=0 if chosen.refresh == "auto" else chosen.refresh,
         few=settings.representation.kind == "layers",
-        folder=files.cache_folder("transport") if chosen.cache else None,
+        folder=array_cache.cache_folder("transport") if chosen.cache else None,
         progress=progress,
     )

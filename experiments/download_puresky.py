@@ -29,9 +29,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from envedit import __version__
-from envedit.errors import EnveditError, InputError
-from envedit.files import write_atomically
-from envedit.progress import Progress
+from envedit.cli.progress import Progress
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError, InputError
 
 API = "https://api.polyhaven.com"
 AGENT = f"envedit/{__version__} (experiments.download_puresky)"

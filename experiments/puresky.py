@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from envedit.errors import ConfigError, EnveditError, InputError
+from envedit.core.errors import ConfigError, EnveditError, InputError
 
 _NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
 _HOW = "python -m experiments.download_puresky DIR fetches them"

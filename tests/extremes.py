@@ -17,7 +17,7 @@ from extremes_precision import CHECKS
 from extremes_stages import DONE, STAGES, Outcome, refused, seen, sky
 from extremes_targets import SCENES, TARGETS
 
-from envedit.errors import EnveditError, InputError, NumericalError
+from envedit.core.errors import EnveditError, InputError, NumericalError
 
 # ---- maps ------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,11 @@ import numpy as np
 from extremes_stages import LUMINANCE, dense, loss_and_gradient, plain, single, sky, transport
 from helpers import plain_ssim
 
-from envedit import fit, health, latlong, lights, losses, metrics, optim, siren, ssim, tonemap
+from envedit.core import color, latlong, radiance
+from envedit.losses import losses, metrics, optimizer, ssim
+from envedit.representations.layers import lights
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
 
 SCALES = [10.0**k for k in range(-5, 6)]
 RANGE = "1e-5 to 1e5"
@@ -90,7 +94,7 @@ def _sun_luminance():
     m = sunny()
     wanted = (m.astype(np.float64) @ LUMINANCE).sum()
     lum = losses.luminance(single(m), single(np.zeros_like(m)))[0]
-    return max(error(lum, wanted), error(tonemap.luminance(m).sum(), wanted))
+    return max(error(lum, wanted), error(color.luminance(m).sum(), wanted))
 
 
 def _sky_under_sun():
@@ -119,7 +123,7 @@ def _resize():
 def _health():
     worst = 0.0
     for m in wild():
-        found, y = health.health(m), m.astype(np.float64) @ LUMINANCE
+        found, y = radiance.health(m), m.astype(np.float64) @ LUMINANCE
         for got, wanted in ((found.median, np.median(y)), (found.dynamic_range, y.max() / y.min())):
             worst = max(worst, error(got, wanted))
     return worst
@@ -237,7 +241,7 @@ def _adam():
     rng, worst = np.random.default_rng(12), 0.0
     for scale in SCALES:
         p = start = rng.random((16, 32, 3)).astype(np.float32).astype(np.float64)
-        one, m, v = optim.Adam({"x": single(start)}, 1e-3), 0.0, 0.0
+        one, m, v = optimizer.Adam({"x": single(start)}, 1e-3), 0.0, 0.0
         for t in range(1, 31):
             g = (scale * rng.normal(size=p.shape)).astype(np.float32)
             one.step({"x": single(g)})

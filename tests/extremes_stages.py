@@ -12,24 +12,16 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-from envedit import (
-    config,
-    envmap,
-    fit,
-    health,
-    image,
-    latlong,
-    loop,
-    losses,
-    metrics,
-    optim,
-    scene,
-    search,
-    ssim,
-)
-from envedit.display import to_display
-from envedit.layers import Layers
-from envedit.transport import LightTransport
+from envedit import config, representations
+from envedit.core import latlong, radiance
+from envedit.images import images
+from envedit.losses import losses, metrics, optimizer, ssim
+from envedit.losses.display_curve import to_display
+from envedit.representations.layers.layers import Layers
+from envedit.representations.siren import fit
+from envedit.scene import scene
+from envedit.solve import adam_loop, light_search
+from envedit.transport.light_transport import LightTransport
 
 FILM = (8, 6)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -132,12 +124,12 @@ def read(m, folder):
     path = write_plain(folder / "map.exr", m)
     wrong = ~np.isfinite(m).all(axis=2)
     if wrong.any() and not wrong.all():  # what is refused below can be asked to be mended
-        mended, info = image.load_envmap(path, repair=True)
+        mended, info = images.load_envmap(path, repair=True)
         np.testing.assert_array_equal(mended[~wrong], m[~wrong])
         near = m[4:7, 8:11].reshape(9, 3)[[0, 1, 2, 3, 5, 6, 7, 8]]
         np.testing.assert_allclose(mended[5, 9], near.mean(axis=0, dtype=np.float64), rtol=1e-6)
         assert info["repaired"] == 1
-    found, info = image.load_envmap(path)
+    found, info = images.load_envmap(path)
     np.testing.assert_array_equal(found, np.maximum(m, 0))
     expected = [
         w
@@ -154,7 +146,7 @@ def read(m, folder):
 
 def check(m, folder):
     """Counts, first places and range are those of plain numpy, and finite whatever the map."""
-    found = health.health(m)
+    found = radiance.health(m)
     wide, finite = m.astype(np.float64), np.isfinite(m)
     for kind, mask in (
         ("nan", np.isnan(m)),
@@ -180,7 +172,7 @@ def write(m, folder):
     path = folder / "out.exr"
     path.unlink(missing_ok=True)
     try:
-        image.write_exr(path, m)
+        images.write_exr(path, m)
     finally:
         assert path.exists() == np.isfinite(m).all()
     pixels = OpenEXR.File(str(path)).parts[0].channels["RGB"].pixels
@@ -214,7 +206,7 @@ def fitted(m, folder):
     told = []
     recipe = config.Fit(epochs=21, lr=5e-3, awp_gamma=0.01, cache=False, polish="always")
     network = config.Representation(hidden=12, depth=1)
-    made = envmap.Siren(network, recipe, progress=lambda done, total, loss: told.append(loss))
+    made = representations.Siren(network, recipe, progress=lambda done, total, loss: told.append(loss))
     params = made.encode(m)
     assert all(np.isfinite(value.numpy()).all() for value in params.values())
     got = made.decode(params).numpy()
@@ -333,7 +325,7 @@ def adam(m, folder):
     """Three steps with the map as gradient: within 1e-5 of float64's; a refused step changes nothing."""
     lr, (b1, b2), eps = 0.1, (0.9, 0.999), 1e-8
     start = sky(*m.shape[:2])
-    one = optim.Adam({"x": single(start)}, lr)
+    one = optimizer.Adam({"x": single(start)}, lr)
     p, g = start.astype(np.float64), m.astype(np.float64)
     first, second = np.zeros(p.shape), np.zeros(p.shape)
     for t in (1, 2, 3):
@@ -369,12 +361,12 @@ def edited(m, folder):
     settle(traced, m, turned)
     wanted = traced.apply(single(turned)).numpy()
     if not same:
-        params, _ = search.start(made, params, traced, wanted, None, m)
+        params, _ = light_search.start(made, params, traced, wanted, None, m)
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
-    objective = loop.Objective(weights, wanted, None, m, STEPS)
+    objective = adam_loop.Objective(weights, wanted, None, m, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.01)
     start = made.decode(params).numpy()
-    params, state = loop.optimise(made, params, traced, objective, m, 0, settings)
+    params, state = adam_loop.optimise(made, params, traced, objective, m, 0, settings)
     got = made.decode(params).numpy()
     assert np.isfinite(got).all() and (got >= 0).all() and state.bad_steps == 0
     if same:

@@ -19,9 +19,13 @@ from extremes_stages import (
     write_plain,
 )
 
-from envedit import config, display, envmap, loop, metrics, optim, painted, scene
-from envedit.errors import InputError, NumericalError
-from envedit.transport import LightTransport
+from envedit import config, representations
+from envedit.core.errors import InputError, NumericalError
+from envedit.losses import display_curve, metrics, optimizer
+from envedit.scene import scene
+from envedit.solve import adam_loop
+from envedit.targets import painted_image
+from envedit.transport.light_transport import LightTransport
 
 SHAPE = (FILM[1], FILM[0])
 STEPS = 10
@@ -36,11 +40,11 @@ def initial():
 
 def follow(picture, weight=None):
     """Edit the logarithms of the map towards a picture; the loss falls, and all stays finite."""
-    made, before = envmap.LogPixels(), sky()
-    objective = loop.Objective(config.Loss(image_l2=1.0), picture, weight, before, STEPS)
+    made, before = representations.LogPixels(), sky()
+    objective = adam_loop.Objective(config.Loss(image_l2=1.0), picture, weight, before, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.02)
     traced = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3)
-    params, state = loop.optimise(made, made.encode(before), traced, objective, before, 0, settings)
+    params, state = adam_loop.optimise(made, made.encode(before), traced, objective, before, 0, settings)
     got = made.decode(params).numpy()
     assert np.isfinite(got).all() and (got >= 0).all() and state.bad_steps == 0
     assert state.history[-1]["loss"] < state.history[0]["loss"]
@@ -56,10 +60,10 @@ def _even(value):
 
     def act(folder):
         picture = np.full((*SHAPE, 3), value, np.float32)
-        found = painted.given(picture, SHAPE, initial())
+        found = painted_image.given(picture, SHAPE, initial())
         np.testing.assert_array_equal(found.picture, np.maximum(picture, 0))
         assert (found.coverage == 1).all()
-        shown = [display.to_display(single(e)).numpy() for e in (initial(), found.picture)]
+        shown = [display_curve.to_display(single(e)).numpy() for e in (initial(), found.picture)]
         for name in ("image_l1", "image_l2", "ssim"):
             for got, wanted in zip(loss_and_gradient(name, *shown), plain(name, *shown), strict=True):
                 close(got, wanted, 1e-5, ssim_rounding(np.maximum(*shown)) if name == "ssim" else 0)
@@ -79,7 +83,7 @@ def _one(value):
     def act(folder):
         picture = initial().copy()
         picture[2, 3] = value
-        found = painted.given(picture, SHAPE, initial())
+        found = painted_image.given(picture, SHAPE, initial())
         assert found.coverage.sum() == 1 and found.coverage[2, 3] == 1
         follow(found.picture)
 
@@ -92,14 +96,17 @@ def _unchecked(value):
     def act(folder):
         picture = initial().copy()
         picture[2, 3] = value
-        made, before = envmap.LogPixels(), sky()
+        made, before = representations.LogPixels(), sky()
         params = made.encode(before)
         start = {name: array.numpy() for name, array in params.items()}
-        traced, held = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3), optim.Adam(params, 0.02)
-        objective = loop.Objective(config.Loss(), picture, None, before, 21)
+        traced, held = (
+            LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3),
+            optimizer.Adam(params, 0.02),
+        )
+        objective = adam_loop.Objective(config.Loss(), picture, None, before, 21)
         settings = config.Optimizer(iterations=21, lr=0.02)  # it stops at the 20th bad step
         try:
-            loop.optimise(made, params, traced, objective, before, 0, settings, adam=held)
+            adam_loop.optimise(made, params, traced, objective, before, 0, settings, adam=held)
         finally:
             for name, array in start.items():
                 np.testing.assert_array_equal(held.params[name].numpy(), array)
@@ -108,20 +115,20 @@ def _unchecked(value):
 
 
 def _equal(folder):
-    painted.given(initial(), SHAPE, initial())
+    painted_image.given(initial(), SHAPE, initial())
 
 
 def _equal_in_the_loop(folder):
     before = sky()
-    made = envmap.LogPixels()
+    made = representations.LogPixels()
     traced = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3)
     params = made.encode(before)
     start = made.decode(params).numpy()
     settle(traced, start)
     picture = traced.apply(single(start)).numpy()
-    objective = loop.Objective(config.Loss(image_l2=1.0), picture, None, before, STEPS)
+    objective = adam_loop.Objective(config.Loss(image_l2=1.0), picture, None, before, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.02)
-    params, state = loop.optimise(made, params, traced, objective, before, 0, settings)
+    params, state = adam_loop.optimise(made, params, traced, objective, before, 0, settings)
     np.testing.assert_array_equal(made.decode(params).numpy(), start)
     assert state.history[-1]["loss"] == 0
     assert metrics.compare(picture, picture) == {"psnr": 200.0, "ssim": 1.0, "mse": 0.0, "lpips": None}
@@ -139,7 +146,7 @@ def _transparent(alpha, light=2.0):
         OpenEXR.File(header, {c: p.astype(np.float32) for c, p in planes.items()}).write(
             str(folder / "p.exr")
         )
-        found = painted.read(folder / "p.exr", SHAPE, "gamma", initial())
+        found = painted_image.read(folder / "p.exr", SHAPE, "gamma", initial())
         np.testing.assert_allclose(found.coverage, alpha, rtol=1e-6)
         mixed = (alpha * light + 1 - alpha) * initial().astype(np.float64)
         np.testing.assert_allclose(found.picture, mixed, rtol=1e-5)
@@ -154,7 +161,7 @@ def _clipped(share):
         codes = np.full((*SHAPE, 3), 128, np.uint8)
         codes.reshape(-1, 3)[: round(share * SHAPE[0] * SHAPE[1])] = 255
         mi.Bitmap(codes).write(str(folder / "p.png"))
-        found = painted.read(folder / "p.png", SHAPE, "gamma", initial())
+        found = painted_image.read(folder / "p.png", SHAPE, "gamma", initial())
         white = (codes == 255).all(axis=2)
         np.testing.assert_array_equal(found.excluded, white)
         assert any(f"{white.sum()} painted pixels are clipped" in line for line in found.warnings)
@@ -167,7 +174,7 @@ def _clipped(share):
 def _not_finite_file(folder):
     picture = initial().copy()
     picture[2, 3, 1] = np.nan
-    painted.read(write_plain(folder / "p.exr", picture), SHAPE, "gamma", initial())
+    painted_image.read(write_plain(folder / "p.exr", picture), SHAPE, "gamma", initial())
 
 
 def done(says):

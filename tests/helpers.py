@@ -7,7 +7,7 @@ import OpenEXR
 import pytest
 
 from envedit import config as cfg
-from envedit.errors import ConfigError
+from envedit.core.errors import ConfigError
 
 # ---- images ------------------------------------------------------------------------------------------------
 

@@ -12,8 +12,12 @@ from test_loop import arrays, case, every_step, same  # noqa: F401 (a fixture)
 from test_pipeline import own_cache, settings_of, sunny  # noqa: F401 (a fixture)
 from test_run import call, changed, isolated, measured, names, pixels, world  # noqa: F401 (a fixture)
 
-from envedit import config, envmap, job, loop, losses, manifest, optim, pipeline, scene
-from envedit.errors import NumericalError
+from envedit import config, pipeline, representations
+from envedit.core.errors import NumericalError
+from envedit.losses import losses, optimizer
+from envedit.report import manifest
+from envedit.scene import scene
+from envedit.solve import adam_loop, edit_job
 
 TERMS = ("ssim", "luminance", "l1", "tv", "image_l1", "image_l2")
 BAD_VALUES = [math.nan, math.inf]
@@ -64,7 +68,7 @@ def spoiled(stage, calls, value, monkeypatch):
     arguments, _ = case(np.random.default_rng(1), weights=weights, iterations=40)
     representation, params, renderer, objective, original, *rest = arguments
     picture = objective._target.numpy()
-    objective = loop.Objective(weights, picture, None, original[:3], 40, FakeDists())
+    objective = adam_loop.Objective(weights, picture, None, original[:3], 40, FakeDists())
     assert objective.ramps.keys() == {*TERMS, "dists"}
     where, how = stage.removeprefix("slope of "), "slope" if stage.startswith("slope") else "value"
     if where == "map":
@@ -91,7 +95,9 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):  # noqa: F811
     arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
     seen.append(arrays(arguments[1]))
-    params, state = loop.optimise(*arguments, after_step=lambda _, adam: seen.append(arrays(adam.params)))
+    params, state = adam_loop.optimise(
+        *arguments, after_step=lambda _, adam: seen.append(arrays(adam.params))
+    )
     assert (state.step, state.bad_steps, state.bad_in_a_row) == (40, 3, 0)
     assert same(seen[6], seen[4]) and same(seen[7], seen[4]) and same(seen[13], seen[11])
     rates = [row["lr"] for row in state.history]
@@ -107,13 +113,13 @@ def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypat
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stage, monkeypatch):
     arguments = spoiled(stage, range(5, 1000), math.nan, monkeypatch)
-    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[-1].beta2)), loop.State()
+    adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[-1].beta2)), adam_loop.State()
     with pytest.raises(NumericalError, match="iteration 24: 20 steps in a row") as info:
-        loop.optimise(*arguments, adam=adam, state=state)
+        adam_loop.optimise(*arguments, adam=adam, state=state)
     assert info.value.exit_code == 5 and state.bad_steps == 20 and len(state.history) == 24
     monkeypatch.undo()
     good = spoiled("map", (), 0, monkeypatch)
-    expected, _ = loop.optimise(*good[:-1], config.Optimizer(iterations=4, lr=0.02, schedule="constant"))
+    expected, _ = adam_loop.optimise(*good[:-1], config.Optimizer(iterations=4, lr=0.02, schedule="constant"))
     assert same(arrays(adam.params), arrays(expected))
 
 
@@ -122,7 +128,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
 def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):  # noqa: F811
     """One bad element, as a faulty memory makes it. An infinite v alone would give steps of zero for ever."""
     arguments, _ = case(np.random.default_rng(0), iterations=60)
-    adam, state = optim.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), loop.State()
+    adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), adam_loop.State()
 
     def spoil(state, adam):
         if state.step == 5:
@@ -132,13 +138,13 @@ def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step)
             moments["log_radiance"] = dr.opaque(mi.TensorXf(bad))
 
     with pytest.raises(NumericalError, match="iteration 24"):
-        loop.optimise(*arguments, adam=adam, state=state, after_step=spoil)
+        adam_loop.optimise(*arguments, adam=adam, state=state, after_step=spoil)
     assert state.bad_steps == 20
     assert all(np.isfinite(values).all() for values in arrays(adam.params).values())
 
 
 def test_a_step_to_parameters_that_are_not_finite_is_refused():
-    adam = optim.Adam({"p": mi.TensorXf([1.0, 3e38])}, lr=1.0)
+    adam = optimizer.Adam({"p": mi.TensorXf([1.0, 3e38])}, lr=1.0)
     good = {"p": mi.TensorXf([1.0, 1.0])}
     before = adam.state_dict()
     assert not adam.step({"p": mi.TensorXf([1.0, -1.0])}, lr=3e38)  # 3e38 + 3e38 is infinite
@@ -147,7 +153,7 @@ def test_a_step_to_parameters_that_are_not_finite_is_refused():
 
 
 def test_a_step_that_is_taken_back_leaves_the_moments():
-    adam = optim.Adam({"p": mi.TensorXf([1.0, 2.0])}, lr=0.1)
+    adam = optimizer.Adam({"p": mi.TensorXf([1.0, 2.0])}, lr=0.1)
     slope = {"p": mi.TensorXf([1.0, -1.0])}
     adam.take_back()
     assert np.array_equal(np.array(adam.params["p"]), [1, 2])
@@ -180,8 +186,8 @@ def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
     _, _, renderer, objective, original, first, _ = arguments
     steep = Steep()
     settings = config.Optimizer(iterations=80, lr=2000.0, schedule="cosine")
-    adam, state = optim.Adam(steep.encode(original[:3]), 2000.0, (0.9, settings.beta2)), loop.State()
-    params, state = loop.optimise(
+    adam, state = optimizer.Adam(steep.encode(original[:3]), 2000.0, (0.9, settings.beta2)), adam_loop.State()
+    params, state = adam_loop.optimise(
         steep, adam.params, renderer, objective, original, first, settings, adam=adam, state=state
     )
     assert 4 <= state.bad_steps < 40 and state.step == 80
@@ -195,16 +201,16 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     """Neither is one that stops, nor the first by default if it is they."""
     lost = object()
     ends = {0: 1.0, 1: math.nan, 2: 0.5, 3: lost}
-    monkeypatch.setattr(loop, "Objective", lambda *_: None)
+    monkeypatch.setattr(adam_loop, "Objective", lambda *_: None)
 
     def ended(self, params, *_):
         if ends[params] is lost:
             raise NumericalError("it stopped")
-        return None, loop.State(history=[{"loss": ends[params]}])
+        return None, adam_loop.State(history=[{"loss": ends[params]}])
 
-    monkeypatch.setattr(job.Job, "_loop", ended)
+    monkeypatch.setattr(edit_job.Job, "_loop", ended)
     wanted = types.SimpleNamespace(aim=None, weight=None)
-    work = job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, job.Watch())
+    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, edit_job.Watch())
     for order, best in (((0, 1, 2, 3), 2), ((1, 0, 2), 2), ((3, 1, 0), 0), ((1, 3), 1), ((0, 1, 3), 0)):
         params, notes = work.best([(i, [f"start {i}"]) for i in order], None)
         assert params == best and f"start {order.index(best) + 1} of {len(order)}" in notes[-1]
@@ -213,7 +219,7 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
 @pytest.fixture
 def recorded(monkeypatch):
     """Record the parameters that ``Pixels`` decodes; those listed in ``recorded.bad`` decode to NaN."""
-    decode, seen = envmap.Pixels.decode, types.SimpleNamespace(all=[], bad=set())
+    decode, seen = representations.Pixels.decode, types.SimpleNamespace(all=[], bad=set())
 
     def noted(self, params):
         values = np.array(dr.detach(params["radiance"]))
@@ -221,7 +227,7 @@ def recorded(monkeypatch):
         crop = decode(self, params)
         return crop * math.nan if values.tobytes() in seen.bad else crop
 
-    monkeypatch.setattr(envmap.Pixels, "decode", noted)
+    monkeypatch.setattr(representations.Pixels, "decode", noted)
     return seen
 
 
@@ -241,8 +247,10 @@ def test_a_last_step_that_leads_to_no_map_is_taken_back(tmp_path, rng, recorded)
 
 
 def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypatch):
-    original, decode = sunny(rng), envmap.Pixels.decode
-    monkeypatch.setattr(envmap.Pixels, "decode", lambda self, params: decode(self, params) * math.nan)
+    original, decode = sunny(rng), representations.Pixels.decode
+    monkeypatch.setattr(
+        representations.Pixels, "decode", lambda self, params: decode(self, params) * math.nan
+    )
     settings = settings_of(tmp_path, original, **PIXELS)
     for iterations, message in (
         (40, "20 steps in a row"),
@@ -257,12 +265,12 @@ def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypat
 
 def test_the_path_tracer_hides_no_bad_slope(tmp_path, rng, monkeypatch):
     """It adds gradients with atomics, which drop NaN on LLVM: the parameters' gradients are all finite."""
-    weigh = loop.Objective.__call__
+    weigh = adam_loop.Objective.__call__
 
     def with_hole(self, rendering, crop, step):
         return weigh(self, dr.custom(Hole, rendering, math.nan) if step == 2 else rendering, crop, step)
 
-    monkeypatch.setattr(loop.Objective, "__call__", with_hole)
+    monkeypatch.setattr(adam_loop.Objective, "__call__", with_hole)
     tables = PIXELS | {"renderer": {"kind": "path", "spp": 4, "max_depth": 3}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
     assert found.metrics["non_finite_steps"] == 1 and np.isfinite(found.envmap).all()

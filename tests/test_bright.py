@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from envedit import bright
+from envedit.transport import bright_texels
 
 
 def test_error_is_that_of_samples_in_proportion_to_solid_angle(rng):
@@ -15,35 +15,36 @@ def test_error_is_that_of_samples_in_proportion_to_solid_angle(rng):
     estimate = exact + (radiance * rest)[drawn].mean(axis=1) * omega.sum()
     found = estimate.std() / (radiance * omega).sum()
     # The texels that are taken out count as samples of the rest's mean, not of 0: a little less noise.
-    assert 0.75 * found < bright.error(radiance, omega, 16, rest) <= 1.02 * found
+    assert 0.75 * found < bright_texels.error(radiance, omega, 16, rest) <= 1.02 * found
 
 
 def test_samples_of_a_grey_sky_have_no_error(rng):
-    assert bright.error(np.full(20, 3.0), rng.random(20) + 0.1, 4, np.full(20, True)) < 1e-6
-    assert len(bright.brightest(np.full(20, 3.0), rng.random(20) + 0.1, 4, 1e-6)) == 0
+    assert bright_texels.error(np.full(20, 3.0), rng.random(20) + 0.1, 4, np.full(20, True)) < 1e-6
+    assert len(bright_texels.brightest(np.full(20, 3.0), rng.random(20) + 0.1, 4, 1e-6)) == 0
 
 
 @pytest.mark.parametrize("tolerance", [0.3, 0.03, 0.003, 0.0])
 def test_as_few_texels_as_it_takes_brightest_first(tolerance, rng):
     radiance, omega = np.exp(3 * rng.normal(size=200)), rng.random(200) + 0.1
-    found = bright.brightest(radiance, omega, 64, tolerance)
+    found = bright_texels.brightest(radiance, omega, 64, tolerance)
     assert (np.diff(radiance[found]) <= 0).all() and len(found) > 0
     for count, enough in ((len(found), True), (len(found) - 1, False)):
         rest = np.full(200, True)
         rest[found[:count]] = False
-        assert (bright.error(radiance, omega, 64, rest) <= tolerance + 1e-9) == enough
+        assert (bright_texels.error(radiance, omega, 64, rest) <= tolerance + 1e-9) == enough
 
 
 def test_black_needs_nothing():
     black, omega = np.zeros(8), np.ones(8)
-    assert len(bright.brightest(black, omega, 4, 0.0)) == 0
-    assert bright.error(black, omega, 4, np.full(8, True)) == 0
-    assert bright.error(np.ones(8), omega, 4, np.full(8, False)) == 0
+    assert len(bright_texels.brightest(black, omega, 4, 0.0)) == 0
+    assert bright_texels.error(black, omega, 4, np.full(8, True)) == 0
+    assert bright_texels.error(np.ones(8), omega, 4, np.full(8, False)) == 0
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-4, 65504.0, 1e6, 1e30])
 def test_scale_of_the_radiance_changes_nothing(scale, rng):
     radiance, omega = np.exp(3 * rng.normal(size=100)), rng.random(100) + 0.1
     np.testing.assert_array_equal(
-        bright.brightest(radiance * scale, omega, 16, 0.05), bright.brightest(radiance, omega, 16, 0.05)
+        bright_texels.brightest(radiance * scale, omega, 16, 0.05),
+        bright_texels.brightest(radiance, omega, 16, 0.05),
     )

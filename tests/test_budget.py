@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import budget, config, image, run, scene
-from envedit.budget import LEVELS, Calibration, Work
-from envedit.errors import ConfigError
+from envedit import config
+from envedit.cli import budget, run
+from envedit.cli.budget import LEVELS, Calibration, Work
+from envedit.core.errors import ConfigError
+from envedit.images import images
+from envedit.scene import scene
 
 HERE = Calibration(budget.REFERENCE_RENDER, 1.0, 0.0, 512)
 """The reference machine."""
@@ -113,7 +116,7 @@ def test_a_picture_keeps_its_shape():
 @pytest.fixture
 def small(tmp_path, rng, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    image.write_exr(tmp_path / "map.exr", (0.5 + rng.random((32, 64, 3))).astype(np.float32))
+    images.write_exr(tmp_path / "map.exr", (0.5 + rng.random((32, 64, 3))).astype(np.float32))
     write_scene(tmp_path, SENSOR, BALL, LIGHT, name="scene.xml")
     path = tmp_path / "c.toml"
     path.write_text('[input]\nenvmap = "map.exr"\n[scene]\nfile = "scene.xml"\n[optimizer]\nlr = 0.01\n')

@@ -5,10 +5,14 @@ import numpy as np
 import pytest
 from helpers import grey
 
-from envedit import carry, image, latlong, layers, places, scene
-from envedit.errors import NumericalError
-from envedit.layers import Layers
-from envedit.lights import DARK, SPARE, rotation_vector
+from envedit.core import latlong
+from envedit.core.errors import NumericalError
+from envedit.export import full_resolution, texel_maps
+from envedit.images import images
+from envedit.representations.layers import layers
+from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.scene import scene
 
 WORKING, ROWS = (64, 128), (0, 32)
 
@@ -68,7 +72,7 @@ def carried(made, params, working, source, rows=ROWS, free=None):
     edited = working.copy()
     edited[rows[0] : rows[0] + rows[1]] = made.decode(params).numpy()
     before = source.copy()
-    result = carry.carry(made, params, working, edited, source, rows, free)
+    result = full_resolution.carry(made, params, working, edited, source, rows, free)
     np.testing.assert_array_equal(source, before)  # the caller's own
     assert result.shape == source.shape and result.dtype == np.float32
     assert np.isfinite(result).all() and (result >= 0).all()
@@ -96,7 +100,7 @@ def sunny():
 
 @pytest.mark.parametrize("band", [1 << 21, 700, 5120])
 def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
-    monkeypatch.setattr(places, "BAND_TEXELS", band)
+    monkeypatch.setattr(texel_maps, "BAND_TEXELS", band)
     source, working, made, params = sunny
     assert carried(made, params, working, source)[0].tobytes() == source.tobytes()
 
@@ -107,8 +111,8 @@ def test_bands_do_not_show(sunny, rng, monkeypatch):
     params["gain.1"] += rng.normal(size=params["gain.1"].shape).astype(np.float32)
     whole = carried(made, params, working, source)[0]
     for band, points in ((512 * 7, 1 << 20), (512 * 50, 40)):
-        monkeypatch.setattr(places, "BAND_TEXELS", band)
-        monkeypatch.setattr(carry, "POINTS_AT_ONCE", points)
+        monkeypatch.setattr(texel_maps, "BAND_TEXELS", band)
+        monkeypatch.setattr(full_resolution, "POINTS_AT_ONCE", points)
         # Points are added up in units of the brightest of their chunk.
         np.testing.assert_allclose(carried(made, params, working, source)[0], whole, rtol=1e-4)
 
@@ -288,7 +292,7 @@ def test_what_is_not_finite_is_refused(sunny):
 
 
 def ratio(working, edited, source, rows=ROWS, free=None):
-    result = carry.carry(None, {}, working, edited, source, rows, free)
+    result = full_resolution.carry(None, {}, working, edited, source, rows, free)
     assert result.dtype == np.float32 and np.isfinite(result).all() and (result >= 0).all()
     return result
 
@@ -349,7 +353,7 @@ def test_bands_do_not_show_beside_a_lamp_that_is_put_out(row, monkeypatch):
     edited[row, 30] = 1e-3 * working[row, 30]
     whole = ratio(working, edited, source)
     for rows in (1, 5):
-        monkeypatch.setattr(places, "BAND_TEXELS", rows * 512)
+        monkeypatch.setattr(texel_maps, "BAND_TEXELS", rows * 512)
         np.testing.assert_allclose(ratio(working, edited, source), whole, rtol=1e-5)
 
 
@@ -402,9 +406,9 @@ def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
 
 def test_shapes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"float32, got \(64, 128, 3\) float64"):
-        carry.carry(None, {}, grey(1), grey(1), np.ones((64, 128, 3)), (0, 4))
+        full_resolution.carry(None, {}, grey(1), grey(1), np.ones((64, 128, 3)), (0, 4))
     with pytest.raises(ValueError, match="working maps have shapes"):
-        carry.carry(None, {}, grey(1), grey(1, 4, 8), grey(1, 32, 64), (0, 4))
+        full_resolution.carry(None, {}, grey(1), grey(1, 4, 8), grey(1, 32, 64), (0, 4))
 
 
 # ---- real maps ---------------------------------------------------------------------------------------------
@@ -418,7 +422,7 @@ def irradiance(m, normals):
 
 @pytest.mark.parametrize("name", ["kloofendal_48d_partly_cloudy", "rustig_koppie"])
 def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
-    source, _ = image.load_envmap(data / f"puresky/{name}_puresky_1k.hdr")
+    source, _ = images.load_envmap(data / f"puresky/{name}_puresky_1k.hdr")
     working, rows = latlong.resize(source, 128, 256), (0, 64)
     made, params = encoded(working, rows)
     d = made.lights.centres[0]

@@ -9,9 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import checkpoint, config, optim
-from envedit.errors import InputError
-from envedit.loop import State
+from envedit import config
+from envedit.core.errors import InputError
+from envedit.losses import optimizer
+from envedit.solve import checkpoint
+from envedit.solve.adam_loop import State
 
 PICTURE = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
 
@@ -54,7 +56,7 @@ def test_a_renderer_without_state_and_a_history_with_bad_steps(tmp_path, rng):
 def test_an_optimiser_continues_from_it(tmp_path, rng):
     grads = [{"p": mi.TensorXf(rng.normal(size=(2, 3)).astype(np.float32))} for _ in range(6)]
     start = {"p": mi.TensorXf(rng.random((2, 3)).astype(np.float32))}
-    whole, first, second = (optim.Adam(start, 0.1) for _ in range(3))
+    whole, first, second = (optimizer.Adam(start, 0.1) for _ in range(3))
     for g in grads:
         whole.step(g)
     for g in grads[:3]:

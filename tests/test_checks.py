@@ -9,9 +9,9 @@ from helpers import refused
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from envedit import checks
 from envedit import config as cfg
-from envedit.errors import ConfigError
+from envedit.config import validators
+from envedit.core.errors import ConfigError
 
 quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 
@@ -81,7 +81,7 @@ plain = st.recursive(
 @given(st.dictionaries(words, plain, max_size=3))
 def test_nested_values_are_written_and_come_back(table):
     """TOML's own parser reads what is written."""
-    found = checks.plain(table)
+    found = validators.plain(table)
     assert tomllib.loads(f"a = {cfg.quote(found)}")["a"] == found == table
 
 
@@ -89,5 +89,5 @@ def test_too_deep_a_value_is_refused():
     deep = []
     for _ in range(20):
         deep = [deep]
-    with pytest.raises(checks.WantedError, match="not too deep"):
-        checks.plain(deep)
+    with pytest.raises(validators.WantedError, match="not too deep"):
+        validators.plain(deep)

@@ -10,7 +10,8 @@ import pytest
 from helpers import BALL, LIGHT, SENSOR, exr, sky, write_scene
 from test_run import FILES, SKY, call, changed, names, pixels, small_world, world
 
-from envedit import doctor, image, run
+from envedit.cli import doctor, run
+from envedit.images import images
 
 ROOT = Path(run.__file__).parent.parent
 ENSURE = doctor.ensure
@@ -154,7 +155,7 @@ def test_a_map_that_is_not_there(path, capsys):
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.99])
 def test_a_truncated_map(share, path, capsys, tmp_path, rng):
-    image.write_exr(tmp_path / "map.exr", sky(rng, 64, 128))
+    images.write_exr(tmp_path / "map.exr", sky(rng, 64, 128))
     data = (tmp_path / "map.exr").read_bytes()
     (tmp_path / "map.exr").write_bytes(data[: int(share * len(data))])
     assert "map.exr" in fails(3, capsys, path)
@@ -167,7 +168,7 @@ def test_a_map_that_is_no_image(data, path, capsys, tmp_path):
 
 
 def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
-    image.write_png(tmp_path / "map.png", sky(rng) / 3)
+    images.write_png(tmp_path / "map.png", sky(rng) / 3)
     assert call(path, "--quiet", *changed(input__envmap="map.png")) == 0
     out, err = capsys.readouterr()
     assert out == "" and len(err.splitlines()) == 1
@@ -177,7 +178,7 @@ def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
 
 @pytest.mark.parametrize("height, width", [(8, 15), (16, 16), (1, 2), (1, 1)])
 def test_a_map_that_is_not_two_to_one_or_too_small(height, width, path, capsys, tmp_path, rng):
-    image.write_exr(tmp_path / "map.exr", sky(rng, height, width))
+    images.write_exr(tmp_path / "map.exr", sky(rng, height, width))
     said = fails(3, capsys, path)
     assert "map.exr" in said and f"{width} x {height}" in said
 
@@ -249,8 +250,8 @@ def test_a_transport_that_does_not_fit_the_memory(path, capsys):
 )
 def test_a_target_that_cannot_be_used(target, says, path, capsys, tmp_path):
     good = np.full((18, 24, 3), 0.5, np.float32)
-    image.write_exr(tmp_path / "good.exr", good)
-    image.write_png(tmp_path / "black.png", 0 * good)
+    images.write_exr(tmp_path / "good.exr", good)
+    images.write_png(tmp_path / "black.png", 0 * good)
     good[2, 5] = np.nan
     exr(tmp_path / "nan.exr", **{c: good[..., i].copy() for i, c in enumerate("RGB")})
     said = fails(3, capsys, path, *changed(**{f"target__{key}": value for key, value in target.items()}))

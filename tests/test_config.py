@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from envedit import config as cfg
-from envedit.errors import ConfigError
-from envedit.tonemap import TONEMAPS
+from envedit.core.color import TONEMAPS
+from envedit.core.errors import ConfigError
 
 quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 

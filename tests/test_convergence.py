@@ -12,7 +12,8 @@ import pytest
 from test_paths import disagreement
 from test_transport import ball, build, one_hot, picture, references, stage
 
-from envedit import latlong, paths, scene
+from envedit.core import latlong
+from envedit.scene import camera_paths, scene
 
 HEIGHT, WIDTH = 16, 32
 SUN = np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])
@@ -80,7 +81,7 @@ def test_error_of_the_transport_falls_faster_than_that_of_random_samples(matte, 
         points = rng.random((2, max(len(index), len(scramble))), dtype=np.float32)
         return mi.Point2f(mi.Float(points[0]), mi.Float(points[1]))
 
-    monkeypatch.setattr(paths, "lattice", random)
+    monkeypatch.setattr(camera_paths, "lattice", random)
     independent = transport_errors(matte, wanted)
     assert -0.55 < slope(SAMPLES, independent) < -0.45
     assert stratified[-1] < 0.5 * independent[-1]  # as four times the random samples would have it

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envedit import curves
+from envedit.report import curves
 
 
 def points_of(svg, name):

@@ -12,8 +12,9 @@ import OpenEXR
 import pytest
 from helpers import SCANLINE, exr, planes, stacked
 
-from envedit import decoders, image
-from envedit.errors import InputError
+from envedit.core.errors import InputError
+from envedit.images import exr as exr_module
+from envedit.images import images
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint32])
@@ -21,7 +22,7 @@ from envedit.errors import InputError
 def test_exr_pixel_types(tmp_path, rng, dtype, alpha):
     p = planes(rng, dtype)
     extra = {"A": np.zeros((4, 8), dtype)} if alpha else {}
-    found, info = image.read(exr(tmp_path / "a.exr", **extra, **p))
+    found, info = images.read(exr(tmp_path / "a.exr", **extra, **p))
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, stacked(p))
     assert (info["format"], info["size"], info["hdr"], info["warnings"]) == ("exr", (8, 4), True, [])
@@ -30,18 +31,18 @@ def test_exr_pixel_types(tmp_path, rng, dtype, alpha):
 def test_exr_mixed_types_layers_and_parts(tmp_path, rng):
     p = planes(rng)
     mixed = {"R": p["R"].astype(np.float16), "G": p["G"], "B": p["B"].astype(np.uint32)}
-    np.testing.assert_array_equal(image.read(exr(tmp_path / "m.exr", **mixed))[0], stacked(mixed))
+    np.testing.assert_array_equal(images.read(exr(tmp_path / "m.exr", **mixed))[0], stacked(mixed))
 
     other = {f"aov.{c}": np.zeros((4, 8), np.float32) for c in "RGB"}
     layers = {f"View.Combined.{c}": p[c] for c in "RGB"} | other | {"Z": p["R"]}
-    found, info = image.read(exr(tmp_path / "l.exr", **layers))
+    found, info = images.read(exr(tmp_path / "l.exr", **layers))
     np.testing.assert_array_equal(found, stacked(p))
     assert info["warnings"] == ["2 colour layers: 'View.Combined' was read"]
 
     part = OpenEXR.Part(dict(SCANLINE), {"Z": p["R"]}, "depth")
     colour = OpenEXR.Part(dict(SCANLINE), dict(p), "colour")
     OpenEXR.File([part, colour]).write(str(tmp_path / "p.exr"))
-    np.testing.assert_array_equal(image.read(tmp_path / "p.exr")[0], stacked(p))
+    np.testing.assert_array_equal(images.read(tmp_path / "p.exr")[0], stacked(p))
 
 
 def test_exr_of_many_channels_is_refused_before_it_is_decoded(tmp_path, rng, monkeypatch):
@@ -49,16 +50,16 @@ def test_exr_of_many_channels_is_refused_before_it_is_decoded(tmp_path, rng, mon
     path = exr(
         tmp_path / "many.exr", **planes(rng), **{f"aov{i}": np.zeros((4, 8), np.float32) for i in range(9)}
     )
-    monkeypatch.setattr(decoders, "_MOST_VALUES", 12 * 32)
-    assert image.read(path)[0].shape == (4, 8, 3)
-    monkeypatch.setattr(decoders, "_MOST_VALUES", 12 * 32 - 1)
+    monkeypatch.setattr(exr_module, "_MOST_VALUES", 12 * 32)
+    assert images.read(path)[0].shape == (4, 8, 3)
+    monkeypatch.setattr(exr_module, "_MOST_VALUES", 12 * 32 - 1)
     with pytest.raises(InputError, match="its 12 channels hold more than 383 values; save only colour"):
-        image.read(path)
+        images.read(path)
 
 
 def test_exr_luminance_is_grey(tmp_path, rng):
     y = rng.random((4, 8)).astype(np.float32)
-    found, info = image.read(exr(tmp_path / "y.exr", Y=y))
+    found, info = images.read(exr(tmp_path / "y.exr", Y=y))
     np.testing.assert_array_equal(found, np.repeat(y[..., None], 3, 2))
     assert "luminance" in info["warnings"][0]
 
@@ -68,18 +69,18 @@ def test_exr_window_and_primaries(tmp_path, rng):
     box = {"dataWindow": ((2, 1), (9, 4)), "displayWindow": ((0, 0), (7, 3))}
     header = {"chromaticities": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)}  # ACES AP0
     path = exr(tmp_path / "w.exr", box, **p)
-    found, info = image.read(path)
+    found, info = images.read(path)
     expected = np.zeros((4, 8, 3), np.float32)
     expected[1:, 2:] = stacked(p)[:3, :6]
     np.testing.assert_array_equal(found, expected)
     assert "cropped" in info["warnings"][0]
-    _, info = image.read(exr(tmp_path / "aces.exr", header, **p))
+    _, info = images.read(exr(tmp_path / "aces.exr", header, **p))
     assert "not Rec.709" in info["warnings"][0]
 
 
 def test_exr_without_colour(tmp_path, rng):
     with pytest.raises(InputError, match=r"z.exr: no R, G, B channels \(found: Z\)"):
-        image.read(exr(tmp_path / "z.exr", Z=rng.random((4, 8)).astype(np.float32)))
+        images.read(exr(tmp_path / "z.exr", Z=rng.random((4, 8)).astype(np.float32)))
 
 
 def rgbe_file(path, body, size="-Y 4 +X 8", header="FORMAT=32-bit_rle_rgbe\n"):
@@ -105,24 +106,24 @@ def test_radiance_encodings(tmp_path, rng):
     expected = np.where(q[..., 3:] > 0, q[..., :3] * 2.0 ** (q[..., 3:] - 136.0), 0).astype(np.float32)
     old = q[0].tobytes() + q[1, 0].tobytes() + bytes([1, 1, 1, 7]) + q[2:].tobytes()
     for name, body in (("flat", q.tobytes()), ("new", run_length(q)), ("old", old)):
-        found, info = image.read(rgbe_file(tmp_path / f"{name}.hdr", body))
+        found, info = images.read(rgbe_file(tmp_path / f"{name}.hdr", body))
         np.testing.assert_array_equal(found, expected, err_msg=name)
         assert info["format"] == "hdr" and info["hdr"] and not info["warnings"]
     # A run longer than 255: the second marker counts in units of 256.
     long = q[0, 1].tobytes() + bytes([1, 1, 1, 255 - 1, 1, 1, 1, 1]) + bytes([1, 1, 1, 1])
-    found, _ = image.read(rgbe_file(tmp_path / "long.hdr", long[:12], size="-Y 1 +X 511"))
+    found, _ = images.read(rgbe_file(tmp_path / "long.hdr", long[:12], size="-Y 1 +X 511"))
     np.testing.assert_array_equal(found, np.broadcast_to(expected[0, 1], (1, 511, 3)))
 
 
 def test_radiance_header(tmp_path, rng):
     q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8).tobytes()
     with pytest.raises(InputError, match=r"x.hdr: holds XYZ colours"):
-        image.read(rgbe_file(tmp_path / "x.hdr", q, header="FORMAT=32-bit_rle_xyze\n"))
+        images.read(rgbe_file(tmp_path / "x.hdr", q, header="FORMAT=32-bit_rle_xyze\n"))
     with pytest.raises(InputError, match=r"x.hdr: rows are stored as '\+Y 4 \+X 8'"):
-        image.read(rgbe_file(tmp_path / "x.hdr", q, size="+Y 4 +X 8"))
-    _, info = image.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=2.5\n"))
+        images.read(rgbe_file(tmp_path / "x.hdr", q, size="+Y 4 +X 8"))
+    _, info = images.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=2.5\n"))
     assert "EXPOSURE=2.5" in info["warnings"][0]
-    assert not image.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=1.000\n"))[1]["warnings"]
+    assert not images.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=1.000\n"))[1]["warnings"]
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -132,7 +133,7 @@ def test_png_is_decoded_and_flagged(tmp_path, rng, dtype, channels):
     q = rng.integers(0, top + 1, (4, 8, channels)).astype(dtype)
     q[0, 0], q[0, 1] = 0, top
     mi.Bitmap(q).write(str(tmp_path / "a.png"))
-    found, info = image.read(tmp_path / "a.png")
+    found, info = images.read(tmp_path / "a.png")
     s = np.repeat(q, 3, 2) / top if channels == 1 else q[..., :3] / top
     expected = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
@@ -142,7 +143,7 @@ def test_png_is_decoded_and_flagged(tmp_path, rng, dtype, channels):
 
 def test_jpeg(tmp_path):
     mi.Bitmap(np.full((16, 32, 3), 188, np.uint8)).write(str(tmp_path / "a.jpg"))
-    found, info = image.read(tmp_path / "a.jpg")
+    found, info = images.read(tmp_path / "a.jpg")
     np.testing.assert_allclose(found, 0.503, atol=0.01)  # sRGB 188 is half the light
     assert info["format"] == "jpeg" and info["size"] == (32, 16)
 
@@ -202,7 +203,7 @@ def damaged_files(folder, rng):
 def test_damaged_files_are_refused_quietly(tmp_path, rng, capfd):
     for name, words in damaged_files(tmp_path, rng):
         with pytest.raises(InputError) as e:
-            image.read(tmp_path / name)
+            images.read(tmp_path / name)
         message = str(e.value)
         assert message.startswith(str(tmp_path / name)) and words in message, message
         assert "\n" not in message
@@ -238,7 +239,7 @@ print(refused)
 
 def test_no_file_stays_open(tmp_path, rng):
     before = set(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else pytest.skip("no /proc")
-    kept = [image.read(exr(tmp_path / "a.exr", **planes(rng)))]
+    kept = [images.read(exr(tmp_path / "a.exr", **planes(rng)))]
     assert set(os.listdir("/proc/self/fd")) == before and kept
 
 
@@ -247,13 +248,13 @@ def test_tiles_larger_than_the_image_are_refused(tmp_path, rng, size):
     tiles = OpenEXR.TileDescription()
     tiles.xSize, tiles.ySize = 8, 4
     path = exr(tmp_path / "t.exr", {"type": OpenEXR.tiledimage, "tiles": tiles}, **planes(rng, size=(16, 32)))
-    assert image.read(path)[0].shape == (16, 32, 3)
+    assert images.read(path)[0].shape == (16, 32, 3)
     raw = bytearray(path.read_bytes())
     struct.pack_into("<2I", raw, raw.index(b"tiles\0tiledesc\0") + 19, *size)
     path.write_bytes(raw)
     words = "tiles of" if max(size) < 2**31 - 1 else "tiles of|damaged"  # the library refuses some itself
     with pytest.raises(InputError, match=words):
-        image.read(path)
+        images.read(path)
 
 
 def test_jpeg_2000_that_ends_early_is_damaged_and_quiet(tmp_path, capfd):
@@ -262,13 +263,13 @@ def test_jpeg_2000_that_ends_early_is_damaged_and_quiet(tmp_path, capfd):
     if method is None:
         pytest.skip("this OpenEXR has no JPEG 2000")
     path = exr(tmp_path / "j.exr", {"compression": method}, **{c: smooth.copy() for c in "RGB"})
-    np.testing.assert_array_equal(image.read(path)[0][..., 0], smooth)
+    np.testing.assert_array_equal(images.read(path)[0][..., 0], smooth)
     raw = path.read_bytes()
     read = 0
     for at in range(len(raw) - 400, len(raw), 7):  # within the stream: all that follows moves
         path.write_bytes(raw[:at] + b"\xff\x7f\0" + raw[at:])
         try:
-            found = image.read(path)[0]
+            found = images.read(path)[0]
             read += not np.array_equal(found[..., 0], smooth)
         except InputError as error:
             assert "damaged" in str(error)
@@ -281,7 +282,7 @@ def test_jpeg_2000_that_ends_early_is_damaged_and_quiet(tmp_path, capfd):
 def test_a_long_line_in_a_radiance_header_takes_no_time(tmp_path, line):
     (tmp_path / "l.hdr").write_bytes(b"#?RADIANCE\n" + line + b"\n\n-Y 4 +X 8\n" + bytes(range(128)))
     start = time.process_time()
-    _, info = image.read(tmp_path / "l.hdr")
+    _, info = images.read(tmp_path / "l.hdr")
     assert time.process_time() - start < 2  # with a pattern: 10 to 25 s of processor time
     assert all(len(w) < 200 and w.isprintable() for w in info["warnings"])
 
@@ -292,7 +293,7 @@ def test_a_long_line_in_a_radiance_header_takes_no_time(tmp_path, line):
 def test_odd_exposures_are_told_and_not_damage(tmp_path, value, told):
     text = f"#?RADIANCE\nEXPOSURE = {value} \n\n-Y 4 +X 8\n"
     (tmp_path / "e.hdr").write_bytes(text.encode() + bytes(range(128)))
-    _, info = image.read(tmp_path / "e.hdr")
+    _, info = images.read(tmp_path / "e.hdr")
     assert info["metadata"] == {"EXPOSURE": value}
     assert [f"EXPOSURE={value} in its header" in w for w in info["warnings"]] == [True] * told
 
@@ -306,4 +307,4 @@ def test_a_jpeg_whose_table_breaks_off_is_damaged(tmp_path):
     for length in (3, 20, 66):  # the table's first byte only, some of it, all but one
         (tmp_path / "b.jpg").write_bytes(raw[: at + 2] + struct.pack(">H", length) + raw[at + 4 :])
         with pytest.raises(InputError, match="b.jpg: damaged"):
-            image.read_stored(tmp_path / "b.jpg")
+            images.read_stored(tmp_path / "b.jpg")

@@ -6,8 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from envedit import disk_cache
-from envedit.disk_cache import DiskCache
+from envedit.core import array_cache
+from envedit.core.array_cache import DiskCache
 
 KEY = {"scene": "abc", "seed": 3, "grid": [8, 16]}
 
@@ -156,7 +156,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, rng, monkeypatch):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(disk_cache.os, "replace", full)
+        patch.setattr(array_cache.os, "replace", full)
         cache.store(KEY, some(rng, 10))
         cache.store({}, some(rng, 10))
     assert same(cache.load(KEY), arrays) and len(list(tmp_path.iterdir())) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import single
 
-from envedit import display
+from envedit.losses import display_curve
 
 
 def plain_display(x):
@@ -16,11 +16,11 @@ def plain_display(x):
 
 
 def shown(x):
-    return display.to_display(single(np.reshape(x, (1, 1, -1)))).numpy().ravel()
+    return display_curve.to_display(single(np.reshape(x, (1, 1, -1)))).numpy().ravel()
 
 
 def slope(x):
-    return display.slope(np.reshape(x, (1, 1, -1))).ravel()
+    return display_curve.slope(np.reshape(x, (1, 1, -1))).ravel()
 
 
 def test_display_values_are_the_metrics_tonemap_in_its_middle():

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from envedit import doctor
-from envedit.errors import MachineError
+from envedit.cli import doctor
+from envedit.core.errors import MachineError
 
 LIBRARIES = Path("/usr/lib/x86_64-linux-gnu")
 

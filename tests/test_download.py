@@ -12,7 +12,7 @@ import urllib.parse
 
 import pytest
 
-from envedit.errors import InputError
+from envedit.core.errors import InputError
 from experiments import download_puresky as fetch
 
 GOOD = "north_field_puresky"

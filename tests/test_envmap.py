@@ -9,7 +9,10 @@ import pytest
 from helpers import double
 from test_siren import numpy_forward
 
-from envedit import config, envmap, fit, latlong, siren
+from envedit import config, representations
+from envedit.core import latlong
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
 
 EXTREMES = np.array([0, 1e-30, 1e-4, 0.01, 0.5, 65504, 1e6, 123456.789, 1.0] * 2, np.float32).reshape(2, 3, 3)
 QUICK = config.Fit(polish="always", epochs=5, awp_gamma=0.0)
@@ -21,7 +24,7 @@ def sky(rng, shape=(8, 16)):
 
 def make(kind, folder=None, rows=None, **network):
     network = config.Representation(**{"kind": kind, "hidden": 10, "depth": 1} | network)
-    return envmap.make(config.Config(representation=network, fit=QUICK), folder, rows=rows)
+    return representations.make(config.Config(representation=network, fit=QUICK), folder, rows=rows)
 
 
 KINDS = ("pixels", "log-pixels", "siren")
@@ -209,14 +212,18 @@ def test_siren_gradient_is_the_finite_difference(rng):
 
 def test_pixels_below_zero_are_black_and_log_pixels_are_never_below():
     params = {"radiance": mi.TensorXf(np.full((1, 2, 3), -0.5, np.float32))}
-    assert not envmap.Pixels().decode(params).numpy().any()
+    assert not representations.Pixels().decode(params).numpy().any()
     params = {"log_radiance": mi.TensorXf(np.full((1, 2, 3), -100, np.float32))}
-    assert not envmap.LogPixels().decode(params).numpy().any()
+    assert not representations.LogPixels().decode(params).numpy().any()
 
 
 def test_configuration_names_the_representation():
     found = [make(kind) for kind in KINDS]
-    assert [type(r) for r in found] == [envmap.Pixels, envmap.LogPixels, envmap.Siren]
+    assert [type(r) for r in found] == [
+        representations.Pixels,
+        representations.LogPixels,
+        representations.Siren,
+    ]
     assert all(r.lr > 0 for r in found)
 
 
@@ -249,7 +256,7 @@ def test_siren_of_another_image_forgets_the_points_of_the_first(rng):
 
 def test_a_fit_that_is_edited_is_not_polished_unless_asked_for():
     settings = config.Config(representation=config.Representation(kind="siren", hidden=8, depth=1))
-    recipe = envmap.make(settings).settings
+    recipe = representations.make(settings).settings
     assert (recipe.awp_until, recipe.light) == (1.0, 0.0) and recipe == fit.unpolished(settings.fit)
     asked = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, polish="always"))
-    assert envmap.make(asked).settings == asked.fit
+    assert representations.make(asked).settings == asked.fit

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.errors import InputError, NumericalError, place_of, unwrapped
+from envedit.core.errors import InputError, NumericalError, place_of, unwrapped
 
 
 class Raising(dr.CustomOp):

@@ -8,10 +8,14 @@ import pytest
 from extremes_stages import transport, write_plain
 from test_pipeline import settings_of
 
-from envedit import health, image, latlong, painted, pipeline, scene, target
-from envedit.envmap import LogPixels, Pixels
-from envedit.errors import InputError, NumericalError
-from envedit.layers import Layers
+from envedit import pipeline
+from envedit.core import latlong, radiance
+from envedit.core.errors import InputError, NumericalError
+from envedit.images import images
+from envedit.representations import LogPixels, Pixels
+from envedit.representations.layers.layers import Layers
+from envedit.scene import scene
+from envedit.targets import painted_image, target
 
 
 @pytest.fixture(autouse=True)
@@ -60,10 +64,10 @@ def test_what_is_no_radiance_is_refused_by_row_and_column(value, says):
     m = np.ones((4, 8, 3), np.float32)
     m[1, 3, 2] = m[2, 0, 0] = value
     with pytest.raises(InputError, match=f"^{says}$"):
-        health.require_radiance(m, "sky", 10, health.BRIGHTEST)
-    health.require_radiance(np.full((4, 8, 3), 1.2e30, np.float32), "sky", 10, health.BRIGHTEST)
-    health.require_radiance(np.full((4, 8, 3), 3e38, np.float32), "sky")
-    health.require_radiance(-np.zeros((4, 8, 3), np.float32), "sky")
+        radiance.require_radiance(m, "sky", 10, radiance.BRIGHTEST)
+    radiance.require_radiance(np.full((4, 8, 3), 1.2e30, np.float32), "sky", 10, radiance.BRIGHTEST)
+    radiance.require_radiance(np.full((4, 8, 3), 3e38, np.float32), "sky")
+    radiance.require_radiance(-np.zeros((4, 8, 3), np.float32), "sky")
 
 
 def test_rows_of_a_refusal_are_those_of_the_map():
@@ -105,9 +109,9 @@ def test_half_floats_cut_a_sun_and_it_is_told(value, stored, tmp_path):
         path = write_plain(tmp_path / "half.exr", extremes.texel(value).astype(np.float16))
     if np.isinf(stored):
         with pytest.raises(InputError, match="1 texels are NaN or infinite, the first at row 5, column 9"):
-            image.load_envmap(path)
+            images.load_envmap(path)
         return
-    found, info = image.load_envmap(path)
+    found, info = images.load_envmap(path)
     assert found[5, 9].tolist() == [stored] * 3
     assert len(info["warnings"]) == 1 and "1 texels sit at 65504, the largest half" in info["warnings"][0]
 
@@ -116,7 +120,7 @@ def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
     m = extremes.sky(8, 16)
     settings = settings_of(tmp_path, m)
     lit = scene.load(settings.scene.file, settings.scene.width)
-    picture = painted.initial(lit, m, settings)
+    picture = painted_image.initial(lit, m, settings)
     picture[3, 4] = 3e38
     made = target.make(settings, lit, m, picture)
     assert any("target: 1 pixels are brighter than 1.27e+30" in line for line in made.warnings)
@@ -128,7 +132,7 @@ def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
 
 
 def test_another_map_beyond_all_light_is_refused_as_a_target(tmp_path):
-    image.write_exr(tmp_path / "other.exr", extremes.texel(3e38))
+    images.write_exr(tmp_path / "other.exr", extremes.texel(3e38))
     settings = settings_of(tmp_path, extremes.sky(8, 16), target={"file": "other.exr"}, input={"width": 16})
     with pytest.raises(InputError, match=r"other.exr: \d+ texels are brighter than 1.27e[+]30"):
         pipeline.run(settings)

@@ -4,7 +4,7 @@ import extremes_precision
 import pytest
 from extremes_precision import CHECKS
 
-from envedit import losses
+from envedit.losses import losses
 
 
 @pytest.mark.parametrize("name", CHECKS)

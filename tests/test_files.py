@@ -5,27 +5,28 @@ import sys
 
 import pytest
 
-from envedit import files
-from envedit.errors import InputError, NumericalError
-from envedit.files import quiet_libraries
+from envedit.core import array_cache, atomic_files
+from envedit.core.errors import InputError, NumericalError
+from envedit.core.quiet_libraries import quiet_libraries
+from envedit.report import output_folder
 
 
 def test_interrupted_move_leaves_no_partial_file(tmp_path, monkeypatch):
     def full(source, target):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, "replace", full)
+    monkeypatch.setattr(atomic_files.os, "replace", full)
     with pytest.raises(InputError, match=r"metrics.json: cannot be written \(No space left on device\)"):
-        files.write_atomically(tmp_path / "metrics.json", b"{}")
+        atomic_files.write_atomically(tmp_path / "metrics.json", b"{}")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_is_replaced_whole(tmp_path):
     path = tmp_path / "zażółć.txt"
     for data in (b"old", b"", b"new" * 100_000):
-        files.write_atomically(path, data)
+        atomic_files.write_atomically(path, data)
         assert path.read_bytes() == data
-    with files.replacing(path, ".txt") as temporary:
+    with atomic_files.replacing(path, ".txt") as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".txt"
         temporary.write_bytes(b"newer")
         assert path.read_bytes() == b"new" * 100_000, "not before the end"
@@ -48,14 +49,14 @@ def test_a_file_is_replaced_whole(tmp_path):
 def test_a_failure_keeps_the_old_file(tmp_path, raised, seen, says):
     path = tmp_path / "a"
     path.write_bytes(b"old")
-    with pytest.raises(seen, match=says), files.replacing(path) as temporary:
+    with pytest.raises(seen, match=says), atomic_files.replacing(path) as temporary:
         temporary.write_bytes(b"half")
         raise raised
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a"]
 
 
 def test_a_block_that_writes_nothing_is_told(tmp_path):
-    with pytest.raises(InputError, match="No such file"), files.replacing(tmp_path / "a"):
+    with pytest.raises(InputError, match="No such file"), atomic_files.replacing(tmp_path / "a"):
         pass
 
 
@@ -64,16 +65,16 @@ def test_an_impossible_place_is_an_input_error(tmp_path, name):
     (tmp_path / "file").write_text("not a folder")
     (tmp_path / "folder").mkdir()
     with pytest.raises(InputError, match="cannot be written"):
-        files.write_atomically(tmp_path / name, b"data")
+        atomic_files.write_atomically(tmp_path / name, b"data")
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 
 
 def test_caches_follow_the_desktop_standard(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert files.cache_folder("fits") == tmp_path / "envedit" / "fits"
+    assert array_cache.cache_folder("fits") == tmp_path / "envedit" / "fits"
     monkeypatch.setenv("XDG_CACHE_HOME", "")
-    monkeypatch.setattr(files.Path, "home", lambda: tmp_path)
-    assert files.cache_folder("transport") == tmp_path / ".cache" / "envedit" / "transport"
+    monkeypatch.setattr(atomic_files.Path, "home", lambda: tmp_path)
+    assert array_cache.cache_folder("transport") == tmp_path / ".cache" / "envedit" / "transport"
 
 
 def test_caches_lie_somewhere_without_a_home(monkeypatch):
@@ -81,12 +82,12 @@ def test_caches_lie_somewhere_without_a_home(monkeypatch):
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(files.Path, "home", nobody)
-    assert files.cache_folder("fits").is_absolute()
+    monkeypatch.setattr(atomic_files.Path, "home", nobody)
+    assert array_cache.cache_folder("fits").is_absolute()
 
 
 def test_libraries_are_heard_and_kept_quiet(capfd):
-    with files.quiet_libraries() as said:
+    with quiet_libraries() as said:
         os.write(2, b"from C, ")
         print("from Python")
     assert said == ["from Python\nfrom C, "] and capfd.readouterr() == ("", "")
@@ -105,19 +106,19 @@ def test_what_libraries_print_to_either_descriptor_is_kept_off(capfd):
 
 def test_a_folder_is_worked_in_by_one_at_a_time(tmp_path):
     folder = tmp_path / "new" / "results"
-    with files.alone(folder):
-        with pytest.raises(InputError, match="another run works in it"), files.alone(folder):
+    with output_folder.alone(folder):
+        with pytest.raises(InputError, match="another run works in it"), output_folder.alone(folder):
             pass
-        with files.alone(tmp_path):
+        with output_folder.alone(tmp_path):
             pass
-    with files.alone(folder):
+    with output_folder.alone(folder):
         assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["file", "file/inside", "x" * 300])
 def test_a_folder_that_cannot_be_is_an_input_error(tmp_path, name):
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(InputError, match="--out"), files.alone(tmp_path / name):
+    with pytest.raises(InputError, match="--out"), output_folder.alone(tmp_path / name):
         pass
 
 
@@ -125,7 +126,7 @@ def test_what_no_checkpoint_protects_is_kept_even_by_a_resumed_run(tmp_path):
     names = ("metrics.json", "edited.exr", "config.toml", "checkpoint.npz")
 
     def prepare():
-        files.prepare_folder(tmp_path, names, keep=True, spare=[tmp_path / "config.toml"])
+        output_folder.prepare_folder(tmp_path, names, keep=True, spare=[tmp_path / "config.toml"])
         return sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
 
     (tmp_path / "config.toml").write_text("mine")

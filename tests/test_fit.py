@@ -10,8 +10,11 @@ import pytest
 from helpers import plain_ssim_loss
 from test_siren import launched
 
-from envedit import config, fit, metrics, optim, siren, ssim
-from envedit.errors import InputError, NumericalError
+from envedit import config
+from envedit.core.errors import InputError, NumericalError
+from envedit.losses import metrics, optimizer, ssim
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
 
 NETWORK = config.Representation(hidden=12, depth=1, coordinates="sphere")
 QUICK = config.Fit(epochs=4, lr=5e-3, awp_gamma=0.0)
@@ -468,13 +471,13 @@ def test_grids_take_turns_at_random(rng, monkeypatch):
 
 
 def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
-    betas, plain = [], optim.Adam.__init__
+    betas, plain = [], optimizer.Adam.__init__
 
     def noted(self, params, lr, betas_=(0.9, 0.999), *args):
         betas.append(betas_)
         plain(self, params, lr, betas_, *args)
 
-    monkeypatch.setattr(optim.Adam, "__init__", noted)
+    monkeypatch.setattr(optimizer.Adam, "__init__", noted)
     image = sky(rng)
     a, b = (fit.fit(image, NETWORK, dataclasses.replace(QUICK, beta2=beta2)) for beta2 in (0.99, 0.9))
     assert betas == [(0.9, 0.99), (0.9, 0.9)] and not same(a.params, b.params)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from helpers import sky
 
-from envedit import config, doctor, fit, fit_command, image, metrics
+from envedit import config
+from envedit.cli import doctor
+from envedit.cli import fit as fit_command
+from envedit.images import images
+from envedit.losses import metrics
+from envedit.representations.siren import fit
 
 SMALL = ["input.width=16", "representation.hidden=10", "representation.depth=1", "fit.epochs=4"]
 
@@ -27,7 +32,7 @@ def call(path, out, *overrides):
 @pytest.mark.parametrize(("rows", "first", "last"), [("upper", 0, 3), ("[2,6]", 2, 6)])
 def test_the_fit_of_the_rows_is_written_and_measured(coordinates, rows, first, last, tmp_path, rng, capsys):
     picture = sky(rng)
-    image.write_exr(tmp_path / "map.exr", picture)
+    images.write_exr(tmp_path / "map.exr", picture)
     given = f"input.rows={rows}", f"representation.coordinates={coordinates}"
     assert call(tmp_path / "map.exr", tmp_path / "out", *given) == 0
     assert "log-PSNR" in capsys.readouterr().out
@@ -35,7 +40,7 @@ def test_the_fit_of_the_rows_is_written_and_measured(coordinates, rows, first, l
     network = config.Representation(hidden=10, depth=1, coordinates=coordinates)
     expected = fit.fit(crop, network, config.Fit(epochs=4), 0, (first, 8), folder=fit.default_folder())
     assert expected.cached  # the command made this very fit
-    written = image.read(tmp_path / "out" / "fitted.exr")[0]
+    written = images.read(tmp_path / "out" / "fitted.exr")[0]
     assert written.shape == crop.shape
     numbers = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert numbers["log_psnr"] == expected.log_psnr == pytest.approx(metrics.log_psnr(written, crop))
@@ -46,17 +51,17 @@ def test_the_fit_of_the_rows_is_written_and_measured(coordinates, rows, first, l
     assert call(tmp_path / "map.exr", tmp_path / "again", *given) == 0
     assert json.loads((tmp_path / "again" / "fit.json").read_text())["cached"] is True
     assert "kept from an earlier run" in capsys.readouterr().out
-    again = image.read(tmp_path / "again" / "fitted.exr")[0]
+    again = images.read(tmp_path / "again" / "fitted.exr")[0]
     assert again.tobytes() == written.tobytes()
 
 
 def test_earlier_results_are_moved_and_the_map_is_not_overwritten(tmp_path, rng, capsys):
-    image.write_exr(tmp_path / "map.exr", sky(rng))
+    images.write_exr(tmp_path / "map.exr", sky(rng))
     out = tmp_path / "out"
     for _ in range(2):
         assert call(tmp_path / "map.exr", out) == 0
     assert {path.name for path in (out / "earlier-1").iterdir()} == {"fit.json", "fitted.exr", "preview.png"}
-    image.write_exr(out / "fitted.exr", sky(rng))  # somebody's map by that name
+    images.write_exr(out / "fitted.exr", sky(rng))  # somebody's map by that name
     before = (out / "fitted.exr").read_bytes()
     assert call(out / "fitted.exr", out) == 3 and "--out" in capsys.readouterr().err
     assert (out / "fitted.exr").read_bytes() == before
@@ -69,7 +74,7 @@ def test_a_map_that_is_not_there_is_an_error_in_one_line(tmp_path, capsys):
 
 
 def test_a_black_map_has_no_peak_to_compare(tmp_path, capsys):
-    image.write_exr(tmp_path / "map.exr", np.zeros((8, 16, 3), np.float32))
+    images.write_exr(tmp_path / "map.exr", np.zeros((8, 16, 3), np.float32))
     assert call(tmp_path / "map.exr", tmp_path / "out") == 0
     assert "undefined" in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "fit.json").read_text())["peak_ratio"] is None

@@ -34,9 +34,9 @@ def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
     """Here without the room that small files have, so that the multiple itself is tested."""
     shape = (512, 1024)
     if name == "ours.exr":
-        from envedit import image
+        from envedit.images import images
 
-        image.write_exr(tmp_path / name, np.tile(pictures.radiance(), (32, 32, 1)))
+        images.write_exr(tmp_path / name, np.tile(pictures.radiance(), (32, 32, 1)))
     elif name == "flat.hdr":
         pixels = np.tile(pictures.shared_exponent(), (32, 32, 1))
         (tmp_path / name).write_bytes(b"#?RADIANCE\n\n-Y 512 +X 1024\n" + pixels.tobytes())

@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import gain
-from envedit.gain import Octave
+from envedit.representations.layers import gain
+from envedit.representations.layers.gain import Octave
 
 SHAPES = [(1, 2), (3, 7), (5, 8), (17, 33), (32, 64)]
 GAINS = [(8, 1.0), (8, 0.5), (6, 0.3), (1, 1.0), (5, 0.1)]

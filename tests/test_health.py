@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from envedit import health
-from envedit.errors import InputError
+from envedit.core import radiance
+from envedit.core.errors import InputError
 
 
 def test_health():
@@ -13,7 +13,7 @@ def test_health():
     values[2, 3] = np.inf
     values[0, 7, 2] = -0.5
     values[3, 7] = 65504
-    h = health.health(values)
+    h = radiance.health(values)
     assert (h.texels, h.nan, h.inf, h.negative, h.saturated) == (32, 2, 1, 1, 1)
     first = (h.first_nan, h.first_inf, h.first_negative, h.first_saturated)
     assert first == ((1, 2), (2, 3), (0, 7), (3, 7))
@@ -27,13 +27,13 @@ def test_a_texel_that_is_repaired_does_not_count_as_negative():
     values[1, 2] = -np.inf
     values[2, 3] = (np.nan, -1, 2)
     values[3, 4] = (1, -1, 2)
-    h = health.health(values)
+    h = radiance.health(values)
     assert (h.inf, h.nan, h.negative, h.first_negative) == (1, 1, 1, (3, 4))
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 1e6, 3e38, np.nan, -np.inf])
 def test_health_is_finite(value):
-    h = health.health(np.full((1, 1, 3), value, np.float32))
+    h = radiance.health(np.full((1, 1, 3), value, np.float32))
     assert np.isfinite([h.minimum, h.maximum, h.median, h.dynamic_range]).all()
     assert h.ok == np.isfinite(value) and h.summary()
 
@@ -42,7 +42,7 @@ def test_repair(rng):
     values = rng.random((6, 8, 3)).astype(np.float32)
     broken = values.copy()
     broken[2, 0, 1] = np.nan  # on the seam: its neighbours are in columns 7, 0 and 1
-    mended, count = health.repair(broken)
+    mended, count = radiance.repair(broken)
     around = np.delete(np.concatenate([values[1:4, 7:], values[1:4, :2]], 1).reshape(9, 3), 4, axis=0)
     assert count == 1 and np.isnan(broken[2, 0, 1])
     np.testing.assert_allclose(mended[2, 0], around.mean(0), rtol=1e-6)
@@ -52,9 +52,9 @@ def test_repair(rng):
 
     broken[:] = np.inf
     broken[5, 3] = [1, 2, 3]
-    mended, count = health.repair(broken)
+    mended, count = radiance.repair(broken)
     assert count == 47
     np.testing.assert_allclose(mended, np.broadcast_to([1, 2, 3], (6, 8, 3)), rtol=1e-6)
-    assert health.repair(values)[1] == 0
+    assert radiance.repair(values)[1] == 0
     with pytest.raises(InputError, match="all 48 texels of the image are NaN or infinite"):
-        health.repair(np.full((6, 8, 3), np.nan))
+        radiance.repair(np.full((6, 8, 3), np.nan))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from envedit import latlong
-from envedit.influence import LEAST_RADIUS, determined, per_solid_angle
+from envedit.core import latlong
+from envedit.transport.influence import LEAST_RADIUS, determined, per_solid_angle
 
 HEIGHT, WIDTH = 32, 64
 PLENTY = np.full(HEIGHT, 1e6)

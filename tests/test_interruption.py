@@ -21,9 +21,14 @@ import pytest
 from test_determinism import differing, pictures
 from test_run import FILES, INFLUENCE, ROOT, call, isolated, names, small_world, world  # noqa: F401 (a fixture)
 
-from envedit import checkpoint, disk_cache, files, image, layered, loop, manifest, pipeline, preview, scene
-from envedit.errors import InputError
-from envedit.progress import Progress
+from envedit import pipeline
+from envedit.cli.progress import Progress
+from envedit.core import array_cache, atomic_files
+from envedit.core.errors import InputError
+from envedit.images import images, layered_exr
+from envedit.report import manifest, output_folder, preview
+from envedit.scene import scene
+from envedit.solve import adam_loop, checkpoint
 from experiments.interruption import run as kills
 
 COMPLETE = FILES | INFLUENCE
@@ -40,7 +45,7 @@ class Killed(BaseException):
 @pytest.fixture(autouse=True)
 def steady(monkeypatch):
     """Let checkpoints come by the count of steps alone."""
-    monkeypatch.setattr(loop, "READ_SECONDS", 1e9)
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", 1e9)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +104,7 @@ def killed_at(patch, number):
         replace(source, target)
 
     with patch.context() as inner:
-        inner.setattr(files.os, "replace", cut)
+        inner.setattr(atomic_files.os, "replace", cut)
         try:
             yield seen
         finally:
@@ -119,11 +124,11 @@ def test_a_run_killed_while_it_writes_any_file_is_resumed_to_the_same_bytes(tmp_
         except Killed:
             killed.append(seen[-1])
         check_visible(folder, reference)
-        assert sum(name.startswith(".") for name in names(folder)) == (killed[-1] in files.RESULTS)
+        assert sum(name.startswith(".") for name in names(folder)) == (killed[-1] in output_folder.RESULTS)
         check_resumed(path, folder, reference)
         number += 1
     assert set(killed) >= COMPLETE and killed.count(checkpoint.NAME) == 3
-    caches = [name for name in killed if name not in files.RESULTS]
+    caches = [name for name in killed if name not in output_folder.RESULTS]
     assert sum(name.endswith(".arrays") for name in caches) >= 3  # the fit, the transport
 
 
@@ -185,9 +190,9 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
     }
     for name in left | others:
         (tmp_path / name).write_bytes(b"half")
-    files.tidy(tmp_path)
+    output_folder.tidy(tmp_path)
     assert names(tmp_path) == others
-    files.tidy(tmp_path / "nowhere")
+    output_folder.tidy(tmp_path / "nowhere")
 
 
 # ---- killed for good -------------------------------------------------------------------------------------
@@ -233,7 +238,7 @@ def test_a_disk_that_is_full_at_any_file_is_told_and_costs_no_work(tmp_path, who
 
         capsys.readouterr()
         with monkeypatch.context() as patch:
-            patch.setattr(files.os, "replace", full)
+            patch.setattr(atomic_files.os, "replace", full)
             assert call(path, "--quiet", "--resume", "--out", folder) == 3
         said = capsys.readouterr().err
         assert len(said.splitlines()) <= 2 and "Traceback" not in said
@@ -273,11 +278,11 @@ def test_caches_without_room_cost_nothing_but_time(tmp_path, whole, monkeypatch)
     replace = os.replace
 
     def full(source, target):
-        if Path(target).name not in files.RESULTS:
+        if Path(target).name not in output_folder.RESULTS:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         replace(source, target)
 
-    monkeypatch.setattr(files.os, "replace", full)
+    monkeypatch.setattr(atomic_files.os, "replace", full)
     assert call(path, "--quiet", "--out", tmp_path / "out") == 0
     assert differing(tmp_path / "out", reference) == set()
     assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
@@ -312,18 +317,18 @@ def largest_file(size):
 
 PICTURE = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
 ROWS = [{"iteration": i, "loss": 1 / (i + 1)} for i in range(50)]
-STATE = loop.State(3, history=ROWS)
+STATE = adam_loop.State(3, history=ROWS)
 RESULT = {"renders": {"initial": PICTURE, "target": PICTURE, "edited": PICTURE}, "maps": {"initial": PICTURE}}
 WRITERS = {
-    "edited.exr": lambda path: image.write_exr(path, PICTURE),
-    "edited_layers.exr": lambda path: layered.write(path, {"edited": PICTURE, "grey": PICTURE[..., 0]}),
+    "edited.exr": lambda path: images.write_exr(path, PICTURE),
+    "edited_layers.exr": lambda path: layered_exr.write(path, {"edited": PICTURE, "grey": PICTURE[..., 0]}),
     "influence.png": lambda path: preview.influence(path, PICTURE[..., 0], None),
     "preview.png": lambda path: preview.preview(path, RESULT["renders"], RESULT["maps"]),
     "history.csv": lambda path: manifest.write_history(path, ROWS),
     "metrics.json": lambda path: manifest.write_metrics(path, {"rows": ROWS}),
-    "config.toml": lambda path: files.write_atomically(path, b"# a comment\n" * 100),
+    "config.toml": lambda path: atomic_files.write_atomically(path, b"# a comment\n" * 100),
     "checkpoint.npz": lambda path: checkpoint.save(path.parent, "what", STATE, {"p": PICTURE}, {}, PICTURE),
-    "unreachable.png": lambda path: image.write_png(path, PICTURE[:8, :16]),
+    "unreachable.png": lambda path: images.write_png(path, PICTURE[:8, :16]),
 }
 
 
@@ -347,7 +352,7 @@ def test_a_write_that_comes_short_leaves_no_file(name, tmp_path):
 
 
 def test_an_entry_of_a_cache_that_comes_short_is_none(tmp_path):
-    cache, key = disk_cache.DiskCache(tmp_path), {"of": "a test"}
+    cache, key = array_cache.DiskCache(tmp_path), {"of": "a test"}
     with largest_file(1000):
         cache.store(key, {"a": PICTURE})
     assert cache.load(key) is None and not names(tmp_path)

@@ -6,7 +6,8 @@ from pathlib import Path
 import drjit as dr
 import pytest
 
-from envedit import config, loop, pipeline
+from envedit import config, pipeline
+from envedit.solve import adam_loop
 
 SMALL = [
     "input.width=64",
@@ -29,7 +30,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
     settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}"])
     fresh, columns, launched = {}, [], []
-    compare, render = loop.Objective.__call__, pipeline.LightTransport.render
+    compare, render = adam_loop.Objective.__call__, pipeline.LightTransport.render
 
     def counted(objective, rendering, crop, step):
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
@@ -42,7 +43,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
         columns.append(len(transport.columns))
         return render(transport, envmap, step)
 
-    monkeypatch.setattr(loop.Objective, "__call__", counted)
+    monkeypatch.setattr(adam_loop.Objective, "__call__", counted)
     monkeypatch.setattr(pipeline.LightTransport, "render", watched)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
@@ -63,14 +64,14 @@ def test_memory_does_not_grow_over_400_iterations(monkeypatch):
             "optimizer.iterations=400",
         ],
     )
-    live, compare = {}, loop.Objective.__call__
+    live, compare = {}, adam_loop.Objective.__call__
 
     def watched(objective, rendering, crop, step):
         # Resident pages now, not the peak: field 1 of statm.
         live[step] = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
         return compare(objective, rendering, crop, step)
 
-    monkeypatch.setattr(loop.Objective, "__call__", watched)
+    monkeypatch.setattr(adam_loop.Objective, "__call__", watched)
     pipeline.run(settings)
     # A leak of one 64 x 32 map a step would be 30 MB over these 300 steps; the history takes 0.2 MB.
     assert len(live) == 400 and live[399] - live[99] < 10e6

@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import latlong
-from envedit.errors import ConfigError, InputError
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError
 
 
 def mitsuba_eval(image, d):

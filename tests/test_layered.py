@@ -6,8 +6,8 @@ import OpenEXR
 import pytest
 from helpers import grey
 
-from envedit import image, layered
-from envedit.errors import ConfigError, InputError, NumericalError
+from envedit.core.errors import ConfigError, InputError, NumericalError
+from envedit.images import images, layered_exr
 
 SIZE = (8, 16)
 
@@ -20,10 +20,10 @@ def parts(rng):
     return {"initial": initial, "edited": edited, "difference": edited - initial, "influence": influence}
 
 
-@pytest.mark.parametrize("compression", list(layered.COMPRESSIONS))
+@pytest.mark.parametrize("compression", list(layered_exr.COMPRESSIONS))
 def test_layers_come_back_by_name(tmp_path, parts, compression):
     path = tmp_path / "layers.exr"
-    layered.write(path, parts, compression)
+    layered_exr.write(path, parts, compression)
     file = OpenEXR.File(str(path), separate_channels=True)
     assert len(file.parts) == 1, "one part: many viewers show only the first"
     channels = file.channels()
@@ -36,15 +36,15 @@ def test_layers_come_back_by_name(tmp_path, parts, compression):
     np.testing.assert_array_equal(np.stack([channels[c].pixels for c in "RGB"], -1), parts["edited"])
     np.testing.assert_array_equal(channels["influence.Y"].pixels, parts["influence"])
     header = file.header()
-    assert header["compression"] == getattr(OpenEXR, layered.COMPRESSIONS[compression] + "_COMPRESSION")
+    assert header["compression"] == getattr(OpenEXR, layered_exr.COMPRESSIONS[compression] + "_COMPRESSION")
     assert header["envmap"] == OpenEXR.ENVMAP_LATLONG and "chromaticities" in header
     assert [p.name for p in tmp_path.iterdir()] == ["layers.exr"]
 
 
 def test_other_programs_see_the_edited_map(tmp_path, parts):
     path = tmp_path / "layers.exr"
-    layered.write(path, parts)
-    np.testing.assert_array_equal(image.read(path)[0], parts["edited"])
+    layered_exr.write(path, parts)
+    np.testing.assert_array_equal(images.read(path)[0], parts["edited"])
     split = dict(mi.Bitmap(str(path)).split())
     assert set(split) == {"<root>", "initial", "difference", "influence"}
     np.testing.assert_array_equal(np.array(split["<root>"]), parts["edited"])
@@ -54,9 +54,9 @@ def test_other_programs_see_the_edited_map(tmp_path, parts):
 
 def test_without_an_edited_map_the_first_is_the_default(tmp_path):
     path = tmp_path / "a.exr"
-    layered.write(path, {"sky": grey(2.0), "sun": grey(3.0)}, threads=0)
-    assert (image.read(path)[0] == 2).all()
-    layered.write(path, {"only": grey(4.0)})  # replaced
+    layered_exr.write(path, {"sky": grey(2.0), "sun": grey(3.0)}, threads=0)
+    assert (images.read(path)[0] == 2).all()
+    layered_exr.write(path, {"only": grey(4.0)})  # replaced
     assert sorted(OpenEXR.File(str(path), separate_channels=True).channels()) == ["B", "G", "R"]
 
 
@@ -66,10 +66,10 @@ def test_threads_are_as_they_were(tmp_path):
     before = OpenEXR.global_thread_count()
     OpenEXR.set_global_thread_count(3)
     try:
-        layered.write(tmp_path / "a.exr", {"edited": grey(1.0)})
+        layered_exr.write(tmp_path / "a.exr", {"edited": grey(1.0)})
         assert OpenEXR.global_thread_count() == 3
         with pytest.raises(InputError):
-            layered.write(tmp_path / "none" / "a.exr", {"edited": grey(1.0)})
+            layered_exr.write(tmp_path / "none" / "a.exr", {"edited": grey(1.0)})
         assert OpenEXR.global_thread_count() == 3
     finally:
         OpenEXR.set_global_thread_count(before)
@@ -87,27 +87,27 @@ def test_threads_are_as_they_were(tmp_path):
 )
 def test_what_cannot_be_written_is_refused(tmp_path, layers, compression, what):
     with pytest.raises(ConfigError, match=what):
-        layered.write(tmp_path / "a.exr", layers, compression)
+        layered_exr.write(tmp_path / "a.exr", layers, compression)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
 def test_values_that_are_not_finite_are_refused(tmp_path, bad):
     path = tmp_path / "a.exr"
-    layered.write(path, {"edited": grey(1.0)})
+    layered_exr.write(path, {"edited": grey(1.0)})
     before = path.read_bytes()
     broken = grey(0.0).astype(np.float64)
     broken[3, 5, 1] = bad
     with pytest.raises(NumericalError, match="1 texels of layer 'difference'.*row 3, column 5"):
-        layered.write(path, {"edited": grey(1.0), "difference": broken})
+        layered_exr.write(path, {"edited": grey(1.0), "difference": broken})
     with pytest.raises(NumericalError, match="layer 'influence'.*row 3, column 5"):
-        layered.write(path, {"edited": grey(1.0), "influence": broken[..., 1]})
+        layered_exr.write(path, {"edited": grey(1.0), "influence": broken[..., 1]})
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("shape", [(8, 16, 4), (8, 16, 1), (4, 16, 3), (4, 16), (0, 16, 3)])
 def test_layers_of_another_shape_are_refused(tmp_path, shape):
     with pytest.raises(ValueError, match="layer 'other' has shape"):
-        layered.write(tmp_path / "a.exr", {"edited": grey(1.0), "other": np.zeros(shape)})
+        layered_exr.write(tmp_path / "a.exr", {"edited": grey(1.0), "other": np.zeros(shape)})
     with pytest.raises(ValueError, match="layer 'edited' has shape"):
-        layered.write(tmp_path / "a.exr", {"edited": np.zeros(SIZE)})
+        layered_exr.write(tmp_path / "a.exr", {"edited": np.zeros(SIZE)})

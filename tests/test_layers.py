@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from helpers import double, grey, single
 
-from envedit import gain, latlong, layers
-from envedit.layers import VEIL, Layers
-from envedit.lights import DARK, SPARE, rotation_vector
-from envedit.tonemap import LUMINANCE
+from envedit.core import latlong
+from envedit.core.color import LUMINANCE
+from envedit.representations.layers import gain, layers
+from envedit.representations.layers.layers import VEIL, Layers
+from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 
 SHAPE, SUN = (64, 128), (20, 126)
 SMALL = (24, 48)  # quick to tell apart

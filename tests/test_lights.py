@@ -11,9 +11,10 @@ from helpers import single
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from envedit import latlong, lights
-from envedit.lights import DARK, LOBE_DEGREES, SPARE, Lights, rotation_vector
-from envedit.separate import GLOW_DEGREES, Light, glow_at
+from envedit.core import latlong
+from envedit.representations.layers import lights
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights, rotation_vector
+from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 
 H, W = 25, 48
 UP = np.array([0.0, 1.0, 0.0])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers import double, gradient, plain_ssim_loss, single
 
-from envedit.errors import InputError
-from envedit.losses import LOSSES, luminance, tv
+from envedit.core.errors import InputError
+from envedit.losses.losses import LOSSES, luminance, tv
 
 REC709 = np.array([0.2126, 0.7152, 0.0722])
 

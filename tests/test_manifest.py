@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import manifest
-from envedit.errors import InputError
+from envedit.core.errors import InputError
+from envedit.report import manifest
 
 
 def test_history_reads_back_with_holes_for_what_is_not_finite(tmp_path):

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from envedit import metrics
-from envedit.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError, InputError
+from envedit.losses import metrics
 
 
 def waves(height=40, width=56):

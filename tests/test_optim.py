@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.errors import ConfigError, InputError
-from envedit.optim import Adam, constant, cosine, cosine_warm_restarts, ramp
+from envedit.core.errors import ConfigError, InputError
+from envedit.losses.optimizer import Adam, constant, cosine, cosine_warm_restarts, ramp
 
 # python experiments/references/make_adam_reference.py tests/data/adam_reference.npz      (PyTorch 2.13.0)
 REFERENCE = Path(__file__).parent / "data" / "adam_reference.npz"

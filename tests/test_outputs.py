@@ -8,7 +8,10 @@ import OpenEXR
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import config, doctor, image, latlong, pipeline, run
+from envedit import config, pipeline
+from envedit.cli import doctor, run
+from envedit.core import latlong
+from envedit.images import images
 
 WIDTH = 64
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
@@ -33,7 +36,7 @@ def source(rng):
 
 def carried_out(folder, picture, *arguments, **tables):
     """Run on the map with 16 working texels; returns the results' folder."""
-    image.write_exr(folder / "map.exr", picture)
+    images.write_exr(folder / "map.exr", picture)
     write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
     given = {
         "input": {"envmap": "map.exr", "width": 16},
@@ -58,7 +61,7 @@ def carried_out(folder, picture, *arguments, **tables):
 def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     picture = source(rng)
     out = carried_out(tmp_path, picture, representation={"kind": kind}, input={"width": 32})
-    full, edited = (image.read(out / name)[0] for name in ("edited_full.exr", "edited.exr"))
+    full, edited = (images.read(out / name)[0] for name in ("edited_full.exr", "edited.exr"))
     assert full.shape == picture.shape and edited.shape == (16, 32, 3)
     assert full[WIDTH // 4 :].tobytes() == picture[WIDTH // 4 :].tobytes()  # below the horizon
     assert not np.array_equal(full, picture)
@@ -104,7 +107,7 @@ def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     out = carried_out(tmp_path, source(rng))
     channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()
     planes = {name: channel.pixels for name, channel in channels.items()}
-    edited, influence = image.read(out / "edited.exr")[0], image.read(out / "influence.exr")[0]
+    edited, influence = images.read(out / "edited.exr")[0], images.read(out / "influence.exr")[0]
     for i, c in enumerate("RGB"):
         np.testing.assert_array_equal(planes[c], edited[..., i])
         np.testing.assert_allclose(planes[f"difference.{c}"], planes[c] - planes[f"initial.{c}"], atol=1e-5)
@@ -119,9 +122,9 @@ def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, c
     assert set(painted) == {"towards", "elsewhere", "reachable"} and 0 <= painted["reachable"] <= 1
     assert found["envmap"] is None and found["timing"]["reach_s"] > 0
     assert any("within reach" in line for line in found["choices"])
-    assert image.read(out / "unreachable.png")[0].shape == (18, 24, 3)
+    assert images.read(out / "unreachable.png")[0].shape == (18, 24, 3)
     assert "What was painted" in (out / "report.html").read_text()
-    wanted, initial = (image.read(out / f"render_{name}.exr")[0] for name in ("target", "initial"))
+    wanted, initial = (images.read(out / f"render_{name}.exr")[0] for name in ("target", "initial"))
     np.testing.assert_allclose(wanted[8:10, 10:14], 0.5 * initial[8:10, 10:14], rtol=1e-5)
 
 

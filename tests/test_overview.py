@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from envedit import latlong, overview
-from envedit.sparse import ColourMatrix
+from envedit.core import latlong
+from envedit.transport import block_transport
+from envedit.transport.sparse_matrix import ColourMatrix
 
 # (picture, map): tiles of one and of several pixels or texels, that divide the sides and that do not.
 SIZES = [((5, 33), (4, 65)), ((40, 7), (5, 130)), ((4, 6), (3, 10)), ((2, 64), (3, 192)), ((1, 1), (3, 2))]
@@ -34,7 +35,7 @@ def transport(rng, shape, grid):
 @pytest.mark.parametrize("shape, grid", SIZES)
 def test_matrix_is_the_dense_one_tile_by_tile(shape, grid, rng):
     matrix, full = transport(rng, shape, grid)
-    result = overview.make(matrix, shape, grid)
+    result = block_transport.make(matrix, shape, grid)
     pixels, texels = sides(shape, grid)
     blocks, cells = list(tiles(*shape, pixels)), list(tiles(*grid, texels))
     assert result.matrix.shape == (3, len(blocks), len(cells)) and result.matrix.dtype == np.float32
@@ -45,7 +46,7 @@ def test_matrix_is_the_dense_one_tile_by_tile(shape, grid, rng):
 @pytest.mark.parametrize("shape, grid", SIZES)
 def test_a_light_constant_in_every_cell_is_rendered_as_by_the_transport(shape, grid, rng):
     matrix, full = transport(rng, shape, grid)
-    result = overview.make(matrix, shape, grid)
+    result = block_transport.make(matrix, shape, grid)
     light = rng.random((result.matrix.shape[2], 3))
     picture = np.einsum("hwrtc,rtc->hwc", full, light[result.cell_of].reshape(*grid, 3))
     blocks = np.einsum("cbl,lc->bc", result.matrix.astype(np.float64), light)
@@ -54,7 +55,7 @@ def test_a_light_constant_in_every_cell_is_rendered_as_by_the_transport(shape, g
 
 @pytest.mark.parametrize("shape, grid", SIZES)
 def test_averages_over_blocks_and_cells(shape, grid, rng):
-    result = overview.make(transport(rng, shape, grid)[0], shape, grid)
+    result = block_transport.make(transport(rng, shape, grid)[0], shape, grid)
     pixels, texels = sides(shape, grid)
     picture, values, weight = rng.random((*shape, 2)), rng.random((*grid, 3)), rng.random(grid)
     expected = [picture[b].mean(axis=(0, 1)) for b in tiles(*shape, pixels)]
@@ -65,7 +66,7 @@ def test_averages_over_blocks_and_cells(shape, grid, rng):
 
 @pytest.mark.parametrize("shape, grid", SIZES)
 def test_cells_are_the_sphere(shape, grid, rng):
-    result = overview.make(transport(rng, shape, grid)[0], shape, grid)
+    result = block_transport.make(transport(rng, shape, grid)[0], shape, grid)
     assert result.omega.sum() == pytest.approx(4 * np.pi, rel=1e-12)
     texel = np.repeat(latlong.lookup_solid_angles(*grid), grid[1]).reshape(grid)
     cells = list(tiles(*grid, sides(shape, grid)[1]))
@@ -80,12 +81,12 @@ def test_cells_are_the_sphere(shape, grid, rng):
 def test_no_more_tiles_than_stated():
     empty = np.zeros(0, np.uint32)
     matrix = ColourMatrix(empty, empty, np.zeros((0, 3), np.float32), (97 * 31, 12 * 200))
-    result = overview.make(matrix, (97, 31), (12, 200))
+    result = block_transport.make(matrix, (97, 31), (12, 200))
     assert result.matrix.shape == (3, 25 * 8, 3 * 50) and not result.matrix.any()
 
 
 def test_a_cell_without_weight_is_zero(rng):
-    result = overview.make(transport(rng, (4, 6), (3, 10))[0], (4, 6), (3, 10))
+    result = block_transport.make(transport(rng, (4, 6), (3, 10))[0], (4, 6), (3, 10))
     weight = np.ones(30)
     weight[7] = 0
     means = result.to_cells(np.ones((30, 3)), weight)

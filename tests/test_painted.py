@@ -10,9 +10,11 @@ import OpenEXR
 import pytest
 from helpers import exr
 
-from envedit import config, image, painted
-from envedit.errors import ConfigError, InputError
-from envedit.tonemap import TONEMAPS, tonemap
+from envedit import config
+from envedit.core.color import TONEMAPS, tonemap
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import images
+from envedit.targets import painted_image
 
 SIZE = (60, 83)  # no multiple of a JPEG's blocks
 RECTANGLE = (slice(13, 37), slice(21, 50))
@@ -87,7 +89,7 @@ def told(result):
 def refused(words, *arguments, **kwargs):
     """Return the message, of one line, with which a picture is refused."""
     with pytest.raises(InputError) as found:
-        painted.read(*arguments, **kwargs)
+        painted_image.read(*arguments, **kwargs)
     message = str(found.value)
     assert found.value.exit_code == 3 and "\n" not in message and len(message) < 400
     assert all(part in message for part in words), message
@@ -111,7 +113,7 @@ def test_exactly_the_rectangle_is_painted(kind, name, initial, tmp_path):
         pixels, step = codes(wanted, name, top), 1 / top
         png(file.with_suffix(".png"), pixels.astype(np.uint16) * 257 if kind == "widened" else pixels)
         file = file.with_suffix(".png")
-    found = painted.read(file, SIZE, name, initial)
+    found = painted_image.read(file, SIZE, name, initial)
     np.testing.assert_array_equal(found.coverage, where[..., None].astype(np.float32))
     assert found.coverage.dtype == found.picture.dtype == np.float32
     assert found.picture[~where].tobytes() == initial[~where].tobytes()
@@ -129,7 +131,7 @@ def test_exactly_the_rectangle_is_painted(kind, name, initial, tmp_path):
 @pytest.mark.parametrize("quality", [80, 90, 95, 100])
 def test_paint_is_found_in_a_jpeg(quality, initial, tmp_path):
     wanted, where = brushed(initial)
-    found = painted.read(jpeg(tmp_path / "p.jpg", codes(wanted), quality), SIZE, "gamma", initial)
+    found = painted_image.read(jpeg(tmp_path / "p.jpg", codes(wanted), quality), SIZE, "gamma", initial)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
     assert found.picture[~where].tobytes() == initial[~where].tobytes()
     error = np.abs(tonemap(found.picture[where]) - tonemap(wanted[where]))
@@ -141,7 +143,7 @@ def test_paint_is_found_where_colours_are_subsampled(quality, initial, tmp_path)
     pillow = pytest.importorskip("PIL.Image")
     wanted, where = brushed(initial)
     pillow.fromarray(codes(wanted)).save(tmp_path / "p.jpg", quality=quality, subsampling=2)
-    found = painted.read(tmp_path / "p.jpg", SIZE, "gamma", initial).coverage[..., 0] > 0
+    found = painted_image.read(tmp_path / "p.jpg", SIZE, "gamma", initial).coverage[..., 0] > 0
     assert (found != where)[np.s_[15:35, 23:48]].sum() == 0  # two pixels inside
     assert (found & ~where).sum() + (where & ~found).sum() <= 12
 
@@ -151,7 +153,9 @@ def test_ringing_beside_strong_paint_is_no_paint(quality, initial, tmp_path):
     wanted, where = codes(initial.clip(0.2, 0.3)), np.zeros(SIZE, bool)
     for part in (np.s_[13:21, 21:50], np.s_[27:43, 30:44]):
         wanted[part], where[part] = 230, True
-    found = painted.read(jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial.clip(0.2, 0.3))
+    found = painted_image.read(
+        jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial.clip(0.2, 0.3)
+    )
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
 
 
@@ -160,7 +164,7 @@ def test_strong_colours_bleed_by_one_pixel_at_most(quality, initial, tmp_path):
     wanted, where = codes(initial.clip(0, 0.5)), np.zeros(SIZE, bool)
     for part in (np.s_[13:21, 21:50], np.s_[27:43, 30:44]):
         wanted[part], where[part] = [250, 120, 10], True
-    found = painted.read(jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial.clip(0, 0.5))
+    found = painted_image.read(jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial.clip(0, 0.5))
     around = where.copy()
     for step in (1, -1):
         around |= np.roll(where, step, 0) | np.roll(where, step, 1)
@@ -173,7 +177,7 @@ def test_strong_colours_bleed_by_one_pixel_at_most(quality, initial, tmp_path):
 
 @pytest.mark.parametrize("quality", [50, 75, 90, 98])
 def test_the_quality_of_a_jpeg_is_known(quality, initial, tmp_path):
-    _, info = image.read_stored(jpeg(tmp_path / "p.jpg", codes(initial), quality))
+    _, info = images.read_stored(jpeg(tmp_path / "p.jpg", codes(initial), quality))
     assert abs(info["quality"] - quality) <= 1
 
 
@@ -207,20 +211,20 @@ def test_rounding_is_no_paint(top, hidden, shown, initial, tmp_path):
     pixels[20:] += np.asarray(hidden).astype(pixels.dtype)
     cut = (tonemap(initial) * top).astype(pixels.dtype)
     pixels[40:] = cut[40:]  # an editor that does not round
-    found = painted.read(png(tmp_path / "p.png", pixels), SIZE, "gamma", initial).coverage
+    found = painted_image.read(png(tmp_path / "p.png", pixels), SIZE, "gamma", initial).coverage
     assert set(zip(*np.nonzero(found[..., 0]), strict=True)) == {(3, 4), (9, 9)}
 
 
 def test_16_bits_are_kept(initial, tmp_path):
     wanted = initial.clip(0, 0.9)
     wanted[RECTANGLE] = np.linspace(0.2, 0.2005, 29)[:, None]  # within a step of 8 bits
-    found = painted.read(png(tmp_path / "p.png", codes(wanted, "gamma", 65535)), SIZE, "gamma", initial)
+    found = painted_image.read(png(tmp_path / "p.png", codes(wanted, "gamma", 65535)), SIZE, "gamma", initial)
     np.testing.assert_allclose(found.picture[RECTANGLE], wanted[RECTANGLE], rtol=4e-5)
     assert len(np.unique(found.picture[RECTANGLE])) > 15
 
 
 def test_without_the_rendering_all_is_painted(initial, tmp_path):
-    found = painted.read(png(tmp_path / "p.png", codes(initial)), SIZE, "gamma")
+    found = painted_image.read(png(tmp_path / "p.png", codes(initial)), SIZE, "gamma")
     assert (found.coverage == 1).all() and found.coverage.shape == (*SIZE, 1)
     np.testing.assert_array_equal(found.excluded, (codes(initial) == 255).any(axis=2))
 
@@ -230,7 +234,7 @@ def test_faint_radiance_is_painted_too(tmp_path):
     wanted = initial.copy()
     wanted[2, 3] *= 1.01
     wanted[5, 5] = 0
-    found = painted.read(floats(tmp_path / "p.exr", wanted), (8, 8), "gamma", initial)
+    found = painted_image.read(floats(tmp_path / "p.exr", wanted), (8, 8), "gamma", initial)
     assert set(zip(*np.nonzero(found.coverage[..., 0]), strict=True)) == {(2, 3), (5, 5)}
 
 
@@ -239,13 +243,15 @@ def test_a_sun_that_a_half_cannot_hold_is_no_paint(tmp_path):
     initial[1, 1] = 1e6
     wanted = np.minimum(initial, 65504)
     wanted[4, 4] = 2
-    found = painted.read(floats(tmp_path / "p.exr", wanted, np.float16), (8, 8), "gamma", initial)
+    found = painted_image.read(floats(tmp_path / "p.exr", wanted, np.float16), (8, 8), "gamma", initial)
     assert found.coverage.sum() == 1 and found.picture[1, 1, 0] == 1e6 and found.picture[4, 4, 0] == 2
 
 
 def test_one_pixel(tmp_path):
     initial = np.full((1, 1, 3), 0.25, np.float32)
-    found = painted.read(png(tmp_path / "p.png", np.full((1, 1, 3), 20, np.uint8)), (1, 1), "gamma", initial)
+    found = painted_image.read(
+        png(tmp_path / "p.png", np.full((1, 1, 3), 20, np.uint8)), (1, 1), "gamma", initial
+    )
     assert found.coverage.item() == 1
     assert "100 %" in told(found) and "another rendering" in told(found)
 
@@ -267,7 +273,7 @@ def test_the_tonemap_that_the_file_names_is_used(kind, text, initial, tmp_path):
     file = png(tmp_path / "p.png", codes(wanted, "log", 65535))
     with_chunk(file, b"tEXt", "Author\0Jürgen".encode("latin-1"))  # as many an editor writes
     with_chunk(file, kind, b"envedit.tonemap\0" + text)
-    found = painted.read(file, SIZE, "gamma", initial)
+    found = painted_image.read(file, SIZE, "gamma", initial)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
     np.testing.assert_allclose(found.picture, wanted, rtol=2e-3)
     assert "'log'" in told(found) and "instead of 'gamma'" in told(found)
@@ -276,29 +282,29 @@ def test_the_tonemap_that_the_file_names_is_used(kind, text, initial, tmp_path):
 @pytest.mark.parametrize("said", [b"filmic", b"", b"\xff\0\xff"])
 def test_a_tonemap_that_is_unknown_is_told(said, initial, tmp_path):
     file = png(tmp_path / "p.png", codes(brushed(initial)[0]))
-    found = painted.read(with_chunk(file, b"tEXt", b"envedit.tonemap\0" + said), SIZE, "gamma", initial)
+    found = painted_image.read(with_chunk(file, b"tEXt", b"envedit.tonemap\0" + said), SIZE, "gamma", initial)
     assert found.coverage.sum() == brushed(initial)[1].sum()
     assert ("which is unknown" in told(found)) is (said != b"")
     for damage in (b"\1\0\0\0x", b"\1", b""):
         with_chunk(file, b"iTXt", b"envedit.x\0" + damage)
         with_chunk(file, b"zTXt", b"envedit.y\0" + damage)
-    assert painted.read(file, SIZE, "gamma", initial).coverage.any()
+    assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
 
 
 def test_another_tonemap_is_noticed(initial, tmp_path):
     file = png(tmp_path / "p.png", codes(brushed(initial)[0], "srgb"))
-    found = painted.read(file, SIZE, "linear", initial)
+    found = painted_image.read(file, SIZE, "linear", initial)
     assert 'set [target] tonemap = "srgb"' in told(found)
 
 
 def test_another_rendering_is_noticed(initial, rng, tmp_path):
     other = initial * (1 + 0.3 * rng.standard_normal((*SIZE, 1))).astype(np.float32).clip(0.1)
     file = floats(tmp_path / "p.exr", other, header={"envedit.seed": 7, "envedit.tonemap": "linear"})
-    found = painted.read(file, SIZE, "gamma", initial)
+    found = painted_image.read(file, SIZE, "gamma", initial)
     assert "another rendering (it was made with" in told(found) and "seed 7" in told(found)
     assert found.coverage.mean() > 0.9
     warm = floats(tmp_path / "w.exr", initial * np.float32([1.1, 1, 0.9]))  # all of it, on purpose: allowed
-    assert "unless all of it was painted" in told(painted.read(warm, SIZE, "gamma", initial))
+    assert "unless all of it was painted" in told(painted_image.read(warm, SIZE, "gamma", initial))
 
 
 # ---- clipped -----------------------------------------------------------------------------------------------
@@ -311,7 +317,7 @@ def test_clipped_pixels_are_excluded(top, name, initial, tmp_path):
     pixels[20, 30] = top
     pixels[21, 30, 0] = top  # one channel is enough
     pixels[22, 30] = 0  # black is no limit
-    found = painted.read(png(tmp_path / "p.png", pixels), SIZE, name, initial)
+    found = painted_image.read(png(tmp_path / "p.png", pixels), SIZE, name, initial)
     expected = (initial >= 1).any(axis=2)
     expected[20:22, 30] = True
     np.testing.assert_array_equal(found.excluded, expected)
@@ -331,14 +337,14 @@ def test_only_white_paint_is_refused(initial, tmp_path):
 def test_white_of_a_jpeg_is_not_quite_white(initial, tmp_path):
     pixels = codes(initial)
     pixels[16:32, 16:32], pixels[32:48, 16:32] = 254, 100
-    found = painted.read(jpeg(tmp_path / "p.jpg", pixels, 100), SIZE, "gamma", initial)
+    found = painted_image.read(jpeg(tmp_path / "p.jpg", pixels, 100), SIZE, "gamma", initial)
     assert found.excluded[16:32, 16:32].mean() > 0.9 and not found.excluded[32:48, 16:32].any()
 
 
 def test_a_float_picture_is_not_clipped(initial, tmp_path):
     wanted = initial.copy()
     wanted[20, 30] = 1
-    assert not painted.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial).excluded.any()
+    assert not painted_image.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial).excluded.any()
 
 
 # ---- alpha -------------------------------------------------------------------------------------------------
@@ -356,7 +362,7 @@ def layer(initial):
 def test_a_layer_is_laid_over_the_rendering(top, initial, tmp_path):
     pixels = layer(initial)
     file = png(tmp_path / "p.png", np.rint(pixels * top).astype(np.uint16 if top > 255 else np.uint8))
-    found = painted.read(file, SIZE, "gamma", initial)
+    found = painted_image.read(file, SIZE, "gamma", initial)
     np.testing.assert_allclose(found.coverage[..., 0], pixels[..., 3], atol=1e-6)
     assert found.picture[pixels[..., 3] == 0].tobytes() == initial[pixels[..., 3] == 0].tobytes()
     edge = (RECTANGLE[0], RECTANGLE[1].start)
@@ -371,13 +377,13 @@ def test_alpha_of_an_exr_is_premultiplied(initial, tmp_path):
     alpha = layer(initial)[..., 3].astype(np.float32)
     paint = np.float32([0.5, 2, 0.25]) * alpha[..., None]
     paint[0, 0] = 9  # colour without alpha
-    found = painted.read(floats(tmp_path / "p.exr", paint, A=alpha), SIZE, "gamma", initial)
+    found = painted_image.read(floats(tmp_path / "p.exr", paint, A=alpha), SIZE, "gamma", initial)
     np.testing.assert_allclose(found.picture[0, 0], initial[0, 0])
     expected = paint + (1 - alpha[..., None]) * initial
     expected[0, 0] = initial[0, 0]
     np.testing.assert_allclose(found.picture, expected, rtol=1e-6)
     np.testing.assert_array_equal(found.coverage[..., 0], alpha)
-    alone = painted.read(tmp_path / "p.exr", SIZE, "gamma")
+    alone = painted_image.read(tmp_path / "p.exr", SIZE, "gamma")
     np.testing.assert_allclose(alone.picture[alpha > 0], np.float32([[0.5, 2, 0.25]] * (24 * 29)), rtol=1e-6)
     np.testing.assert_array_equal(alone.excluded, alpha == 0)
     assert not alone.picture[0, 0].any() and "taken as it is" in told(alone)
@@ -386,7 +392,7 @@ def test_alpha_of_an_exr_is_premultiplied(initial, tmp_path):
 def test_a_cropped_exr_is_not_black_paint(initial, tmp_path):
     part = brushed(initial)[0][10:40, 15:60]
     box = {"dataWindow": ((15, 10), (59, 39)), "displayWindow": ((0, 0), (82, 59))}
-    found = painted.read(floats(tmp_path / "p.exr", part, header=box), SIZE, "gamma", initial)
+    found = painted_image.read(floats(tmp_path / "p.exr", part, header=box), SIZE, "gamma", initial)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
 
 
@@ -412,11 +418,11 @@ def test_grey(kind, initial, tmp_path):
     else:
         opaque = np.full_like(one, 255)
         file = png(tmp_path / "p.png", np.concatenate([one, opaque], 2) if "alpha" in kind else one)
-    found = painted.read(file, SIZE, "gamma", grey)
+    found = painted_image.read(file, SIZE, "gamma", grey)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
     assert "read as grey" in told(found) and "transparent" not in told(found)
     refused(["is grey", "RGB"], file, SIZE, "gamma", initial)
-    assert painted.read(file, SIZE, "gamma").coverage.all()
+    assert painted_image.read(file, SIZE, "gamma").coverage.all()
 
 
 def test_palette_with_transparency(tmp_path):
@@ -427,7 +433,7 @@ def test_palette_with_transparency(tmp_path):
     data = b"".join(chunk(*part) for part in parts)
     (tmp_path / "p.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data + chunk(b"IEND", b""))
     initial = np.full((2, 3, 3), 0.5, np.float32)
-    found = painted.read(tmp_path / "p.png", (2, 3), "linear", initial)
+    found = painted_image.read(tmp_path / "p.png", (2, 3), "linear", initial)
     np.testing.assert_array_equal(found.coverage[..., 0], [[1, 0, 1], [0, 0, 1]])
     np.testing.assert_allclose(found.picture[0, 0] * 255, [10, 20, 30], rtol=1e-6)
 
@@ -439,7 +445,7 @@ def test_interlaced(tmp_path):
     rows = b"\0" + a + b"\0" + b + b"\0" + c + d
     data = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
     (tmp_path / "p.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data)
-    found = painted.read(tmp_path / "p.png", (2, 2), "linear").picture * 65535
+    found = painted_image.read(tmp_path / "p.png", (2, 2), "linear").picture * 65535
     np.testing.assert_allclose(found[..., 0], [[1, 2], [3, 4]], rtol=1e-6)
     np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
 
@@ -451,10 +457,10 @@ def test_turned_pictures_are_refused(initial, tmp_path):
     file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE1, b"Exif\0\0" + turned(3))
     refused(["p.jpg", "EXIF orientation 3"], file, SIZE, "gamma", initial)
     file = with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + turned(1))
-    assert painted.read(file, SIZE, "gamma", initial).coverage.any()
+    assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
     for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff"):
         with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + damage)
-        assert painted.read(file, SIZE, "gamma", initial).coverage.any()
+        assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
 
 
 @pytest.mark.parametrize(
@@ -464,10 +470,10 @@ def test_turned_pictures_are_refused(initial, tmp_path):
 def test_a_colour_profile_is_told(profile, odd, initial, tmp_path):
     wanted = codes(brushed(initial)[0])
     file = with_chunk(png(tmp_path / "p.png", wanted), b"iCCP", b"ICC\0\0" + zlib.compress(profile))
-    assert ("colour profile" in told(painted.read(file, SIZE, "gamma", initial))) is odd
+    assert ("colour profile" in told(painted_image.read(file, SIZE, "gamma", initial))) is odd
     segment = b"ICC_PROFILE\0\1\1" + profile
     file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE2, segment)
-    assert ("colour profile" in told(painted.read(file, SIZE, "gamma", initial))) is odd
+    assert ("colour profile" in told(painted_image.read(file, SIZE, "gamma", initial))) is odd
 
 
 def test_cmyk_is_refused(initial, tmp_path):
@@ -501,7 +507,7 @@ def test_values_that_are_not_finite(value, initial, tmp_path):
 def test_negative_values_are_set_to_zero(initial, tmp_path):
     wanted = initial.copy()
     wanted[7, 11] = [-0.5, 1, 1]
-    found = painted.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial)
+    found = painted_image.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial)
     np.testing.assert_array_equal(found.picture[7, 11], [0, 1, 1])
     assert "1 pixels are negative, the first at row 7, column 11" in told(found)
 
@@ -514,12 +520,14 @@ def test_a_mask_overrides_what_is_seen(initial, tmp_path):
     mask = np.zeros((*SIZE, 3), np.uint8)
     mask[10:20, 15:30], mask[20:25, 15:30] = 255, 128
     file = png(tmp_path / "p.png", codes(wanted))
-    found = painted.read(file, SIZE, "gamma", initial, png(tmp_path / "m.png", mask))
+    found = painted_image.read(file, SIZE, "gamma", initial, png(tmp_path / "m.png", mask))
     np.testing.assert_allclose(found.coverage, mask[..., :1] / 255, atol=1e-6)
     kept = ~where | (mask[..., 0] == 0)  # what no stroke touched, and what the mask leaves out
     assert found.picture[kept].tobytes() == initial[kept].tobytes()
     assert np.abs(found.picture - initial)[~kept].min(axis=0).max() > 0
-    same = painted.read(png(tmp_path / "s.png", codes(initial)), SIZE, "gamma", initial, tmp_path / "m.png")
+    same = painted_image.read(
+        png(tmp_path / "s.png", codes(initial)), SIZE, "gamma", initial, tmp_path / "m.png"
+    )
     assert same.coverage.any()  # nothing differs, and that is meant
 
 
@@ -527,19 +535,19 @@ def test_a_mask_overrides_what_is_seen(initial, tmp_path):
 def test_greys_of_a_mask_are_weights(top, tmp_path):
     values = np.linspace(0, top, 24).reshape(4, 6, 1)
     pixels = np.rint(values).astype(np.uint16 if top > 255 else np.uint8)
-    weight = painted.read_mask(png(tmp_path / "m.png", pixels), (4, 6))
+    weight = painted_image.read_mask(png(tmp_path / "m.png", pixels), (4, 6))
     np.testing.assert_allclose(weight, pixels / top, rtol=1e-6)
     assert weight.shape == (4, 6, 1) and weight.dtype == np.float32
     strokes = np.full((4, 6, 4), 255, np.uint8)
     strokes[..., 3] = np.arange(24).reshape(4, 6)
-    weight = painted.read_mask(png(tmp_path / "m.png", strokes), (4, 6))
+    weight = painted_image.read_mask(png(tmp_path / "m.png", strokes), (4, 6))
     np.testing.assert_allclose(weight[..., 0] * 255, strokes[..., 3], rtol=1e-6)
 
 
 def test_black_of_a_jpeg_mask_is_black(tmp_path):
     mask = np.full((*SIZE, 3), 3, np.uint8)
     mask[16:32, 16:48] = 252
-    weight = painted.read_mask(jpeg(tmp_path / "m.jpg", mask, 100), SIZE)
+    weight = painted_image.read_mask(jpeg(tmp_path / "m.jpg", mask, 100), SIZE)
     np.testing.assert_array_equal(weight[..., 0], mask[..., 0] > 100)
 
 
@@ -554,7 +562,7 @@ def test_black_of_a_jpeg_mask_is_black(tmp_path):
 )
 def test_masks_that_cannot_be_used(values, says, tmp_path):
     with pytest.raises(InputError, match=rf"m\.exr.*{says}"):
-        painted.read_mask(floats(tmp_path / "m.exr", values), (4, 6))
+        painted_image.read_mask(floats(tmp_path / "m.exr", values), (4, 6))
 
 
 # ---- the rendering to paint on -----------------------------------------------------------------------------
@@ -568,8 +576,8 @@ def settings(**target):
 @pytest.mark.parametrize("name", TONEMAPS)
 def test_exported_and_painted_on(ending, name, initial, tmp_path):
     file = tmp_path / f"paint{ending}"
-    told_now = painted.export(file, initial, settings(tonemap=name))
-    pixels, info = image.read_stored(file)
+    told_now = painted_image.export(file, initial, settings(tonemap=name))
+    pixels, info = images.read_stored(file)
     stored = info["metadata"]
     assert {k: str(stored[f"envedit.{k}"]) for k in ("scene", "envmap", "seed")} == {
         "scene": "sphere", "envmap": "sunsky", "seed": "3"
@@ -587,13 +595,13 @@ def test_exported_and_painted_on(ending, name, initial, tmp_path):
         assert ("clipped" in "".join(told_now)) is (name != "log")
         pixels[RECTANGLE] //= 2
         png(file, pixels)
-    found = painted.read(file, SIZE, name, initial)
+    found = painted_image.read(file, SIZE, name, initial)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
 
 
 def test_texts_of_a_png_are_as_another_program_reads_them(tmp_path, rng):
     picture = rng.random((5, 7, 3))
-    image.write_png(
+    images.write_png(
         tmp_path / "a.png", picture, 16, {"envedit.tonemap": "gamma", "envedit.envmap": "fjälls 空.hdr"}
     )
     raw, at, texts = (tmp_path / "a.png").read_bytes(), 8, {}
@@ -606,7 +614,7 @@ def test_texts_of_a_png_are_as_another_program_reads_them(tmp_path, rng):
             texts[key.decode()] = text.decode("latin-1")
         at += 12 + length
     assert texts["envedit.tonemap"] == "gamma" and texts["envedit.envmap"] == "fjälls ?.hdr"
-    pixels, info = image.read_stored(tmp_path / "a.png")
+    pixels, info = images.read_stored(tmp_path / "a.png")
     assert info["metadata"]["envedit.tonemap"] == "gamma"
     np.testing.assert_array_equal(pixels, np.rint(picture.astype(np.float32) * np.float32(65535)))
 
@@ -620,7 +628,7 @@ def test_what_is_not_exported(initial, tmp_path):
         ("gone/a.exr", InputError, "folder does not exist"),
     ):
         with pytest.raises(error, match=says):
-            painted.export(tmp_path / file, initial, settings())
+            painted_image.export(tmp_path / file, initial, settings())
     assert (tmp_path / "there.png").read_bytes() == b"mine" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -633,5 +641,5 @@ def test_the_run_renders_the_exported_picture_again():
         return envmap, spp, None
 
     lit = types.SimpleNamespace(sampled=sampled)
-    assert painted.initial(lit, "map", settings(spp=32)) == "map"
-    assert seen == [(32, 3 + painted.SEED)]
+    assert painted_image.initial(lit, "map", settings(spp=32)) == "map"
+    assert seen == [(32, 3 + painted_image.SEED)]

@@ -9,10 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import config, envmap, fit, image, latlong, layered, siren
-from envedit.errors import ConfigError, InputError
-from envedit.files import write_atomically
+from envedit import config, representations
+from envedit.core import latlong
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import images, layered_exr
 from envedit.inputs import load_map
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
 from experiments import puresky
 from experiments.paper import ceiling, measured, network, plan, plot, run, sheets, skies, tables
 from experiments.paper.kinds import KINDS
@@ -176,7 +180,7 @@ def test_figure_8_has_another_map_for_its_target_turned_where_there_is_one(maps,
     assert target().file == "" and target().rotate_degrees == 60
     sky, content = np.random.default_rng(0).random((8, 16, 3), np.float32), content_of(maps)
     for name in ("dawn", skies.OTHER):
-        image.write_exr(maps / f"{name}_puresky_1k.exr", sky)
+        images.write_exr(maps / f"{name}_puresky_1k.exr", sky)
     assert target().file == str(
         tmp_path / "maps" / f"{skies.OTHER}_puresky_1k-turned-60-{content(skies.OTHER)}.exr"
     )
@@ -186,7 +190,7 @@ def test_figure_8_has_another_map_for_its_target_turned_where_there_is_one(maps,
     found = target(target="dawn", angle=90)
     assert found.file == str(tmp_path / "maps" / f"dawn_puresky_1k-turned-90-{content('dawn')}.exr")
     assert found.rotate_degrees == 0
-    np.testing.assert_array_equal(image.read(found.file)[0], np.roll(sky, -4, axis=1))
+    np.testing.assert_array_equal(images.read(found.file)[0], np.roll(sky, -4, axis=1))
     with pytest.raises(ConfigError, match="--target: no map dusky; did you mean dusk"):
         target(target="dusky")
     with pytest.raises(ConfigError, match="--angle"):
@@ -380,10 +384,10 @@ def finish(out, made, row, sky=None, *, color=RED, numbers=SOME, fit_s=None, cac
         write_atomically(folder / "config.toml", job.toml.encode())
         edited = np.ones((8, 16, 3), np.float32) * np.float32(color)
         initial = np.full((8, 16, 3), 0.2, np.float32)
-        image.write_exr(folder / "edited.exr", edited)
-        layered.write(folder / "edited_layers.exr", {"edited": edited, "initial": initial})
+        images.write_exr(folder / "edited.exr", edited)
+        layered_exr.write(folder / "edited_layers.exr", {"edited": edited, "initial": initial})
         for name, value in (("initial", 0.1), ("target", 0.4), ("edited", 0.7)):
-            image.write_exr(folder / f"render_{name}.exr", np.full((6, 6, 3), value, np.float32))
+            images.write_exr(folder / f"render_{name}.exr", np.full((6, 6, 3), value, np.float32))
         about = {
             "envmap": numbers,
             "render": {**numbers, "psnr": numbers["psnr"] + 20},
@@ -504,12 +508,12 @@ def test_the_true_map_is_the_map_turned_or_the_other_one(maps, tmp_path):
     finish(tmp_path, made, "layers")
     ((cell, job),) = made
     ramp = np.broadcast_to(np.arange(16, dtype=np.float32)[None, :, None], (8, 16, 3))
-    layered.write(cell.folder(tmp_path) / "edited_layers.exr", {"edited": ramp, "initial": ramp.copy()})
+    layered_exr.write(cell.folder(tmp_path) / "edited_layers.exr", {"edited": ramp, "initial": ramp.copy()})
     found = measured.pictures(tmp_path, cell)
     assert found["initial_map"].shape == (4, 16, 3)
     np.testing.assert_array_equal(found["true_map"], latlong.rotate(ramp, 90)[:4])
     other = tmp_path / "other.exr"
-    image.write_exr(other, np.full((8, 16, 3), 3, np.float32))
+    images.write_exr(other, np.full((8, 16, 3), 3, np.float32))
     changed = job.toml.replace(
         '[target]\nkind = "envmap"\nfile = ""', f'[target]\nkind = "envmap"\nfile = "{other}"'
     )
@@ -533,7 +537,7 @@ def test_every_table_and_figure_is_drawn_and_printed(maps, tmp_path, capsys):
                 folder = cell.folder(out)
                 folder.mkdir(parents=True, exist_ok=True)
                 for i, file in enumerate(("original", "fitted", "noisy")):
-                    image.write_exr(folder / f"{file}.exr", np.full((4, 16, 3), 10.0**i, np.float32))
+                    images.write_exr(folder / f"{file}.exr", np.full((4, 16, 3), 10.0**i, np.float32))
                 text = {"log_psnr": 40.0, "peak_ratio": None, "mean_ratio": 0.5, "noisy": [30.0, 20.0]}
                 (folder / "fit.json").write_text(json.dumps({**text, "seconds": 9.0, "epochs": 3}))
                 (folder / "done.json").touch()
@@ -595,7 +599,7 @@ def test_a_fit_leaves_its_numbers_and_pictures(maps, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     sky = tmp_path / "maps" / "dusk_puresky_1k.exr"
     (maps / "dusk_puresky_1k.hdr").unlink()
-    image.write_exr(sky, np.random.default_rng(0).random((16, 32, 3), np.float32) + 0.1)
+    images.write_exr(sky, np.random.default_rng(0).random((16, 32, 3), np.float32) + 0.1)
     sets = ("fit.epochs=3", "input.width=32", "representation.hidden=8", "representation.depth=1")
     made = build("figure5", Question(sets=sets), ("ours",), maps, ["dusk"])
     for cell, job in made[:2]:
@@ -606,13 +610,13 @@ def test_a_fit_leaves_its_numbers_and_pictures(maps, tmp_path, monkeypatch):
         found = json.loads((folder / "fit.json").read_text())
         assert found["epochs"] == 3 and len(found["noisy"]) == network.NOISE_SEEDS
         original, fitted, noisy = (
-            image.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")
+            images.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")
         )
         assert original.shape == fitted.shape == (8, 32, 3)
         assert 0 < np.abs(noisy - fitted).mean() < 0.1
         # An edit of the same row finds the fit on disk.
         (_, edit), *_ = build("table1", Question(sets=sets), ("ours",), maps, ["dusk"], [cell.row])
-        siren_of = envmap.make(settings_of(edit), fit.default_folder(), None, (0, 16))
+        siren_of = representations.make(settings_of(edit), fit.default_folder(), None, (0, 16))
         siren_of.encode(load_map(settings_of(edit).input)[0][:8])
         assert siren_of.fitted.cached and siren_of.fitted.seconds == found["seconds"]
     (tmp_path / "bad").mkdir()
@@ -645,7 +649,7 @@ def test_the_ceiling_is_the_noise_of_two_renderings(tmp_path, capsys):
     sun = np.full((8, 16, 3), 0.2, np.float32)
     sun[2, 5] = 2000.0
     for name, content in (("clear", sun), ("grey", np.full((8, 16, 3), 0.4, np.float32)), ("night", 0 * sun)):
-        image.write_exr(tmp_path / f"{name}_puresky_1k.exr", content)
+        images.write_exr(tmp_path / f"{name}_puresky_1k.exr", content)
     few = ["--maps", str(tmp_path), "--width", "16", "--roughness", "0", "1"]
     assert ceiling.main([*few, "--only", "clear", "grey"]) == 0
     head, _, clear, grey, mean = capsys.readouterr().out.splitlines()

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import latlong, paths, scene
+from envedit.core import latlong
+from envedit.scene import camera_paths, scene
 
 # ---- statistics (also used by the tests of the renderers) --------------------------------------------------
 #
@@ -103,7 +104,9 @@ def test_comparison_passes_noise_and_sees_a_bias(rng):
 
 def test_lattice_is_the_r2_sequence_below_one():
     index = np.concatenate([np.arange(2000), 2**32 - 1 - np.arange(2000)]).astype(np.uint32)
-    points = np.array(paths.lattice(mi.UInt32(index), dr.full(mi.UInt32, 7, len(index)))).astype(np.float64)
+    points = np.array(camera_paths.lattice(mi.UInt32(index), dr.full(mi.UInt32, 7, len(index)))).astype(
+        np.float64
+    )
     assert (points >= 0).all() and (points < 1).all()
     # Roberts 2018: steps of 1/g and 1/g^2 with g^3 = g + 1. 2000 steps of an error of 2^-33, float32's 2^-24.
     g = np.real(np.roots([1, 0, -1, -1])[0])
@@ -115,14 +118,14 @@ def test_lattice_is_the_r2_sequence_below_one():
 def test_lattice_stays_below_one_at_every_shift():
     # 2^32 - 1 rounds to 2^32 in float32.
     shift = dr.arange(mi.UInt32, 1 << 20)
-    points = paths.lattice(dr.full(mi.UInt32, 3, 1 << 20), shift)
+    points = camera_paths.lattice(dr.full(mi.UInt32, 3, 1 << 20), shift)
     assert dr.max(dr.maximum(points.x, points.y))[0] < 1
 
 
 def test_lattice_fills_the_square_more_evenly_than_random_points():
     index = mi.UInt32(np.tile(np.arange(256, dtype=np.uint32), 50))
     scramble = mi.UInt32(np.repeat(np.arange(50, dtype=np.uint32), 256))
-    points = np.array(paths.lattice(index, scramble)).reshape(2, 50, 256)
+    points = np.array(camera_paths.lattice(index, scramble)).reshape(2, 50, 256)
     variance = np.mean([np.histogram2d(*points[:, i], 8, [(0, 1)] * 2)[0].var() for i in range(50)])
     assert variance < 0.25 * (256 / 64)  # 256 / 64 for random points (Poisson)
     # Shifts of different pixels are independent: their first points are uniform (mean 1/2 within 5 sigma).
@@ -154,7 +157,7 @@ def every_pixel(s):
 @pytest.mark.parametrize("bounces", [0, 1, 3])
 def test_trace_yields_escapes_and_vertices_bounce_by_bounce(bounces):
     s = scene.load("matte", 8, 8)
-    events = list(paths.trace(s.mi, every_pixel(s), 4, bounces, 0))
+    events = list(camera_paths.trace(s.mi, every_pixel(s), 4, bounces, 0))
     order = [(type(e).__name__, e.bounce) for e in events]
     expected = [("Escape", 0)]
     for b in range(bounces):
@@ -173,8 +176,8 @@ def test_trace_yields_escapes_and_vertices_bounce_by_bounce(bounces):
 def test_every_path_carries_all_light_of_a_white_furnace():
     s = stage(ball(WHITE))
     total = mi.Color3f(0)
-    for event in paths.trace(s.mi, every_pixel(s), 8, 2, 3):
-        if isinstance(event, paths.Escape):
+    for event in camera_paths.trace(s.mi, every_pixel(s), 8, 2, 3):
+        if isinstance(event, camera_paths.Escape):
             total += dr.select(event.active, event.throughput, 0)
     # A white convex body absorbs nothing and no path meets it twice; a few roundings.
     np.testing.assert_allclose(np.array(total), 1, rtol=1e-5)
@@ -182,11 +185,11 @@ def test_every_path_carries_all_light_of_a_white_furnace():
 
 def test_density_is_infinite_for_what_only_the_path_can_find():
     s = stage(ball({"type": "conductor", "material": "none"}))
-    seen, hit, mirrored, *_ = paths.trace(s.mi, every_pixel(s), 4, 1, 0)
+    seen, hit, mirrored, *_ = camera_paths.trace(s.mi, every_pixel(s), 4, 1, 0)
     assert dr.all(dr.isinf(seen.pdf)) and dr.any(hit.active)
     assert dr.all(dr.isinf(mirrored.pdf) | ~mirrored.active)
     np.testing.assert_array_equal(np.array(mirrored.active), np.array(hit.active))
-    *_, matte = paths.trace(stage(ball(WHITE)).mi, every_pixel(s), 4, 1, 0)
+    *_, matte = camera_paths.trace(stage(ball(WHITE)).mi, every_pixel(s), 4, 1, 0)
     pdf = np.array(matte.pdf)[np.array(matte.active)]
     assert (pdf > 0).all() and (pdf <= 1 / np.pi * 1.0001).all()  # cos / pi
 
@@ -195,7 +198,7 @@ def test_same_seed_same_paths_and_another_seed_others():
     s = stage(ball(WHITE))
 
     def directions(seed):
-        seen, *_, scattered = paths.trace(s.mi, every_pixel(s), 4, 1, seed)
+        seen, *_, scattered = camera_paths.trace(s.mi, every_pixel(s), 4, 1, seed)
         gone = np.array(scattered.active)  # paths that never hit anything have no direction now
         return np.array(seen.direction), np.array(scattered.direction) * gone
 
@@ -210,9 +213,9 @@ def test_same_seed_same_paths_and_another_seed_others():
 
 def test_pixels_of_a_path_are_those_asked_for():
     s = stage(ball(WHITE))
-    whole = list(paths.trace(s.mi, every_pixel(s), 4, 1, 0))[-1]
+    whole = list(camera_paths.trace(s.mi, every_pixel(s), 4, 1, 0))[-1]
     some = np.array([200, 3, 77], np.uint32)
-    part = list(paths.trace(s.mi, some, 4, 1, 0))[-1]
+    part = list(camera_paths.trace(s.mi, some, 4, 1, 0))[-1]
     lanes = (some[:, None] * 4 + np.arange(4)).ravel()
     np.testing.assert_array_equal(np.array(part.direction), np.array(whole.direction)[:, lanes])
 
@@ -243,7 +246,7 @@ def test_pixels_see_the_sky_through_the_filter_of_the_film(rng, name):
     count = 64
 
     def ours(seed):
-        seen = next(iter(paths.trace(s.mi, every_pixel(s), count, 0, seed)))
+        seen = next(iter(camera_paths.trace(s.mi, every_pixel(s), count, 0, seed)))
         radiance = latlong.lookup(sky, np.array(seen.direction).T.astype(np.float64))
         radiance *= np.array(seen.throughput).T * np.array(seen.active)[:, None]
         return radiance.reshape(s.height, s.width, count, 3).mean(axis=2)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_paths import disagreement
 
-from envedit import scene
-from envedit.errors import ConfigError
-from envedit.pathtrace import PathTracer
-from envedit.transport import LightTransport
+from envedit.core.errors import ConfigError
+from envedit.scene import scene
+from envedit.scene.path_tracer import PathTracer
+from envedit.transport.light_transport import LightTransport
 
 HEIGHT, WIDTH, DEPTH, STEPS = 6, 12, 3, 8
 

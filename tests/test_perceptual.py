@@ -14,10 +14,10 @@ import pytest
 from helpers import double, gradient, single
 from test_weights import write_safetensors
 
-from envedit import convolution
-from envedit.errors import ConfigError, InputError
-from envedit.features import KINDS, Backbone
-from envedit.perceptual import Dists, Lpips
+from envedit.core.errors import ConfigError, InputError
+from envedit.losses.perceptual import convolution
+from envedit.losses.perceptual.backbones import KINDS, Backbone
+from envedit.losses.perceptual.distances import Dists, Lpips
 
 ROOT = Path(__file__).parents[1]
 

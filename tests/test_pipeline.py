@@ -11,23 +11,15 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import (
-    checkpoint,
-    config,
-    edit,
-    envmap,
-    gain,
-    image,
-    inputs,
-    job,
-    latlong,
-    loop,
-    pipeline,
-    recording,
-    scene,
-    target,
-)
-from envedit.errors import InputError
+from envedit import api, config, inputs, pipeline, representations
+from envedit.core import latlong
+from envedit.core.errors import InputError
+from envedit.images import images
+from envedit.representations.layers import gain
+from envedit.scene import scene
+from envedit.solve import adam_loop, checkpoint, edit_job
+from envedit.targets import target
+from envedit.transport import recording
 
 WIDTH, HEIGHT = 16, 8
 PIXELS = {"representation": {"kind": "pixels"}}
@@ -41,7 +33,7 @@ def own_cache(tmp_path, monkeypatch):
 
 def settings_of(folder, picture, **tables):
     """Return the configuration of a tiny run on a map, which is written; keys by table."""
-    image.write_exr(folder / "map.exr", picture)
+    images.write_exr(folder / "map.exr", picture)
     write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
     given = {
         "input": {"envmap": "map.exr", "width": WIDTH},
@@ -247,7 +239,7 @@ def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
     picture = np.full((32, 64, 3), 0.3, np.float32)
     wanted = picture.copy()
     picture[10, 12], wanted[14, 20] = 300, 300
-    image.write_exr(tmp_path / "wanted.exr", wanted)
+    images.write_exr(tmp_path / "wanted.exr", wanted)
     target = {"file": "wanted.exr", "rotate_degrees": 0.0, "spp": 256}
     found = pipeline.run(plated(tmp_path, picture, target=target, optimizer={"iterations": 5}))
     assert found.frozen.mean() > 0.2 and len(found.separation.lights) == 1
@@ -307,8 +299,8 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
     lit = scene.load(settings_of(tmp_path, picture, **tables).scene.file, 48, 36)
     painted, counted = lit.render(wanted, spp=1024, seed=5), np.ones((36, 48, 3), np.float32)
     painted[8:13], counted[8:13] = 0, 0
-    image.write_exr(tmp_path / "painted.exr", painted)
-    image.write_exr(tmp_path / "mask.exr", counted)
+    images.write_exr(tmp_path / "painted.exr", painted)
+    images.write_exr(tmp_path / "mask.exr", counted)
     target = {"kind": "image", "file": "painted.exr"} | ({"mask": mask, "hold": 0.0} if mask else {})
     found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
     rest = counted[..., 0] > 0
@@ -342,7 +334,7 @@ def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, r
 
 @pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
 def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp_path, rng, monkeypatch):
-    places, plain = [], envmap.make
+    places, plain = [], representations.make
 
     def noted(*args):
         representation = plain(*args)
@@ -420,14 +412,14 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
     make, tables = CASES[name]
     picture = make(rng)
     if name == "pixels, no columns":  # an even map turned is the same map: ask for one twice as bright
-        image.write_exr(tmp_path / "bright.exr", 2 * picture)
+        images.write_exr(tmp_path / "bright.exr", 2 * picture)
         tables = tables | {"target": {"file": "bright.exr"}}
     settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     assert (whole.envmap != picture).any()
 
-    monkeypatch.setattr(loop, "READ_EVERY", 7)
-    monkeypatch.setattr(loop, "READ_SECONDS", 1e9)
+    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", 1e9)
     folder = tmp_path / "run"
     folder.mkdir()
     for step in (7, 14, 20):
@@ -470,7 +462,7 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
     assert len(levels) > gain.LEVELS
     assert all(np.abs(whole.found.params[name].numpy()).max() > 0 for name in levels)
 
-    monkeypatch.setattr(loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted, match="iteration 7"):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -483,7 +475,7 @@ def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path
     """Mitsuba adds the gradients of a texel in any order: its runs agree but for the last bits."""
     settings = settings_of(tmp_path, smooth(rng), renderer={"kind": "path", "spp": 4, "max_depth": 3})
     whole = pipeline.run(settings)
-    monkeypatch.setattr(loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -532,7 +524,7 @@ def test_a_checkpoint_of_another_scene_is_refused(tmp_path, rng):
     """Where the target is painted nothing but the scene itself tells that it has changed."""
     folder = tmp_path / "run"
     folder.mkdir()
-    image.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
+    images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
     tables = {"target": {"kind": "image", "file": "painted.exr"}, "optimizer": {"iterations": 3}}
     settings = settings_of(tmp_path, sunny(rng), **tables)
     with pytest.raises(pipeline.Interrupted):
@@ -546,14 +538,14 @@ def test_a_checkpoint_of_another_mask_is_refused(tmp_path, rng):
     folder = tmp_path / "run"
     folder.mkdir()
     mask = np.ones((18, 24, 3), np.float32)
-    image.write_exr(tmp_path / "painted.exr", 0.5 * mask)
-    image.write_exr(tmp_path / "mask.exr", mask)
+    images.write_exr(tmp_path / "painted.exr", 0.5 * mask)
+    images.write_exr(tmp_path / "mask.exr", mask)
     painted = {"kind": "image", "file": "painted.exr", "mask": "mask.exr"}
     settings = settings_of(tmp_path, sunny(rng), target=painted, optimizer={"iterations": 3})
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=folder, watch=interrupting())
     mask[:9] = 0
-    image.write_exr(tmp_path / "mask.exr", mask)
+    images.write_exr(tmp_path / "mask.exr", mask)
     with pytest.raises(InputError, match="another configuration or other input files"):
         pipeline.run(settings, folder=folder, resume=True)
 
@@ -565,7 +557,7 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
     """
     settings = settings_of(tmp_path, sunny(rng), **PIXELS)
     whole = pipeline.run(settings)
-    monkeypatch.setattr(loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
     folder = tmp_path / "run"
     folder.mkdir()
     with pytest.raises(pipeline.Interrupted):
@@ -593,7 +585,7 @@ def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):
 
 
 def test_a_second_ctrl_c_is_not_waited_for():
-    with pytest.raises(KeyboardInterrupt), job.ctrl_c() as event:
+    with pytest.raises(KeyboardInterrupt), edit_job.ctrl_c() as event:
         signal.raise_signal(signal.SIGINT)
         assert event.is_set()
         signal.raise_signal(signal.SIGINT)
@@ -604,7 +596,7 @@ def test_outside_the_main_thread_signals_are_left_alone():
 
     def enter():
         try:
-            with job.ctrl_c() as event:
+            with edit_job.ctrl_c() as event:
                 assert not event.is_set()
         except Exception as error:
             failures.append(error)
@@ -634,7 +626,7 @@ def test_paint_on_a_black_map_is_followed(tmp_path):
 
 def test_a_configuration_s_files_are_looked_for_beside_it_from_python_too(tmp_path, monkeypatch):
     (tmp_path / "c.toml").write_text('[input]\nenvmap = "sunsky"\n')
-    monkeypatch.setattr(edit, "run", lambda settings, **named: named)
-    assert edit.edit(tmp_path / "c.toml")["base"] == tmp_path
-    assert edit.edit(tmp_path / "c.toml", base=tmp_path / "other")["base"] == tmp_path / "other"
-    assert "base" not in edit.edit(config.load(tmp_path / "c.toml"))
+    monkeypatch.setattr(api, "run", lambda settings, **named: named)
+    assert api.edit(tmp_path / "c.toml")["base"] == tmp_path
+    assert api.edit(tmp_path / "c.toml", base=tmp_path / "other")["base"] == tmp_path / "other"
+    assert "base" not in api.edit(config.load(tmp_path / "c.toml"))

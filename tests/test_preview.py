@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from helpers import grey, read_png
 
-from envedit import latlong, preview
-from envedit.errors import InputError
-from envedit.tonemap import luminance
+from envedit.core import latlong
+from envedit.core.color import luminance
+from envedit.core.errors import InputError
+from envedit.report import preview
 
 BAD = [np.nan, np.inf, -np.inf]
 

@@ -6,8 +6,8 @@ import re
 import pytest
 from tqdm import tqdm
 
-from envedit import progress
-from envedit.progress import Progress
+from envedit.cli import progress
+from envedit.cli.progress import Progress
 
 
 class Terminal(io.StringIO):

@@ -4,10 +4,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import latlong, reach, scene
-from envedit.errors import InputError
-from envedit.tonemap import tonemap
-from envedit.transport import LightTransport
+from envedit.core import latlong
+from envedit.core.color import tonemap
+from envedit.core.errors import InputError
+from envedit.scene import scene
+from envedit.solve import feasibility
+from envedit.transport.light_transport import LightTransport
 
 HEIGHT, WIDTH = 4, 8
 PIXELS = (5, 6)
@@ -76,7 +78,7 @@ def sane(found, original):
     for array in (found.picture, found.residual, found.envmap):
         assert array.dtype == np.float32 and np.isfinite(array).all()
     assert (found.envmap >= 0).all() and found.envmap.shape == original.shape
-    shown = reach.unreachable(found)
+    shown = feasibility.unreachable(found)
     assert shown.shape == found.picture.shape and (shown >= 0).all() and (shown <= 1).all()
     return found
 
@@ -87,8 +89,8 @@ def sane(found, original):
 def test_solution_and_bound_against_coordinate_descent(dense, envmap, rng, monkeypatch):
     target = np.clip(render(dense, envmap) * rng.choice([0.3, 1.5], size=(*PIXELS, 3)), 0, 0.99)
     weight = rng.random((*PIXELS, 1))
-    question = reach._Question(dense, envmap, target, weight, None, None, None, None)
-    model = reach._Model(question, np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH))
+    question = feasibility._Question(dense, envmap, target, weight, None, None, None, None)
+    model = feasibility._Model(question, np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH))
     w = question.weights(question.initial)
 
     def value(picture):
@@ -101,9 +103,9 @@ def test_solution_and_bound_against_coordinate_descent(dense, envmap, rng, monke
     least, start = value(render(dense, exact.reshape(envmap.shape))), value(question.initial)
     assert 0.05 * start < least < 0.8 * start  # something is left, and something is to be had
     for steps, near in ((10, 0.2), (2000, 0.002)):
-        monkeypatch.setattr(reach, "STEPS", steps)
-        monkeypatch.setattr(reach, "ENOUGH", 0)
-        x, _, bound = reach._solve(model, model.start(), question.initial)
+        monkeypatch.setattr(feasibility, "STEPS", steps)
+        monkeypatch.setattr(feasibility, "ENOUGH", 0)
+        x, _, bound = feasibility._solve(model, model.start(), question.initial)
         over = (value(question.apply(model.map(x))) - least) / start
         assert (x >= 0).all()
         assert -1e-5 < over < near
@@ -114,7 +116,7 @@ def test_solution_and_bound_against_coordinate_descent(dense, envmap, rng, monke
 def test_what_a_map_makes_is_within_reach(dense, envmap, rng):
     true = (0.2 + rng.random(envmap.shape)) * [1.2, 1, 0.7]
     target = render(dense, true)
-    found = sane(reach.reachable(dense, envmap, target), envmap)
+    found = sane(feasibility.reachable(dense, envmap, target), envmap)
     assert found.share > 0.9
     assert found.warning is None
     np.testing.assert_allclose(found.picture, render(dense, found.envmap), rtol=1e-5)
@@ -124,7 +126,9 @@ def test_what_a_map_makes_is_within_reach(dense, envmap, rng):
 def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):
     initial, painted = render(dense, envmap), rng.random(PIXELS)
     target = initial * np.where(rng.random((*PIXELS, 1)) < 0.5, 0.5, 1.4)
-    found = sane(reach.reachable(dense, envmap, target, 0.3 + painted[..., None], painted=painted), envmap)
+    found = sane(
+        feasibility.reachable(dense, envmap, target, 0.3 + painted[..., None], painted=painted), envmap
+    )
     wanted = 1 - apart(found.picture, target, painted) / apart(initial, target, painted)
     assert found.share == pytest.approx(wanted, abs=1e-4)
     assert 0.1 < found.share < 0.9
@@ -135,12 +139,12 @@ def test_only_the_texels_that_may_change_do(dense, envmap):
     free = np.ones((2, WIDTH), bool)
     free[0, 3] = False
     for rows in ((1, 2), slice(1, 3)):
-        found = sane(reach.reachable(dense, envmap, target, rows=rows, free=free), envmap)
+        found = sane(feasibility.reachable(dense, envmap, target, rows=rows, free=free), envmap)
         fixed = np.ones((HEIGHT, WIDTH), bool)
         fixed[1:3] = ~free
         np.testing.assert_array_equal(found.envmap[fixed], envmap[fixed])
         assert (found.envmap[~fixed] != envmap[~fixed]).mean() > 0.9
-    assert found.share < reach.reachable(dense, envmap, target).share
+    assert found.share < feasibility.reachable(dense, envmap, target).share
 
 
 # ---- what is left ------------------------------------------------------------------------------------------
@@ -155,23 +159,23 @@ def test_two_pixels_that_see_the_same_cannot_differ(dense, envmap):
     painted = np.zeros(PIXELS)
     painted[1, 1] = 1
     weight = np.where(painted > 0, 1, 100)[..., None]
-    found = sane(reach.reachable(transport, envmap, target, weight, painted=painted), envmap)
+    found = sane(feasibility.reachable(transport, envmap, target, weight, painted=painted), envmap)
     assert found.share < 0.05
     assert (found.residual[1, 1] < -0.05).all()
     assert f"only {int(100 * found.share)} %" in found.warning and "darker" in found.warning
-    shown = reach.unreachable(found)[1, 1]
+    shown = feasibility.unreachable(found)[1, 1]
     assert shown[2] == 1 and shown[0] < 0.8  # blue
 
     target[1, 1] *= 3  # half as bright again
-    found = sane(reach.reachable(transport, envmap, target, weight, painted=painted), envmap)
+    found = sane(feasibility.reachable(transport, envmap, target, weight, painted=painted), envmap)
     assert found.share < 0.05 and "brighter" in found.warning
-    shown = reach.unreachable(found)[1, 1]
+    shown = feasibility.unreachable(found)[1, 1]
     assert shown[0] == 1 and shown[2] < 0.8  # red
 
 
 def test_other_lamps_cannot_be_darkened(dense, envmap):
     transport = Dense(dense.matrix, lamps=0.3)
-    found = sane(reach.reachable(transport, envmap, np.full((*PIXELS, 3), 0.05)), envmap)
+    found = sane(feasibility.reachable(transport, envmap, np.full((*PIXELS, 3), 0.05)), envmap)
     np.testing.assert_allclose(found.picture, 0.3, atol=0.02)
     assert "darker" in (found.warning or "darker") and found.too_dark == 0
 
@@ -183,24 +187,27 @@ def test_white_is_any_value_above(dense, envmap, white):
     painted = np.zeros(PIXELS)
     painted[2, 3] = 1
     weight = np.where(painted > 0, 1, 1e-3)[..., None]
-    found = sane(reach.reachable(dense, envmap, target, weight, painted=painted), envmap)
+    found = sane(feasibility.reachable(dense, envmap, target, weight, painted=painted), envmap)
     assert found.share > 0.9 and (found.picture[2, 3] < 3).all()
 
 
 def test_colours_show_sign_and_size():
     residual = np.zeros((1, 4, 3), np.float32)
     residual[0, 1] = [0.1, -0.05, 0]
-    residual[0, 2] = -reach.FULL / 2
+    residual[0, 2] = -feasibility.FULL / 2
     residual[0, 3] = 1
-    shown = reach.unreachable(reach.Reach(0.5, residual, residual, residual))
+    shown = feasibility.unreachable(feasibility.Reach(0.5, residual, residual, residual))
     np.testing.assert_allclose(shown[0], [[1, 1, 1], [1, 0.6, 0.6], [0.5, 0.5, 1], [1, 0, 0]], atol=1e-6)
 
 
 def test_sentences():
     blank = np.zeros((1, 1, 3), np.float32)
-    assert reach.Reach(0.829, blank, blank, blank).note == "82 % of the request is within reach of some map"
-    assert reach.Reach(0.5, blank, blank, blank).warning is None
-    warning = reach.Reach(0.499, blank, blank, blank, too_dark=0.8).warning
+    assert (
+        feasibility.Reach(0.829, blank, blank, blank).note
+        == "82 % of the request is within reach of some map"
+    )
+    assert feasibility.Reach(0.5, blank, blank, blank).warning is None
+    warning = feasibility.Reach(0.499, blank, blank, blank, too_dark=0.8).warning
     assert warning.startswith("only 49 % of the request") and "brighter" in warning
     assert warning.endswith("see unreachable.png") and "\n" not in warning
 
@@ -209,30 +216,30 @@ def test_sentences():
 
 
 def test_nothing_asked_is_all_within_reach(dense, envmap):
-    found = sane(reach.reachable(dense, envmap, render(dense, envmap)), envmap)
+    found = sane(feasibility.reachable(dense, envmap, render(dense, envmap)), envmap)
     assert found.share == 1 and found.steps == 0
     np.testing.assert_array_equal(found.envmap, envmap)
 
 
 def test_the_noise_of_the_painted_rendering_is_not_asked_for(dense, envmap, rng):
     noisy = render(dense, envmap) * rng.uniform(0.8, 1.2, (*PIXELS, 3))
-    assert reach.reachable(dense, envmap, noisy, rendered=noisy).share == 1
-    wanted = reach.reachable(dense, envmap, 0.8 * noisy).share
-    assert reach.reachable(dense, envmap, 0.8 * noisy, rendered=noisy).share > wanted + 0.05
+    assert feasibility.reachable(dense, envmap, noisy, rendered=noisy).share == 1
+    wanted = feasibility.reachable(dense, envmap, 0.8 * noisy).share
+    assert feasibility.reachable(dense, envmap, 0.8 * noisy, rendered=noisy).share > wanted + 0.05
 
 
 def test_black_maps_and_black_targets(dense, envmap):
     black, none = np.zeros_like(envmap), np.zeros((*PIXELS, 3))
-    assert sane(reach.reachable(dense, black, none), envmap).share == 1
-    assert sane(reach.reachable(dense, envmap, none), envmap).share > 0.8
-    grown = sane(reach.reachable(dense, black, render(dense, envmap)), envmap)
+    assert sane(feasibility.reachable(dense, black, none), envmap).share == 1
+    assert sane(feasibility.reachable(dense, envmap, none), envmap).share > 0.8
+    grown = sane(feasibility.reachable(dense, black, render(dense, envmap)), envmap)
     assert grown.share > 0.8
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-6, 65504, 1e6])
 def test_radiance_of_any_size(dense, envmap, scale):
     target = np.full((*PIXELS, 3), 0.3)
-    assert sane(reach.reachable(dense, envmap * np.float32(scale), target), envmap).share > 0.7
+    assert sane(feasibility.reachable(dense, envmap * np.float32(scale), target), envmap).share > 0.7
 
 
 def test_one_painted_pixel(dense, envmap):
@@ -240,16 +247,16 @@ def test_one_painted_pixel(dense, envmap):
     target[0, 0] *= 1.3
     painted = np.zeros(PIXELS)
     painted[0, 0] = 1
-    found = sane(reach.reachable(dense, envmap, target, painted[..., None], painted=painted), envmap)
+    found = sane(feasibility.reachable(dense, envmap, target, painted[..., None], painted=painted), envmap)
     assert found.share > 0.95
 
 
 def test_nothing_free_and_nothing_seen(dense, envmap):
     target = 0.5 * render(dense, envmap)
-    kept = sane(reach.reachable(dense, envmap, target, free=np.zeros((HEIGHT, WIDTH), bool)), envmap)
+    kept = sane(feasibility.reachable(dense, envmap, target, free=np.zeros((HEIGHT, WIDTH), bool)), envmap)
     assert kept.share == 0 and "darker" in kept.warning
     blind = Dense(np.zeros_like(dense.matrix), lamps=0.2)
-    found = sane(reach.reachable(blind, envmap, target + 0.1), envmap)
+    found = sane(feasibility.reachable(blind, envmap, target + 0.1), envmap)
     assert found.share == 0
     np.testing.assert_array_equal(found.envmap, envmap)
 
@@ -260,11 +267,11 @@ def test_what_does_not_fit_is_refused(dense, envmap):
         wrong = target.copy()
         wrong[3, 2, 1] = value
         with pytest.raises(InputError, match="row 3, column 2 is not finite"):
-            reach.reachable(dense, envmap, wrong)
+            feasibility.reachable(dense, envmap, wrong)
     with pytest.raises(ValueError, match=r"target must have shape \(5, 6, 3\), got \(5, 5, 3\)"):
-        reach.reachable(dense, envmap, target[:, :5])
+        feasibility.reachable(dense, envmap, target[:, :5])
     with pytest.raises(ValueError, match="no pixel is painted or counts"):
-        reach.reachable(dense, envmap, target, painted=np.zeros(PIXELS))
+        feasibility.reachable(dense, envmap, target, painted=np.zeros(PIXELS))
 
 
 # ---- groups of texels --------------------------------------------------------------------------------------
@@ -276,7 +283,7 @@ def test_cells_are_told_apart_only_where_the_transport_is_sharp(rng):
     matrix = np.zeros((256, 64 * 128))
     matrix[rng.integers(0, 256, 6 * 4096), rng.integers(0, 4096, 6 * 4096)] += 0.5 / 256
     matrix[np.arange(256), 4096 + 16 * np.arange(256)] += 0.9
-    groups = reach._cells(Dense(matrix, shape, grid), grid)
+    groups = feasibility._cells(Dense(matrix, shape, grid), grid)
     count = np.bincount(groups.ravel())
     assert (count[groups[:32]] == 4).all()
     assert (count[groups.ravel()[4096 + 16 * np.arange(256)]] == 1).all()
@@ -335,7 +342,7 @@ def test_what_is_promised_is_seen_in_a_fresh_rendering(name, matte, rng):
     target, painted, low, high = requests(initial, turned, rng)[name]
     weight = (painted + 0.3 * (1 - painted))[..., None]
     found = sane(
-        reach.reachable(transport, original, target, weight, slice(0, ROWS), None, painted), original
+        feasibility.reachable(transport, original, target, weight, slice(0, ROWS), None, painted), original
     )
     if name == "turned":  # the sun has exact columns where it went
         assert {(14, 69), (14, 70), (14, 71)} <= {divmod(int(k), 128) for k in transport.columns}

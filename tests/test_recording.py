@@ -5,10 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import columns, recording, scene
-from envedit.errors import InputError
-from envedit.grid import Grid
-from envedit.transport import LightTransport
+from envedit.core.errors import InputError
+from envedit.scene import scene
+from envedit.transport import exact_columns, recording
+from envedit.transport.light_transport import LightTransport
+from envedit.transport.texel_sampling import Grid
 
 NAN, INF = float("nan"), float("inf")
 
@@ -101,14 +102,14 @@ def test_exact_columns_leave_out_and_count_what_is_not_finite(monkeypatch):
     sky[1, 3] = 300
     clean, spoiled = (LightTransport.build(s, 4, 8, spp=4, max_depth=2, memory_gb=0.1) for _ in range(2))
     clean.resolve(sky, tolerance=0)
-    real, calls = columns.connect, []
+    real, calls = exact_columns.connect, []
 
     def connect(*arguments):
         calls.append(value := real(*arguments))
         middle = dr.width(value) // 2
         return dr.select(dr.arange(mi.UInt32, dr.width(value)) == middle, NAN, value)
 
-    monkeypatch.setattr(columns, "connect", connect)
+    monkeypatch.setattr(exact_columns, "connect", connect)
     spoiled.resolve(sky, tolerance=0)
     assert len(spoiled.columns) == len(clean.columns) > 0
     (said,) = [line for line in spoiled.choices if "not finite" in line]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from test_siren import numpy_forward, own
 
-from envedit import fit, refit, siren
+from envedit.representations.siren import fit, output_layer
+from envedit.representations.siren import network as siren
 
 OMEGA = 30.0
 
@@ -54,7 +55,7 @@ def problem(rng, points=200, hidden=8, depth=1, inputs=3):
 
 def again(params, times, x, wanted, light, share):
     for _ in range(times):
-        params = refit.last_layer(params, x, OMEGA, wanted, light, share)
+        params = output_layer.last_layer(params, x, OMEGA, wanted, light, share)
     return params
 
 
@@ -113,7 +114,7 @@ def test_a_last_layer_that_explains_everything_is_found(rng):
     params, x, _, light = problem(rng, points=300, hidden=6)
     truth = params | {"2.weight": own(0.3 * rng.normal(size=(3, 6))), "2.bias": own([0.4, -0.3, 0.1])}
     wanted = numpy_forward(arrays(truth), x.numpy(), OMEGA)
-    solved = refit.last_layer(params, x, OMEGA, wanted, light, 1.0)
+    solved = output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0)
     given = x, wanted, light, 1.0
     # Two steps of Newton: what is left is squared twice, but for the damping.
     assert error(solved, *given) < 1e-3 * error(params, *given)
@@ -130,7 +131,7 @@ def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):
     for order in (list(params), sorted(params, reverse=True)):
         given = {name: params[name] for name in order}
         before = {name: value.numpy().copy() for name, value in given.items()}
-        solved = refit.last_layer(given, x, OMEGA, wanted, light, 1.0)
+        solved = output_layer.last_layer(given, x, OMEGA, wanted, light, 1.0)
         assert list(solved) == order and solved is not given
         assert all(isinstance(p, mi.TensorXf) and p.shape == params[name].shape for name, p in solved.items())
         changed = {name for name in order if not np.array_equal(solved[name].numpy(), before[name])}
@@ -149,9 +150,9 @@ def test_a_perfect_layer_stays_as_it_is(rng):
     params, x, _, light = problem(rng)
     params |= {"2.weight": dr.zeros(mi.TensorXf, (3, 8)), "2.bias": dr.zeros(mi.TensorXf, 3)}
     wanted = np.full((200, 3), 0.5)
-    assert unchanged(params, refit.last_layer(params, x, OMEGA, wanted, light, 1.0))
+    assert unchanged(params, output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0))
     # Control: a little beside it, and it moves.
-    assert not unchanged(params, refit.last_layer(params, x, OMEGA, wanted + 0.01, light, 1.0))
+    assert not unchanged(params, output_layer.last_layer(params, x, OMEGA, wanted + 0.01, light, 1.0))
 
 
 def test_steps_that_lead_too_far_are_not_taken():
@@ -159,7 +160,7 @@ def test_steps_that_lead_too_far_are_not_taken():
     params = siren.init(0, 4, 0)
     params |= {"1.weight": dr.zeros(mi.TensorXf, (3, 4)), "1.bias": own([5, 5, 5])}
     x, light = siren.coordinates(4, 8), np.ones((32, 3), np.float32)
-    assert unchanged(params, refit.last_layer(params, x, OMEGA, np.full((32, 3), 0.55), light, 1.0))
+    assert unchanged(params, output_layer.last_layer(params, x, OMEGA, np.full((32, 3), 0.55), light, 1.0))
 
 
 @pytest.mark.parametrize("where", ["wanted", "2.bias", "2.weight", "0.weight"])
@@ -171,7 +172,7 @@ def test_what_is_not_finite_changes_no_channel_that_it_meets(where, rng):
         value = params[where].numpy().copy()
         value[0] = np.nan
         params[where] = own(value)
-    solved = refit.last_layer(params, x, OMEGA, wanted, light, 1.0)
+    solved = output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0)
     met = {"wanted": [1], "0.weight": [0, 1, 2]}.get(where, [0])
     assert len(met) == 3 or not unchanged(params, solved)
     for name in ("2.weight", "2.bias"):
@@ -212,7 +213,7 @@ def test_never_worse_and_always_finite(name, share, headroom, rng):
         x = own(rng.uniform(-1, 1, (len(image), 3)))
         before = error(params, x, wanted, image, share)
         for _ in range(3):
-            params = refit.last_layer(params, x, OMEGA, wanted, image, share)
+            params = output_layer.last_layer(params, x, OMEGA, wanted, image, share)
             assert all(np.isfinite(p.numpy()).all() for p in params.values())
             after = error(params, x, wanted, image, share)
             # The solution is rounded to float32 last: 1e-7 of a value, 1e-14 of its square, times the weight.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import grey
 
-from envedit import report
+from envedit.report import html_report
 
 
 class Page(HTMLParser):
@@ -70,7 +70,7 @@ def write(path, **changes):
         "notes": ["renderer.spp = 64"],
     }
     assert not set(changes) - set(settings)
-    report.write_report(path, **{**settings, **changes})
+    html_report.write_report(path, **{**settings, **changes})
     return Page(path)
 
 
@@ -171,7 +171,7 @@ def test_report_of_nothing(tmp_path):
 def test_map_statistics_weight_the_mean_by_solid_angle():
     image = grey(0.0, 33, 64)
     image[:8] = 2.0
-    cells = report._map_statistics(image)
+    cells = html_report._map_statistics(image)
     # Eight of 33 rows aligned to the corners are a cap of angle pi * 7.5 / 32 around the pole.
     mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
     assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"]
@@ -183,12 +183,12 @@ def test_map_statistics_of_a_real_map(data):
     image = np.array(mi.Bitmap(str(source)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
     light = image.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
     row, column = np.unravel_index(light.argmax(), light.shape)
-    cells = report._map_statistics(image)
+    cells = html_report._map_statistics(image)
     assert float(cells[1]) == pytest.approx(light.max(), rel=1e-3) and cells[2] == f"{row}, {column}"
 
 
 def test_only_what_writes_results_imports_the_report():
-    for source in Path(report.__file__).parent.glob("*.py"):
+    for source in Path(html_report.__file__).parent.glob("*.py"):
         if source.name not in ("outputs.py", "report.py"):
             tree = ast.parse(source.read_text(encoding="utf-8"))
             nodes = [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom))]

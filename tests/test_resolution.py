@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from envedit import latlong, resolution
-from envedit.device import tensor
-from envedit.gain import grid_size
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.representations.layers.gain import grid_size
+from envedit.solve import gain_bandwidth
 
 WIDTH, ROWS = 64, (0, 32)
 FILM = 24
@@ -49,7 +50,7 @@ def sampled(exact, seed, samples=64):
 
 def told(first, second=None, weight=None, value=0.5):
     picture = np.full((FILM, FILM, 3), value)
-    return resolution.octaves(first, second or first, BACKGROUND, ROWS, picture, weight, 4)
+    return gain_bandwidth.octaves(first, second or first, BACKGROUND, ROWS, picture, weight, 4)
 
 
 def test_a_mirror_tells_every_octave_down_to_the_texel():

@@ -21,8 +21,12 @@ import OpenEXR
 import pytest
 from helpers import BALL, SENSOR, read_png, sky, write_scene
 
-from envedit import checkpoint, config, doctor, image, loop, pipeline, run, scene
-from envedit.transport import LightTransport
+from envedit import config, pipeline
+from envedit.cli import doctor, run
+from envedit.images import images
+from envedit.scene import scene
+from envedit.solve import adam_loop, checkpoint
+from envedit.transport.light_transport import LightTransport
 
 ROOT = Path(run.__file__).parent.parent
 FILES = {
@@ -48,7 +52,7 @@ def world(folder, rng, **changes):
     """Write a map, a scene and a configuration of a tiny run; returns the configuration's path."""
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "map.exr").exists():
-        image.write_exr(folder / "map.exr", sky(rng) + 0.1)
+        images.write_exr(folder / "map.exr", sky(rng) + 0.1)
     write_scene(folder, SENSOR, BALL, SKY, name="scene.xml")
     given = {"input": {"envmap": "map.exr"}, "scene": {"file": "scene.xml"}}
     lines = []
@@ -80,7 +84,7 @@ def content(folder):
 
 
 def pixels(path):
-    return image.read(path)[0]
+    return images.read(path)[0]
 
 
 def numbers(value):
@@ -340,8 +344,8 @@ def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path,
 
 def test_a_painted_target_has_no_known_map(tmp_path, rng):
     path = world(tmp_path, rng, target={"kind": "image", "file": "painted.exr", "mask": "mask.png"})
-    image.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
-    image.write_png(tmp_path / "mask.png", np.ones((18, 24, 3)))
+    images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
+    images.write_png(tmp_path / "mask.png", np.ones((18, 24, 3)))
     assert call(path, "--quiet") == 0
     out = tmp_path / "c_out"
     found = measured(out)
@@ -363,7 +367,7 @@ def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
     path = world(tmp_path, rng, representation={"kind": kind})
-    image.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
+    images.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
     assert call(path, "--quiet") == 0
     assert ("black" in capsys.readouterr().err) == (value == 0)
     assert np.isfinite(pixels(tmp_path / "c_out" / "edited.exr")).all()
@@ -374,7 +378,7 @@ def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
     path = world(tmp_path, rng)
     bright = sky(rng)
     bright[2, 5] = value
-    image.write_exr(tmp_path / "map.exr", bright)
+    images.write_exr(tmp_path / "map.exr", bright)
     assert call(path, "--quiet") == 0
     assert all(math.isfinite(number) for number in numbers(measured(tmp_path / "c_out")))
 
@@ -382,7 +386,7 @@ def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
 def test_layers_without_iterations_are_where_the_search_put_them(tmp_path, rng):
     """A sun in an even sky, turned by a quarter: most of the way is made before the first step."""
     path = world(tmp_path, rng, target={"rotate_degrees": 90.0, "spp": 64}, optimizer={"iterations": 0})
-    image.write_exr(tmp_path / "map.exr", one_sun(1, 3))
+    images.write_exr(tmp_path / "map.exr", one_sun(1, 3))
     assert call(path, "--quiet", *changed(renderer__spp=256)) == 0
     found = measured(tmp_path / "c_out")
     assert found["render"]["mse"] < 0.2 * found["initial"]["mse"]
@@ -533,7 +537,7 @@ def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, c
     assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
     before = content(out)
     named = Path(config.load(path).input.envmap)
-    image.write_exr(named, 2 * image.read(named)[0])
+    images.write_exr(named, 2 * images.read(named)[0])
     assert call(path, "--resume", *changed(optimizer__iterations=1)) == 3
     said = capsys.readouterr().err
     assert said.startswith(f"envedit: {named}: has changed since") and len(said.splitlines()) == 1
@@ -554,7 +558,7 @@ def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch
     def press(self, crop, original, start):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(loop._PlaceRows, "eval", press)
+    monkeypatch.setattr(adam_loop._PlaceRows, "eval", press)
     assert call(world(tmp_path, rng), "--quiet") == 130
     assert "interrupted" in capsys.readouterr().err
 
@@ -590,7 +594,7 @@ def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypat
 def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
-    from envedit.progress import Progress
+    from envedit.cli.progress import Progress
 
     def stage(self, text):
         if text == "rendering the result":

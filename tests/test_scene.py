@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import image as images
-from envedit import latlong, scene
-from envedit.errors import ConfigError, InputError, NumericalError
+from envedit.core import latlong, shipped
+from envedit.core.errors import ConfigError, InputError, NumericalError
+from envedit.images import images
+from envedit.scene import scene
 
 SCENES = Path(__file__).parent.parent / "scenes"
 
@@ -272,7 +273,7 @@ def test_names_are_found_in_included_files(tmp_path):
 # ---- shipped scenes and the statue -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", scene.SHIPPED)
+@pytest.mark.parametrize("name", shipped.scenes())
 def test_shipped_scenes_render(name, rng):
     parameters = {"mesh": "statue.ply"} if name == "mesh" else None
     loaded = scene.load(name, parameters=parameters)

@@ -6,10 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import changes, grid, latlong, pursuit, scene, search
-from envedit.layers import Layers
-from envedit.overview import Overview
-from envedit.transport import LightTransport
+from envedit.core import latlong
+from envedit.representations.layers.layers import Layers
+from envedit.scene import scene
+from envedit.solve import light_search, matching_pursuit, painted_change
+from envedit.transport import texel_sampling
+from envedit.transport.block_transport import Overview
+from envedit.transport.light_transport import LightTransport
 
 HEIGHT, WIDTH, ROWS = 32, 64, 16
 PIXELS = 96  # at half of it the recording is too coarse to tell where a sun near the zenith is
@@ -62,10 +65,10 @@ class Start:
         layers = Layers((0, HEIGHT))
         encoded = layers.encode(image[:ROWS])
         if initial is None:
-            params, self.notes = search.start(layers, encoded, transport, wanted, weight, image)
+            params, self.notes = light_search.start(layers, encoded, transport, wanted, weight, image)
         else:
             asked = initial, wanted, weight, image
-            params, self.notes = changes.start(layers, encoded, transport, *asked)
+            params, self.notes = painted_change.start(layers, encoded, transport, *asked)
             assert not any(params[name].numpy().any() for name in params if name.startswith("gain"))
         assert params.keys() == encoded.keys()
         assert all(params[name].shape == encoded[name].shape for name in params)
@@ -240,7 +243,7 @@ def test_least_squares_without_negative_numbers(columns, rng):
     for _ in range(200):
         a, noise = rng.random((30, columns)) ** 3, rng.standard_normal(30)
         b = a @ np.maximum(rng.standard_normal(columns), 0) + 0.05 * noise
-        x = pursuit.not_negative(a, b)
+        x = matching_pursuit.not_negative(a, b)
         assert (x >= 0).all()
         zeros += (x == 0).any()
         assert np.linalg.norm(a @ x - b) <= brute_force(a, b) * 1.01
@@ -248,8 +251,8 @@ def test_least_squares_without_negative_numbers(columns, rng):
 
 
 def test_least_squares_of_nothing():
-    assert (pursuit.not_negative(np.ones((4, 2)), -np.ones(4)) == 0).all()
-    assert (pursuit.not_negative(np.zeros((4, 2)), np.ones(4)) == 0).all()
+    assert (matching_pursuit.not_negative(np.ones((4, 2)), -np.ones(4)) == 0).all()
+    assert (matching_pursuit.not_negative(np.zeros((4, 2)), np.ones(4)) == 0).all()
 
 
 def small_overview(rng, blocks=(6, 8), cells=20):
@@ -271,7 +274,7 @@ def test_strengths_that_made_a_picture_are_found(rng):
     wanted = np.stack(
         [overview.matrix[c] @ hats[c] @ gain[:, c] + lights[c] @ strength[:, c] for c in range(3)], axis=-1
     ).reshape(6, 8, 3)
-    found = search.spread(overview, wanted, None, wanted, hats, lights)
+    found = light_search.spread(overview, wanted, None, wanted, hats, lights)
     np.testing.assert_allclose(found[0], gain, rtol=0.1)
     np.testing.assert_allclose(found[1], strength, rtol=0.05)
     # From a start that is off by far more.
@@ -279,7 +282,9 @@ def test_strengths_that_made_a_picture_are_found(rng):
 
     # What is 1 already stays exactly, but for rounding.
     ones = np.stack([overview.matrix[c] @ hats[c].sum(1) + lights[c].sum(1) for c in range(3)], -1)
-    for values in search.spread(overview, ones.reshape(6, 8, 3), None, ones.reshape(6, 8, 3), hats, lights):
+    for values in light_search.spread(
+        overview, ones.reshape(6, 8, 3), None, ones.reshape(6, 8, 3), hats, lights
+    ):
         np.testing.assert_allclose(values, 1, rtol=1e-6)
 
 
@@ -290,7 +295,7 @@ def test_strengths_that_no_counted_pixel_tells_stay_one(rng):
     hats, weight = np.zeros((3, 20, 1)), np.ones((6, 8, 1))
     weight.reshape(-1)[40:] = 0
     wanted = np.full((6, 8, 3), 2.0)
-    gain, strength = search.spread(overview, wanted, weight, wanted, hats, lights)
+    gain, strength = light_search.spread(overview, wanted, weight, wanted, hats, lights)
     assert (gain == 1).all() and (strength[1] == 1).all()
     np.testing.assert_allclose(strength[0], 2, rtol=1e-6)
 
@@ -299,12 +304,12 @@ def test_strengths_that_no_counted_pixel_tells_stay_one(rng):
     "values, place", [((0, 3, 0), 0), ((1, 2, 2), 0.5), ((2, 2, 1), -0.5), ((1, 4, 3), 0.25)]
 )
 def test_vertex_of_three_neighbours(values, place):
-    assert search._vertex(np.array(values, float), 1) == pytest.approx(place)
+    assert light_search._vertex(np.array(values, float), 1) == pytest.approx(place)
 
 
 def test_vertex_at_a_border_or_in_a_valley_is_the_point_itself():
     values = np.array([3.0, 1.0, 2.0])
-    assert [search._vertex(values, i) for i in range(3)] == [0, 0, 0]
+    assert [light_search._vertex(values, i) for i in range(3)] == [0, 0, 0]
 
 
 def test_refinement_finds_a_light_from_three_texels_off(transport):
@@ -315,7 +320,7 @@ def test_refinement_finds_a_light_from_three_texels_off(transport):
     t.resolve(light)
     wanted = 2.5 * t.linear(mi.TensorXf(light)).numpy().reshape(-1, 3)
     none = np.full((1, PIXELS**2, 3), 1e-12) * np.random.default_rng(0).random((1, PIXELS**2, 3))
-    direction, factor = search.refine(
+    direction, factor = light_search.refine(
         t, wanted, wanted, None, none, DIRECTIONS[5, 36], np.ones(3), 0, ROWS - 1
     )
     assert degrees_apart(direction, DIRECTIONS[7, 33]) < 0.3 * TEXEL
@@ -356,7 +361,7 @@ def test_softened_lights_keep_their_flux_and_place(transport):
     image = sky(SUN)
     layers = Layers((0, HEIGHT))
     params = layers.encode(image[:ROWS])
-    soft, notes = changes.softened(layers, params)
+    soft, notes = painted_change.softened(layers, params)
     dark = soft | {"flux": mi.TensorXf(np.full((layers.lights.count, 3), -40.0, np.float32))}
     before, after, without = (layers.decode(p).numpy() for p in (params, soft, dark))
     lobe = after - without  # a glow goes with the light that it is of
@@ -382,7 +387,7 @@ def test_a_light_is_refined_on_a_map_of_few_texels(width, rng):
     height = max(width // 2, 2)
 
     class Few:
-        grid = grid.Grid(height, width, np.eye(3), np.ones(height))
+        grid = texel_sampling.Grid(height, width, np.eye(3), np.ones(height))
 
         def probe(self, texels):
             assert len(np.unique(texels)) == len(texels)
@@ -390,7 +395,7 @@ def test_a_light_is_refined_on_a_map_of_few_texels(width, rng):
 
     wanted, known, gains = (rng.random(shape) for shape in ((30, 3), (30, 3), (4, 30, 3)))
     asked = wanted, known, None, gains, np.array([0.6, 0.5, 0.6]), np.ones(3), 0, height - 1
-    direction, factor = search.refine(Few(), *asked)
+    direction, factor = light_search.refine(Few(), *asked)
     assert abs(np.linalg.norm(direction) - 1) < 1e-6 and np.isfinite(factor).all() and factor.min() >= 0
 
 
@@ -399,7 +404,7 @@ def test_pixels_count_by_their_brightness_and_a_floor_at_every_scale(size):
     known = np.array([[1.0, 2, 3], [0, 0, 0], [2, 2, 2], [0, 0, 0]], np.float32) * np.float32(size)
     weight = np.array([[1.0], [1], [0.5], [0]], np.float32)
     mean = known[0, 1].astype(float) / 2
-    found = pursuit.relative(known, known, weight)
+    found = matching_pursuit.relative(known, known, weight)
     floor = 0.2 * mean
     assert found == pytest.approx([1 / (2 * mean + floor), 1 / floor, 0.5 / (2 * mean + floor), 0], rel=1e-5)
 
@@ -407,5 +412,5 @@ def test_pixels_count_by_their_brightness_and_a_floor_at_every_scale(size):
 def test_paint_on_black_counts_by_its_own_light_and_nothing_by_nothing():
     black, paint = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32)
     paint[2] = -6
-    assert pursuit.relative(black, paint) == pytest.approx(1 / (0.2 * 1.5))
-    assert (pursuit.relative(black, black) == 1).all()
+    assert matching_pursuit.relative(black, paint) == pytest.approx(1 / (0.2 * 1.5))
+    assert (matching_pursuit.relative(black, black) == 1).all()

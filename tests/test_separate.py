@@ -5,8 +5,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from envedit import image, latlong, separate
-from envedit.tonemap import LUMINANCE
+from envedit.core import latlong
+from envedit.core.color import LUMINANCE
+from envedit.images import images
+from envedit.representations.layers import separation
 
 HEIGHT, WIDTH = 64, 128
 SUNS = {
@@ -45,7 +47,7 @@ def discs(*lights, height=HEIGHT, width=WIDTH):
 def checked(m, rows=None):
     """Separate; what holds for any map: the parts make the map, and the lights make the parts."""
     before = m.copy()
-    s = separate.separate(m, rows)
+    s = separation.separate(m, rows)
     np.testing.assert_array_equal(m, before)  # the caller's own
     for part in (s.background, s.glow, s.core):
         assert part.shape == m.shape and part.dtype == np.float64
@@ -60,9 +62,9 @@ def checked(m, rows=None):
         assert not core[light.texels].any(), "a texel belongs to one light"
         core[light.texels] = light.radiance
         if light.glow is not None:
-            assert light.glow.shape == (len(separate.GLOW_DEGREES), 3)
+            assert light.glow.shape == (len(separation.GLOW_DEGREES), 3)
             assert (np.diff(light.glow, axis=0) <= 0).all() and (light.glow >= 0).all()
-            glow *= 1 + separate.glow_at(light.glow, d @ light.direction)
+            glow *= 1 + separation.glow_at(light.glow, d @ light.direction)
     np.testing.assert_allclose(s.glow, glow, rtol=1e-12)
     np.testing.assert_array_equal(s.core, core.reshape(s.core.shape))
     assert [x.share for x in s.lights] == sorted((x.share for x in s.lights), reverse=True)
@@ -142,7 +144,7 @@ def test_of_many_lamps_the_strongest_are_told_apart():
     flux = flux * [np.hypot(v[0], v[2]) for v in lamps]
     lights = checked(m).lights
     found = [int(np.argmax(np.array(lamps) @ light.direction)) for light in lights]
-    assert len(found) == separate.MOST_LIGHTS == 8
+    assert len(found) == separation.MOST_LIGHTS == 8
     assert found == np.argsort(-flux)[:8].tolist()
 
 
@@ -245,7 +247,7 @@ def test_a_crop_has_the_light_where_the_map_has_it(rows, scale):
 def test_the_copy_in_which_lights_are_looked_for_lies_where_the_crop_does(rows):
     height, width = 350, 701
     d = latlong.directions(height, width)[slice(*rows)]
-    small = separate._reduced(d - d.min() + 1, rows[0], height)
+    small = separation._reduced(d - d.min() + 1, rows[0], height)
     theta = small.upsampled(np.arccos(small.directions[..., 1:2]), *d.shape[:2])[2:-2, :, 0]
     np.testing.assert_allclose(theta, np.arccos(d[2:-2, :, 1]), atol=1e-7)
     upsampled = small.upsampled(small.directions, *d.shape[:2])[2:-2]
@@ -326,14 +328,14 @@ def test_a_sun_without_glow_gets_none(unrest):
 
 
 def test_a_glow_is_interpolated_and_ends():
-    table = np.zeros((len(separate.GLOW_DEGREES), 3))
+    table = np.zeros((len(separation.GLOW_DEGREES), 3))
     table[:, 0], table[:, 1] = 3, np.arange(len(table))
     cosine = np.cos(np.radians([[0, 10.25], [120.5, 180]]))
-    result = separate.glow_at(table, cosine)
+    result = separation.glow_at(table, cosine)
     np.testing.assert_allclose(result[..., 0], [[3, 3], [0, 0]])
     np.testing.assert_allclose(result[..., 1], [[0, 10.25], [0, 0]], atol=1e-6)
     assert not result[..., 2].any()
-    np.testing.assert_array_equal(separate.glow_at(table, np.array([1 + 1e-9])), [[3, 0, 0]])
+    np.testing.assert_array_equal(separation.glow_at(table, np.array([1 + 1e-9])), [[3, 0, 0]])
 
 
 # ---- filled ------------------------------------------------------------------------------------------------
@@ -353,7 +355,7 @@ def test_a_constant_stays_constant_under_a_hole(size, value):
     mask = hole(*size, 0, max(1, size[0] // 5))
     m = np.full((*size, 3), value)
     m[mask] = 1e9
-    np.testing.assert_allclose(separate.filled(m, mask), value, rtol=1e-9)
+    np.testing.assert_allclose(separation.filled(m, mask), value, rtol=1e-9)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -361,12 +363,12 @@ def test_texels_outside_the_hole_keep_their_bits(size):
     m = np.exp(np.random.default_rng(1).normal(0, 3, (*size, 3)))
     m[0, 0] = 0
     mask = hole(*size, size[1] - 1, max(1, size[0] // 5))
-    result = separate.filled(m, mask)
+    result = separation.filled(m, mask)
     assert result[~mask].tobytes() == m[~mask].tobytes()
     assert (result[mask] >= 0).all() and (result[mask] <= m[~mask].max() * (1 + 1e-9)).all()
     other = m.copy()
     other[mask] = 1e9
-    np.testing.assert_array_equal(separate.filled(other, mask), result)  # what was there does not matter
+    np.testing.assert_array_equal(separation.filled(other, mask), result)  # what was there does not matter
 
 
 @pytest.mark.parametrize("size", [(9, 18), (48, 96), (50, 100), (63, 125), (64, 127), (64, 128), (65, 130)])
@@ -380,13 +382,13 @@ def test_a_ramp_goes_on_under_a_hole(size, axis):
         truth = np.exp(log)[..., None] * [1, 0.5, 2]
         mask = hole(height, width, column, max(1, height // 8))
         m = np.where(mask[..., None], 1e6, truth)
-        np.testing.assert_allclose(separate.filled(m, mask), truth, rtol=0.03)
+        np.testing.assert_allclose(separation.filled(m, mask), truth, rtol=0.03)
 
 
 def test_nothing_known_is_black_and_nothing_missing_is_the_map():
     m = np.full((5, 7, 3), 3.0)
-    assert not separate.filled(m, np.ones((5, 7), bool)).any()
-    np.testing.assert_array_equal(separate.filled(m, np.zeros((5, 7), bool)), m)
+    assert not separation.filled(m, np.ones((5, 7), bool)).any()
+    np.testing.assert_array_equal(separation.filled(m, np.zeros((5, 7), bool)), m)
 
 
 # ---- survey ------------------------------------------------------------------------------------------------
@@ -409,11 +411,11 @@ def test_a_survey_tells_where_the_lights_are(rows):
 def test_a_label_grows_into_what_has_none():
     label = np.full((5, 8), -1)
     label[2, 0], label[2, 4] = 0, 3
-    result = separate.grown(label)
+    result = separation.grown(label)
     assert (result == 0).sum() == (result == 3).sum() == 9 and (result[1:4, [7, 0, 1]] == 0).all()
     assert result[0].max() == result[4].max() == -1
     label[2, 2] = 1
-    result = separate.grown(label)
+    result = separation.grown(label)
     assert (result[2, 0], result[2, 4]) == (0, 3), "what a light has it keeps"
 
 
@@ -434,7 +436,7 @@ def real(data, name, width=256):
     path = (
         f"hdri/{name}_1k.hdr" if (data / f"hdri/{name}_1k.hdr").exists() else f"puresky/{name}_puresky_1k.hdr"
     )
-    return image.load_envmap(data / path, width)[0].astype(np.float64)
+    return images.load_envmap(data / path, width)[0].astype(np.float64)
 
 
 @pytest.mark.parametrize("name", SUNNY)
@@ -465,7 +467,7 @@ def test_an_overcast_sky_has_no_light(name, data):
 )
 def test_lamps_of_a_studio_a_night_and_a_town(name, least, data):
     lights = checked(real(data, name)).lights
-    assert least <= len(lights) <= separate.MOST_LIGHTS
+    assert least <= len(lights) <= separation.MOST_LIGHTS
     assert lights[0].share > 0.01
 
 

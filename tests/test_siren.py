@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import latlong, siren
+from envedit.core import latlong
+from envedit.representations.siren import network as siren
 
 OMEGA = 30.0
 

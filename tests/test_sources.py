@@ -5,14 +5,14 @@ import dataclasses
 import pytest
 
 from envedit import config as cfg
-from envedit import sources
-from envedit.errors import ConfigError
+from envedit.config import presets
+from envedit.core.errors import ConfigError
 
 # ---- presets -----------------------------------------------------------------------------------------------
 
 
 def test_standard_is_the_defaults_and_the_presets_are_named():
-    assert sources.PRESETS["standard"] == {}
+    assert presets.PRESETS["standard"] == {}
     assert cfg.preset_names() == ("draft", "standard", "paper")
 
 
@@ -20,7 +20,7 @@ def test_standard_is_the_defaults_and_the_presets_are_named():
 def test_every_preset_takes_effect_key_by_key(preset):
     config = cfg.loads("", preset=preset)
     assert config.preset == preset and (config.optimizer.lr == "auto") == (preset != "paper")
-    for table, keys in sources.PRESETS[preset].items():
+    for table, keys in presets.PRESETS[preset].items():
         for key, value in keys.items():
             assert getattr(getattr(config, table), key) == value, (table, key)
 
@@ -44,7 +44,7 @@ def test_the_paper_preset_spells_out_every_number_of_the_method():
     free = {"fit": {"cache"}, "optimizer": {"checkpoint_s"}, "representation": {"cycles"}, "loss": set()}
     for table, left_out in free.items():
         keys = {f.name for f in dataclasses.fields(getattr(cfg.Config(), table))}
-        assert set(sources.PRESETS["paper"][table]) == keys - left_out, table
+        assert set(presets.PRESETS["paper"][table]) == keys - left_out, table
 
 
 # ---- precedence --------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.sparse import ColourMatrix, merge
+from envedit.transport.sparse_matrix import ColourMatrix, merge
 
 
 def dense(rows, columns, weights, shape):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers import double, gradient, plain_ssim, single, waves
 
-from envedit.errors import ConfigError, InputError
-from envedit.ssim import Ssim, ssim_index, ssim_loss, ssim_map
+from envedit.core.errors import ConfigError, InputError
+from envedit.losses.ssim import Ssim, ssim_index, ssim_loss, ssim_map
 
 
 def test_ssim_matches_scikit_image():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, sky, write_scene
 
-from envedit import scene, stage
-from envedit.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError, InputError
+from envedit.scene import parser, scene
 
 # ---- film, environment, smooth limit -----------------------------------------------------------------------
 
@@ -171,7 +171,7 @@ def test_digest_follows_what_the_rendering_depends_on(tmp_path):
 
 
 def test_a_scene_s_parameters_may_have_any_name():
-    assert stage.told("scene.xml", dict, where="1", call="2") == {"where": "1", "call": "2"}
+    assert parser.told("scene.xml", dict, where="1", call="2") == {"where": "1", "call": "2"}
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="may read everything")

@@ -6,8 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import config, recording, starts
-from envedit.target import Target
+from envedit import config
+from envedit.solve import initialization
+from envedit.targets.target import Target
+from envedit.transport import recording
 
 SHAPE = (24, 32, 3)
 MAP = np.ones((8, 16, 3), np.float32)
@@ -32,7 +34,7 @@ def seen(rng, spp=(256, 32)):
     first[10:13, 20:23] += 3
     base[10:13, 20:23] += 3
     pair = (Recording(picture, n) for picture, n in zip((first, second), spp, strict=True))
-    return starts.Recordings(*pair), base
+    return initialization.Recordings(*pair), base
 
 
 def target(picture, weight=None):
@@ -41,7 +43,7 @@ def target(picture, weight=None):
 
 def test_weights_have_a_mean_of_one_and_are_told(rng):
     recordings, base = seen(rng)
-    weight, said = starts._trusted(MAP, recordings, target(base))
+    weight, said = initialization._trusted(MAP, recordings, target(base))
     assert weight.shape == (24, 32, 1) and float(weight.mean()) == pytest.approx(1, abs=1e-5)
     assert weight[11, 21] == 0 and "% of the pixels are mostly noise" in said
 
@@ -50,7 +52,7 @@ def test_a_mask_counts_too(rng):
     recordings, base = seen(rng)
     mask = np.ones((24, 32, 1), np.float32)
     mask[:, :8] = 0
-    weight, _ = starts._trusted(MAP, recordings, target(base, mask))
+    weight, _ = initialization._trusted(MAP, recordings, target(base, mask))
     assert not weight[:, :8].any() and weight[0, 31] > 1
 
 
@@ -58,7 +60,7 @@ def test_a_mask_around_nothing_but_noise_is_kept_as_it_is(rng):
     recordings, base = seen(rng)
     mask = np.zeros((24, 32, 1), np.float32)
     mask[10:13, 20:23] = 1
-    assert starts._trusted(MAP, recordings, target(base, mask)) == (None, "")
+    assert initialization._trusted(MAP, recordings, target(base, mask)) == (None, "")
 
 
 @pytest.mark.parametrize(
@@ -108,7 +110,7 @@ def test_where_detail_is_told_a_large_picture_gets_more_samples(
 
 def test_no_detail_is_looked_for_that_a_small_map_cannot_hold(monkeypatch):
     asked = tracing(monkeypatch, ["one"])
-    assert recorded({}, first := Traced(256), width=46) == starts.Recordings(first) and not asked
+    assert recorded({}, first := Traced(256), width=46) == initialization.Recordings(first) and not asked
 
 
 def test_a_path_tracer_s_recording_stays_as_it_is(monkeypatch):
@@ -138,8 +140,8 @@ def tracing(monkeypatch, octaves):
             assert settings.renderer.max_depth == 4 and settings.renderer.memory_gb == few
         return Traced(64 if settings.renderer.spp == "auto" else settings.renderer.spp)
 
-    monkeypatch.setattr(starts.renderers, "trace", trace)
-    monkeypatch.setattr(starts.resolution, "octaves", lambda *asked: [Told(o) for o in octaves])
+    monkeypatch.setattr(initialization.renderers, "trace", trace)
+    monkeypatch.setattr(initialization.resolution, "octaves", lambda *asked: [Told(o) for o in octaves])
     return asked
 
 
@@ -152,4 +154,4 @@ def recorded(tables, traced, coverage=None, size=24, width=48):
     layers = SimpleNamespace(separation=SimpleNamespace(background=MAP), rows=(0, 8))
     wished = Target(np.zeros(SHAPE, np.float32), None, None, "", coverage=coverage)
     lit = SimpleNamespace(width=size, height=size)
-    return starts.recordings(settings, lit, (24, width), layers, wished, traced)
+    return initialization.recordings(settings, lit, (24, width), layers, wished, traced)

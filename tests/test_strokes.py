@@ -8,10 +8,10 @@ import pytest
 from helpers import grey, refused
 
 from envedit import config as cfg
-from envedit import strokes
-from envedit.errors import ConfigError, InputError
-from envedit.stroke_keys import STROKES, stroke_list
-from envedit.tonemap import TONEMAPS, inverse_tonemap, luminance, tonemap
+from envedit.config.stroke_schema import STROKES, stroke_list
+from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
+from envedit.core.errors import ConfigError, InputError
+from envedit.targets import strokes
 
 EDITS = Path(__file__).parent.parent / "scenes" / "edits"
 BOX = [0.25, 0.25, 0.75, 0.75]

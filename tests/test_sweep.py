@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import checkpoint, config, loop
-from envedit.errors import ConfigError, InputError
+from envedit import config
+from envedit.core.errors import ConfigError, InputError
+from envedit.solve import adam_loop, checkpoint
 from experiments import sweep as package
 from experiments.sweep import COMMAND, drive, job, locks, process, read_jobs, run_job, sweep, table
 from experiments.sweep.__main__ import main
@@ -278,7 +279,7 @@ def test_what_a_checkpoint_that_is_no_use_is_told_by_is_what_envedit_says(tmp_pa
     with pytest.raises(InputError) as said:
         checkpoint.load(tmp_path, what)
     assert process._USELESS[0] in str(said.value)
-    checkpoint.save(tmp_path, what, loop.State(), {}, {}, np.zeros((1, 1, 3), np.float32))
+    checkpoint.save(tmp_path, what, adam_loop.State(), {}, {}, np.zeros((1, 1, 3), np.float32))
     with pytest.raises(InputError) as said:
         checkpoint.load(tmp_path, "other")
     assert process._USELESS[1] in str(said.value)

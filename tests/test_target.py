@@ -5,8 +5,12 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, exr, sky, write_scene
 
-from envedit import config, image, latlong, painted, scene, target
-from envedit.errors import ConfigError, InputError
+from envedit import config
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import images
+from envedit.scene import scene
+from envedit.targets import painted_image, target
 
 SIZE = (12, 16)
 
@@ -62,7 +66,7 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
     other[0, 0, 0] = -1
     file = paint(tmp_path / "other.exr", other)
     made = target.make(asking(1, file=str(file)), ball, sky(rng))
-    expected, info = image.load_envmap(file, 16)
+    expected, info = images.load_envmap(file, 16)
     np.testing.assert_array_equal(made.envmap, expected)
     np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=1 + target.SEED))
     assert str(file) in made.source
@@ -103,7 +107,7 @@ def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
 @pytest.fixture(scope="module")
 def seen(ball):
     envmap = sky(np.random.default_rng(3))
-    return envmap, painted.initial(ball, envmap, asking())
+    return envmap, painted_image.initial(ball, envmap, asking())
 
 
 def a_stroke(**kwargs):

@@ -12,8 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from envedit import budget, config, image, latlong, metrics
-from envedit.errors import InputError
+from envedit import config
+from envedit.cli import budget
+from envedit.core import latlong
+from envedit.core.errors import InputError
+from envedit.images import images
+from envedit.losses import metrics
 from experiments.sweep import drive
 from experiments.tradeoff import analyse, levels, measured, plan, plot, run
 from experiments.tradeoff.judge import Judge, loss_noise, without_noise
@@ -27,7 +31,7 @@ def folder(tmp_path):
     for i, name in enumerate(plan.MAPS):
         sky = np.full((16, 32, 3), 0.4, np.float32)
         sky[7, 3 + i] = 5000
-        image.write_exr(tmp_path / f"{name}.exr", sky)
+        images.write_exr(tmp_path / f"{name}.exr", sky)
     return tmp_path
 
 
@@ -347,14 +351,14 @@ def cell(folder):
     # An elevation of the sun that the plane is lit from; its column moves by whole texels under the turn.
     sky = np.full((48, 96, 3), 0.3, np.float32)
     sky[12, 60] = (1400, 1200, 900)  # as much light as leaves the picture below white
-    image.write_exr(folder / "sunny.exr", sky)
+    images.write_exr(folder / "sunny.exr", sky)
     return plan.Cell("sunny", "matte", folder / "sunny.exr")
 
 
 def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(cell, tmp_path):
     judge = tiny(tmp_path, width=96)
     true, wanted = judge.true(cell)
-    np.testing.assert_array_equal(true, latlong.resize(np.roll(image.read(cell.file)[0], -16, 1), 48, 96))
+    np.testing.assert_array_equal(true, latlong.resize(np.roll(images.read(cell.file)[0], -16, 1), 48, 96))
     assert wanted.shape == (2, 12, 12, 3) and (wanted[0] != wanted[1]).any()
     bounds = judge.bounds(cell)
     best, before = bounds["ceiling"], bounds["unedited"]
@@ -372,7 +376,7 @@ def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(cel
 
 
 def test_a_map_without_a_sun_has_no_place_of_it(folder, tmp_path):
-    image.write_exr(folder / "grey.exr", np.full((8, 16, 3), 999, np.float32))
+    images.write_exr(folder / "grey.exr", np.full((8, 16, 3), 999, np.float32))
     cell = plan.Cell("grey", "matte", folder / "grey.exr")
     judge = tiny(tmp_path, spp=2, true_spp=2)
     assert judge.compare(cell, judge.true(cell)[0])["sun_degrees"] is None
@@ -381,9 +385,9 @@ def test_a_map_without_a_sun_has_no_place_of_it(folder, tmp_path):
 def leave(folder, edited, full=None):
     """What a run leaves, of what is looked at."""
     folder.mkdir(exist_ok=True)
-    image.write_exr(folder / "edited.exr", edited)
+    images.write_exr(folder / "edited.exr", edited)
     if full is not None:
-        image.write_exr(folder / "edited_full.exr", full)
+        images.write_exr(folder / "edited_full.exr", full)
     told = {
         "render": {"psnr": 44.0},
         "iterations": 12,
@@ -399,7 +403,7 @@ def leave(folder, edited, full=None):
 
 def test_runs_are_judged_by_the_map_at_full_resolution_once(cell, tmp_path):
     judge = tiny(tmp_path)
-    true = latlong.rotate(image.read(cell.file)[0], plan.ANGLE)
+    true = latlong.rotate(images.read(cell.file)[0], plan.ANGLE)
     wrong = np.full((8, 16, 3), 0.3, np.float32)
     found = judge(cell, leave(tmp_path / "a", wrong, true))
     assert found["map"]["psnr"] == metrics.PSNR_CAP and found["full"]

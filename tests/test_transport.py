@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from test_paths import LEVEL, disagreement
 
-from envedit import latlong, overview, scene
-from envedit.errors import InputError
-from envedit.image import load_envmap
-from envedit.transport import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE, LightTransport
+from envedit.core import latlong, shipped
+from envedit.core.errors import InputError
+from envedit.images.images import load_envmap
+from envedit.scene import scene
+from envedit.transport import block_transport
+from envedit.transport.light_transport import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE, LightTransport
 
 DEPTH = 4  # of every path, here and in the reference: both leave out the same light
 SEEDS = 8
@@ -153,7 +155,7 @@ def references(s, image, spp=256, depth=DEPTH):
 
 
 def test_every_shipped_scene_is_compared():
-    assert {value[0] for value in SCENES.values() if isinstance(value, tuple)} == set(scene.SHIPPED)
+    assert {value[0] for value in SCENES.values() if isinstance(value, tuple)} == set(shipped.scenes())
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -667,7 +669,7 @@ def test_overview_does_not_depend_on_columns(wide):
 def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
     first = build(lamp_scene, spp=32, folder=tmp_path).overview()
     with monkeypatch.context() as patch:
-        patch.setattr(overview, "make", lambda *_: 1 / 0)
+        patch.setattr(block_transport, "make", lambda *_: 1 / 0)
         again = build(lamp_scene, spp=32, folder=tmp_path).overview()
         with pytest.raises(ZeroDivisionError):  # of another recording it is not
             build(lamp_scene, spp=32, seed=1, folder=tmp_path).overview()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from helpers import BALL, LIGHT, SENSOR, write_scene
 
-from envedit import recording, scene, transport
-from envedit.transport import LightTransport
+from envedit.scene import scene
+from envedit.transport import light_transport, recording
+from envedit.transport.light_transport import LightTransport
 
 LAMP = """<shape type="sphere"><point name="center" x="0" y="3" z="0"/><float name="radius" value="0.3"/>
     <emitter type="area"><rgb name="radiance" value="6, 3, 12"/></emitter></shape>"""
@@ -148,7 +149,7 @@ def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp
 
 def test_a_later_version_records_anew(lit, tmp_path, monkeypatch):
     build(tmp_path, lit)
-    monkeypatch.setattr(transport, "_RECORDING", transport._RECORDING + 1)
+    monkeypatch.setattr(light_transport, "_RECORDING", light_transport._RECORDING + 1)
     assert not build(tmp_path, lit).cached
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from envedit import trust
+from envedit.solve import pixel_confidence
 
 SHAPE = (24, 32, 3)
 
@@ -15,20 +15,20 @@ def pictures(rng, noise=0.003):
 
 def test_equal_pictures_are_trusted(rng):
     (_, _), base = pictures(rng)
-    assert trust.weights(base, base, 1 / 8, base) is None
-    assert trust.weights(base, base, 1 / 8, base, np.zeros(SHAPE[:2])) is None
+    assert pixel_confidence.weights(base, base, 1 / 8, base) is None
+    assert pixel_confidence.weights(base, base, 1 / 8, base, np.zeros(SHAPE[:2])) is None
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_even_noise_is_nothing_special(rng, noise):
     both, base = pictures(rng, noise)
-    assert trust.weights(*both, 1 / 8, base) is None
+    assert pixel_confidence.weights(*both, 1 / 8, base) is None
 
 
 def test_a_caustic_counts_less_and_the_rest_as_before(rng):
     (first, second), base = pictures(rng)
     first[10:13, 20:23] += 3
-    found = trust.weights(first, second, 1 / 8, base)
+    found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert found.shape == (24, 32, 1) and found.dtype == np.float32
     assert found[11, 21] < 0.01 and found[9, 19] < 0.05, "and around it, where others are hit"
     assert found[:, :16].min() > 0.99
@@ -37,7 +37,7 @@ def test_a_caustic_counts_less_and_the_rest_as_before(rng):
 def test_a_second_recording_of_more_samples_leaves_more_of_the_noise_to_the_first(rng):
     (first, second), base = pictures(rng)
     first[10:13, 20:23] += 0.1
-    few, many = (trust.weights(first, second, share, base) for share in (1 / 2, 2))
+    few, many = (pixel_confidence.weights(first, second, share, base) for share in (1 / 2, 2))
     assert many[11, 21] < few[11, 21] < 0.5
 
 
@@ -45,7 +45,7 @@ def test_the_target_s_own_noise_counts_too(rng):
     (first, second), base = pictures(rng)
     noise = np.full(SHAPE[:2], 0.002)
     noise[4, 5] = 0.5
-    found = trust.weights(first, second, 1 / 8, base, noise)
+    found = pixel_confidence.weights(first, second, 1 / 8, base, noise)
     assert found[4, 5] < 0.05 and found[20, 28] > 0.99
 
 
@@ -53,7 +53,7 @@ def test_pixels_that_show_the_light_itself_tell_nothing(rng):
     (first, second), base = pictures(rng)
     first[10, 20] += 3
     base[3, 3], first[3, 3], second[3, 3] = 100, 120, 80
-    found = trust.weights(first, second, 1 / 8, base)
+    found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert not found[2:5, 2:5].any() and found[6, 6] > 0.99
 
 
@@ -63,7 +63,7 @@ def test_what_is_bright_and_no_noise_counts_beside_what_is(rng):
     for picture in (first, second, base):
         picture[12:, :] *= 8
     first[2, 2] += 3
-    found = trust.weights(first, second, 1 / 8, base)
+    found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert found[2, 2] < 0.05 and np.median(found[16:]) > 0.5
 
 
@@ -73,19 +73,19 @@ def test_a_mirror_ball_in_the_dark_is_judged_by_its_own_pixels(rng, backdrop):
     for picture in (first, second, base):
         picture[:, 12:] = backdrop
     first[2, 2] += 3
-    found = trust.weights(first, second, 1 / 8, base)
+    found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert found[2, 2] < 0.05 and np.median(found[:, :12]) > 0.9
-    assert trust.weights(*pictures(rng)[0], 1 / 8, np.zeros(SHAPE)) is None
+    assert pixel_confidence.weights(*pictures(rng)[0], 1 / 8, np.zeros(SHAPE)) is None
 
 
 def test_radiance_at_the_extremes_is_finite(rng):
     (first, second), base = pictures(rng)
     first[5, 5], second[6, 6], first[8, 8] = 3e38, 0, 1e-30
-    found = trust.weights(first, second, 1 / 8, base)
+    found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
 
 
 def test_a_picture_of_noise_alone_is_trusted_as_a_whole(rng):
     base = np.full(SHAPE, 0.5)
     both = [base + rng.random(SHAPE) for _ in range(2)]
-    assert trust.weights(*both, 1 / 8, base) is None
+    assert pixel_confidence.weights(*both, 1 / 8, base) is None

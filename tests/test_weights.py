@@ -8,8 +8,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from envedit import weights
-from envedit.errors import InputError
+from envedit.core.errors import InputError
+from envedit.losses.perceptual import weights
 
 KINDS_OF_NUMBERS = {"F16": "<f2", "F32": "<f4", "F64": "<f8"}
 

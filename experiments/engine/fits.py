@@ -15,11 +15,13 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import config, fit, metrics
-from envedit.errors import EnveditError
-from envedit.files import write_atomically
+from envedit import config
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError
 from envedit.inputs import active_rows, load_map
-from envedit.manifest import manifest
+from envedit.losses import metrics
+from envedit.report.manifest import manifest
+from envedit.representations.siren import fit
 from experiments import puresky
 
 from . import maps, tables

@@ -11,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import scene, sparse
+from envedit.scene import scene
+from envedit.transport import sparse_matrix
 
 from . import network
 from .timing import side_by_side
@@ -62,7 +63,7 @@ def bandwidth(elements: int | None = None, repeats: int = 7) -> dict:
         np.add(host_a, host_b, out=host_a)
         return host_a[0]
 
-    lanes = sparse.SLICE * 512  # enough for any number of cores; each lane then reads a long row
+    lanes = sparse_matrix.SLICE * 512  # enough for any number of cores; each lane then reads a long row
     rows = dr.opaque(mi.UInt32, elements // 4 // lanes)
     jobs = {
         "Dr.Jit sum": (4, lambda: dr.sum(b)),
@@ -82,11 +83,11 @@ def bandwidth(elements: int | None = None, repeats: int = 7) -> dict:
 def _read_packets(packed, rows, lanes):
     """Sum packets in the order in which a product with T reads its own, but without reading a map."""
     lane = dr.arange(mi.UInt32, lanes)
-    place = (lane // sparse.SLICE) * (rows * sparse.SLICE) + lane % sparse.SLICE
+    place = (lane // sparse_matrix.SLICE) * (rows * sparse_matrix.SLICE) + lane % sparse_matrix.SLICE
     total, done = mi.Vector4f(0), dr.zeros(mi.UInt32, lanes)
     while done < rows:
         total += dr.gather(mi.Vector4f, packed, place)
-        place += sparse.SLICE
+        place += sparse_matrix.SLICE
         done += 1
     return total
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import image, sky
+from envedit.images import analytic_sky, images
 from experiments import puresky
 
 SUNNY = "kloofendal_48d_partly_cloudy"
@@ -37,8 +37,8 @@ def sunny(width: int, real: bool = True) -> tuple[str, np.ndarray]:
     A real one, unless ``real`` is False or there is none; then the analytic sun at 45 degrees.
     """
     if real and (file := skies().get(SUNNY)):
-        return SUNNY, image.load_envmap(file, width)[0]
-    return "analytic sun and sky", sky.sunsky(width, 130, 45)
+        return SUNNY, images.load_envmap(file, width)[0]
+    return "analytic sun and sky", analytic_sky.sunsky(width, 130, 45)
 
 
 def one_texel_sun(

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import siren
+from envedit.representations.siren import network as siren
 
 from .timing import compiled, growth, side_by_side
 

@@ -13,10 +13,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import scene
 from envedit.config import Config
-from envedit.pathtrace import AUTO_DEPTH, PathTracer
-from envedit.transport import LightTransport
+from envedit.core import shipped
+from envedit.scene import scene
+from envedit.scene.path_tracer import AUTO_DEPTH, PathTracer
+from envedit.transport.light_transport import LightTransport
 
 from . import maps
 from .timing import side_by_side
@@ -39,7 +40,7 @@ def measure(quick: bool = False) -> dict:
         same without the light that comes to a matte surface by way of it, see :func:`without_caustics`;
         ``curve``: error against time, see :func:`curve`; ``choices`` by scene; ``skipped``.
     """
-    chosen, skipped = {name: {} for name in scene.SHIPPED if name != "mesh"}, []
+    chosen, skipped = {name: {} for name in shipped.scenes() if name != "mesh"}, []
     if mesh := maps.mesh():
         chosen["mesh"] = mesh
     elif not quick:

@@ -20,10 +20,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from envedit import doctor
-from envedit.errors import EnveditError
-from envedit.files import write_atomically
-from envedit.manifest import manifest
+from envedit.cli import doctor
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError
+from envedit.report.manifest import manifest
 
 SECTIONS = ("floors", "siren", "transport", "quality", "scaling", "fits")
 VARIANT = "llvm_ad_rgb"

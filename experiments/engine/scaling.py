@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import scene
+from envedit.scene import scene
 
 from . import maps
 from .timing import side_by_side

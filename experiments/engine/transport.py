@@ -12,9 +12,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import latlong, scene
-from envedit.pathtrace import PathTracer
-from envedit.transport import RESOLVE_EVERY, LightTransport
+from envedit.core import latlong
+from envedit.scene import scene
+from envedit.scene.path_tracer import PathTracer
+from envedit.transport.light_transport import RESOLVE_EVERY, LightTransport
 
 from . import floors, maps
 from .timing import compiled, side_by_side

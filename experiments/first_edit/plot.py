@@ -22,12 +22,13 @@ def main():
     parser.add_argument("--maps", nargs="+", default=MAPS)
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    from envedit import image, tonemap
+    from envedit.core import color
+    from envedit.images import images
 
     def show(axis, path, title):
         axis.set_axis_off()
         if path.exists():
-            axis.imshow(tonemap.tonemap(image.read(path)[0]))
+            axis.imshow(color.tonemap(images.read(path)[0]))
             axis.set_title(title, fontsize=7)
 
     for name in arguments.maps:

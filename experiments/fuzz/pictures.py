@@ -51,7 +51,7 @@ def exr_files(folder: Path) -> dict[str, bytes]:
     """Write OpenEXR files: every compression, tiles, halves, parts, layers, grey, windows, deep data."""
     import OpenEXR
 
-    from envedit import image
+    from envedit.images import images
 
     full = {c: np.ascontiguousarray(radiance()[..., i]) for i, c in enumerate("RGB")}
     half = {c: v.astype(np.float16) for c, v in full.items()}
@@ -73,7 +73,7 @@ def exr_files(folder: Path) -> dict[str, bytes]:
         parts.write(str(folder / "seed.exr"))
         files[name + ".exr"] = (folder / "seed.exr").read_bytes()
 
-    image.write_exr(folder / "ours.exr", radiance(), {"source": "sky.hdr", "seed": 3, "gamma": 0.5})
+    images.write_exr(folder / "ours.exr", radiance(), {"source": "sky.hdr", "seed": 3, "gamma": 0.5})
     files["ours.exr"] = (folder / "ours.exr").read_bytes()
     methods = [name for name in sorted(dir(OpenEXR)) if name.endswith("_COMPRESSION")]
     for method in methods:  # whatever this OpenEXR has
@@ -228,9 +228,9 @@ def weight_files() -> dict[str, bytes]:
 
 def checkpoint_files(folder: Path) -> dict[str, bytes]:
     """Write a checkpoint as a run does."""
-    from envedit import checkpoint, loop
+    from envedit.solve import adam_loop, checkpoint
 
-    state = loop.State(2, history=[{"iteration": 0, "loss": 0.5}, {"iteration": 1, "loss": 0.25}])
+    state = adam_loop.State(2, history=[{"iteration": 0, "loss": 0.5}, {"iteration": 1, "loss": 0.25}])
     optimiser = {"step": np.int64(2), "params/gain": radiance()[:4, :8, 0]}
     checkpoint.save(folder, "what", state, optimiser, {"columns": np.arange(5)}, radiance()[:8])
     return {checkpoint.NAME: (folder / checkpoint.NAME).read_bytes()}

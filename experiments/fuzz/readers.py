@@ -19,19 +19,19 @@ def _demand(true, text):
 
 def environment(path: Path, index: int) -> None:
     """Read as the map to edit and as a picture with alpha: exr, hdr."""
-    from envedit import image
-    from envedit.errors import EnveditError
+    from envedit.core.errors import EnveditError
+    from envedit.images import images
 
     first = None
     try:
-        found, info = image.load_envmap(path, 16, repair=bool(index % 2))
+        found, info = images.load_envmap(path, 16, repair=bool(index % 2))
         _demand(found.shape == (8, 16, 3) and found.dtype == np.float32, f"shape {found.shape}")
         # A file may hold values whose mean float32 cannot; then the map must be refused, not infinite.
         _demand(np.isfinite(found).all() and (found >= 0).all(), "a map that is not finite, or negative")
         _demand(_plain(info["warnings"]), f"warnings {info['warnings']!r:.200}")
     except EnveditError as error:
         first = error
-    pixels, info = image.read_stored(path)
+    pixels, info = images.read_stored(path)
     _demand(pixels.ndim == 3 and pixels.shape[1::-1] == info["size"], f"shape {pixels.shape}")
     if first:
         raise first
@@ -39,13 +39,13 @@ def environment(path: Path, index: int) -> None:
 
 def picture(path: Path, index: int) -> None:
     """Read as a painted picture, with and without the rendering it was painted on, and as a mask."""
-    from envedit import painted
-    from envedit.errors import EnveditError
+    from envedit.core.errors import EnveditError
+    from envedit.targets import painted_image
 
     first = None
     for call in (
-        lambda: painted.read(path, pictures.SIZE, "gamma", _initial() if index % 2 else None),
-        lambda: painted.read_mask(path, pictures.SIZE),
+        lambda: painted_image.read(path, pictures.SIZE, "gamma", _initial() if index % 2 else None),
+        lambda: painted_image.read_mask(path, pictures.SIZE),
     ):
         try:
             found = call()
@@ -80,7 +80,7 @@ def configuration(path: Path, index: int) -> None:
 
 def tensors(path: Path, index: int) -> None:
     """Read as weights of a network."""
-    from envedit import weights
+    from envedit.losses.perceptual import weights
 
     found = weights.read(path, pictures.WANTED, "the test", "nowhere")
     shapes = {name: values.shape for name, values in found.items()}
@@ -91,7 +91,7 @@ def tensors(path: Path, index: int) -> None:
 
 def state(path: Path, index: int) -> None:
     """Read as the checkpoint of a run; the file has its name already."""
-    from envedit import checkpoint
+    from envedit.solve import checkpoint
 
     found = checkpoint.load(path.parent, "what")
     _demand(found is not None and found[0].step == 2 and found[3].shape == (8, 32, 3), f"{found!r:.200}")

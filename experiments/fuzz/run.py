@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
 
 from . import drive
 from .readers import READERS

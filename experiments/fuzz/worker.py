@@ -81,7 +81,7 @@ def main(reader: str, answers) -> None:
 
 def judged(read, path: Path, index: int) -> dict:
     """Call a reader and say how it went: "read", "refused", "unclear", "wrong" or "traceback"."""
-    from envedit.errors import ConfigError, InputError
+    from envedit.core.errors import ConfigError, InputError
 
     from .readers import WrongError
 
@@ -119,14 +119,14 @@ def _prepare(reader):
     """Import what the reader imports when first used, which is no memory of a case's."""
     import OpenEXR  # noqa: F401
 
-    from envedit import config, image, weights  # noqa: F401
+    from envedit.losses.perceptual import weights  # noqa: F401
 
     if reader in ("painted", "checkpoint"):
         import mitsuba as mi
 
         mi.set_variant("llvm_ad_rgb")
         mi.set_log_level(mi.LogLevel.Error)
-        from envedit import checkpoint, painted  # noqa: F401
+        from envedit.targets import painted_image  # noqa: F401
 
 
 def _status(key):

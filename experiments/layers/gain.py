@@ -14,11 +14,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import config, files, latlong, loop, metrics, scene, search, siren
-from envedit.gain import GridGain
+from envedit import config
+from envedit.core import array_cache, latlong
 from envedit.inputs import load_map
-from envedit.layers import Layers
-from envedit.transport import LightTransport
+from envedit.losses import metrics
+from envedit.representations.layers.gain import GridGain
+from envedit.representations.layers.layers import Layers
+from envedit.representations.siren import network as siren
+from envedit.scene import scene
+from envedit.solve import adam_loop, light_search
+from envedit.transport.light_transport import LightTransport
 from experiments import puresky
 
 from .run import SCENES
@@ -81,14 +86,14 @@ def one(lit, transport, original, true, picture, gain, from_search):
     crop = original[: height // 2]
     rows = (0, height)
     plain = Layers(rows)
-    begun, _ = search.start(plain, plain.encode(crop), transport, picture, None, original)
+    begun, _ = light_search.start(plain, plain.encode(crop), transport, picture, None, original)
     layers = type("Variant", (Layers,), {"Gain": gain})(rows)
     params = layers.encode(crop)
     params |= {k: v for k, v in begun.items() if from_search or not k.startswith("gain")}
     chosen = config.Optimizer(iterations=ITERATIONS)
-    objective = loop.Objective(config.Loss(), picture, None, crop, ITERATIONS)
+    objective = adam_loop.Objective(config.Loss(), picture, None, crop, ITERATIONS)
     start = time.perf_counter()
-    params, _ = loop.optimise(layers, params, transport, objective, original, 0, chosen)
+    params, _ = adam_loop.optimise(layers, params, transport, objective, original, 0, chosen)
     ms = 1000 * (time.perf_counter() - start) / ITERATIONS
     edited = original.copy()
     edited[: height // 2] = layers.decode(params).numpy()
@@ -111,7 +116,7 @@ def main():
     given = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     lit = scene.load(given.scene, 128, 0, {"roughness": 0.3} if given.scene == "sphere" else {}, None)
-    folder = files.cache_folder("transport")
+    folder = array_cache.cache_folder("transport")
     transport = LightTransport.build(lit, 128, 256, few=True, folder=folder)
     print("| gain | map | rendering PSNR | map PSNR | sharp | ms a step |\n|---|---|---|---|---|---|")
     for name, file in puresky.of_script(given.maps).items():

@@ -15,8 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import image, latlong, metrics
-from envedit.tonemap import luminance
+from envedit.core import latlong
+from envedit.core.color import luminance
+from envedit.images import images
+from envedit.losses import metrics
 from experiments import puresky, trials
 
 SUNNY = 1000.0
@@ -51,10 +53,10 @@ def measure(folder: Path, file: Path, angle: float) -> dict | None:
     if not (folder / "metrics.json").exists():
         return None
     found = json.loads((folder / "metrics.json").read_text())
-    original, _ = image.load_envmap(str(file), 256)
+    original, _ = images.load_envmap(str(file), 256)
     first, last = found["active_rows"]
     rows = slice(first, last + 1)
-    edited = image.read(str(folder / "edited.exr"))[0]
+    edited = images.read(str(folder / "edited.exr"))[0]
     true = latlong.rotate(original, angle)
     directions = latlong.directions(*true.shape[:2])[rows]
     omega = latlong.solid_angles(*true.shape[:2])[rows, None]

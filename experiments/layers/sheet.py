@@ -11,8 +11,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import image, latlong
-from envedit.tonemap import tonemap
+from envedit.core import latlong
+from envedit.core.color import tonemap
+from envedit.images import images
 from experiments import puresky
 
 from .run import NAMES, SCENES
@@ -24,14 +25,14 @@ def row(out: Path, name, file, scene, angle, kinds):
     done = {kind: folder for kind, folder in folders.items() if (folder / "metrics.json").exists()}
     if not done:
         return None
-    original, _ = image.load_envmap(str(file), 256)
+    original, _ = images.load_envmap(str(file), 256)
     half = original.shape[0] // 2
     skies = [original, latlong.rotate(original, angle)]
-    skies += [image.read(str(done[k] / "edited.exr"))[0] if k in done else 0 * original for k in kinds]
+    skies += [images.read(str(done[k] / "edited.exr"))[0] if k in done else 0 * original for k in kinds]
     first = next(iter(done.values()))
-    pictures = [image.read(str(first / "render_target.exr"))[0]]
+    pictures = [images.read(str(first / "render_target.exr"))[0]]
     pictures += [
-        image.read(str(done[k] / "render_edited.exr"))[0] if k in done else 0 * pictures[0] for k in kinds
+        images.read(str(done[k] / "render_edited.exr"))[0] if k in done else 0 * pictures[0] for k in kinds
     ]
     step = pictures[0].shape[0] // half
     tiles = [s[:half] for s in skies]
@@ -54,7 +55,7 @@ def main():
             if rows:
                 pixels = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)
                 path = given.to / f"{scene}_{angle}.png"
-                path.write_bytes(image.png(pixels))
+                path.write_bytes(images.png(pixels))
                 print(path)
 
 

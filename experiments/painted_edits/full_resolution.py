@@ -15,14 +15,19 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import carry, config, image, inputs, latlong, layered, metrics, pipeline, scene
+from envedit import config, inputs, pipeline
+from envedit.core import latlong
+from envedit.export import full_resolution
+from envedit.images import images, layered_exr
+from envedit.losses import metrics
+from envedit.scene import scene
 
 from .run import file_of
 
 
 def large(file: str, width: int) -> np.ndarray:
     """Enlarge a map, with 10 % of fine detail."""
-    base = latlong.resize(image.load_envmap(file)[0], width // 2, width)
+    base = latlong.resize(images.load_envmap(file)[0], width // 2, width)
     row, column = np.mgrid[: width // 2, :width].astype(np.float32)
     for k, (a, b) in enumerate(((0.9, 0.35), (0.21, 0.57), (1.7, 1.3))):
         base *= (1 + 0.05 * np.sin(a * row + b * column + k))[..., None].astype(np.float32)
@@ -43,7 +48,7 @@ def main():
     if not file.exists():
         if not (small := file_of(given.map)):
             parser.error("ENVEDIT_DATA has no such map")
-        layered.write(file, {"edited": large(small, given.width)})
+        layered_exr.write(file, {"edited": large(small, given.width)})
         print(f"{file} made; run again, so that its making does not count")
         return
     settings = config.from_dict(
@@ -57,16 +62,18 @@ def main():
     result = pipeline.run(settings)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     start = time.perf_counter()
-    source, _ = image.load_envmap(str(file))
+    source, _ = images.load_envmap(str(file))
     read = time.perf_counter() - start
     first, last = inputs.active_rows(settings.input.rows, result.envmap.shape[0])
     found, rows = result.found, (first, last - first + 1)
     original, edited = result.maps["initial"], result.envmap
     start = time.perf_counter()
-    full = carry.carry(found.representation, found.params, original, edited, source, rows, found.free)
+    full = full_resolution.carry(
+        found.representation, found.params, original, edited, source, rows, found.free
+    )
     carried = time.perf_counter() - start
     start = time.perf_counter()
-    layered.write(given.out / "edited_full.exr", {"edited": full})
+    layered_exr.write(given.out / "edited_full.exr", {"edited": full})
     written = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(

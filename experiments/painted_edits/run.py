@@ -17,8 +17,9 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from envedit import image, metrics
-from envedit.errors import EnveditError
+from envedit.core.errors import EnveditError
+from envedit.images import images
+from envedit.losses import metrics
 from experiments import puresky, trials
 
 ROOT = Path(__file__).parents[2]
@@ -72,7 +73,7 @@ def layers(folder: Path):
     import OpenEXR
 
     channels = OpenEXR.File(str(folder / "edited_layers.exr"), separate_channels=True).channels()
-    edited = image.read(str(folder / "edited.exr"))[0]
+    edited = images.read(str(folder / "edited.exr"))[0]
     original = edited.copy()
     for i, channel in enumerate("RGB"):
         original[..., i] = channels[f"initial.{channel}"].pixels

@@ -11,17 +11,17 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import image
-from envedit.tonemap import tonemap
+from envedit.core.color import tonemap
+from envedit.images import images
 
 from .run import EDITS, MAPS, layers
 
 
 def row(folder: Path):
     """Pictures of one edit, display values."""
-    renders = [image.read(str(folder / f"render_{n}.exr"))[0] for n in ("initial", "target", "edited")]
+    renders = [images.read(str(folder / f"render_{n}.exr"))[0] for n in ("initial", "target", "edited")]
     shown = [tonemap(picture, "gamma") for picture in renders]
-    unreachable, _ = image.read_stored(str(folder / "unreachable.png"))
+    unreachable, _ = images.read_stored(str(folder / "unreachable.png"))
     shown.append(unreachable[..., :3] / 255)
     edited, original = layers(folder)
     half = original.shape[0] // 2
@@ -43,7 +43,7 @@ def main():
         if rows:
             pixels = (np.clip(np.concatenate(rows), 0, 1) * 255 + 0.5).astype(np.uint8)
             path = given.to / f"{name}.png"
-            path.write_bytes(image.png(pixels))
+            path.write_bytes(images.png(pixels))
             print(path)
 
 

@@ -16,10 +16,14 @@ from collections.abc import Iterator
 import mitsuba as mi
 import numpy as np
 
-from envedit import config, doctor, inputs, latlong, metrics, scene
-from envedit.errors import EnveditError, unwrapped
+from envedit import config, inputs
+from envedit.cli import doctor
+from envedit.core import latlong
+from envedit.core.errors import EnveditError, unwrapped
+from envedit.losses import metrics
 from envedit.pipeline import JUDGE_SEED
-from envedit.target import SEED
+from envedit.scene import scene
+from envedit.targets.target import SEED
 from experiments import puresky
 
 from .kinds import ROUGHNESS

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import config, image, latlong, metrics
-from envedit.errors import EnveditError, InputError
+from envedit import config
+from envedit.core import latlong
+from envedit.core.errors import EnveditError, InputError
+from envedit.images import images
+from envedit.losses import metrics
 from experiments.painted_edits.run import layers
 from experiments.sweep.process import DONE
 
@@ -70,7 +73,7 @@ def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:
     if not (folder / DONE).exists():
         return {}
     if cell.store != "edits":
-        return {name: image.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")}
+        return {name: images.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")}
     first, last = numbers(out, cell)["active_rows"]
     rows = slice(first, last + 1)
     edited, original = layers(folder)
@@ -78,7 +81,7 @@ def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:
     found = {"initial_map": original[rows], "true_map": None if true is None else true[rows]}
     found["map"] = edited[rows]
     for name, file in (("initial", "initial"), ("target", "target"), ("render", "edited")):
-        found[name] = image.read(str(folder / f"render_{file}.exr"))[0]
+        found[name] = images.read(str(folder / f"render_{file}.exr"))[0]
     return found
 
 
@@ -89,14 +92,14 @@ def _true_map(folder: Path, original):
     if not settings.target.file:
         return latlong.rotate(original, settings.target.rotate_degrees)
     with contextlib.suppress(EnveditError):  # it may have been moved since
-        return image.load_envmap(settings.target.file, original.shape[1], settings.input.repair)[0]
+        return images.load_envmap(settings.target.file, original.shape[1], settings.input.repair)[0]
     return None
 
 
 def of_paint(out, cell: Cell) -> dict:
     """Measure a painted edit against its original map: ``ssim`` of the two, ``sharp`` high frequencies.
 
-    ``sharp`` is the ratio of :func:`envedit.metrics.high_frequency_energy`, NaN where the original has none.
+    ``sharp`` is the ratio of :func:`.metrics.high_frequency_energy`, NaN where the original has none.
     """
     shown = pictures(out, cell)
     edited, original = shown["map"], shown["initial_map"]

@@ -17,10 +17,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import config, fit, image, metrics, optim, siren
-from envedit.errors import EnveditError
-from envedit.files import write_atomically
+from envedit import config
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError
+from envedit.images import images
 from envedit.inputs import active_rows, load_map
+from envedit.losses import metrics, optimizer
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
 
 NOISE, NOISE_SEEDS = 1e-3, 5
 """Standard deviation of the noise on weights and biases (Fig. 5), and how many draws are measured."""
@@ -51,7 +55,7 @@ def stock(
     Returns
     -------
     params : dict
-        Weights, as of :func:`envedit.siren.init`.
+        Weights, as of :func:`envedit.representations.siren.network.init`.
     range : (float, float)
         (low, span): radiance is low + span * output.
     """
@@ -62,7 +66,7 @@ def stock(
     wanted = dr.opaque(mi.TensorXf(wanted))
     x = fit.points(network, crop.shape[:2])
     params = siren.init(seed, network.hidden, network.depth, network.omega)
-    adam = optim.Adam(params, settings.lr, (0.9, settings.beta2))
+    adam = optimizer.Adam(params, settings.lr, (0.9, settings.beta2))
     for epoch in range(settings.epochs):
         z, tape = linear(adam.params, x, network.omega)
         grads = backward(adam.params, tape, (2 / len(wanted.array)) * (z - wanted))
@@ -71,7 +75,7 @@ def stock(
 
 
 def linear(params: siren.Params, x, omega: float):
-    """Evaluate a SIREN without its sigmoid: values (N, 3), and the tape of :func:`envedit.siren.forward`."""
+    """Evaluate a SIREN without its sigmoid: values (N, 3), and the tape of :func:`.network.forward`."""
     _, tape = siren.forward(params, x, omega)
     last = siren.layers(params) - 1
     z = dr.matmul(tape[-1][0], params[f"{last}.weight"], Bt=True) + params[f"{last}.bias"]
@@ -126,7 +130,7 @@ def carry_out(folder: Path, store: str) -> None:
     fitted = picture(params)
     noisy = [picture(perturbed(params, seed)) for seed in range(NOISE_SEEDS)]
     for name, content in (("original", crop), ("fitted", fitted), ("noisy", noisy[0])):
-        image.write_exr(folder / f"{name}.exr", content, panorama=False)
+        images.write_exr(folder / f"{name}.exr", content, panorama=False)
     text = {
         "log_psnr": metrics.log_psnr(fitted, crop),
         "peak_ratio": metrics.peak_ratio(fitted, crop),

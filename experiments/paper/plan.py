@@ -13,9 +13,11 @@ import tomllib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from envedit import config, scene, sources
-from envedit.errors import ConfigError, InputError
-from envedit.files import write_atomically
+from envedit import config
+from envedit.config import presets
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import ConfigError, InputError
+from envedit.scene import scene
 from experiments import puresky
 from experiments.sweep import Job, job
 
@@ -127,7 +129,7 @@ def build(
                     continue
                 for sky, file in chosen.items():
                     tables = kind.methods[row].under(setting)
-                    tables = sources.overlaid(tables, _shared(name, question, file, lit, roughness, target))
+                    tables = presets.overlaid(tables, _shared(name, question, file, lit, roughness, target))
                     if row == "lum-l1-dists" and not _names(question, "perceptual", "vgg"):
                         continue
                     varied = "" if roughness is None else f", roughness {roughness:g}"
@@ -179,7 +181,7 @@ def _shared(name, question, file, lit, roughness, target):
     tables["output"] = {"report": False, "full": False}
     tables["renderer"] = {"cache": False}  # every run pays for its transport, whichever comes first
     if name == "figure9":
-        return sources.overlaid(read_edit(question.edit or "move_shadow"), tables)
+        return presets.overlaid(read_edit(question.edit or "move_shadow"), tables)
     tables |= {"scene": {"file": lit}, "target": target}
     if roughness is not None:
         tables["scene"] |= {"parameters": {"roughness": roughness}}
@@ -209,8 +211,8 @@ def _set(tables, overrides):
         for key in reversed(keys):
             value = {key: value}
         if keys == ("target", "file"):
-            tables = sources.overlaid(tables, {"target": {"rotate_degrees": 0.0}})
-        tables = sources.overlaid(tables, value)
+            tables = presets.overlaid(tables, {"target": {"rotate_degrees": 0.0}})
+        tables = presets.overlaid(tables, value)
     return tables
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from envedit.errors import EnveditError, InputError
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError, InputError
 
 from . import kinds, plan, tables
 from .run import OUT

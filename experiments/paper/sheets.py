@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from envedit.tonemap import luminance, tonemap
+from envedit.core.color import luminance, tonemap
 
 from . import measured, tables
 from .kinds import KINDS

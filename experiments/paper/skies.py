@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from envedit import image, latlong
-from envedit.errors import InputError
+from envedit.core import latlong
+from envedit.core.errors import InputError
+from envedit.images import images
 from experiments import puresky
 
 DEFAULT = "kloofendal_48d_partly_cloudy"
@@ -67,12 +68,12 @@ def turned(file: Path, degrees: float, folder) -> Path:
     content = hashlib.sha256(file.read_bytes()).hexdigest()[:8]
     path = Path(folder).absolute() / f"{file.stem}-turned-{degrees:g}-{content}.exr"
     if not path.exists():
-        original, _ = image.load_envmap(str(file))
+        original, _ = images.load_envmap(str(file))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(
                 f"{path.parent}: cannot be made ({error.strerror}): give another --out"
             ) from None
-        image.write_exr(path, latlong.rotate(original, degrees))
+        images.write_exr(path, latlong.rotate(original, degrees))
     return path

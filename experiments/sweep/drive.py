@@ -16,8 +16,8 @@ import uuid
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from envedit.errors import ConfigError, EnveditError, InputError
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import ConfigError, EnveditError, InputError
 
 from .board import Board
 from .jobs import Job

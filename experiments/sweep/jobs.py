@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import envedit
-from envedit import config, sources
-from envedit.errors import ConfigError, InputError
+from envedit import config
+from envedit.config import presets
+from envedit.core.errors import ConfigError, InputError
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def read_jobs(path) -> list[Job]:
         raise ConfigError(f"{path}: no job in it, wanted a table [jobs.NAME] for each")
     if wrong := [name for name, table in ({"common": common} | jobs).items() if not isinstance(table, dict)]:
         raise ConfigError(f"{path}: {wrong[0]}: wanted a table")
-    return [job(name, sources.overlaid(common, table), path.parent) for name, table in jobs.items()]
+    return [job(name, presets.overlaid(common, table), path.parent) for name, table in jobs.items()]
 
 
 def _text(path):

@@ -10,7 +10,7 @@ import time
 import uuid
 from pathlib import Path
 
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
 
 BEAT, LOST = 20.0, 150.0
 """Seconds between signs of life, and without any until another machine's lock is taken for dead."""

@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Callable
 
-from envedit.errors import EnveditError
+from envedit.core.errors import EnveditError
 
 
 def add(parser: argparse.ArgumentParser) -> None:

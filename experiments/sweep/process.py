@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import envedit
-from envedit.errors import InputError
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import InputError
 
 from .jobs import Job
 from .locks import Lock
@@ -32,7 +32,7 @@ GRACE = 15.0
 LONGEST = 300
 """Characters of an error that is reported."""
 _USELESS = "the checkpoint cannot be read", "belongs to another configuration"
-"""What :mod:`envedit.checkpoint` says of a checkpoint that no further try can use."""
+"""What :mod:`envedit.solve.checkpoint` says of a checkpoint that no further try can use."""
 
 COMMAND = (
     "{python}",

@@ -13,9 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import image, inputs, latlong, metrics, scene
-from envedit.files import write_atomically
-from envedit.tonemap import luminance, tonemap
+from envedit import inputs
+from envedit.core import latlong
+from envedit.core.atomic_files import write_atomically
+from envedit.core.color import luminance, tonemap
+from envedit.images import images
+from envedit.losses import metrics
+from envedit.scene import scene
 
 from .plan import ANGLE, SCENES, Cell, Setting, job_of
 
@@ -63,8 +67,8 @@ class Judge:
         if found := self._kept(kept):
             return found
         full = folder / "edited_full.exr"
-        working = self._sized(image.read(str(folder / "edited.exr"))[0])
-        edited = self._sized(image.read(str(full))[0]) if full.exists() else working
+        working = self._sized(images.read(str(folder / "edited.exr"))[0])
+        edited = self._sized(images.read(str(full))[0]) if full.exists() else working
         own = json.loads((folder / "metrics.json").read_text())
         with open(folder / "history.csv", newline="") as file:
             losses = [float(row["loss"]) for row in csv.DictReader(file) if row.get("loss")]
@@ -117,7 +121,7 @@ class Judge:
         kept = self.out / f"bounds-{job_of(cell, Setting('bounds', '', {})).key}.json"
         if found := self._kept(kept):
             return found
-        original = self._sized(image.load_envmap(str(cell.file))[0])
+        original = self._sized(images.load_envmap(str(cell.file))[0])
         true = self.true(cell)[0]
         found = {
             "of": self._of,
@@ -138,7 +142,7 @@ class Judge:
     def true(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         """Return the true map (H, W, 3) and two independent renderings under it, (2, h, w, 3)."""
         if cell not in self._cells:
-            source = image.load_envmap(str(cell.file))[0]
+            source = images.load_envmap(str(cell.file))[0]
             true = self._sized(latlong.rotate(source, ANGLE))
             self._cells[cell] = true, self._halves(cell, true, self.true_spp, TRUE_SEED)
         return self._cells[cell]
@@ -172,7 +176,7 @@ def without_noise(halves: np.ndarray, wanted: np.ndarray) -> float:
 
     With a_1, a_2 and b_1, b_2 independent, E[(a_1 - b_1)(a_2 - b_2)] = (E a - E b)^2: their noise has no
     square in it. On display values, whose curve turns noise into a bias of second order. The estimate may
-    come out negative for equal pictures, which is the cap of :func:`envedit.metrics.psnr`.
+    come out negative for equal pictures, which is the cap of :func:`envedit.losses.metrics.psnr`.
     """
     a, b = tonemap(halves, "gamma"), tonemap(wanted, "gamma")
     square = float(np.mean((a[0] - b[0]) * (a[1] - b[1])))

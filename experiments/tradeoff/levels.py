@@ -1,4 +1,4 @@
-r"""Measure the levels of ``--budget``: what each costs and loses, for the table in ``envedit/budget.py``.
+r"""Measure the levels of ``--budget``: what each costs and loses, for the table in ``envedit/cli/budget.py``.
 
     ENVEDIT_DATA=... python -m experiments.tradeoff.levels [--out runs/levels] [--maps DIR]
 
@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import budget, config
+from envedit import config
+from envedit.cli import budget
 
 from . import measured
 from .judge import Judge
@@ -58,7 +59,7 @@ def run(cell, level, out: Path) -> tuple[dict, Path]:
 
 
 def parts(timing: dict) -> dict:
-    """Seconds of rendering, of tracing and search, and of all else, as :class:`envedit.budget.Level` has."""
+    """Seconds of rendering, of tracing and search, and of all else, as :class:`.budget.Level` has."""
     return {
         "rendering": timing["target_s"] + timing["judge_s"],
         "tracing": timing["transport_s"] + timing["start_s"],

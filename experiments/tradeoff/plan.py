@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit.errors import InputError
-from envedit.sources import overlaid
+from envedit.config.presets import overlaid
+from envedit.core.errors import InputError
 from experiments.sweep import Job, job
 
 MAPS = ("overcast_soil", "wasteland_clouds", "kloofendal_48d_partly_cloudy")

@@ -12,8 +12,8 @@ import json
 import sys
 from pathlib import Path
 
-from envedit.errors import EnveditError, InputError
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError, InputError
 
 from .analyse import TIMES, front, means, ratios, tables
 

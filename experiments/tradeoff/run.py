@@ -18,8 +18,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from envedit.errors import EnveditError, InputError
-from envedit.files import write_atomically
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import EnveditError, InputError
 from experiments.sweep import Job, options, sweep
 
 from . import plan
@@ -171,7 +171,7 @@ def collect(given, judge=None) -> dict:
 
 
 def _judge(given, out):
-    from envedit import doctor
+    from envedit.cli import doctor
 
     doctor.ensure("llvm_ad_rgb")
     import mitsuba as mi

@@ -1,0 +1,1 @@
+"""The command lines: the only part that prints and chooses exit codes."""

@@ -1,0 +1,331 @@
+"""Find out whether this machine can run envedit, and say what is missing where it cannot.
+
+Some LLVM releases load and compile small kernels, then abort the whole process at the first path-traced one
+(mitsuba 3.9.1 with LLVM 15 and 16: "Cannot select ... fminimum"). Nothing in Python can catch that, so a
+child process is the one to try: it selects the variant, traces a white environment over a grey plane, whose
+radiance is the plane's albedo, and reports step by step on its standard output. What it managed to say before
+it died, and its last words, are the diagnosis.
+
+    python -m envedit.doctor [--variant llvm_ad_rgb]        # exit code 0, or 4 with the remedy
+
+:func:`ensure` is for programs: it remembers a success in the user's cache folder until mitsuba, drjit or the
+LLVM library changes, so that later runs pay a millisecond.
+"""
+
+import argparse
+import contextlib
+import glob
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from envedit.core.atomic_files import write_atomically
+from envedit.core.errors import InputError, MachineError
+
+__all__ = ["Diagnosis", "check", "ensure", "main"]
+
+ALBEDO = 0.5
+_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+_TIMEOUT = 300  # seconds; a cold start on a loaded machine takes ten
+_MEND = "install a newer one (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
+# Where Dr.Jit and the dynamic loader find libraries; a change there ends the validity of a remembered probe.
+_LIBRARIES = (
+    "/usr/lib/*-linux-gnu/libLLVM*",
+    "/usr/lib64/libLLVM*",
+    "/usr/lib/libLLVM*",
+    "/usr/local/lib/libLLVM*",
+    "/opt/homebrew/opt/llvm/lib/libLLVM*",
+)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a probe found.
+
+    Attributes
+    ----------
+    ok : bool
+        True if the probe rendered the right picture.
+    lines : tuple of str
+        If not ok: what is wrong and how to mend it, in one or two lines.
+    versions : dict
+        What the probe came to know: ``mitsuba``, ``drjit``, ``llvm``, ``llvm_path``, ``radiance``, ...
+    """
+
+    ok: bool
+    lines: tuple[str, ...] = ()
+    versions: dict = field(default_factory=dict)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The parent
+
+
+def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
+    """Probe a variant in a child process and explain the outcome; never raises for a broken machine."""
+    if variant not in _VARIANTS:
+        wrong = f"envedit does not run on variant {variant!r}"
+        return Diagnosis(False, (wrong, f"use {' or '.join(_VARIANTS)}"))
+    for package in ("mitsuba", "drjit"):
+        if _version(package) is None:
+            return Diagnosis(False, (f"the package {package} is missing", f"run: pip install {package}"))
+    # The child finds this package even when it is a source checkout that lies elsewhere and is not installed.
+    root = str(Path(__file__).resolve().parents[2])
+    program = (
+        f"import sys; sys.path.append({root!r}); from envedit.cli import doctor; doctor._probe({variant!r})"
+    )
+    # A file, not a pipe, for stderr: LLVM's last words can be megabytes.
+    with tempfile.TemporaryFile() as errors:
+        try:
+            child = subprocess.run(
+                [sys.executable, "-c", program],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                timeout=_TIMEOUT,
+            )
+            code, output = child.returncode, child.stdout
+        except subprocess.TimeoutExpired as error:
+            code, output = None, error.stdout or b""
+        except OSError as error:
+            return Diagnosis(False, (f"cannot start {sys.executable}: {error.strerror or error}",))
+        errors.seek(0)
+        said = errors.read(200_000).decode(errors="replace")
+    versions = {}
+    for line in output.decode(errors="replace").splitlines():
+        with contextlib.suppress(ValueError):
+            found = json.loads(line)
+            versions |= found if isinstance(found, dict) else {}
+    if code == 0 and versions.get("done"):
+        radiance = versions.get("radiance")
+        if isinstance(radiance, float) and abs(radiance - ALBEDO) < 1e-3:
+            return Diagnosis(True, (), versions)
+        wrong = f"the self test computed {radiance}, not {ALBEDO}, with {_backend(variant, versions)}"
+        remedy = _MEND if variant.startswith("llvm") else "update the driver"
+        return Diagnosis(False, (wrong, remedy), versions)
+    return Diagnosis(False, _explain(variant, code, said, versions), versions)
+
+
+def ensure(variant: str = "llvm_ad_rgb") -> None:
+    """Raise MachineError unless this machine can run a variant; cheap after the first success.
+
+    A success is remembered in ``$XDG_CACHE_HOME/envedit`` (or ``~/.cache/envedit``) until the versions of
+    Python, mitsuba or drjit, the LLVM library used or those installed change. Only success is remembered. A
+    cache that cannot be written costs a probe every time and nothing else.
+    """
+    memory = _memory(variant)
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        known = json.loads(memory.read_text())
+        if known["ok"] is True and known["library"] == _stamp(known["library"][0]):
+            return
+    diagnosis = check(variant)
+    if not diagnosis.ok:
+        raise MachineError("\n".join(diagnosis.lines))
+    # A stamp of None (no library file is seen on this system) would never prove a change: then probe again.
+    if (stamp := _stamp(diagnosis.versions.get("llvm_path"))) or not variant.startswith("llvm"):
+        with contextlib.suppress(OSError, RuntimeError, InputError):
+            memory.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(memory, json.dumps({"ok": True, "library": stamp or [None]}).encode())
+
+
+def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple[str, str]:
+    """Turn how the child ended and what it said into one line of cause and one of remedy."""
+    backend = _backend(variant, versions)
+    library = os.environ.get("DRJIT_LIBLLVM_PATH")
+    errors = [line.strip() for line in said.splitlines() if line.strip()]
+    if code is None:
+        return f"the self test did not end in {_TIMEOUT} s with {backend}", "try again on an idle machine"
+    if variant.startswith("cuda"):
+        why = "no usable NVIDIA GPU or driver was found" if not versions.get("selected") else _last(errors)
+        return f"{variant}: {why}", 'use variant = "llvm_ad_rgb", or install the NVIDIA driver'
+    for line in errors:
+        if "is too old" in line:
+            found = line.partition("located LLVM version (")[2].partition(")")[0]
+            named = f" ({library}, from DRJIT_LIBLLVM_PATH)" if library else ""
+            return f"LLVM {found or 'here'}{named} is too old for this Dr.Jit", _MEND
+        if "Unable to load" in line and library:
+            detail = line.rpartition(": ")[2].rstrip("!")
+            return f"LLVM cannot be loaded from DRJIT_LIBLLVM_PATH={library}: {detail}", (
+                "correct or unset DRJIT_LIBLLVM_PATH, or run: apt-get install libllvm19"
+            )
+    if "LLVM backend is inactive" in said or "LLVM shared library" in said:
+        return "no LLVM library was found", _MEND
+    if code < 0 or "LLVM ERROR" in said:
+        name = f"exit code {code}"
+        with contextlib.suppress(ValueError):
+            name = signal.Signals(-code).name
+        words = next((": " + line[:60] for line in errors if "LLVM ERROR" in line), "")
+        return f"{backend} stops the process at the first rendering ({name}{words})", _MEND
+    return f"the self test failed with {backend}: {_last(errors)}", "see python -m envedit.doctor"
+
+
+def _backend(variant: str, versions: dict) -> str:
+    if variant.startswith("llvm"):
+        path = versions.get("llvm_path") or "path unknown"
+        return f"LLVM {versions.get('llvm', 'of unknown version')} ({path})"
+    return f"variant {variant}"
+
+
+def _last(lines: list[str]) -> str:
+    return lines[-1][:200] if lines else "it said nothing"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _memory(variant: str) -> Path:
+    """Return the file that remembers a success for this variant, these packages and these libraries."""
+    libraries = sorted(name for pattern in _LIBRARIES for name in glob.glob(pattern))
+    parts = [variant, sys.version, sys.executable, _version("mitsuba"), _version("drjit"), libraries]
+    parts += [os.environ.get(name) for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")]
+    key = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(home) / "envedit" / f"doctor-{key}.json"
+
+
+def _stamp(path: str | None) -> list | None:
+    """Return [path, size, modification time] of a library, [None] for none, None if it cannot be read."""
+    if path is None:
+        return [None]
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return [path, status.st_size, status.st_mtime_ns]
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The child
+
+
+def _probe(variant: str) -> None:
+    """Select the variant, render and multiply, saying what is known before each step that may be the last."""
+
+    def say(**facts):
+        print(json.dumps(facts), flush=True)
+
+    say(mitsuba=_version("mitsuba"), drjit=_version("drjit"))
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    dr.eval(mi.Float(1, 2) + 1)
+    library = None
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/self/maps").read_text().splitlines()
+        mapped = [line.split(None, 5)[-1].strip() for line in lines]
+        named = os.environ.get("DRJIT_LIBLLVM_PATH") or "libLLVM"
+        names = {os.path.basename(named), os.path.basename(os.path.realpath(named)), "libLLVM"}
+        library = next((m for m in mapped if any(n in os.path.basename(m) for n in names)), None)
+    facts = {"selected": True, "llvm_path": library}
+    if variant.startswith("llvm"):
+        facts["llvm"] = ".".join(map(str, dr.detail.llvm_version()))
+    say(**facts)
+
+    start = time.perf_counter()
+    radiance = _self_test(mi)
+    say(radiance=radiance, render_s=round(time.perf_counter() - start, 3))
+    say(gflops=_matmul_rate(mi, dr))
+    say(done=True)
+
+
+def _self_test(mi) -> float:
+    """Return the mean radiance of a plane of albedo 0.5 under a white map: 0.5, within the noise of 1e-3.
+
+    A convex diffuse surface under radiance 1 reflects its albedo. The light is an ``envmap`` and is found by
+    both of the integrator's strategies, so that the kernel is of the kind that stops the process with the
+    wrong LLVM.
+    """
+    import numpy as np
+
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "rgb", "filter": {"type": "box"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "envmap", "bitmap": mi.Bitmap(np.ones((8, 16, 3), np.float32))},
+            "plane": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(100),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": ALBEDO}},
+            },
+            "sensor": {"type": "perspective", "to_world": to_world, "film": film},
+        }
+    )
+    integrator = mi.load_dict({"type": "path", "max_depth": 3})
+    return float(np.array(mi.render(scene, integrator=integrator, spp=1024, seed=1)).mean())
+
+
+def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
+    """Return the rate of ``size`` x ``size`` matrix products in GFLOP/s, after one to compile."""
+    a = dr.full(mi.TensorXf, 1 / size, (size, size))
+    product = a @ a
+    dr.eval(product)
+    dr.sync_thread()
+    start = time.perf_counter()
+    for _ in range(repeats):
+        product = a @ product
+        dr.eval(product)
+    dr.sync_thread()
+    return round(2 * size**3 * repeats / (time.perf_counter() - start) / 1e9, 1)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The command line
+
+
+def main(arguments=None) -> int:
+    """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
+    about = "Say whether this machine can run envedit, and what is missing where it cannot."
+    parser = argparse.ArgumentParser(prog="python -m envedit.doctor", description=about)
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    print(f"python    {platform.python_version()} ({sys.executable})")
+    for package in ("mitsuba", "drjit", "OpenEXR", "numpy"):
+        print(f"{package.lower():9} {_version(package) or 'missing'}")
+    print(f"cores     {_cores()}")
+    print(f"memory    {_memory_size()}")
+    diagnosis = check(options.variant)
+    versions = diagnosis.versions
+    if "llvm" in versions:
+        print(f"llvm      {versions['llvm']} ({versions['llvm_path'] or 'path unknown'})")
+    if "radiance" in versions:
+        print(f"render    {versions['radiance']:.5f} for {ALBEDO} in {versions['render_s']} s with compiling")
+    if "gflops" in versions:
+        print(f"matmul    {versions['gflops']} GFLOP/s (256 x 256, float32)")
+    missing = [name for name in ("OpenEXR", "numpy") if _version(name) is None]
+    if diagnosis.ok and missing:
+        diagnosis = Diagnosis(False, (f"missing packages; run: pip install {' '.join(missing)}",))
+    print(f"{options.variant}: {'ready' if diagnosis.ok else 'cannot run envedit'}", flush=True)
+    for line in diagnosis.lines:
+        print(line, file=sys.stderr)
+    return 0 if diagnosis.ok else MachineError.exit_code
+
+
+def _cores() -> int:
+    with contextlib.suppress(AttributeError):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _memory_size() -> str:
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GB"
+    return "unknown"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""The command line of the fit: ``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set ...]``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+
+from envedit import config, inputs
+from envedit.cli import doctor
+from envedit.cli.progress import Progress
+from envedit.core.errors import EnveditError, unwrapped
+from envedit.images import images
+from envedit.losses import metrics
+from envedit.report import manifest, output_folder, preview
+from envedit.representations.siren import fit
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="envedit fit",
+        description="Fit a SIREN to an HDR map.",
+        epilog="example: envedit fit sky.hdr --preset draft",
+    )
+    parser.add_argument("map", metavar="MAP", help="EXR, Radiance HDR, or sunsky")
+    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: MAP_fit, here)")
+    parser.add_argument("--preset", choices=config.preset_names())
+    parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
+    arguments = parser.parse_args(argv)
+    try:
+        with unwrapped():
+            return _run(arguments)
+    except EnveditError as error:
+        print(f"envedit: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        goes_on = "running it again goes on where the fit was last kept"
+        print(f"envedit: interrupted; no results were written ({goes_on})", file=sys.stderr)
+        return 130
+
+
+def _run(arguments):
+    chosen = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
+    settings = config.loads("", Path.cwd(), "command line", arguments.preset, chosen)
+    doctor.ensure(settings.variant)
+    mi.set_variant(settings.variant)
+    original, warnings = inputs.load_map(settings.input)
+    folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
+    with output_folder.alone(folder):
+        output_folder.prepare_folder(folder, ("fit.json", "fitted.exr", "preview.png"), [arguments.map])
+        return _fit(arguments, settings, original, warnings, folder)
+
+
+def _fit(arguments, settings, original, warnings, folder):
+    """Fit, and leave the results in a folder."""
+    first, last = inputs.active_rows(settings.input.rows, original.shape[0])
+    crop = original[first : last + 1]
+    rows = first, original.shape[0]
+    with Progress() as progress:
+        progress.stage(f"fitting {arguments.map}")
+        fitted = fit.fit(
+            crop,
+            settings.representation,
+            settings.fit,
+            settings.seed,
+            rows,
+            folder=fit.default_folder(),
+            progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
+        )
+    params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
+    network = settings.representation
+    shape = crop.shape[:2]
+    x = fit.points(network, shape, rows)
+    got = fit.evaluate(params, fitted.normalisation, x, shape, network.omega).numpy()
+    about = {"source": arguments.map, "rows": f"{first} to {last}"}
+    images.write_exr(folder / "fitted.exr", got, about, panorama=len(got) == len(original))
+    preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
+    numbers = {
+        "log_psnr": fitted.log_psnr,
+        "peak_ratio": fitted.peak_ratio,
+        "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
+        "epochs": fitted.epochs,
+        "seconds": round(fitted.seconds, 2),
+        "cached": fitted.cached,
+    }
+    manifest.write_metrics(folder / "fit.json", numbers)
+    for line in warnings:
+        print(f"envedit: warning: {line}", file=sys.stderr)
+    quality, peak = (
+        "undefined" if number is None else f"{number:.{digits}f}"
+        for number, digits in ((fitted.log_psnr, 1), (fitted.peak_ratio, 2))
+    )
+    kept = " (kept from an earlier run)" if fitted.cached else ""
+    print(f"log-PSNR {quality} dB, peak ratio {peak}, {fitted.seconds:.1f} s{kept}; results in {folder}")
+    return 0

@@ -1,0 +1,43 @@
+"""Configuration: TOML to frozen dataclasses, with presets, checks and errors that name the key."""
+
+from envedit.config.schema import (
+    Config,
+    Fit,
+    Input,
+    Loss,
+    Optimizer,
+    Output,
+    Perceptual,
+    Renderer,
+    Representation,
+    Scene,
+    Target,
+    from_dict,
+    load,
+    loads,
+    parse_override,
+    preset_names,
+    quote,
+    to_toml,
+)
+
+__all__ = [
+    "Config",
+    "Fit",
+    "Input",
+    "Loss",
+    "Optimizer",
+    "Output",
+    "Perceptual",
+    "Renderer",
+    "Representation",
+    "Scene",
+    "Target",
+    "from_dict",
+    "load",
+    "loads",
+    "parse_override",
+    "preset_names",
+    "quote",
+    "to_toml",
+]

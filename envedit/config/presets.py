@@ -1,0 +1,155 @@
+"""Sources of a configuration's values: presets, file and overrides, checked and laid over one another.
+
+Each source is a nested dict with the tables and keys of the configuration. ``top`` and ``tables`` are the
+fields of :class:`envedit.config.schema.Config` and of its tables, by name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from pathlib import Path
+from typing import Any
+
+from envedit.config.validators import checked, show
+from envedit.core.errors import ConfigError
+
+Fields = dict[str, Any]
+
+# Presets are nested dicts of defaults. "paper" is Sec. 6 of the paper, every number of it spelled out even
+# where it is a default today; the path tracer's samples a pixel and the rendering's size are not in it.
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {
+        "input": {"width": 128},
+        "scene": {"width": 64},
+        "representation": {"hidden": 64},
+        "fit": {"epochs": 500},
+        "optimizer": {"iterations": 200},
+    },
+    "standard": {},
+    "paper": {
+        "input": {"width": 256, "rows": "upper"},
+        "scene": {"width": 256},
+        "representation": {"kind": "siren", "hidden": 256, "depth": 6, "omega": 30.0, "coordinates": "plane"},
+        "fit": {
+            "epochs": 1500, "lr": 5e-5, "schedule": "warm-restarts", "restart_period": 100,
+            "log_mse": 0.85, "log_ssim": 0.25, "hdr": 1e-2, "awp_gamma": 0.01, "awp_lr": 1e-4, "awp_every": 1,
+            "beta2": 0.999, "stride": 1, "headroom": 0.0, "polish": "never", "awp_until": 1.0, "light": 0.0,
+        },
+        "loss": {
+            "ssim": (1.0, 1e4), "luminance": (1e-4, 1e-8), "l1": (1e-4, 1e-8), "dists": 0.6,
+            "tv": 0.0, "change": 0.0, "image_l1": 0.0, "image_l2": 0.0,
+        },
+        "optimizer": {"iterations": 400, "lr": 5e-6, "beta2": 0.999, "schedule": "constant"},
+        "renderer": {"kind": "path", "spp": 16, "refresh": 1},
+    },
+}  # fmt: skip
+
+# Layers start near the end and have few parameters; a map of many parameters needs more steps, and the SSIM,
+# to which noise matters, to hold its structure together.
+MANY_PARAMETERS: dict[str, dict[str, Any]] = {
+    "draft": {"loss": {"ssim": 1.0}, "optimizer": {"iterations": 150}},
+    "standard": {"loss": {"ssim": 1.0}, "optimizer": {"iterations": 600}},
+    "paper": {},
+}
+
+# Paint need not be what any sky does: the map is held where the paint leaves it free. For the paper's method,
+# luminance weighs less, so that light may be added (Sec. 6.4; a tenth: the paper gives no number).
+PAINTED: dict[str, dict[str, Any]] = {
+    "draft": {"loss": {"change": 0.01}},
+    "standard": {"loss": {"change": 0.01}},
+    "paper": {"loss": {"luminance": (1e-5, 1e-9)}},
+}
+
+_PATHS = (
+    ("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"),
+    *(("perceptual", key) for key in ("vgg", "dists", "backbone", "heads")),
+)  # fmt: skip
+
+
+def checked_layer(layer: Any, where: str, top: Fields, tables: dict[str, Fields]) -> dict[str, Any]:
+    """Check every table, key and value that one source gives, and normalise the values."""
+    if not isinstance(layer, dict):
+        raise ConfigError(f"{where}: came {show(layer)}, wanted a table of tables")
+    found: dict[str, Any] = {}
+    try:
+        for name, value in layer.items():
+            if name in tables:
+                if not isinstance(value, dict):
+                    raise ConfigError(f"{name}: came {show(value)}, wanted a table, [{name}]")
+                found[name] = {}
+                for key, entry in value.items():
+                    if key not in tables[name]:
+                        raise ConfigError(_unknown(key, name, top, tables))
+                    found[name][key] = checked(tables[name][key], f"{name}.{key}", entry)
+            elif name in top:
+                found[name] = checked(top[name], name, value)
+            else:
+                raise ConfigError(_unknown(name, "", top, tables))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    return found
+
+
+def _unknown(key: Any, table: str, top: Fields, tables: dict[str, Fields]) -> str:
+    """Say that a key is unknown, with the nearest name: of its own table first, then of any other."""
+    own = tables[table] if table else top
+    text = key[:60] if isinstance(key, str) else ""
+    shown = key if text == key and re.fullmatch(r"[\w-]{1,60}", text) else show(key)
+    kind = f"[{table}] has no key {shown}" if table else f"unknown table or key {shown}"
+    if close := difflib.get_close_matches(text, own, 1):
+        return f"{kind}; did you mean {close[0]}?"
+    elsewhere = {k: f"{name}.{k}" for name, keys in tables.items() for k in keys} | {k: k for k in top}
+    if close := difflib.get_close_matches(text, elsewhere, 1, 0.8):
+        return f"{kind}; did you mean {elsewhere[close[0]]}?"
+    return f"{kind}; known: {', '.join(own)}"
+
+
+def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Lay one nested dict over another: tables are merged key by key, anything else is replaced."""
+    merged = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = overlaid(merged[key], value) if both else value
+    return merged
+
+
+def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Return a preset's defaults for the representation and the target that it, or what is given, names."""
+    chosen = PRESETS[preset]
+    asked = overlaid(chosen, given)
+    if asked.get("representation", {}).get("kind", "layers") != "layers":
+        chosen = overlaid(chosen, MANY_PARAMETERS[preset])
+    if asked.get("target", {}).get("kind", "envmap") != "envmap":
+        chosen = overlaid(chosen, PAINTED[preset])
+    return chosen
+
+
+def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, Any]:
+    """Settle ``target.file`` against ``rotate_degrees``: a source gives one of them, the last source wins."""
+    target = dict(merged.get("target", {}))
+    if target.get("kind", "envmap") == "envmap":
+        for where, source in sources.items():
+            given = source.get("target", {})
+            if given.get("file") and given.get("rotate_degrees"):
+                raise ConfigError(
+                    f"{where}: target.file and target.rotate_degrees: came both, wanted one: "
+                    "the other map, or the input turned"
+                )
+            if given.get("rotate_degrees"):
+                target["file"] = ""
+            elif "file" in given:
+                target["file"] = given["file"]
+    return target
+
+
+def resolve_paths(merged: dict[str, Any], base: Path, stem: str) -> None:
+    """Make the paths absolute in place; ``sunsky`` and the bare names of shipped scenes are no paths."""
+    output = dict(merged.get("output", {}))
+    output["dir"] = output.get("dir") or f"{stem}_out"
+    merged["output"] = output
+    for table, key in _PATHS:
+        value = merged.get(table, {}).get(key, "")
+        shipped = key == "file" and table == "scene" and Path(value).name == value and not Path(value).suffix
+        if value and not shipped and not (key == "envmap" and value == "sunsky"):
+            merged[table] = merged[table] | {key: str(base / value)}

@@ -1,0 +1,1 @@
+"""What everything stands on: errors, files, arrays, the texel grid, colour."""

@@ -1,0 +1,63 @@
+"""Files that are written whole or not at all."""
+
+import contextlib
+import os
+import re
+from pathlib import Path
+
+from envedit.core.errors import EnveditError, InputError
+
+
+@contextlib.contextmanager
+def replacing(path, suffix: str = ""):
+    """Give a temporary name in the same folder, and move what was written there to ``path`` at the end.
+
+    .. code-block:: python
+
+       with replacing("sky.exr", ".exr") as temporary:
+           library.write(str(temporary))
+
+    A reader sees the old file or the new one. If anything fails the old file stays and the temporary one is
+    removed.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; an existing one is replaced.
+    suffix : str
+        Ending of the temporary name, for libraries that read the format from it.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written: for an OSError, RuntimeError or ValueError (libraries raise any of
+        these) inside the block or while moving.
+    """
+    target = Path(os.fsdecode(path))
+    temporary = target.with_name(f".{target.name}.{os.getpid()}{suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except EnveditError:
+        raise
+    except (OSError, RuntimeError, ValueError) as e:
+        if not target.parent.is_dir():
+            reason = "its folder does not exist"
+        else:  # the libraries' texts name the temporary file; what follows the last stop is the cause
+            reason = (getattr(e, "strerror", None) or re.split(r"[:.] ", str(e))[-1]).strip(" .")
+        raise InputError(f"{target}: cannot be written ({reason}); check folder and free space") from None
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path, data: bytes) -> None:
+    """Write bytes as a file, whole or not at all; see :func:`replacing`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)

@@ -1,0 +1,77 @@
+"""Luminance, and the curves between linear radiance and what a display shows.
+
+Everything here is numpy on arrays of any shape. The losses take their luminance weights from here.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from envedit.core.errors import ConfigError
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Rec.709 weights of red, green and blue (Eq. 7)."""
+
+
+def luminance(image) -> np.ndarray:
+    """Return Rec.709 luminance float64 ``(...)`` of radiance ``(..., 3)``: 0.2126 R + 0.7152 G + 0.0722 B."""
+    image = np.asarray(image)
+    r, g, b = (np.float64(w) for w in LUMINANCE)  # float64, so that 3e38 does not overflow
+    return r * image[..., 0] + g * image[..., 1] + b * image[..., 2]
+
+
+def srgb_to_linear(t) -> np.ndarray:
+    """Undo the sRGB curve (IEC 61966-2-1) of display values in [0, 1]."""
+    t = np.clip(t, 0, 1)
+    return np.where(t <= 0.04045, t / 12.92, ((t + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(e) -> np.ndarray:
+    """Apply the sRGB curve (IEC 61966-2-1) to linear values, cut to [0, 1]."""
+    e = np.clip(e, 0, 1)
+    return np.where(e <= 0.0031308, 12.92 * e, 1.055 * e ** (1 / 2.4) - 0.055)
+
+
+LOG_SCALE = 100.0
+"""The "log" tonemap is linear well below 1/100 and logarithmic above; it ends at a radiance of 100."""
+
+TONEMAPS: dict[str, Callable] = {
+    "gamma": lambda e: np.clip(e, 0, 1) ** (1 / 2.2),
+    "srgb": linear_to_srgb,
+    "log": lambda e: np.log1p(LOG_SCALE * np.clip(e, 0, LOG_SCALE)) / math.log1p(LOG_SCALE**2),
+    "linear": lambda e: np.clip(e, 0, 1),
+}
+INVERSE_TONEMAPS: dict[str, Callable] = {
+    "gamma": lambda t: np.clip(t, 0, 1) ** 2.2,
+    "srgb": srgb_to_linear,
+    "log": lambda t: np.expm1(np.clip(t, 0, 1) * math.log1p(LOG_SCALE**2)) / LOG_SCALE,
+    "linear": lambda t: np.clip(t, 0, 1),
+}
+
+
+def tonemap(image, name: str = "gamma") -> np.ndarray:
+    """Map linear radiance to display values in [0, 1], element by element; NaN stays NaN.
+
+    - ``gamma``: clip(E, 0, 1)^(1/2.2)
+    - ``srgb``: the sRGB curve of clip(E, 0, 1)
+    - ``log``: log(1 + 100 E) / log(1 + 100^2) of clip(E, 0, 100), so that 1 maps to 0.50
+    - ``linear``: clip(E, 0, 1)
+
+    Raises
+    ------
+    ConfigError
+        If there is no such tonemap.
+    """
+    return _named(TONEMAPS, name)(np.asarray(image))
+
+
+def inverse_tonemap(image, name: str = "gamma") -> np.ndarray:
+    """Map display values back to linear radiance; what :func:`tonemap` has cut does not come back."""
+    return _named(INVERSE_TONEMAPS, name)(np.asarray(image))
+
+
+def _named(table, name):
+    if name not in table:
+        raise ConfigError(f"unknown tonemap '{name}'; use one of {', '.join(table)}")
+    return table[name]

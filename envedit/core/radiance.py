@@ -1,0 +1,178 @@
+"""What is wrong with an image: texels not finite, negative or cut; counted, named, mended, refused."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit.core.color import luminance
+from envedit.core.errors import InputError
+
+HALF_MAX = 65504.0
+"""The largest half: where many programs cut the sun."""
+BRIGHTEST = 2.0**100
+"""Radiance, 1.27e30, up to which logarithms, fluxes and sums of a map stay within single precision."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """What is in an image: texels of each kind, the first (row, column) of them, and the range of luminance.
+
+    A texel counts if any of its channels does, as negative only if all of them are finite. ``minimum`` and
+    ``maximum`` are over finite channel values; ``median`` is of finite luminance; ``dynamic_range`` is the
+    largest over the smallest positive luminance, 0.0 without any. Everything is finite, an image without
+    finite values has 0.0.
+    """
+
+    texels: int
+    nan: int
+    inf: int
+    negative: int
+    saturated: int
+    first_nan: tuple[int, int] | None
+    first_inf: tuple[int, int] | None
+    first_negative: tuple[int, int] | None
+    first_saturated: tuple[int, int] | None
+    minimum: float
+    maximum: float
+    median: float
+    dynamic_range: float
+
+    @property
+    def ok(self) -> bool:
+        """True when every value is finite and none is negative."""
+        return not (self.nan or self.inf or self.negative)
+
+    def summary(self) -> str:
+        """Return one line for a log or a report."""
+        kinds = (
+            (self.nan, "NaN", self.first_nan),
+            (self.inf, "infinite", self.first_inf),
+            (self.negative, "negative", self.first_negative),
+            (self.saturated, "at the largest half (65504)", self.first_saturated),
+        )
+        found = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if n]
+        stops = math.log2(self.dynamic_range) if self.dynamic_range > 0 else 0.0
+        spread = f"{self.minimum:.4g} to {self.maximum:.4g}, median {self.median:.4g}, {stops:.1f} stops"
+        return f"{self.texels} texels, {spread}; {', '.join(found) or 'nothing unusual'}"
+
+
+def health(image) -> Health:
+    """Count the NaN, infinite, negative and half-saturated texels of an image; see :class:`Health`."""
+    image = np.asarray(image)
+    finite = np.isfinite(image)
+    masks = {
+        "nan": any_channel(np.isnan(image)),
+        "inf": any_channel(np.isinf(image)),
+        "negative": any_channel(image < 0),
+        "saturated": any_channel(image == HALF_MAX),
+    }
+    clean = bool(finite.all())  # then nothing has to be copied
+    if not clean:
+        masks["negative"] &= ~any_channel(~finite)
+    fields = {}
+    for kind, mask in masks.items():
+        fields[kind] = int(mask.sum())
+        first = np.unravel_index(mask.argmax(), mask.shape)
+        fields[f"first_{kind}"] = (int(first[0]), int(first[1])) if fields[kind] else None
+    values = image if clean else image[finite]
+    y = luminance(image if clean else image[~any_channel(~finite)])
+    positive = y[y > 0]
+    return Health(
+        texels=image.shape[0] * image.shape[1],
+        minimum=float(values.min()) if values.size else 0.0,
+        maximum=float(values.max()) if values.size else 0.0,
+        median=float(np.median(y)) if y.size else 0.0,
+        dynamic_range=float(positive.max() / positive.min()) if positive.size else 0.0,
+        **fields,
+    )
+
+
+def any_channel(mask):
+    """Return where any channel of (H, W, 3) is set; numpy's own ``any(2)`` takes five times as long."""
+    return mask[..., 0] | mask[..., 1] | mask[..., 2]
+
+
+def require_radiance(image, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
+    """Refuse an image that holds anything but radiance: finite, not negative and at most ``brightest``.
+
+    Parameters
+    ----------
+    image : array (H, W, 3)
+        Linear radiance.
+    what : str
+        What the message calls it.
+    first_row : int
+        Row of its map at which the image begins; the message tells the map's rows.
+    brightest : float
+        The largest value that may be.
+
+    Raises
+    ------
+    InputError
+        With the number of texels of the first kind found, the first of them, and what to do.
+    """
+    image = np.asarray(image)
+    for bad, how, cure in (
+        (~np.isfinite(image), "not finite", "repair the map"),
+        (image < 0, "negative", "set them to 0"),
+        (image > brightest, f"brighter than {brightest:.3g}", "scale the map down"),
+    ):
+        if bad.any():
+            texels = any_channel(bad)
+            row, column = np.unravel_index(texels.argmax(), texels.shape)
+            where = f"the first at row {first_row + row}, column {column}"
+            raise InputError(f"{what}: {texels.sum()} texels are {how}, {where}: {cure}")
+
+
+def repair(image) -> tuple[np.ndarray, int]:
+    """Replace every non-finite texel by the mean of its finite neighbours.
+
+    The eight neighbours, columns periodic; holes are filled from their rim inwards. A texel with one bad
+    channel is replaced whole, as its other channels are no more to be trusted.
+
+    Parameters
+    ----------
+    image : array (H, W, 3)
+        The map; not changed.
+
+    Returns
+    -------
+    image : array (H, W, 3) float32
+        The same where it was finite.
+    count : int
+        Texels replaced.
+
+    Raises
+    ------
+    InputError
+        If no texel is finite.
+    """
+    with np.errstate(over="ignore"):
+        image = np.array(image, np.float32)
+    height, width = image.shape[:2]
+    good = ~any_channel(~np.isfinite(image))
+    count = int(good.size - good.sum())
+    if count == 0:
+        return image, 0
+    if count == good.size:
+        raise InputError(f"all {count} texels of the image are NaN or infinite: nothing to repair from")
+    steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    row, column = np.nonzero(~good)
+    while len(row):
+        total = np.zeros((len(row), 3))
+        weight = np.zeros(len(row))
+        for i, j in steps:
+            r, c = row + i, (column + j) % width
+            valid = (r >= 0) & (r < height) & good[np.clip(r, 0, height - 1), c]
+            total[valid] += image[r[valid], c[valid]]
+            weight += valid
+        rim = weight > 0
+        row, column = row[rim], column[rim]
+        image[row, column] = total[rim] / weight[rim, None]
+        good[row, column] = True
+        # Only neighbours of what was just filled can be next.
+        texel = [np.clip(row + i, 0, height - 1) * width + (column + j) % width for i, j in steps]
+        texel = np.unique(np.concatenate(texel))
+        row, column = np.divmod(texel[~good.ravel()[texel]], width)
+    return image, count

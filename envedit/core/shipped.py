@@ -1,0 +1,37 @@
+"""Scenes and configurations that come with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import envedit
+
+
+def folder() -> Path | None:
+    """Return the folder of the shipped files; None where the installation lacks them."""
+    package = Path(envedit.__file__).parent
+    # In a source checkout it lies beside the package, in an installed wheel inside it.
+    found = (parent / "scenes" for parent in (package, package.parent))
+    return next((path for path in found if (path / "sphere.xml").is_file()), None)
+
+
+def scenes() -> tuple[str, ...]:
+    """Name the shipped scenes: what ``[scene] file`` takes without a path."""
+    return tuple(sorted(path.stem for path in folder().glob("*.xml"))) if folder() else ()
+
+
+def configurations() -> tuple[str, ...]:
+    """Name the shipped configurations: what ``envedit run`` takes without a path."""
+    root = folder()
+    return tuple(sorted(str(p.relative_to(root))[:-5] for p in root.rglob("*.toml"))) if root else ()
+
+
+def configuration(name: str) -> Path | None:
+    """Return the file of a shipped configuration; None if none has that name."""
+    return folder() / f"{name}.toml" if name in configurations() else None
+
+
+def holds(path: Path) -> bool:
+    """Tell whether a file is one of the shipped ones."""
+    root = folder()
+    return root is not None and path.resolve().is_relative_to(root.resolve())

@@ -1,0 +1,1 @@
+"""An edit carried to the resolution of the source file."""

@@ -1,0 +1,218 @@
+"""What was done to a working map, done to its source: for edits of which nothing else is known.
+
+See :func:`.full_resolution.carry` for what is kept and how closely.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import flat
+from envedit.export.texel_maps import Places, as_image
+
+MODERATE = 4.0
+"""Largest ratio by which a texel of the source is scaled."""
+TOLERANCE = 0.005
+"""Of the means of working texels, relative to their radiance; see :func:`.full_resolution.carry`."""
+LEAST = 1e-3
+"""Radiance, relative to the mean of the edited map, that the tolerance is relative to at least."""
+ROUNDS = 3, 3
+"""Most corrections of the means: of what is interpolated, and of working texels one by one."""
+
+
+class Ratio:
+    """What was done to a working map, applied to its source; see :func:`.full_resolution.carry`."""
+
+    def __init__(self, original, edited, rows, free, grid: Places):
+        self.grid = grid
+        self.old, self.want = (np.asarray(e, np.float64)[rows] for e in (original, edited))
+        self.changed = (np.asarray(original)[rows] != np.asarray(edited)[rows]).any(axis=2)
+        if free is not None:
+            self.changed &= free
+        height, width = grid.shape
+        whole = np.shape(edited)[:2]
+        self.same_size = height <= whole[0] or width <= whole[1]
+        self._overlaps(whole, rows)
+        if self.same_size:
+            target = np.asarray(edited) if grid.shape == whole else latlong.resize(edited, height, width)
+            self.target = np.asarray(target, np.float32)
+            return
+        with np.errstate(divide="ignore", over="ignore"):
+            ratio = np.where(
+                self.old > 0, self.want / np.maximum(self.old, 1e-30), 1 + 1e30 * (self.want > 0)
+            )
+        ratio = np.where(self.changed[..., None], ratio, 1.0)
+        self.m = np.minimum(ratio, MODERATE)
+        taken = _most_around(-np.log2(np.maximum(ratio.min(axis=2), 1e-30)))
+        given = _most_around(np.log2(np.maximum(ratio.max(axis=2), 1e-30)))
+        replaced, added = _step(taken - 1), _step(given - 1)
+        self.parts = np.stack([replaced, added * (1 - replaced)], axis=2)
+        self.wanted = _Linear(np.where(self.changed[..., None], self.want, self.old))
+        self.more = _Linear(np.where(self.changed[..., None], self.want - self.old, 0))
+        self.fix = np.ones(self.m.shape), np.zeros(self.m.shape)
+        self.fixed = False
+
+    def _overlaps(self, whole, rows):
+        """Find the working rows and columns that the source's overlap, and the weights of a mean."""
+        (height, width), (total, columns) = self.grid.shape, whole
+        # As latlong.row_edges has them, in rows of the working map.
+        edges = (
+            np.clip((np.arange(height + 1) - 0.5) * ((total - 1) / (height - 1)), 0, total - 1) - rows.start
+        )
+        few = height < 2 * total
+        low, high = np.floor(edges[:-1] + 0.5 + 1e-9), np.ceil(edges[1:] - 0.5 - 1e-9)
+        self.rows = [np.int64(self.grid.row if few else v) for v in (low, high)]
+        across = np.arange(width + 1) * (columns / width)
+        few = width < 2 * columns
+        low, high = np.floor(across[:-1] + 1e-9), np.ceil(across[1:] - 1e-9) - 1
+        self.columns = [np.int64(self.grid.column if few else v) for v in (low, high)]
+        v = latlong.row_edges(height)
+        target = latlong.row_edges(total)[rows.start : rows.stop + 1]
+        cap = np.sin(np.pi / 2 * np.clip(v, target[:-1, None], target[1:, None])) ** 2
+        weights = np.diff(cap, axis=1)
+        self.down = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+        target = np.arange(columns + 1) / columns
+        weights = np.diff(np.clip(np.arange(width + 1) / width, target[:-1, None], target[1:, None]), axis=1)
+        self.over = (weights / weights.sum(axis=1, keepdims=True)).T
+
+    def correct(self, source):
+        """Correct m and a until the means of the changed working texels are the edited map's."""
+        if self.same_size or not self.changed.any():
+            return
+        least = LEAST * float(self.want.mean())
+        for step in range(sum(ROUNDS)):
+            mean = self._means(source)
+            off = np.abs(mean - self.want) > TOLERANCE * np.maximum(self.want, least)
+            off &= self.changed[..., None]
+            if not off.any():
+                return
+            ratio = np.where(mean > 0, self.want / np.maximum(mean, 1e-30), np.inf)
+            scaled = ratio <= 2
+            m = np.where(off & scaled, ratio, 1.0)
+            a = np.where(off & ~scaled, self.want - mean, 0.0)
+            if step < ROUNDS[0]:
+                self.m = self.m * m
+            else:
+                self.fix, self.fixed = (self.fix[0] * m, self.fix[1] * m + a), True
+
+    def _means(self, source):
+        """Mean of the result over each active working texel, as :func:`.latlong.resize` makes it."""
+        height, width = self.grid.shape
+        sums = np.zeros((*self.changed.shape, 3))
+        for start, fresh, size in self.grid.bands():
+            made = self.band(source[start : start + size], start)[fresh - start :]
+            sums += self._mean_of(made, fresh)
+        # Rows that reach out of the active ones: what lies there is the source's.
+        for part in (range(max(self.grid.start - 1, 0), self.grid.start), range(self.grid.stop, height)):
+            for row in part:
+                if not self.down[:, row].any():
+                    break
+                sums += self._mean_of(source[row : row + 1], row)
+        return sums
+
+    def _mean_of(self, made, start):
+        weights = self.down[:, start : start + len(made)]
+        used = np.flatnonzero(weights.any(axis=1))
+        result = np.zeros((*self.changed.shape, 3))
+        if len(used):
+            part = (weights[used] @ made.reshape(len(made), -1)).reshape(len(used), -1, 3)
+            result[used] = np.einsum("rwc,wk->rkc", part.astype(np.float64), self.over, optimize=True)
+        return result
+
+    def band(self, source, start):
+        """Compose the rows of a source that begin at ``start``."""
+        size = len(source)
+        low, high = (r[start : start + size] for r in self.rows)
+        inside = (low >= 0) & (high < len(self.changed))
+        top, bottom = (self.changed[np.clip(r, 0, len(self.changed) - 1)] for r in (low, high))
+        changed = top & bottom & inside[:, None]
+        changed = changed[:, self.columns[0]] & changed[:, self.columns[1]]
+        if not changed.any():
+            return source
+        if self.same_size:
+            return np.where(changed[..., None], self.target[start : start + size], source)
+        row, column = self.grid.texels(size)
+        near = self.grid.row[start : start + size]
+
+        def smooth(values):
+            table = flat(mi.Float, self.grid.along_rows(values, start, size))
+            return self.grid.across(mi.Color3f, table, row, column)
+
+        def nearest(values):
+            table = flat(mi.Float, values[near].astype(np.float32))
+            return self.grid.nearest(mi.Color3f, table, row, column)
+
+        image = dr.unravel(mi.Color3f, flat(mi.Float, source))
+        made = image * smooth(self.m)
+        if self.parts[max(near[0] - 1, 0) : near[-1] + 2].any():  # rows between which is interpolated
+            table = flat(mi.Float, self.grid.along_rows(self.parts, start, size))
+            replaced, added = self.grid.across(mi.Vector2f, table, row, column)
+            over = self.grid.beside(column)
+
+            def linear(field):
+                mean, slope = (flat(mi.Float, t) for t in field.along_rows(*places))
+                mean, slope = (self.grid.nearest(mi.Color3f, t, row, column) for t in (mean, slope))
+                return mean + slope * over
+
+            last = len(self.changed) - 1
+            places = [np.clip(r, 0, last) for r in (low, high)], self.grid.place[start : start + size]
+            made += (image + linear(self.more) - made) * added + (linear(self.wanted) - made) * replaced
+            made = dr.maximum(made, 0)
+        if self.fixed:
+            made = made * nearest(self.fix[0]) + nearest(self.fix[1])
+        made = dr.select(flat(mi.Bool, changed), made, image)
+        return as_image(made, size, self.grid.shape[1]).numpy()
+
+
+def _most_around(values):
+    """Most of each texel (rows, w) and its 8 neighbours, columns periodic."""
+    padded = np.pad(values, ((1, 1), (0, 0)), mode="edge")
+    down = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(np.roll(down, 1, axis=1), down), np.roll(down, -1, axis=1))
+
+
+def _step(x):
+    """0 up to 0, 1 from 1 on, smooth between."""
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+class _Linear:
+    """A field that is linear within every texel, with the texel's value as its mean and no new extremes.
+
+    The slope is the mean of the differences to both sides, at most twice the smaller one, 0 at an extreme
+    (van Leer 1977): where a texel is a thousand times as bright as the next, nothing leaks.
+    """
+
+    def __init__(self, values):
+        self.value = values
+        padded = np.pad(values, ((1, 1), (0, 0), (0, 0)), mode="edge")
+        self.down = self._slope(values - padded[:-2], padded[2:] - values)
+        self.over = self._slope(values - np.roll(values, 1, axis=1), np.roll(values, -1, axis=1) - values)
+        # In a corner both add up: it keeps a tenth of the mean, or it would be a black dot.
+        steep = np.abs(self.down) + np.abs(self.over)
+        held = np.minimum(1.8 * np.abs(values) / np.maximum(steep, 1e-30), 1)
+        self.down, self.over = self.down * held, self.over * held
+
+    def along_rows(self, rows, place):
+        """Mean and slope to the right, (R, w, 3) each, at rows of a finer image.
+
+        ``rows`` are the first and the last row that each overlaps: one that lies in two takes the lesser of
+        both, so that the light of a bright one is not counted for a dark one.
+        """
+        means = [self.value[r] + self.down[r] * np.clip(place - r, -0.5, 0.5)[:, None, None] for r in rows]
+        slopes = [self.over[r] for r in rows]
+        return [_lesser(*both).astype(np.float32) for both in (means, slopes)]
+
+    @staticmethod
+    def _slope(a, b):
+        size = np.minimum(np.minimum(np.abs(a), np.abs(b)) * 2, np.abs(a + b) / 2)
+        return np.where(a * b > 0, np.sign(a) * size, 0.0)
+
+
+def _lesser(a, b):
+    """Return the one nearer to 0 of two of one sign, else 0."""
+    return np.where(a * b > 0, np.where(np.abs(a) < np.abs(b), a, b), 0.0)

@@ -1,0 +1,1 @@
+"""Pictures and maps: read, checked, resized and written."""

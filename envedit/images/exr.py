@@ -1,0 +1,143 @@
+"""OpenEXR files: which part and channels are a picture, and their pixels as float32."""
+
+import re
+
+import numpy as np
+
+from envedit.core.errors import InputError
+from envedit.core.quiet_libraries import quiet_libraries
+from envedit.images.headers import MAX_TEXELS, check_declared, damaged, shown
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities of red, green, blue and white (D65), as the OpenEXR attribute orders them."""
+
+_MOST_VALUES = 4 * MAX_TEXELS  # over all channels: colour and alpha of the largest
+_MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
+
+
+def read(name, head, info, stored):
+    """Decode a file; arguments as in :mod:`.headers`."""
+    import OpenEXR
+
+    try:
+        with quiet_libraries():
+            parts = OpenEXR.File(name, header_only=True).parts
+    except Exception as e:  # the library raises bare RuntimeError for anything
+        raise damaged(name, e) from None
+    windows = [_window(p.header["dataWindow"]) for p in parts]
+    for _, _, width, height in windows:
+        check_declared(name, width, height)
+    if sum(w * h for _, _, w, h in windows) > MAX_TEXELS:  # the library decodes every part
+        raise InputError(
+            f"{name}: its {len(parts)} parts hold more than {MAX_TEXELS} texels; save only colour"
+        )
+    counts = [len(p.header["channels"]) for p in parts]  # and every channel
+    if sum(w * h * n for (_, _, w, h), n in zip(windows, counts, strict=True)) > _MOST_VALUES:
+        many = f"its {sum(counts)} channels hold more than {_MOST_VALUES} values"
+        raise InputError(f"{name}: {many}; save only colour")
+    for part, (_, _, width, height) in zip(parts, windows, strict=True):
+        tile = part.header.get("tiles")
+        if tile is not None and tile.xSize * tile.ySize > max(width * height, _MOST_TILE):
+            raise InputError(
+                f"{name}: the header declares tiles of {tile.xSize} x {tile.ySize} texels for an image of "
+                f"{width} x {height}; the file is damaged, or has to be saved in scanlines"
+            )
+    index, names = _choose_channels(name, [p.header for p in parts], info)
+    header = parts[index].header
+    if stored:
+        layer = names[0].rpartition(".")[0]
+        beside = [c for c in header["channels"] if c.name.rpartition(".")[0] == layer]
+        alpha = [c for c in beside if c.name.rpartition(".")[2].upper() == "A"]
+        names += [c.name for c in alpha if c.xSampling == c.ySampling == 1]
+
+    # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
+    try:
+        with quiet_libraries() as said:
+            decoded = OpenEXR.File(name, separate_channels=True)
+            channels = decoded.parts[index].channels if len(decoded.parts) == len(parts) else None
+            planes = None if channels is None else [np.array(channels[c].pixels, np.float32) for c in names]
+    except MemoryError:
+        raise
+    except Exception as e:
+        raise damaged(name, e) from None
+    left, top, width, height = windows[index]
+    # A part that cannot be decoded is dropped with a printed warning, and the others move up.
+    # The decoder of JPEG 2000 says that a stream ended early, and fills up with what it likes.
+    early = "terminated early" in (said[0] if said else "")
+    if planes is None or early or any(p.shape != (height, width) for p in planes):
+        raise damaged(name, said and said[0] or "not all of its parts could be decoded")
+    display = _window(header["displayWindow"])
+    if stored and len(planes) in (1, 3) and windows[index] != display:
+        planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
+    image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
+    _describe(header, info)
+    return _to_display(image, (left, top), display, name, info)
+
+
+def _window(box):
+    """Return (left, top, width, height) of an inclusive OpenEXR box."""
+    (x0, y0), (x1, y1) = ([int(c) for c in corner] for corner in box)
+    return x0, y0, x1 - x0 + 1, y1 - y0 + 1
+
+
+def _choose_channels(name, headers, info):
+    """Return the first part with colour and its channel names, three or (luminance) one."""
+    seen = []
+    for index, header in enumerate(headers):
+        if "deep" in str(header.get("type", "")).lower():
+            seen.append("deep data")
+            continue
+        channels = {c.name: c for c in header["channels"]}
+        seen.extend(channels)
+        layers = {}
+        for full in channels:
+            layer, _, short = full.rpartition(".")
+            layers.setdefault(layer, {})[short.upper()] = full
+        # Unnamed channels first, then a layer that calls itself the picture, then the order of the file.
+        colour = [k for k, v in layers.items() if {"R", "G", "B"} <= v.keys()]
+        colour.sort(key=lambda k: (k != "", not re.search("combined|beauty|rgba", k.lower())))
+        if colour:
+            names = [layers[colour[0]][c] for c in "RGB"]
+            if len(colour) > 1:
+                chosen = shown(colour[0]) or "R, G, B"
+                info["warnings"].append(f"{len(colour)} colour layers: '{chosen}' was read")
+        else:
+            grey = [v["Y"] for v in layers.values() if "Y" in v and not {"RY", "BY", "X", "Z"} & v.keys()]
+            if not grey:
+                continue
+            names = grey[:1]
+            info["warnings"].append(f"only luminance ('{shown(names[0])}'): read as grey")
+        if any(channels[c].xSampling != 1 or channels[c].ySampling != 1 for c in names):
+            raise InputError(f"{name}: subsampled channels are not supported; save R, G, B in full")
+        return index, names
+    found = ", ".join(shown(channel, 30) for channel in seen[:12])
+    raise InputError(f"{name}: no R, G, B channels (found: {found}); save it as RGB")
+
+
+def _describe(header, info):
+    """Take over the header's plain attributes, and warn of a colour space or projection we would misread."""
+    info["metadata"] = {k: v for k, v in header.items() if isinstance(v, str | int | float)}
+    primaries = header.get("chromaticities")
+    if primaries is not None and not np.allclose(primaries, REC709, atol=2e-3):
+        info["warnings"].append("its primaries are not Rec.709: values are used as they are, hues may be off")
+    if "CUBE" in str(header.get("envmap", "")):
+        info["warnings"].append("it is marked as a cube map: read as if it were lat-long")
+
+
+def _to_display(image, corner, display, name, info):
+    """Place the data window in the display window; what is not stored is black."""
+    left, top, width, height = display
+    if corner == (left, top) and image.shape[:2] == (height, width):
+        return image
+    check_declared(name, width, height)
+    info["warnings"].append(
+        f"data window {image.shape[1]} x {image.shape[0]} at {corner[0]}, {corner[1]} differs from the "
+        f"display window {width} x {height} at {left}, {top}: cropped, or filled with black"
+    )
+    whole = np.zeros((height, width, image.shape[2]), np.float32)
+    y, x = corner[1] - top, corner[0] - left
+    y0, x0 = max(y, 0), max(x, 0)
+    y1, x1 = min(y + image.shape[0], height), min(x + image.shape[1], width)
+    if y1 > y0 and x1 > x0:
+        whole[y0:y1, x0:x1] = image[y0 - y : y1 - y, x0 - x : x1 - x]
+    return whole

@@ -1,0 +1,60 @@
+"""What the decoders share: a file's first bytes, the sizes that a header may declare, errors of damage.
+
+Each decoder (:mod:`.exr`, :mod:`.rgbe`, :mod:`.ldr`) has a function ``read`` that takes the file's name, its
+first bytes, the ``info`` of :func:`.images.read`, which it fills, and whether the pixels are wanted as stored
+(:func:`.images.read_stored`). Damage is reported as ``InputError`` or left to the caller as the library's own
+exception.
+"""
+
+import os
+import stat
+
+from envedit.core.errors import EnveditError, InputError
+
+MAX_SIDE = 32768
+MAX_TEXELS = 2**27
+"""16384 x 8192 texels: 1.6 GB as float32. A header that declares more is refused before allocation."""
+
+
+def head_of(name):
+    """Return the first bytes of a regular file."""
+    try:
+        mode = os.stat(name).st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(f"{name}: is a folder; name an image file")
+        if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
+            raise InputError(f"{name}: is not a regular file; name an image file")
+        with open(name, "rb") as file:
+            head = file.read(1 << 16)
+    except FileNotFoundError:
+        raise InputError(f"{name}: no such file; check the path") from None
+    except (OSError, ValueError) as e:
+        if isinstance(e, EnveditError):
+            raise
+        raise InputError(f"{name}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
+    if not head:
+        raise InputError(f"{name}: the file is empty; export or download it again")
+    return head
+
+
+def check_declared(name, width, height):
+    """Refuse a size before memory is asked for."""
+    if width < 1 or height < 1:
+        raise InputError(f"{name}: the header declares {width} x {height} texels; the file is damaged")
+    if max(width, height) > MAX_SIDE or width * height > MAX_TEXELS:
+        raise InputError(
+            f"{name}: the header declares {width} x {height} texels, more than {MAX_SIDE} on a side or "
+            f"{MAX_TEXELS} in all; the file is damaged, or has to be made smaller"
+        )
+
+
+def damaged(name, reason):
+    """Return the error for a file that starts well and cannot be decoded."""
+    reason = shown(" ".join(str(reason).split()), 160) or "no reason given"
+    return InputError(f"{name}: damaged or truncated ({reason}); export or download it again")
+
+
+def shown(text, most=60):
+    """Return text of a file for a message: cut to ``most`` characters, without control codes."""
+    text = text[:most]
+    return text if text.isprintable() else ascii(text)[1:-1][:most]

@@ -1,0 +1,328 @@
+"""HDR images: read, check, write.
+
+An image is a float32 array ``(H, W, 3)`` of linear radiance with Rec.709 primaries. Problems that a user can
+mend raise ``InputError`` with the file's name; what is merely odd goes to ``info["warnings"]``, a list of
+sentences.
+"""
+
+import os
+import sys
+import zlib
+
+import numpy as np
+
+from envedit.core import latlong, radiance
+from envedit.core.atomic_files import replacing, write_atomically
+from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError
+from envedit.core.quiet_libraries import quiet_libraries
+from envedit.images import exr, ldr, rgbe
+from envedit.images.exr import REC709
+from envedit.images.headers import MAX_SIDE, damaged, head_of
+
+FORMATS = (
+    ("exr", b"\x76\x2f\x31\x01", exr.read),
+    ("hdr", b"#?", rgbe.read),
+    ("png", b"\x89PNG\r\n\x1a\n", ldr.read),
+    ("jpeg", b"\xff\xd8\xff", ldr.read),
+)
+"""Kind, first bytes and decoder of every format."""
+
+__all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_png"]
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Reading
+
+
+def read(path) -> tuple[np.ndarray, dict]:
+    """Read an image file as linear radiance.
+
+    The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; layers; the
+    first part with colour; luminance-only files become grey), Radiance HDR, and PNG or JPEG, whose sRGB curve
+    is undone. Alpha is left out. Values are as stored: they may be negative or not finite, see
+    :func:`envedit.core.radiance.health`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    image : array (H, W, 3) float32
+        Linear radiance.
+    info : dict
+        ``path`` (str), ``format`` ("exr", "hdr", "png" or "jpeg"), ``size`` (width, height), ``hdr`` (False
+        for 8- and 16-bit pictures), ``metadata`` (dict of str, int and float) and ``warnings`` (list of str).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, empty, truncated, of another kind, or declares more than 32768 texels on a
+        side or 2^27 in all.
+    """
+    return _decode(path, stored=False)
+
+
+def read_stored(path) -> tuple[np.ndarray, dict]:
+    """Read an image file as it was painted: with alpha, and without undoing any display curve.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    pixels : array (H, W, C)
+        float32 linear radiance for OpenEXR and Radiance; uint8 or uint16 codes of display values for PNG
+        and JPEG. C is 1 (grey), 2 (grey and alpha), 3 (RGB) or 4 (RGB and alpha). Alpha is premultiplied in
+        OpenEXR and straight in PNG, by convention.
+    info : dict
+        As of :func:`read`; ``metadata`` holds a PNG's texts. A JPEG also has ``quality``, as libjpeg
+        counts it, estimated from its first table.
+
+    Raises
+    ------
+    InputError
+        As :func:`read`, and if the picture is marked to be turned (EXIF orientation).
+    """
+    pixels, info = _decode(path, stored=True)
+    if (orientation := info.pop("orientation", 1)) not in (0, 1):
+        raise InputError(
+            f"{info['path']}: is marked as turned (EXIF orientation {orientation}), which is not undone: "
+            "save it upright, without that mark"
+        )
+    profile = info.pop("profile", b"sRGB").replace(b"\0", b"")  # its name may be UTF-16
+    if b"sRGB" not in profile or b"inear" in profile:
+        info["warnings"].append(
+            "its colour profile is not sRGB: values are used as they are, hues may be off"
+        )
+    return pixels, info
+
+
+def _decode(path, stored):
+    name = os.fsdecode(path)
+    head = head_of(name)
+    info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
+    for kind, magic, reader in FORMATS:
+        if head.startswith(magic):
+            info["format"] = kind
+            try:
+                image = reader(name, head, info, stored)
+            except MemoryError:
+                raise InputError(f"{name}: not enough memory to read this image; make it smaller") from None
+            except EnveditError:
+                raise
+            except OSError as e:
+                raise InputError(f"{name}: cannot be read ({e.strerror or e})") from None
+            except (LookupError, TypeError, ValueError, RuntimeError) as e:
+                # Damage reaches header fields as well: names that are no text, windows of another type.
+                raise damaged(name, f"{type(e).__name__}: {e}") from None
+            info["size"] = (image.shape[1], image.shape[0])
+            return image, info
+    raise InputError(f"{name}: not an image envedit can read; use OpenEXR or Radiance HDR (or PNG, JPEG)")
+
+
+def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[np.ndarray, dict]:
+    """Read a lat-long environment map, check it, and bring it to a working width.
+
+    Parameters
+    ----------
+    path : path-like
+        An image of 2:1.
+    width : int, optional
+        Working width in texels, even and at least 6; the height is half of it. Without, the file's own size.
+    repair : bool
+        Replace NaN and infinite texels instead of refusing them.
+
+    Returns
+    -------
+    image : array (width / 2, width, 3) float32
+        Linear radiance, finite and not negative.
+    info : dict
+        As of :func:`read` (``size`` is the file's), with ``health`` (:class:`.radiance.Health` of the file's
+        values) and ``repaired`` and ``clipped`` (numbers of texels).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is not 2:1, is smaller than 6 x 3, or holds texels that are not finite.
+    ConfigError
+        If ``width`` is odd or less than 6.
+    """
+    if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
+        raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
+    image, info = read(path)
+    name, warnings = info["path"], info["warnings"]
+    rows, columns = image.shape[:2]
+    if columns != 2 * rows:
+        raise InputError(f"{name}: a lat-long map is 2:1, this is {columns} x {rows}; crop or resize it")
+    if rows < latlong.MIN_HEIGHT:
+        raise InputError(f"{name}: {columns} x {rows} texels are too few for a map; use at least 6 x 3")
+    found = info["health"] = radiance.health(image)
+    info["repaired"], info["clipped"] = 0, found.negative
+    if found.nan or found.inf:
+        row, column = min(p for p in (found.first_nan, found.first_inf) if p)
+        bad = int(radiance.any_channel(~np.isfinite(image)).sum())
+        where = f"{bad} texels are NaN or infinite, the first at row {row}, column {column}"
+        if not repair:
+            raise InputError(f"{name}: {where}; repair the map, or ask for repair")
+        try:
+            image, info["repaired"] = radiance.repair(image)
+        except InputError as e:
+            raise InputError(f"{name}: {e}") from None
+        warnings.append(f"{where}: replaced from their neighbours")
+    if found.negative:
+        row, column = found.first_negative
+        warnings.append(
+            f"{found.negative} texels are negative (down to {found.minimum:.3g}), the first at row {row}, "
+            f"column {column}: set to 0"
+        )
+    image = np.maximum(image, 0)  # also turns -0.0 into 0
+    if found.saturated:
+        row, column = found.first_saturated
+        warnings.append(
+            f"{found.saturated} texels sit at 65504, the largest half, the first at row {row}, "
+            f"column {column}: the light was cut when the file was saved"
+        )
+    if not image.any():
+        warnings.append("the map is black: it lights nothing")
+    if width is not None:
+        if width > columns:
+            warnings.append(f"enlarged from {columns} to {width} texels across: no detail is added")
+        image = latlong.resize(image, width // 2, width)
+    return image, info
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Writing
+
+
+def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) -> None:
+    """Write an image as a float32 OpenEXR file, whole or not at all.
+
+    Marked as lat-long, unless it is no ``panorama``, with Rec.709 primaries.
+    Written under another name in the same folder and then renamed.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; an existing one is replaced.
+    image : array (H, W, 3)
+        Linear radiance, finite in float32. Never written as half: 65504 is less than many a sun.
+    metadata : dict, optional
+        Attributes to add (str, int or float; anything else as its text), such as ``{"source": "sky.hdr"}``.
+    panorama : bool
+        Mark it as a lat-long map, which some viewers show as a sphere.
+
+    Raises
+    ------
+    NumericalError
+        If a value is not finite in float32; names the first texel.
+    InputError
+        If the file cannot be written.
+    """
+    import OpenEXR
+
+    name = os.fsdecode(path)
+    image = _checked(name, image)
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": REC709,
+        **({"envmap": OpenEXR.ENVMAP_LATLONG} if panorama else {}),
+        "software": f"envedit {_version()}",
+    }
+    reserved = {"channels", "dataWindow", "displayWindow", "envmap", "lineOrder", "name", "tiles", "view"}
+    reserved |= header.keys() - {"software"}
+    for key, value in (metadata or {}).items():
+        if key in reserved or not 0 < len(str(key)) < 256:
+            raise ConfigError(f"{name}: '{key}' cannot be used as the name of a metadata attribute")
+        plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
+        header[str(key)] = value if plain else str(value)
+    planes = {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}
+    _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
+
+
+def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
+    """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel, whole or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; an existing one is replaced.
+    image : array (H, W, 3) or (H, W)
+        Display values, already tonemapped; values outside [0, 1] are cut.
+    bits : int
+        8 or 16.
+    metadata : dict, optional
+        Texts to add, as ``tEXt`` chunks.
+
+    Raises
+    ------
+    NumericalError, InputError
+        As :func:`write_exr`.
+    """
+    name = os.fsdecode(path)
+    image = np.asarray(image)
+    image = _checked(name, np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image)
+    codes = np.rint(np.clip(image, 0, 1) * np.float32(2**bits - 1))
+    data = png(codes.astype({8: np.uint8, 16: np.uint16}[bits]))
+    # By hand: Mitsuba puts its own texts in quotation marks.
+    texts = b"".join(_text_chunk(*item) for item in (metadata or {}).items())
+    write_atomically(name, data[:_PNG_HEADER] + texts + data[_PNG_HEADER:])
+
+
+def png(codes) -> bytes:
+    """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG.
+
+    In memory: Mitsuba does not tell that the last bytes of a file did not fit on the disk.
+    """
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(codes)).write(stream, mi.Bitmap.FileFormat.PNG)
+    return stream.raw_buffer()
+
+
+_PNG_HEADER = 8 + 25  # magic and IHDR
+
+
+def _text_chunk(key, value):
+    """Return a PNG chunk ``tEXt``, whose characters are Latin-1; others become question marks."""
+    body = b"tEXt" + f"{key}\0{value}".encode("latin-1", "replace")
+    return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+
+
+def _checked(name, image):
+    """Return the image as float32 (H, W, 3), refusing anything a file must not hold."""
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"{name}: an image to write is (H, W, 3), got shape {image.shape}")
+    with np.errstate(over="ignore"):  # caught below, as an infinity
+        image = image.astype(np.float32)
+    bad = radiance.any_channel(~np.isfinite(image))
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise NumericalError(
+            f"{name}: not written: {bad.sum()} texels are not finite, the first at row {row}, "
+            f"column {column} ({', '.join(f'{v:g}' for v in image[row, column])})"
+        )
+    return image
+
+
+def _write_whole(name, suffix, write):
+    """Call ``write(temporary name)`` and rename the result to ``name``."""
+    with replacing(name, suffix) as temporary, quiet_libraries():
+        write(str(temporary))
+
+
+def _version():
+    """Return the package's version, or "unknown" when it runs uninstalled."""
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version("envedit")
+    except importlib.metadata.PackageNotFoundError:
+        return getattr(sys.modules.get("envedit"), "__version__", "unknown")

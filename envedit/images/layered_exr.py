@@ -1,0 +1,106 @@
+"""Several pictures of one map in one OpenEXR file, as layers that viewers list by name."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+import numpy as np
+
+from envedit.core.atomic_files import replacing
+from envedit.core.errors import ConfigError, NumericalError, place_of
+from envedit.core.quiet_libraries import quiet_libraries
+from envedit.images.exr import REC709
+
+DEFAULT = "edited"
+"""The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
+COMPRESSIONS = {"none": "NO", "rle": "RLE", "zips": "ZIPS", "zip": "ZIP", "piz": "PIZ"}
+"""Lossless ones that every reader of OpenEXR knows."""
+
+
+def write(path, layers: dict[str, np.ndarray], compression: str = "zip", threads: int | None = None) -> None:
+    """Write layers as one float32 OpenEXR file, whole or not at all.
+
+    The layer ``edited``, or else the first, becomes the channels ``R``, ``G``, ``B``; any other NAME becomes
+    ``NAME.R``, ``NAME.G``, ``NAME.B``, and one of two dimensions ``NAME.Y``. One part, marked as lat-long
+    with Rec.709 primaries.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; an existing one is replaced.
+    layers : dict of str to ndarray (H, W, 3) or (H, W)
+        Linear radiance, or anything else with a value a texel; all of one size and finite in float32.
+        The first, or ``edited``, has three channels.
+    compression : str
+        One of :data:`COMPRESSIONS`.
+    threads : int, optional
+        Threads of the compression; None: one a core that this process may use.
+
+    Raises
+    ------
+    ConfigError
+        If there is no layer, a name is no layer's name, or ``compression`` is not known.
+    NumericalError
+        If a value is not finite in float32; names the layer and the first texel.
+    InputError
+        If the file cannot be written.
+    """
+    import OpenEXR
+
+    name = os.fsdecode(path)
+    if compression not in COMPRESSIONS:
+        raise ConfigError(f"{name}: compression '{compression}' is not one of {', '.join(COMPRESSIONS)}")
+    if not layers:
+        raise ConfigError(f"{name}: a layered file needs at least one layer")
+    default = DEFAULT if DEFAULT in layers else next(iter(layers))
+    planes, size = {}, np.shape(layers[default])[:2]
+    for layer, values in layers.items():
+        values = np.asarray(values)
+        colour = values.ndim == 3 and values.shape[2] == 3
+        if not (colour or values.ndim == 2 and layer != default) or values.shape[:2] != size or 0 in size:
+            raise ValueError(
+                f"{name}: layer '{layer}' has shape {values.shape}, wanted {size} with 3 channels"
+            )
+        if layer != default and not (layer.isascii() and layer.isidentifier()):
+            raise ConfigError(f"{name}: '{layer}' cannot be the name of a layer: use letters, digits and _")
+        values = _finite(name, layer, values)
+        prefix = "" if layer == default else f"{layer}."
+        for i, channel in enumerate("RGB" if colour else "Y"):
+            planes[prefix + channel] = np.ascontiguousarray(values[..., i] if colour else values)
+    header = {
+        "compression": getattr(OpenEXR, COMPRESSIONS[compression] + "_COMPRESSION"),
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": REC709,
+        "envmap": OpenEXR.ENVMAP_LATLONG,
+    }
+    with replacing(name, ".exr") as temporary, quiet_libraries(), _threads(OpenEXR, threads):
+        OpenEXR.File(header, planes).write(str(temporary))
+
+
+def _finite(name, layer, values):
+    with np.errstate(over="ignore"):  # caught below, as an infinity
+        values = values.astype(np.float32, copy=False)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        count = (bad if bad.ndim == 2 else bad.any(axis=2)).sum()
+        raise NumericalError(
+            f"{name}: not written: {count} texels of layer '{layer}' are not finite, "
+            f"the first at {place_of(bad)}"
+        )
+    return values
+
+
+@contextlib.contextmanager
+def _threads(library, count):
+    """Let the library compress on several cores; it uses one unless told, and before 3.5 cannot be told."""
+    if not hasattr(library, "set_global_thread_count"):
+        yield
+        return
+    before = library.global_thread_count()
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    library.set_global_thread_count(available if count is None else count)
+    try:
+        yield
+    finally:
+        library.set_global_thread_count(before)

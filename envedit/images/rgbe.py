@@ -1,0 +1,102 @@
+"""Radiance files (RGBE). Decoded here, as ``mi.Bitmap`` corrupts the heap on damaged ones."""
+
+import re
+
+import numpy as np
+
+from envedit.core.errors import InputError
+from envedit.images.headers import check_declared, damaged, shown
+
+
+def read(name, head, info, stored):
+    """Decode a file; arguments as in :mod:`.headers`."""
+    end = re.search(rb"\n\r?\n([^\n]*)\n", head)
+    size = end and re.fullmatch(rb"([-+][XY]) +(\d{1,9}) +([-+][XY]) +(\d{1,9})\s*", end[1])
+    if not size:
+        raise damaged(name, "no Radiance resolution line")
+    if (size[1], size[3]) != (b"-Y", b"+X"):
+        stored_as = " ".join(end[1].decode().split())
+        raise InputError(f"{name}: rows are stored as '{stored_as}'; save them as '-Y H +X W'")
+    height, width = int(size[2]), int(size[4])
+    check_declared(name, width, height)
+    header = info["metadata"] = _radiance_header(head[: end.start()].decode("latin-1"))
+    if "xyze" in header.get("FORMAT", ""):
+        raise InputError(f"{name}: holds XYZ colours (32-bit_rle_xyze); save it as RGB (32-bit_rle_rgbe)")
+    for key in {"EXPOSURE", "COLORCORR"} & header.keys():
+        if not _all_ones(header[key]):
+            value = shown(header[key])
+            info["warnings"].append(f"{key}={value} in its header is not undone: values are as stored")
+    with open(name, "rb") as file:
+        file.seek(end.end())
+        # No encoding takes more than 1 + 1/127 bytes for one.
+        data = file.read(height * (4 + 4 * width + 4 * (width // 64 + 2)))
+    if data[:2] == b"\x02\x02" and int.from_bytes(data[2:4], "big") == width:
+        rgbe = _radiance_runs(name, data, height, width)
+    else:
+        rgbe = _radiance_pixels(name, data, height, width)
+    # Ward's format: (R, G, B) 2^(E - 136), and E = 0 is black.
+    scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
+    scale[rgbe[..., 3] == 0] = 0
+    return rgbe[..., :3] * scale[..., None]
+
+
+def _radiance_header(text):
+    """Return the ``KEY=value`` lines of a header. By hand: a pattern takes the square of a line's length."""
+    header = {}
+    for line in text.split("\n"):
+        key, equals, value = line.partition("=")
+        if equals and re.fullmatch(r"\w+", key.rstrip(" ")):
+            header[key.rstrip(" ")] = value.strip()
+    return header
+
+
+def _all_ones(text):
+    try:
+        return all(float(number) == 1 for number in text.split())
+    except ValueError:
+        return False
+
+
+def _radiance_runs(name, data, height, width):
+    """Decode run-length encoded scanlines: (2, 2, W >> 8, W & 255), then four bands of runs and literals.
+
+    Mitsuba's reader is quicker and overruns its buffer on damaged files, which kills the process.
+    """
+    rows = bytearray()
+    start, at = data[:4], 0
+    for y in range(height):
+        if data[at : at + 4] != start:
+            raise damaged(name, f"scanline {y} of {height} does not begin")
+        at += 4
+        for _ in range(4):
+            goal = len(rows) + width
+            while len(rows) < goal:
+                count = data[at] if at < len(data) else 0
+                if count > 128:
+                    rows += data[at + 1 : at + 2] * (count - 128)
+                    at += 2
+                else:
+                    rows += data[at + 1 : at + 1 + count]
+                    at += 1 + count
+                if count == 0 or at > len(data):
+                    raise damaged(name, f"scanline {y} of {height} breaks off")
+            if len(rows) > goal:
+                raise damaged(name, f"scanline {y} of {height} is too long")
+    return np.frombuffer(rows, np.uint8).reshape(height, 4, width).transpose(0, 2, 1)
+
+
+def _radiance_pixels(name, data, height, width):
+    """Decode flat pixels with the old run lengths: (1, 1, 1, n) repeats the pixel before it n times."""
+    pixels = np.frombuffer(data[: len(data) // 4 * 4], np.uint8).reshape(-1, 4)
+    place = np.arange(len(pixels))
+    marker = (pixels[:, :3] == 1).all(1)
+    source = np.maximum.accumulate(np.where(marker, 0, place))
+    # Markers in a row are the digits of one count, the lowest first: n + 256 n' + ...
+    digit = np.minimum(place - source - 1, 3)
+    count = np.where(marker, pixels[:, 3].astype(np.int64) << 8 * np.maximum(digit, 0), 1)
+    total = np.cumsum(count)
+    if not len(total) or marker[0] or total[-1] < height * width:
+        raise damaged(name, f"holds {total[-1] if len(total) else 0} of {height * width} texels")
+    stop = int(np.searchsorted(total, height * width)) + 1
+    count[stop - 1] -= total[stop - 1] - height * width
+    return pixels[np.repeat(source[:stop], count[:stop])].reshape(height, width, 4)

@@ -1,0 +1,1 @@
+"""How a rendering or a map is judged, and the optimiser that follows it."""

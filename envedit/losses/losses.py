@@ -1,0 +1,156 @@
+"""Losses of the edit and of the fit, natively in Dr.Jit, behind one signature.
+
+``loss(x, reference, weight=None)`` returns a size-1 array of the tensor's own type, differentiable in ``x``.
+Images are ``(H, W, C)`` tensors (C = 3 unless said otherwise) of any Dr.Jit precision; ``weight`` is
+``(H, W, 1)`` or ``(H, W, C)``, not negative. A weighted mean divides by the sum of the weights and is 0 where
+all weights are 0. Sums run in double precision: Dr.Jit's single-precision sum is off by 5e-5 on a megapixel
+sky with a sun of 1e6. A non-finite texel makes the loss non-finite, whatever its weight; nothing is clipped.
+"""
+
+import math
+
+import drjit as dr
+
+from envedit.core.color import LUMINANCE
+from envedit.core.errors import InputError
+from envedit.losses.ssim import check_image, check_pair, expand, ssim_loss, total
+
+CHANGE_SOFT = 0.05
+"""Factors less than 5 % from 1 count by their square."""
+CHANGE_FLOOR = 0.01
+"""Share of a map's mean below which radiance is as good as black."""
+
+# --------------------------------------------------------------------------------------------------------
+# Differences, light and smoothness
+# --------------------------------------------------------------------------------------------------------
+
+
+def image_l1(x, reference, weight=None):
+    """Compute the mean absolute error of two images ``(H, W, C)``.
+
+    The subgradient where they are equal is 0.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ or the weight does not fit.
+    """
+    check_pair(x, reference)
+    return _mean(dr.abs(x.array - reference.array), x.shape, weight)
+
+
+def image_l2(x, reference, weight=None):
+    """Compute the mean squared error of two images ``(H, W, C)``; arguments and errors as `image_l1`."""
+    check_pair(x, reference)
+    return _mean(dr.square(x.array - reference.array), x.shape, weight)
+
+
+def log_mse(x, reference, weight=None):
+    """Compare normalised log radiance: the first term of Eq. 4, its norm read as the mean squared error."""
+    return image_l2(x, reference, weight)
+
+
+def hdr(x, reference, weight=None):
+    """Compare linear radiance: the last term of Eq. 4, its norm read as the mean absolute error.
+
+    Squared, this term is 1e5 times the logarithmic ones on a map with a sun.
+    """
+    return image_l1(x, reference, weight)
+
+
+def luminance(x, reference, weight=None):
+    r"""Compare total luminance, ``|Lum(E) - Lum(E')|`` (Eq. 8).
+
+    ``Lum(E) = sum of 0.2126 R + 0.7152 G + 0.0722 B`` over texels (Eq. 7), not weighted by solid angle, as
+    in the paper; a ``weight`` multiplies the terms of both sums. The subgradient where the sums are equal is
+    0. Both sums and their difference are taken in double precision.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ or the images are not RGB.
+    """
+    check_pair(x, reference)
+    if x.shape[2] != 3:
+        raise InputError(f"luminance needs RGB images (H, W, 3), got {tuple(x.shape)}.")
+    difference = _luminance_sum(x, weight) - _luminance_sum(reference, weight)
+    return type(x.array)(dr.abs(difference))
+
+
+def _luminance_sum(x, weight):
+    values = x.array if weight is None else x.array * expand(weight, x.shape)
+    wide = dr.float64_array_t(type(values))  # 0.2126 in single precision is itself off by 1e-8
+    channel = dr.arange(dr.uint32_array_t(wide), math.prod(x.shape)) % 3
+    red, green, blue = LUMINANCE
+    factor = dr.select(channel == 0, wide(red), dr.select(channel == 1, wide(green), wide(blue)))
+    return dr.sum(wide(values) * factor)
+
+
+def l1(x, reference=None, weight=None):
+    """Sum ``|E|`` over texels and channels (Eq. 9): a sum, not a mean; ``reference`` is not used.
+
+    A ``weight`` multiplies the terms. The subgradient at 0 is 0.
+    """
+    check_image(x, "image")
+    return _sum(dr.abs(x.array), x.shape, weight)
+
+
+def tv(x, reference=None, weight=None):
+    """Compute the anisotropic total variation of a lat-long image, as a mean; ``reference`` is not used.
+
+    The sum of ``|x[i, j+1] - x[i, j]| + |x[i+1, j] - x[i, j]|``, columns periodic, rows not, divided by the
+    number of texels and channels. A weight belongs to the texel ``(i, j)`` of each pair.
+    """
+    check_image(x, "image")
+    height, width, channels = x.shape
+    row, values = width * channels, x.array
+    index = dr.arange(dr.uint32_array_t(type(values)), height * row)
+    column = index % row
+    right = dr.select(column < row - channels, index + channels, index + channels - row)
+    below = dr.select(index < (height - 1) * row, index + row, column)
+    across = dr.abs(dr.gather(type(values), values, right) - values)
+    down = dr.abs(dr.gather(type(values), values, below) - values)
+    return _mean(across + dr.select(index < (height - 1) * row, down, 0), x.shape, weight)
+
+
+def change(x, reference, weight=None):
+    """Compare the logarithms of two maps: mean of sqrt(d^2 + s^2) - s, d = log((x + e) / (reference + e)).
+
+    About the mean factor by which texels were changed: a sun that moves counts as a few texels, a sky that
+    takes on another colour as many. s is :data:`CHANGE_SOFT`, e :data:`CHANGE_FLOOR` of the mean of the
+    reference. Arguments and errors as `image_l1`; x must not be negative.
+    """
+    check_pair(x, reference)
+    values = type(x.array)
+    floor = CHANGE_FLOOR * total(dr.detach(reference.array)) / math.prod(x.shape)
+    floor = values(dr.maximum(floor, 1e-12))
+    distance = dr.log((x.array + floor) / (reference.array + floor))
+    return _mean(dr.sqrt(dr.square(distance) + CHANGE_SOFT**2) - CHANGE_SOFT, x.shape, weight)
+
+
+def _sum(values, shape, weight):
+    return type(values)(total(values if weight is None else values * expand(weight, shape)))
+
+
+def _mean(values, shape, weight):
+    if weight is None:
+        return type(values)(total(values) / math.prod(shape))
+    weight = expand(weight, shape)
+    mass = total(weight)
+    # Not a select of the quotient: its derivative at 0 / 0 would be NaN.
+    return type(values)(total(values * weight) / dr.select(mass == 0, 1, mass))
+
+
+LOSSES = {
+    "ssim": ssim_loss,
+    "log_ssim": ssim_loss,
+    "luminance": luminance,
+    "l1": l1,
+    "tv": tv,
+    "change": change,
+    "image_l1": image_l1,
+    "image_l2": image_l2,
+    "log_mse": log_mse,
+    "hdr": hdr,
+}
+"""Name in the configuration -> loss."""

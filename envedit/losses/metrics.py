@@ -1,0 +1,270 @@
+"""Numbers that judge an image: PSNR, SSIM and MSE on a stated tonemap, and what they do not see.
+
+Images are numpy arrays ``(H, W, 3)`` of linear radiance unless said otherwise; sums run in double precision.
+Every function refuses images that are not finite or differ in shape, and returns a finite number or None.
+"""
+
+import math
+
+import numpy as np
+
+from envedit.core.color import luminance
+from envedit.core.color import tonemap as apply_tonemap
+from envedit.core.errors import ConfigError, InputError, place_of
+
+PSNR_CAP = 200.0
+"""PSNR of identical images, and the most that is ever reported, in dB: JSON has no infinity."""
+
+LOG_EPS = 0.01
+"""Radiance added before a logarithm, so that black has one; small beside any daylight sky."""
+
+
+def _checked(image, name):
+    image = np.asarray(image, np.float64)
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise InputError(f"{name}: expected an image of shape (H, W, 3), got {image.shape}.")
+    bad = ~np.isfinite(image).all(axis=2)
+    if bad.any():
+        where = f"the first at {place_of(bad)}"
+        raise InputError(f"{name}: {bad.sum()} texel(s) are not finite, {where}; repair the image first.")
+    return image
+
+
+def _pair(a, b):
+    a, b = _checked(a, "first image"), _checked(b, "second image")
+    if a.shape != b.shape:
+        raise InputError(f"images differ in shape: {a.shape} and {b.shape}; resize one to the other first.")
+    return a, b
+
+
+# --------------------------------------------------------------------------------------------------------
+# Two images: how far apart
+# --------------------------------------------------------------------------------------------------------
+
+
+def mse(a, b) -> float:
+    """Compute the mean squared error over texels and channels.
+
+    Raises
+    ------
+    InputError
+        If the images differ in shape or hold values that are not finite.
+    """
+    a, b = _pair(a, b)
+    return float(np.mean(np.square(a - b)))
+
+
+def psnr(a, b, data_range: float = 1.0) -> float:
+    """Compute the peak signal-to-noise ratio ``10 log10(data_range^2 / MSE)`` in dB, at most `PSNR_CAP`.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    ConfigError
+        If ``data_range`` is not a positive number.
+    """
+    if not (math.isfinite(data_range) and data_range > 0):
+        raise ConfigError(f"PSNR: data_range must be a positive number, got {data_range}.")
+    error = mse(a, b)
+    if error == 0:
+        return PSNR_CAP
+    return min(PSNR_CAP, 20 * math.log10(data_range) - 10 * math.log10(error))
+
+
+def ssim(a, b, data_range: float = 1.0) -> float:
+    """Compute the mean structural similarity of ``envedit.ssim.Ssim``, in double precision.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    ConfigError
+        If ``data_range`` is not a positive number.
+    """
+    import mitsuba as mi  # here: the variant, once selected, provides the tensor type
+
+    from envedit.losses.ssim import ssim_index
+
+    a, b = _pair(a, b)
+    return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
+
+
+def compare(a, b, tonemap: str = "gamma", lpips=None) -> dict:
+    """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.
+
+    Parameters
+    ----------
+    a, b : array (H, W, 3)
+        Linear radiance.
+    tonemap : str
+        A name of `envedit.tonemap.TONEMAPS`.
+    lpips : perceptual.Lpips, optional
+        What measures LPIPS of the display values.
+
+    Returns
+    -------
+    dict
+        ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1, and ``lpips``, None without one, or where the
+        image is too small for its network.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    ConfigError
+        If there is no such tonemap.
+    """
+    a, b = (apply_tonemap(image, tonemap) for image in _pair(a, b))
+    small = lpips is None or min(a.shape[:2]) < lpips.backbone.least_size("max")
+    seen = None if small else float(lpips(a.astype(np.float32), b.astype(np.float32)))
+    return {"psnr": psnr(a, b), "ssim": ssim(a, b), "mse": mse(a, b), "lpips": seen}
+
+
+def painted(edited, wanted, initial, coverage, tonemap: str = "gamma") -> dict:
+    """Tell how far a painted picture was followed, and how still the rest was held.
+
+    On display values d, with coverage c in [0, 1], means over pixels and channels.
+
+    Parameters
+    ----------
+    edited, wanted, initial : array (h, w, 3)
+        The result's rendering, the painted picture and what it was painted on; linear radiance.
+    coverage : array (h, w, 1)
+        How much each pixel was painted.
+    tonemap : str
+        Of the display values.
+
+    Returns
+    -------
+    dict
+        ``towards``: 1 - sum c |edited - wanted| / sum c |initial - wanted|, None where nothing was asked;
+        ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    """
+    edited, wanted = _pair(edited, wanted)
+    _, initial = _pair(edited, initial)
+    d, t, before = (apply_tonemap(image, tonemap) for image in (edited, wanted, initial))
+    cover = np.broadcast_to(coverage, d.shape).astype(np.float64)
+    asked, rest = float((cover * np.abs(before - t)).sum()), float((1 - cover).sum())
+    return {
+        "towards": 1 - float((cover * np.abs(d - t)).sum()) / asked if asked > 0 else None,
+        "elsewhere": float(((1 - cover) * np.abs(d - before)).sum()) / rest if rest > 0 else None,
+    }
+
+
+def _log(values):
+    return np.log(np.maximum(values, 0) + LOG_EPS)
+
+
+def log_psnr(a, b) -> float | None:
+    """Compute the PSNR of log radiance, normalised as in Eq. 1 by the range of the reference ``b``.
+
+    The logarithm is that of ``max(E, 0) + LOG_EPS``. None if the reference is constant and the images differ.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    """
+    a, b = (_log(image) for image in _pair(a, b))
+    span = float(np.ptp(b))
+    if span == 0:
+        return PSNR_CAP if np.array_equal(a, b) else None
+    return psnr(a, b, data_range=span)
+
+
+# --------------------------------------------------------------------------------------------------------
+# Lights, and texture
+# --------------------------------------------------------------------------------------------------------
+
+
+def peak_position(image) -> tuple[int, int]:
+    """Find the row and column of the greatest luminance, the first of several.
+
+    Raises
+    ------
+    InputError
+        If the image holds values that are not finite.
+    """
+    values = luminance(_checked(image, "image"))
+    row, column = np.unravel_index(int(np.argmax(values)), values.shape)
+    return int(row), int(column)
+
+
+def sun_offset(a, b) -> float:
+    """Measure the distance between the brightest texels of two lat-long maps, in texels, columns periodic.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    """
+    a, b = _pair(a, b)
+    (row_a, column_a), (row_b, column_b) = peak_position(a), peak_position(b)
+    across = abs(column_a - column_b)
+    return math.hypot(row_a - row_b, min(across, a.shape[1] - across))
+
+
+def _ratio(a, b):
+    # A quotient that overflows, or has no denominator, says nothing: null in the file.
+    ratio = float(a) / float(b) if b else math.inf
+    return ratio if math.isfinite(ratio) else None
+
+
+def peak_ratio(a, b) -> float | None:
+    """Divide the greatest luminance of ``a`` by that of the reference ``b``; None where that is 0.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    """
+    a, b = _pair(a, b)
+    return _ratio(luminance(a).max(), luminance(b).max())
+
+
+def mean_luminance_ratio(a, b) -> float | None:
+    """Divide the mean luminance of ``a`` by that of the reference ``b``; None where that is 0.
+
+    Texels count alike, not by their solid angle, as in Eq. 7.
+
+    Raises
+    ------
+    InputError
+        As `mse`.
+    """
+    a, b = _pair(a, b)
+    return _ratio(luminance(a).mean(), luminance(b).mean())
+
+
+def high_frequency_energy(image) -> float:
+    """Compute the mean squared high-pass response of a lat-long map: speckle that PSNR does not see.
+
+    The high pass is ``log(max(L, 0) + LOG_EPS)`` of the luminance L minus its 5 x 5 binomial blur
+    (1, 4, 6, 4, 1) / 16 on either axis; columns are periodic, the outermost rows repeat. Independent noise of
+    variance s^2 gives 0.794 s^2 (squared taps: 1 - 2 (6/16)^2 + (70/256)^2), a smooth gradient about 0.
+
+    Raises
+    ------
+    InputError
+        If the image holds values that are not finite.
+    """
+    values = _log(luminance(_checked(image, "image")))
+    height, width = values.shape
+    blurred = sum(
+        tap * values[np.clip(np.arange(height) + shift, 0, height - 1)]
+        for shift, tap in zip(range(-2, 3), _BINOMIAL, strict=True)
+    )
+    blurred = sum(
+        tap * blurred[:, (np.arange(width) + shift) % width]
+        for shift, tap in zip(range(-2, 3), _BINOMIAL, strict=True)
+    )
+    return float(np.mean(np.square(values - blurred)))
+
+
+_BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)

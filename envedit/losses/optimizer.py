@@ -1,0 +1,274 @@
+"""Adam that owns its parameters, and the schedules of learning rates and loss weights.
+
+.. code-block:: python
+
+   adam = Adam({"w": w, "b": b}, lr=1e-3)
+   for step in range(total):
+       with dr.isolate_grad():
+           leaves = adam.leaves()                       # fresh leaves of the AD graph
+           dr.backward(loss(leaves))
+       adam.step({name: dr.grad(leaf) for name, leaf in leaves.items()}, lr=cosine(1e-3, step, total))
+"""
+
+import math
+
+import drjit as dr
+import numpy as np
+
+from envedit.core.errors import ConfigError, InputError
+
+# --------------------------------------------------------------------------------------------------------
+# Adam
+# --------------------------------------------------------------------------------------------------------
+
+
+class Adam:
+    r"""Adam with epsilon after the bias correction, as PyTorch has it (`drjit.opt.Adam` adds it before).
+
+    .. code-block:: text
+
+       m <- b1 m + (1 - b1) g        v <- b2 v + (1 - b2) g^2
+       p <- p - lr (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)         Kingma and Ba 2015, Algorithm 1
+
+    State and arithmetic have the precision of the parameters; bias corrections are double. A gradient
+    below 1e-19 in single precision has a square that underflows: its v stays 0; its step is ``lr m / eps``,
+    small and finite. A gradient that is not finite, or whose square is not (above 1.8e19), would leave v
+    infinite and the parameter stuck for good, and so would moments or a step that are not: such a step is
+    refused as a whole. What a step leads to is seen in the next one only: `take_back` returns to the
+    parameters before it.
+
+    Parameters
+    ----------
+    params : dict of str to tensor or array
+        Starting values; copied. Read them as ``adam.params[name]``.
+    lr : float
+        Learning rate of a `step` that is not given its own.
+    betas : (float, float)
+        Decay of the two moments, in [0, 1).
+    eps : float
+        Added to the root of the second moment; at least 1e-30, so that 0 / 0 cannot arise.
+
+    Raises
+    ------
+    ConfigError
+        If a setting is out of its range.
+    """
+
+    def __init__(self, params, lr, betas=(0.9, 0.999), eps=1e-8):
+        if not (math.isfinite(lr) and lr >= 0):
+            raise ConfigError(f"Adam: the learning rate must be a number >= 0, got {lr}.")
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ConfigError(f"Adam: both betas must lie in [0, 1), got {tuple(betas)}.")
+        if not (math.isfinite(eps) and eps >= 1e-30):
+            raise ConfigError(f"Adam: eps must be a number >= 1e-30, got {eps}.")
+        self.lr, self.betas, self.eps, self.t = lr, tuple(betas), eps, 0
+        # Copies in memory of Dr.Jit's own: a literal would be part of the first step's kernel, and an array
+        # wrapped around numpy's memory is not aligned, which is part of a kernel too and costs a compilation.
+        self.params = {name: dr.opaque(dr.detach(value)) for name, value in params.items()}
+        self._before = dict(self.params)
+        self._m = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
+        self._v = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
+
+    def leaves(self):
+        """Return the parameters as a new dict of leaves with gradients enabled."""
+        leaves = {name: type(value)(value) for name, value in self.params.items()}
+        dr.enable_grad(leaves)
+        return leaves
+
+    def step(self, grads, lr=None, check=True):
+        """Update all parameters in one evaluation.
+
+        Parameters
+        ----------
+        grads : dict of str to tensor or array
+            One gradient for each parameter, of its shape.
+        lr : float, optional
+            Learning rate of this step.
+        check : bool
+            Refuse gradients that are not finite or too large to square, and steps that lead to parameters
+            or moments that are not finite. This waits for the step to end; without it such a gradient
+            spoils the parameters.
+
+        Returns
+        -------
+        bool
+            True if the step was taken; False if it was refused and nothing has changed.
+
+        Raises
+        ------
+        ConfigError
+            If ``lr`` is negative or not finite.
+        InputError
+            If a gradient is missing, unknown or of the wrong shape.
+        """
+        lr = self.lr if lr is None else lr
+        if not (math.isfinite(lr) and lr >= 0):
+            raise ConfigError(f"Adam: the learning rate must be a number >= 0, got {lr}.")
+        if grads.keys() != self.params.keys():
+            odd = sorted(grads.keys() ^ self.params.keys())
+            raise InputError(f"Adam: gradients and parameters differ in {', '.join(odd)}.")
+
+        (b1, b2), t = self.betas, self.t + 1
+        scalars = {}  # one pair per precision, in memory: kernels do not depend on the step then
+        new, refused = {}, []
+        for name, p in self.params.items():
+            if grads[name].shape != p.shape:
+                raise InputError(f"Adam: gradient of {name} has shape {grads[name].shape}, not {p.shape}.")
+            flat, g = dr.array_t(type(p)), _flat(dr.detach(grads[name]))
+            if flat not in scalars:
+                scalars[flat] = (dr.opaque(flat, lr / (1 - b1**t)), dr.opaque(flat, math.sqrt(1 - b2**t)))
+            rate, root = scalars[flat]
+            m = b1 * _flat(self._m[name]) + (1 - b1) * g
+            v = b2 * _flat(self._v[name]) + (1 - b2) * dr.square(g)
+            update = rate * m / (dr.sqrt(v) / root + self.eps)
+            new[name] = _flat(p) - update, m, v
+            if check:
+                # v takes up the gradient's square; an infinite one gives finite steps, of zero, for good.
+                good = dr.isfinite(v) & dr.isfinite(new[name][0])
+                index = dr.uint32_array_t(flat)
+                # A flag each: a second scatter to the same one would force an evaluation in between.
+                flag = dr.opaque(index, 0)
+                dr.scatter(flag, index(1), index(0), ~good)
+                refused.append(flag)
+        dr.eval(new, refused)
+        if any(flag[0] for flag in refused):
+            return False
+        self._before = dict(self.params)
+        for name, (p, m, v) in new.items():
+            shape, kind = self.params[name].shape, type(self.params[name])
+            self.params[name], self._m[name], self._v[name] = (_shaped(kind, a, shape) for a in (p, m, v))
+        self.t = t
+        return True
+
+    def take_back(self):
+        """Return to the parameters that the last step was taken from; twice is as once.
+
+        The moments stay, as the gradients that they are means of were finite.
+        """
+        self.params = dict(self._before)
+
+    def state_dict(self):
+        """Return everything that a later `load_state_dict` needs, as a flat dict of numpy arrays."""
+        state = {"step": np.int64(self.t)}
+        for part, values in self._parts():
+            state |= {f"{part}/{name}": np.array(value) for name, value in values.items()}
+        return state
+
+    def _parts(self):
+        return ("params", self.params), ("before", self._before), ("m", self._m), ("v", self._v)
+
+    def load_state_dict(self, state):
+        """Continue exactly where `state_dict` was taken.
+
+        Raises
+        ------
+        InputError
+            If the state does not belong to these parameters; nothing has changed then.
+        """
+        found, expected = dict(state), self.state_dict()
+        if found.keys() != expected.keys():
+            odd = sorted(found.keys() ^ expected.keys())
+            raise InputError(f"optimiser state: its entries and the parameters differ in {', '.join(odd)}.")
+        for key, value in expected.items():
+            got, shape = np.shape(found[key]), np.shape(value)
+            if got != shape:
+                raise InputError(f"optimiser state: {key} has shape {got}, expected {shape}.")
+        for name, value in self.params.items():
+            kind, shape = type(value), value.shape
+            for part, target in self._parts():
+                flat = dr.array_t(kind)(np.ascontiguousarray(found[f"{part}/{name}"]).ravel())
+                target[name] = dr.opaque(_shaped(kind, flat, shape))
+        self.t = int(found["step"])
+
+
+def _flat(value):
+    return value.array if dr.is_tensor_v(value) else value
+
+
+def _shaped(kind, flat, shape):
+    return kind(flat, shape) if dr.is_tensor_v(kind) else kind(flat)
+
+
+# --------------------------------------------------------------------------------------------------------
+# Schedules: functions of the step, counted from 0
+# --------------------------------------------------------------------------------------------------------
+
+
+def constant(lr, step=0):
+    """Return ``lr`` at every step.
+
+    ======  ====  ====  ====
+    step    0     10    100
+    lr=1    1     1     1
+    ======  ====  ====  ====
+    """
+    return lr
+
+
+def cosine(lr, step, total, final=0.0):
+    """Anneal from ``lr`` at step 0 to ``final`` at step ``total``, and stay there (CosineAnnealingLR).
+
+    ``final + (lr - final) (1 + cos(pi step / total)) / 2``. With ``lr=1, total=4``:
+
+    ======  ====  ======  ====  ======  ====  ====
+    step    0     1       2     3       4     5
+    rate    1     0.854   0.5   0.146   0     0
+    ======  ====  ======  ====  ======  ====  ====
+
+    Raises
+    ------
+    ConfigError
+        If ``total`` is less than one step.
+    """
+    if total < 1:
+        raise ConfigError(f"cosine: total must be at least 1 step, got {total}.")
+    return final + (lr - final) * 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
+
+
+def cosine_warm_restarts(lr, step, period):
+    """Anneal from ``lr`` towards 0 again and again, every ``period`` steps.
+
+    Loshchilov and Hutter 2017, Eq. 5, with T_mult = 1 and a minimum of 0: PyTorch's
+    CosineAnnealingWarmRestarts. With ``lr=1, period=4``:
+
+    ======  ====  ======  ====  ======  ====  ======
+    step    0     1       2     3       4     5
+    rate    1     0.854   0.5   0.146   1     0.854
+    ======  ====  ======  ====  ======  ====  ======
+
+    Raises
+    ------
+    ConfigError
+        If ``period`` is less than one step.
+    """
+    if period < 1:
+        raise ConfigError(f"cosine_warm_restarts: period must be at least 1 step, got {period}.")
+    return cosine(lr, step % period, period)
+
+
+def ramp(start, end, step, total):
+    """Walk geometrically from ``start`` at step 0 to ``end`` at step ``total - 1``, and stay there.
+
+    ``start (end / start)^(step / (total - 1))``; a run of one step stays at ``start``.
+    With ``start=1, end=1e4, total=5``:
+
+    ======  ====  ====  =====  ======  =======  =======
+    step    0     1     2      3       4        5
+    value   1     10    100    1000    10000    10000
+    ======  ====  ====  =====  ======  =======  =======
+
+    Raises
+    ------
+    ConfigError
+        If the ends differ and are not both positive, or ``total`` is less than one step.
+    """
+    if total < 1:
+        raise ConfigError(f"ramp: total must be at least 1 step, got {total}.")
+    if start == end:
+        return start
+    if not (0 < start < math.inf and 0 < end < math.inf):
+        raise ConfigError(f"ramp: both ends must be positive numbers, got [{start}, {end}].")
+    share = min(step / max(total - 1, 1), 1.0)
+    if share in (0.0, 1.0):
+        return end if share else start
+    return math.exp((1 - share) * math.log(start) + share * math.log(end))

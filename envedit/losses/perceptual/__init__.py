@@ -1,0 +1,1 @@
+"""DISTS and LPIPS, with network weights from the user's files."""

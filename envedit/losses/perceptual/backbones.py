@@ -1,0 +1,287 @@
+"""Feature stacks of VGG16, AlexNet and SqueezeNet 1.1 as torchvision has them, on `convolution`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core.arrays import tensor
+from envedit.core.errors import ConfigError, InputError
+from envedit.losses.perceptual import convolution, weights
+
+# --------------------------------------------------------------------------------------------------------
+# The stacks, as torchvision has them
+# --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Conv:
+    """A convolution and its ReLU; several names are convolutions of one input whose outputs lie side by side.
+
+    Those of a smaller kernel stand in the middle of the larger one, among zeros.
+    """
+
+    names: tuple[str, ...]
+    inputs: int
+    outputs: int
+    kernel: int
+    stride: int = 1
+    padding: int = 0
+    kernels: tuple[int, ...] = ()
+    tap: bool = False
+
+    def parts(self) -> dict[str, tuple[int, ...]]:
+        """Name the tensors of the layer, with their shapes in torchvision's layout (O, I, kh, kw)."""
+        outputs, found = self.outputs // len(self.names), {}
+        for name, k in zip(self.names, self.kernels or (self.kernel,), strict=True):
+            found[name + ".weight"] = outputs, self.inputs, k, k
+            found[name + ".bias"] = (outputs,)
+        return found
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Max pooling; with ``ceil`` a last window may reach over the edge of the image."""
+
+    kernel: int
+    stride: int = 2
+    ceil: bool = False
+
+
+def _vgg16():
+    layers, index, channels = [], 0, 3
+    for block, (width, count) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)]):
+        if block:
+            layers.append(Pool(2))
+            index += 1
+        for i in range(count):
+            layers.append(Conv((f"features.{index}",), channels, width, 3, padding=1, tap=i == count - 1))
+            channels, index = width, index + 2
+    return layers
+
+
+def _alexnet():
+    sizes = [(0, 3, 64, 11, 4, 2), (3, 64, 192, 5, 1, 2), (6, 192, 384, 3, 1, 1)]
+    sizes += [(8, 384, 256, 3, 1, 1), (10, 256, 256, 3, 1, 1)]
+    convs = [Conv((f"features.{i}",), *size, tap=True) for i, *size in sizes]
+    return [convs[0], Pool(3), convs[1], Pool(3), *convs[2:]]
+
+
+def _squeezenet():
+    def fire(index, inputs, inner, outputs, tap=True):
+        at = f"features.{index}."
+        expand = Conv((at + "expand1x1", at + "expand3x3"), inner, outputs, 3, 1, 1, (1, 3), tap)
+        return [Conv((at + "squeeze",), inputs, inner, 1), expand]
+
+    pool = Pool(3, ceil=True)
+    return [
+        Conv(("features.0",), 3, 64, 3, 2, tap=True),
+        *(pool, *fire(3, 64, 16, 128, tap=False), *fire(4, 128, 16, 128)),
+        *(pool, *fire(6, 128, 32, 256, tap=False), *fire(7, 256, 32, 256)),
+        *(pool, *fire(9, 256, 48, 384), *fire(10, 384, 48, 384)),
+        *(*fire(11, 384, 64, 512), *fire(12, 512, 64, 512)),
+    ]
+
+
+KINDS = {
+    "vgg": ("VGG16", _vgg16, "vgg16", "vgg16-397923af.pth"),
+    "alex": ("AlexNet", _alexnet, "alexnet", "alexnet-owt-7be5be79.pth"),
+    "squeeze": ("SqueezeNet 1.1", _squeezenet, "squeezenet1_1", "squeezenet1_1-b8a52dc0.pth"),
+}
+"""Name as LPIPS has it -> title, layers, torchvision's name, torchvision's file."""
+
+
+def title(kind: str) -> str:
+    """Return the name of a network in words.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such network here.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"unknown network '{kind}'; use one of {', '.join(KINDS)}")
+    return KINDS[kind][0]
+
+
+class Backbone:
+    """The weights of a feature stack.
+
+    .. code-block:: python
+
+       backbone = Backbone.load("vgg", "vgg16.safetensors")
+       stack = backbone.stack(64, 256)
+       tape = stack.forward(x)              # flat, 64 * 256 * 3 numbers, normalised as the network wants
+       taps = stack.taps(tape)              # [(flat array of N * C numbers, N, C), ...]
+       gradient = stack.backward(tape, [gradient of the first tap, None, ...])
+
+    Parameters
+    ----------
+    kind : str
+        "vgg" (VGG16), "alex" (AlexNet) or "squeeze" (SqueezeNet 1.1).
+    tensors : dict
+        torchvision's state dict, as far as it is named ``features.*``: float32 arrays.
+    """
+
+    def __init__(self, kind: str, tensors: dict[str, np.ndarray]):
+        self.title, self.kind = title(kind), kind
+        self.layers = KINDS[kind][1]()
+        self.channels = [layer.outputs for layer in self.layers if isinstance(layer, Conv) and layer.tap]
+        self._weights = [
+            _as_matrix(layer, tensors) if isinstance(layer, Conv) else None for layer in self.layers
+        ]
+
+    @classmethod
+    def load(cls, kind: str, file) -> Backbone:
+        """Read the weights from a ``safetensors`` or ``npz`` file that holds torchvision's state dict.
+
+        Further tensors, such as those of the classifier, are ignored.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such network here.
+        InputError
+            If the file does not hold it; see :func:`envedit.losses.perceptual.weights.read`.
+        """
+        title(kind)
+        words, layers, model, original = KINDS[kind]
+        wanted = {}
+        for layer in layers():
+            wanted |= layer.parts() if isinstance(layer, Conv) else {}
+        source = f"torchvision.models.{model}, https://download.pytorch.org/models/{original}"
+        return cls(kind, weights.read(file, wanted, words, source))
+
+    def least_size(self, pooling: str = "max") -> int:
+        """Return how many pixels an image must have along each side to leave one after the last layer."""
+        return next(n for n in range(1, 256) if self._sizes(n, pooling)[-1] > 0)
+
+    def stack(self, height: int, width: int, pooling: str = "max") -> Stack:
+        """Lay the network out for images of one size.
+
+        Parameters
+        ----------
+        height, width : int
+            Size of the images.
+        pooling : str
+            "max", or "hanning" for the L2 pooling of DISTS in place of every max pooling.
+
+        Raises
+        ------
+        InputError
+            If nothing would be left of images as small as these.
+        """
+        rows, columns = self._sizes(height, pooling), self._sizes(width, pooling)
+        if min(rows[-1], columns[-1]) < 1:
+            least = self.least_size(pooling)
+            raise InputError(
+                f"image of {height} rows and {width} columns: too small for {self.title}; "
+                f"it needs {least} of each."
+            )
+        return Stack(self.layers, self._weights, rows, columns, pooling)
+
+    def _sizes(self, n, pooling):
+        """Sizes along one side: of the image, and after every layer; 0 from where nothing is left."""
+        sizes = [n]
+        for layer in self.layers:
+            sizes.append(_size_after(layer, sizes[-1], pooling) if sizes[-1] else 0)
+        return sizes
+
+
+def _size_after(layer, n, pooling):
+    if isinstance(layer, Conv):
+        return max((n + 2 * layer.padding - layer.kernel) // layer.stride + 1, 0)
+    if pooling == "hanning":
+        return (n - 1) // 2 + 1
+    reach = n - layer.kernel + (layer.stride - 1 if layer.ceil else 0)
+    return max(reach // layer.stride + 1, 0)
+
+
+def _as_matrix(layer, tensors):
+    """Weights (O, taps * I), channels together as in an image, and bias (O,), in memory."""
+    blocks = []
+    for name in layer.names:
+        block = tensors[name + ".weight"]
+        margin = (layer.kernel - block.shape[2]) // 2
+        block = np.pad(block, ((0, 0), (0, 0), (margin, margin), (margin, margin)))
+        blocks.append(block.transpose(0, 2, 3, 1).reshape(len(block), -1))
+    matrix = np.ascontiguousarray(np.concatenate(blocks), np.float32)
+    bias = np.concatenate([tensors[name + ".bias"] for name in layer.names]).astype(np.float32)
+    return tensor(matrix), dr.opaque(mi.Float(bias))
+
+
+# --------------------------------------------------------------------------------------------------------
+# A network laid out for one size of image
+# --------------------------------------------------------------------------------------------------------
+
+
+class Stack:
+    """A feature stack for images of one size; made by :meth:`Backbone.stack`."""
+
+    def __init__(self, layers, matrices, rows, columns, pooling):
+        self._steps, self._tapped, self.channels = [], [], []
+        channels = 3
+        for i, layer in enumerate(layers):
+            before, after = (rows[i], columns[i], channels), (rows[i + 1], columns[i + 1])
+            if isinstance(layer, Conv):
+                channels = layer.outputs
+                sizes = layer.kernel, layer.stride, layer.padding
+                step = convolution.Convolution(*matrices[i], before, (*after, channels), *sizes)
+                if layer.tap:
+                    self._tapped.append((i + 1, after[0] * after[1], channels))
+                    self.channels.append(channels)
+            elif pooling == "hanning":
+                step = convolution.HanningPool(before, (*after, channels))
+            else:
+                step = convolution.MaxPool(layer.kernel, layer.stride, before, (*after, channels))
+            self._steps.append(step)
+
+    def forward(self, x) -> list:
+        """Evaluate all layers.
+
+        Parameters
+        ----------
+        x : Float
+            Image, H * W * 3 numbers, normalised as the network wants; not differentiated.
+
+        Returns
+        -------
+        list
+            The image and the output of every layer: what :meth:`taps` and :meth:`backward` need.
+        """
+        tape = [(x, None)]
+        for step in self._steps:
+            tape.append(step.forward(tape[-1][0]))
+        return tape
+
+    def taps(self, tape) -> list:
+        """Pick the tapped features: a list of (N * C numbers, N, C), N pixels of C channels."""
+        return [(tape[i][0], pixels, channels) for i, pixels, channels in self._tapped]
+
+    def backward(self, tape, gradients):
+        """Pull gradients of the taps back to the image.
+
+        Parameters
+        ----------
+        tape : list
+            What :meth:`forward` returned.
+        gradients : list
+            One for each tap, N * C numbers, or None.
+
+        Returns
+        -------
+        Float
+            Gradient with respect to the image, H * W * 3 numbers.
+        """
+        at = {i: gradient for (i, _, _), gradient in zip(self._tapped, gradients, strict=True)}
+        gradient = None
+        for i in range(len(self._steps), 0, -1):
+            own = at.get(i)
+            if own is not None:
+                gradient = own if gradient is None else gradient + own
+            if gradient is not None:
+                gradient = self._steps[i - 1].backward(tape[i - 1][0], *tape[i], gradient)
+        return dr.zeros(type(tape[0][0]), len(tape[0][0])) if gradient is None else gradient

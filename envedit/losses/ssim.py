@@ -1,0 +1,273 @@
+"""Structural similarity with a hand-written gradient, and the shape checks and sums that all losses share.
+
+Images are ``(H, W, C)`` tensors of any Dr.Jit precision; a ``weight`` is ``(H, W, 1)`` or ``(H, W, C)``.
+"""
+
+import math
+
+import drjit as dr
+
+from envedit.core.errors import ConfigError, InputError
+
+# --------------------------------------------------------------------------------------------------------
+# Shapes and sums, shared with the other losses
+# --------------------------------------------------------------------------------------------------------
+
+
+def check_image(x, name):
+    """Refuse what is not an image ``(H, W, C)``."""
+    if x.ndim != 3 or 0 in x.shape:
+        raise InputError(f"{name}: expected an image of shape (H, W, C), got {tuple(x.shape)}.")
+
+
+def check_pair(x, reference):
+    """Refuse images that differ in shape."""
+    check_image(x, "image")
+    if x.shape != reference.shape:
+        shapes = f"image {tuple(x.shape)} and reference {tuple(reference.shape)}"
+        raise InputError(f"{shapes} differ in shape: resize one to the other first.")
+
+
+def expand(weight, shape):
+    """Return the weight as a flat array with one entry per texel and channel."""
+    height, width, channels = shape
+    if weight.shape == shape:
+        return weight.array
+    if weight.shape != (height, width, 1):
+        raise InputError(f"weight {tuple(weight.shape)} fits neither {shape} nor {(height, width, 1)}.")
+    index = dr.arange(dr.uint32_array_t(type(weight.array)), height * width * channels) // channels
+    return dr.gather(type(weight.array), weight.array, index)
+
+
+def total(values):
+    """Sum a flat array in double precision, returned in double precision."""
+    return dr.sum(dr.float64_array_t(type(values))(values))
+
+
+# --------------------------------------------------------------------------------------------------------
+# Structural similarity
+# --------------------------------------------------------------------------------------------------------
+
+WINDOW = 11
+"""Texels along a side of the Gaussian window."""
+
+
+class Ssim:
+    r"""Structural similarity to a fixed reference, with a hand-written gradient.
+
+    .. code-block:: python
+
+       ssim = Ssim(reference, weight)
+       loss = ssim(x)                    # 1 - mean SSIM, differentiable in x
+
+    Wang et al. 2004 ("Image quality assessment: from error visibility to structural similarity", Eq. 13):
+    Gaussian window of 11 x 11, sigma 1.5, K1 = 0.01, K2 = 0.03, population covariance, windows that lie
+    wholly inside the image, one map per channel, averaged. It is scikit-image's ``structural_similarity``
+    with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``. In an image smaller than 11 along
+    an axis the window shrinks along that axis to the largest odd size that fits, down to one texel.
+
+    With ``d = x - y`` the map is ``(1 - a)(1 - b)``, ``a = mu_d^2 / (mu_x^2 + mu_y^2 + C1)``,
+    ``b = var_d / (var_x + var_y + C2)``, and the loss the mean of ``a + b - ab``: identical images give
+    exactly 0 and near ones keep their digits. Variances are merged from columns of squared deviations, never
+    ``E[x^2] - E[x]^2``: they are not negative and carry a relative error of some 1e-6 in single precision,
+    whatever the offset of the image; the gradient's is as much times ``|x|`` over the local contrast. Squares
+    must be representable: ``|x|`` up to 1e18 in single precision, NaN beyond.
+
+    Parameters
+    ----------
+    reference : tensor (H, W, C)
+        The image y; not differentiated.
+    weight : tensor (H, W, 1) or (H, W, C), optional
+        Weight of the window centred there, not negative; windows that cross an edge do not exist.
+    data_range : float
+        Difference between the largest and the smallest value that the images may take.
+
+    Raises
+    ------
+    InputError
+        If a shape does not fit, or a weight is negative or not finite.
+    ConfigError
+        If ``data_range`` is not a positive number.
+    """
+
+    def __init__(self, reference, weight=None, data_range: float = 1.0):
+        check_image(reference, "reference")
+        if not (math.isfinite(data_range) and data_range > 0):
+            raise ConfigError(f"SSIM: data_range must be a positive number, got {data_range}.")
+        self.c1, self.c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+        self.shape = height, width, channels = tuple(reference.shape)
+        self._rows, self._columns = _gaussian(height), _gaussian(width)
+        self.map_shape = height - len(self._rows) + 1, width - len(self._columns) + 1, channels
+        self._y = dr.detach(reference.array)
+        self._mean_y, self._variance_y = self._window(self._moments(self._y))
+        self._weight = 1 / math.prod(self.map_shape)
+        if weight is not None:
+            self._weight = self._normalised(dr.detach(weight))
+        dr.eval(self._y, self._mean_y, self._variance_y, self._weight)
+
+    def __call__(self, x):
+        """Return ``1 - mean SSIM`` of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
+        self._check(x)
+        if not dr.grad_enabled(x):
+            return self._evaluate(x.array, False)[0]
+        return dr.custom(KnownGradient, x.array, self)
+
+    def map(self, x):
+        """Return the SSIM of every window, ``(H - 10, W - 10, C)`` from 11 x 11 texels on; no gradient."""
+        self._check(x)
+        a, b = self._terms(dr.detach(x.array))[:2]
+        return type(x)((1 - a) * (1 - b), self.map_shape)
+
+    def _check(self, x):
+        if tuple(x.shape) != self.shape:
+            raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
+
+    def _normalised(self, weight):
+        """Crop the weights to the window centres and let them sum to one (or all be zero)."""
+        values = expand(weight, self.shape)
+        if not dr.all(dr.isfinite(values) & (values >= 0))[0]:
+            raise InputError("SSIM: the weight holds negative or non-finite values.")
+        crop = self._row_start(len(self._columns) // 2) + len(self._rows) // 2 * self.shape[1] * self.shape[2]
+        values = dr.gather(type(values), values, crop)
+        mass = total(values)
+        return dr.select(mass > 0, values / type(values)(mass), 0)
+
+    def _row_start(self, shift=0):
+        """Index, in an array with full-length rows, of each window's first column."""
+        height, width, channels = self.map_shape
+        index = dr.arange(dr.uint32_array_t(type(self._y)), height * width * channels)
+        return index + index // (width * channels) * ((self.shape[1] - width) * channels) + shift * channels
+
+    def _moments(self, *operands):
+        """Filter along columns: mean and variance of the first operand and, if there are two, of x - y."""
+        row, F = self.shape[1] * self.shape[2], type(self._y)
+        index = dr.arange(dr.uint32_array_t(F), self.map_shape[0] * row)
+        taps = [[dr.gather(F, o, index + j * row) for j in range(len(self._rows))] for o in operands]
+        moments = list(_mean_and_variance(self._rows, taps[0]))
+        if len(taps) == 2:
+            moments += _mean_and_variance(self._rows, [x - y for x, y in zip(*taps, strict=True)])
+        dr.eval(moments)
+        return moments
+
+    def _window(self, moments):
+        """Merge the moments of the columns of a window into its means and variances."""
+        start, step, F = self._row_start(), self.shape[2], type(self._y)
+        merged = []
+        for mean, variance in zip(moments[::2], moments[1::2], strict=True):
+            means = [dr.gather(F, mean, start + j * step) for j in range(len(self._columns))]
+            inner = (dr.gather(F, variance, start + j * step) for j in range(len(self._columns)))
+            mean, between = _mean_and_variance(self._columns, means)
+            merged += [mean, between + sum(k * v for k, v in zip(self._columns, inner, strict=True))]
+        return merged
+
+    def _terms(self, x):
+        mean_x, variance_x, mean_d, variance_d = self._window(self._moments(x, self._y))
+        scale_a = 1 / (dr.square(mean_x) + dr.square(self._mean_y) + self.c1)
+        scale_b = 1 / (variance_x + self._variance_y + self.c2)
+        return dr.square(mean_d) * scale_a, variance_d * scale_b, scale_a, scale_b, mean_x, mean_d
+
+    def _evaluate(self, x, with_gradient):
+        """Return the loss and, if asked for, its gradient, both without derivatives attached."""
+        x = dr.detach(x)
+        a, b, scale_a, scale_b, mean_x, mean_d = self._terms(x)
+        values = self._weight * (a + b - a * b)
+        loss = type(x)(total(values))
+        if not with_gradient:
+            return loss, None
+        # Derivatives of a window's term in its two means and two variances. A variance acts on a texel as
+        # 2 (x - mean), which is split: one field is filtered, one filtered and then multiplied by the texel.
+        wa, wb = self._weight * (1 - b) * scale_a, self._weight * (1 - a) * scale_b
+        grad_x = -wb * b
+        offset = 2 * (wa * (mean_d - a * mean_x) - wb * mean_d - grad_x * mean_x)
+        offset, grad_d, grad_x = self._spread([offset, wb, grad_x])
+        gradient = offset + 2 * ((x - self._y) * grad_d + x * grad_x)
+        dr.eval(loss, gradient)
+        return loss, gradient
+
+    def _spread(self, fields):
+        """Apply the transposed window filter: along rows first, then along columns."""
+        (height, width, channels), (full_height, full_width, _) = self.map_shape, self.shape
+        F = type(self._y)
+        dr.eval(fields)
+        index = dr.arange(dr.int32_array_t(F), height * full_width * channels)
+        row = index // (full_width * channels)
+        column = index - row * (full_width * channels)
+        base, length = row * (width * channels), width * channels
+        fields = _scatter_filter(self._columns, fields, column, base, channels, length)
+        dr.eval(fields)
+        index = dr.arange(dr.int32_array_t(F), full_height * full_width * channels)
+        step = full_width * channels
+        return _scatter_filter(self._rows, fields, index, 0, step, height * step)
+
+
+class KnownGradient(dr.CustomOp):
+    """A measure of a flat array as one node of the AD graph: its gradient is known as soon as its value is.
+
+    ``measure._evaluate(x, True)`` returns both.
+    """
+
+    def eval(self, x, measure):
+        """Return the value; keep the gradient."""
+        value, self.gradient = measure._evaluate(dr.detach(x), True)
+        return value
+
+    def forward(self):
+        """Multiply the tangent by the gradient and add up."""
+        self.set_grad_out(dr.sum(self.gradient * self.grad_in("x")))
+
+    def backward(self):
+        """Scale the gradient by the loss's."""
+        self.set_grad_in("x", self.gradient * self.grad_out())
+
+    def name(self):
+        """Name the node in Dr.Jit's graphs."""
+        return "measure"
+
+
+def _gaussian(length, size=WINDOW, sigma=1.5):
+    """Gaussian window of the largest odd size up to ``size`` that fits, with sum one."""
+    radius = (min(size, length) - 1) // 2
+    taps = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
+    return [tap / sum(taps) for tap in taps]
+
+
+def _mean_and_variance(taps, values):
+    mean = sum(k * v for k, v in zip(taps, values, strict=True))
+    return mean, sum(k * dr.square(v - mean) for k, v in zip(taps, values, strict=True))
+
+
+def _scatter_filter(taps, fields, position, base, step, length):
+    """Gather each field against the reversed window, taking nothing from outside ``[0, length)``."""
+    F, sums = type(fields[0]), [0] * len(fields)
+    for j, tap in enumerate(taps):
+        source = position - j * step
+        inside = (source >= 0) & (source < length)
+        index = dr.uint32_array_t(F)(source + base)
+        sums = [s + tap * dr.gather(F, field, index, inside) for s, field in zip(sums, fields, strict=True)]
+    return sums
+
+
+def ssim_loss(x, reference, weight=None, data_range: float = 1.0):
+    """Compute ``1 - mean SSIM`` of two images ``(H, W, C)``; see `Ssim`, which keeps the reference's share.
+
+    Differentiable in ``x`` only.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ, or gradients are expected of the reference.
+    """
+    if dr.grad_enabled(reference):
+        raise InputError("SSIM: gradients of the reference are not available: swap the two, or detach it.")
+    check_pair(x, reference)
+    return Ssim(reference, weight, data_range)(x)
+
+
+def ssim_index(x, reference, weight=None, data_range: float = 1.0):
+    """Compute the mean SSIM of two images ``(H, W, C)`` as a size-1 array; see `Ssim`."""
+    return 1 - ssim_loss(x, reference, weight, data_range)
+
+
+def ssim_map(x, reference, data_range: float = 1.0):
+    """Compute the SSIM of every window that lies inside the image; see `Ssim.map`."""
+    return Ssim(reference, None, data_range).map(x)

@@ -1,0 +1,210 @@
+"""What a run leaves to be read by programs: history, metrics, and a manifest that explains it later.
+
+Numbers are finite or null; whoever writes learns where one was not.
+"""
+
+import csv
+import datetime
+import hashlib
+import importlib.metadata
+import io
+import json
+import math
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+import envedit
+from envedit.core.atomic_files import write_atomically
+
+# ----------------------------------------------------------------------------------------------------------
+# Files
+
+
+def plain(value, where, lost):
+    """Turn a nested value into what JSON knows; the places of non-finite numbers are appended to ``lost``."""
+    if isinstance(value, dict):
+        inside = f"{where}." if where else ""
+        return {str(key): plain(item, f"{inside}{key}", lost) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item, f"{where}[{i}]", lost) for i, item in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        return plain(list(value) if value.ndim else value[()], where, lost)
+    if value is None or isinstance(value, (bool, str, int)):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, np.floating) and np.isfinite(value):
+        return float(str(value))  # the shortest decimal that is this float32, not its 17 digits as a double
+    if isinstance(value, np.generic):
+        value = value.item()
+        return plain(value, where, lost)
+    if isinstance(value, float):
+        if math.isfinite(value):
+            return value
+        lost.append(where)
+        return None
+    raise TypeError(f"{where}: {type(value).__name__} cannot be written as JSON")
+
+
+def _write_json(path, value) -> list[str]:
+    lost: list[str] = []
+    text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
+    write_atomically(path, text.encode("ascii") + b"\n")
+    return lost
+
+
+def write_metrics(path, metrics: dict) -> list[str]:
+    """Write ``metrics.json``; numbers are finite or null.
+
+    Returns
+    -------
+    list of str
+        Where a NaN or Inf became null, as ``"render.psnr"``, so that the caller can warn.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    TypeError
+        If a value is neither number, text, list, dict, path nor NumPy scalar or array.
+    """
+    return _write_json(path, metrics)
+
+
+def write_manifest(path, manifest: dict) -> list[str]:
+    """Write ``manifest.json``; returns and raises as `write_metrics`."""
+    return _write_json(path, manifest)
+
+
+def write_history(path, rows: list[dict]) -> list[str]:
+    """Write ``history.csv``, a row an iteration.
+
+    The columns are the union of the rows' keys in the order first seen. A value that is missing, None, NaN
+    or Inf is an empty cell.
+
+    Returns
+    -------
+    list of str
+        Where a NaN or Inf became an empty cell, as ``"[17].loss"`` (index of the row, column).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    lost: list[str] = []
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns(rows) or ["iteration"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(plain(rows, "", lost))
+    write_atomically(path, text.getvalue().encode("utf-8", "backslashreplace"))
+    return lost
+
+
+def columns(rows) -> list[str]:
+    """List the keys of all rows in the order first seen."""
+    return list(dict.fromkeys(str(key) for row in rows for key in row))
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The manifest
+
+
+def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
+    """Collect what it takes to explain a run later: versions, machine, seeds, and the digests of its inputs.
+
+    Parameters
+    ----------
+    config_summary : dict
+        Whatever of the configuration is worth repeating; its keys that name a seed are listed as ``seeds``.
+    inputs : dict of str to path or None
+        Files read, by role. None is left out; a file that cannot be read any more is listed with the reason.
+    variant : str
+        Mitsuba variant.
+
+    Returns
+    -------
+    dict
+        Ready for `write_manifest`. ``commit`` is None unless the package runs from its own git checkout.
+    """
+    versions = {"envedit": _envedit_version(), "python": platform.python_version()}
+    for package in ("mitsuba", "drjit", "numpy", "OpenEXR"):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "time_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "versions": versions,
+        "commit": _commit(Path(envedit.__file__).resolve().parent.parent),
+        "variant": variant,
+        "llvm": _llvm() if variant.startswith("llvm") else None,
+        "platform": platform.platform(),
+        "cores": {"usable": usable, "machine": os.cpu_count()},
+        "seeds": {key: value for key, value in config_summary.items() if "seed" in str(key)},
+        "inputs": {role: _digest(path) for role, path in inputs.items() if path is not None},
+        "config": config_summary,
+    }
+
+
+def _envedit_version():
+    import envedit  # here: the package may import its modules before it has its version
+
+    return getattr(envedit, "__version__", None)
+
+
+def changed(file) -> list[str]:
+    """Return the inputs that a manifest names and that hold something else now; none without a manifest."""
+    try:
+        listed = json.loads(Path(file).read_text(encoding="utf-8"))["inputs"].values()
+        known = {entry["path"]: entry["sha256"] for entry in listed}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return []
+    return [path for path, digest in known.items() if _digest(path)["sha256"] not in (digest, None)]
+
+
+def _digest(path):
+    try:
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            return {"path": str(path), "bytes": os.fstat(file.fileno()).st_size, "sha256": digest}
+    except (OSError, ValueError) as error:
+        return {"path": str(path), "bytes": None, "sha256": None, "error": str(error)}
+
+
+def _commit(root):
+    """Commit of the checkout whose top is ``root``, with ``-dirty`` after it; None for any other folder."""
+
+    def git(*arguments):
+        command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+
+    try:
+        # An installed package may lie inside somebody else's repository: that commit would be a lie.
+        top, commit = git("rev-parse", "--show-toplevel", "HEAD").splitlines()
+        if Path(top).resolve() != Path(root).resolve():
+            return None
+        return commit + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return None
+
+
+def _llvm():
+    """Version and file of the LLVM that Dr.Jit loaded, as far as they can be had."""
+    try:
+        from drjit.detail import llvm_version
+
+        version = ".".join(map(str, llvm_version()))
+    except Exception:  # an optional line of the manifest must not end a finished run
+        version = None
+    try:
+        loaded = Path("/proc/self/maps").read_text().splitlines()
+        path = next((line.split(maxsplit=5)[-1] for line in loaded if "/libLLVM" in line), None)
+    except OSError:
+        path = os.environ.get("DRJIT_LIBLLVM_PATH")
+    return {"version": version, "path": path}

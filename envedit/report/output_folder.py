@@ -1,0 +1,141 @@
+"""The folder of a run: the names of what it may hold, one run at a time, nothing of an earlier run lost."""
+
+import contextlib
+import filecmp
+import os
+import shutil
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+from envedit.core.errors import InputError
+
+RESULTS = (
+    "metrics.json", "edited.exr", "edited_full.exr", "edited_layers.exr", "render_initial.exr",
+    "render_target.exr", "render_edited.exr", "influence.exr", "influence.png", "unreachable.png",
+    "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "checkpoint.npz",
+)  # fmt: skip
+"""Every file that a run may leave in its folder, the last only while it runs.
+
+The first says that a run is complete: whoever moves them away moves it first of all.
+"""
+EARLIER = "earlier"
+"""With a number, the folder that what an earlier run left is moved to."""
+
+
+def tidy(folder: Path) -> None:
+    """Remove what killed processes were writing in a folder: temporary names of :data:`RESULTS`."""
+    for name in RESULTS:
+        for path in folder.glob(f".{name}.*"):
+            writer = path.name.removeprefix(f".{name}.").partition(".")[0]
+            if writer.isdecimal() and not _runs(int(writer)):
+                with contextlib.suppress(OSError):
+                    path.unlink()
+
+
+def _runs(process):
+    """Say whether another process of this number runs, as far as can be told without touching it."""
+    if process == os.getpid() or os.name != "posix":
+        return False
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        pass
+    return True
+
+
+@contextlib.contextmanager
+def alone(folder: Path):
+    """Make a folder for results, and let no other process of this machine work in it meanwhile.
+
+    Raises
+    ------
+    InputError
+        It cannot be made, or another process works in it.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file, the results need a folder: give another with --out")
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unusable(folder, error) from error
+    descriptor = None
+    if fcntl:
+        with contextlib.suppress(OSError):  # some file systems have no locks
+            descriptor = os.open(folder, os.O_RDONLY)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(descriptor)
+                raise InputError(f"{folder}: another run works in it: wait, or give another --out") from None
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def prepare_folder(folder: Path, names, inputs=(), keep: bool = False, spare=()) -> None:
+    """Move what an earlier run left in a folder to ``earlier-N`` in it.
+
+    Parameters
+    ----------
+    folder : Path
+        Where results will go.
+    names : sequence of str
+        Their names; the first, which says that a run is complete, is moved first, and the last is a
+        checkpoint's.
+    inputs : sequence of path
+        What the run reads, and must not be moved.
+    keep : bool
+        Leave what is there, if it is complete or there is a checkpoint: it is to be continued.
+    spare : sequence of path
+        What is copied and not moved, if it is among the results: the run will be asked for by it again.
+
+    Raises
+    ------
+    InputError
+        An input lies where a result would go, or the folder cannot be used.
+    """
+    try:
+        old = [folder / name for name in names if (folder / name).exists()]
+        read = {os.path.realpath(path) for path in inputs}
+        if mine := [path for path in old if os.path.realpath(path) in read]:
+            raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
+        if keep and {folder / names[0], folder / names[-1]} & set(old):
+            old = []
+        stay = {os.path.realpath(path) for path in spare}
+        kept = [path for path in old if os.path.realpath(path) in stay]
+        if len(kept) < len(old) or not all(_copied(path) for path in kept):
+            numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{EARLIER}-*")]
+            number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)
+            aside = folder / f"{EARLIER}-{number}"
+            aside.mkdir()
+            for path in old:
+                if path in kept:
+                    shutil.copy2(path, aside / path.name)
+                else:
+                    path.rename(aside / path.name)
+    except OSError as error:
+        raise _unusable(folder, error) from error
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{folder}: cannot be written to: give another folder with --out")
+
+
+def _copied(path):
+    """Say whether a file lies in one of the folders of earlier runs beside it, as it is."""
+    return any(
+        filecmp.cmp(path, earlier, shallow=False)
+        for earlier in path.parent.glob(f"{EARLIER}-*/{path.name}")
+        if earlier.is_file()
+    )
+
+
+def _unusable(folder, error):
+    reason = f"{folder}: cannot be used for the results ({error.strerror or error})"
+    return InputError(f"{reason}: give another with --out")

@@ -1,0 +1,113 @@
+"""What a run leaves in its folder: maps, renderings, metrics, manifest and report."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from envedit import config, results
+from envedit.core import atomic_files
+from envedit.core.errors import InputError, NumericalError
+from envedit.images import images, layered_exr
+from envedit.report import html_report, manifest, output_folder, preview
+from envedit.solve import checkpoint, feasibility
+
+
+def write(settings: config.Config, folder: Path, result: results.Result, import_s: float) -> list[str]:
+    """Write a result; the checkpoint goes last of all.
+
+    Parameters
+    ----------
+    settings : config.Config
+        What was carried out.
+    folder : Path
+        Where to; files of the same names are replaced.
+    result : results.Result
+        What was found; the timing of its metrics is completed.
+    import_s : float
+        Seconds that imports took.
+
+    Returns
+    -------
+    list of str
+        Warnings: the result's, and numbers that were not finite.
+    """
+    start = time.perf_counter()
+    timing = result.metrics["timing"]
+    _maps(settings, folder, result)
+    timing["full_s"] = round(time.perf_counter() - start, 3)
+    start = time.perf_counter()
+    text = config.to_toml(settings)
+    atomic_files.write_atomically(folder / "config.toml", text.encode())
+    manifest.write_history(folder / "history.csv", result.history)
+    named = {
+        "envmap": settings.input.envmap,
+        "scene": result.scene or "",
+        "target": settings.target.file,
+        "mask": settings.target.mask,
+        **{name: value for name, value in vars(settings.perceptual).items() if name != "network"},
+    }
+    inputs = {role: path for role, path in named.items() if os.path.isfile(path)}
+    facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)
+    manifest.write_manifest(folder / "manifest.json", facts)
+    timing["import_s"] = round(import_s, 3)
+    if settings.output.report:
+        preview.preview(folder / "preview.png", result.renders, result.maps, settings.output.tonemap)
+        html_report.write_report(
+            folder / "report.html",
+            title=f"{Path(settings.input.envmap).stem}, {Path(settings.scene.file).stem}",
+            config_toml=text,
+            metrics=result.metrics,
+            manifest=facts,
+            history=result.history,
+            renders=result.renders,
+            maps=result.maps,
+            influence=result.influence,
+            frozen=result.frozen,
+            separation=result.separation,
+            unreachable=None if result.reach is None else feasibility.unreachable(result.reach),
+            warnings=result.warnings,
+            notes=result.notes,
+            tonemap=settings.output.tonemap,
+        )
+    timing["report_s"] = round(time.perf_counter() - start, 3)
+    timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full", "report")), 3)
+    lost = manifest.write_metrics(folder / "metrics.json", result.metrics)
+    checkpoint.remove(folder)
+    output_folder.tidy(folder)
+    return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
+
+
+def _maps(settings, folder, result):
+    """Write maps and renderings."""
+    source = {"source": settings.input.envmap}
+    images.write_exr(folder / "edited.exr", result.envmap, source)
+    for name, picture in result.renders.items():
+        images.write_exr(
+            folder / f"render_{name}.exr", picture, {"source": settings.scene.file}, panorama=False
+        )
+    initial = result.maps["initial"]
+    layers = {"edited": result.envmap, "initial": initial, "difference": result.envmap - initial}
+    if result.influence is not None:
+        grey = result.influence[..., None].repeat(3, axis=2)
+        images.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
+        preview.influence(folder / "influence.png", result.influence, result.frozen)
+        layers["influence"] = result.influence
+    layered_exr.write(folder / "edited_layers.exr", layers)
+    if result.reach is not None:
+        images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
+    if settings.output.full:
+        try:
+            full = results.at_full_resolution(settings.input, result)
+            if full is not None:
+                layered_exr.write(folder / "edited_full.exr", {"edited": full})
+        except MemoryError:
+            result.warnings.append(
+                f"{settings.input.envmap}: not enough memory to carry the edit to its size; "
+                "edited.exr has it at working resolution"
+            )
+        except (InputError, NumericalError) as error:  # the file may be gone by now
+            result.warnings.append(
+                f"edited_full.exr is not written: {error}; edited.exr has it at working resolution"
+            )

@@ -1,0 +1,51 @@
+"""The interface through which loop, solver and export see a representation, whichever it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import mitsuba as mi
+import numpy as np
+
+if TYPE_CHECKING:
+    from envedit.representations.layers.separation import Separation
+    from envedit.representations.siren.fit import Fitted
+
+EPSILON = 0.01
+"""Added to radiance inside a logarithm (paper, below Eq. 3)."""
+Params = dict[str, "mi.TensorXf"]
+"""What the optimiser owns: tensors by name."""
+
+
+class Representation(Protocol):
+    """The part of a map that is edited, as parameters.
+
+    Attributes
+    ----------
+    lr : float
+        Learning rate that suits the parameters.
+    models_edit : bool
+        The parameters describe the edit and not the map: they start at "no change", are searched for before
+        they are optimised, and apply to the original at any resolution.
+    fitted : Fitted or None
+        How well the map was fitted, where :meth:`encode` fits.
+    separation : Separation or None
+        Lights and background of the map, where :meth:`encode` tells them apart.
+    """
+
+    lr: float
+    models_edit: bool
+    fitted: Fitted | None
+    separation: Separation | None
+
+    def encode(self, image: np.ndarray, seed: int = 0) -> Params:
+        """Return the parameters that reproduce an image (H, W, 3) as well as the representation can.
+
+        Raises
+        ------
+        InputError
+            If the image is not radiance, or holds what :meth:`decode` could not give back.
+        """
+
+    def decode(self, params: Params) -> mi.TensorXf:
+        """Return (H, W, 3) linear radiance, finite and not negative, differentiable in the parameters."""

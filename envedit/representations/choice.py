@@ -1,0 +1,25 @@
+"""The representation that a configuration asks for."""
+
+from __future__ import annotations
+
+from envedit import config
+from envedit.representations.base import Representation
+from envedit.representations.layers.gain import CYCLES
+from envedit.representations.layers.layers import Layers
+from envedit.representations.pixels import LogPixels, Pixels
+from envedit.representations.siren import fit
+from envedit.representations.siren.siren import Siren
+
+
+def make(settings: config.Config, folder=None, progress=None, rows=None) -> Representation:
+    """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map."""
+    kind = settings.representation.kind
+    if kind == "layers":
+        cycles = settings.representation.cycles
+        return Layers(rows, CYCLES if cycles == "auto" else cycles)
+    if kind == "pixels":
+        return Pixels()
+    if kind == "log-pixels":
+        return LogPixels()
+    recipe = settings.fit if settings.fit.polish == "always" else fit.unpolished(settings.fit)
+    return Siren(settings.representation, recipe, folder, progress, rows)

@@ -1,0 +1,137 @@
+"""The smooth gain of the sky: a field of log factors that starts at zero.
+
+A sum of bilinear grids over the active rows, periodic in azimuth, each twice as fine as the one before. The
+three coarse ones, up to a stated number of cycles around the horizon, are each half as strong per step of
+their nodes: what a coarse grid can say is said by it. Finer ones are added where a picture tells them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core.arrays import tensor
+
+MOST = 12.0
+"""Largest log factor: e^12 is more than any sky needs, and leaves float32 room."""
+LEVELS = 3
+"""Coarse grids, which any picture may move."""
+CYCLES = 12
+"""Cycles around the horizon that any picture may move; what is finer must be told by it."""
+
+
+DETAIL = 1.0
+"""A step of the nodes of finer grids, where they are well known."""
+
+
+def grid_size(cycles: float, share: float) -> tuple[int, int]:
+    """Return rows and columns of the grid that holds so many cycles; ``share`` as for :class:`GridGain`."""
+    columns = max(2, 2 * round(cycles))
+    return max(2, round(columns / 2 * share) + 1), columns
+
+
+def tents(size, shape) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of a grid's rows (height, rows) and columns (width, columns) at texel centres."""
+    (rows, columns), (height, width) = size, shape
+    y = (np.arange(height) + 0.5) / height * (rows - 1)
+    x = (np.arange(width) + 0.5) / width * columns
+    down = np.maximum(1 - np.abs(y[:, None] - np.arange(rows)), 0)
+    apart = np.abs(x[:, None] - np.arange(columns))
+    return down, np.maximum(1 - np.minimum(apart, columns - apart), 0)
+
+
+@dataclass(frozen=True)
+class Octave:
+    """One grid of detail.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Its rows and columns of nodes.
+    known : ndarray (rows, columns)
+        How well the picture tells it at each node, in [0, 1).
+    share : float
+        How much of the active rows' solid angle it tells, in [0, 1].
+    """
+
+    size: tuple[int, int]
+    known: np.ndarray
+    share: float
+
+    @property
+    def cycles(self) -> int:
+        """Cycles around the horizon that it can hold."""
+        return self.size[1] // 2
+
+
+class GridGain:
+    """Log gain per channel on bilinear grids.
+
+    Parameters
+    ----------
+    cycles : int
+        Cycles around the horizon that the finest grid can hold: it has twice as many columns.
+    share : float
+        Rows of the image over rows of its map: the grids are as fine in elevation as in azimuth.
+    """
+
+    def __init__(self, cycles: int, share: float):
+        self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
+        self._units = [0.5**level for level in range(LEVELS)]
+
+    def refine(self, octaves) -> None:
+        """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
+        for octave in octaves:
+            self.sizes.append(octave.size)
+            self._units.append(DETAIL * np.repeat(octave.known[..., None], 3, axis=2).astype(np.float32))
+
+    def init(self) -> dict:
+        """Return its parameters: all zero."""
+        return {f"gain.{i}": np.zeros((*size, 3), np.float32) for i, size in enumerate(self.sizes)}
+
+    def scales(self) -> dict:
+        """Return what a unit of each parameter is: a number, or an array (rows, columns, 3)."""
+        return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
+
+    def hats(self, level: int, shape) -> list[tuple[np.ndarray, np.ndarray]]:
+        """List the four nodes around every texel of an image (rows, W): (index of the node, bilinear weight).
+
+        Each is an array (rows * W,); the same map as :func:`tents` as matrices.
+        """
+        (rows, columns), (height, width) = self.sizes[level], shape
+        y = (np.arange(height) + 0.5) / height * (rows - 1)
+        x = (np.arange(width) + 0.5) / width * columns
+        top = np.minimum(y.astype(int), rows - 2)
+        left = x.astype(int) % columns
+        fy, fx = (y - top)[:, None], (x - np.floor(x))[None]
+        taps = []
+        for a in (0, 1):
+            for b in (0, 1):
+                node = np.add.outer((top + a) * columns, (left + b) % columns)
+                weight = (fy if a else 1 - fy) * (fx if b else 1 - fx)
+                taps.append((node.ravel(), weight.ravel()))
+        return taps
+
+    def prepare(self, shape, rows=None) -> list:
+        """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
+        found = []
+        for size in self.sizes:
+            down, across = tents(size, shape)
+            across = np.kron(across.T, np.eye(3))  # three channels, one apart from the other
+            found.append([tensor(m) for m in (down, across)])
+        return found
+
+    def evaluate(self, params: dict, prepared) -> mi.Color3f:
+        """Return the log gain at every texel.
+
+        Products of matrices and not gathers, whose adjoint adds in the order in which threads come.
+        """
+        g = 0
+        for level, (down, across) in enumerate(prepared):
+            rows, columns = self.sizes[level]
+            nodes = dr.reshape(params[f"gain.{level}"], (rows, 3 * columns))
+            g = g + dr.matmul(dr.matmul(down, nodes), across)
+        return dr.clip(dr.unravel(mi.Color3f, g.array), -MOST, MOST)

@@ -1,0 +1,424 @@
+"""Lights that move on the sphere: their texels carried along a rotation, differentiably.
+
+A light is a set of points, each a direction with a flux. A rotation, a size and a flux per channel place it;
+then every point is shared out among the texels around it. A point's share of a texel is the tent of
+Mitsuba's own interpolation: in rows one row wide to either side, in columns one column, or as wide as the
+texel that the point came from where columns lie closer. A point that has not moved falls into its own texel,
+all of it: no blur; turned about the vertical, a light is interpolated as any turned map is; and flux
+(radiance times :func:`.latlong.lookup_solid_angles`) is kept wherever it goes.
+
+The shares are piecewise linear in the place, so their derivatives are exact everywhere but on the lines
+through texel centres, where they jump. Sums run in integers: the order in which threads add does not matter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.representations.layers.separation import GLOW_DEGREES, Light
+
+SPARE = 2
+"""Lights beside the map's own, dark until one is needed: lobes, without a glow."""
+DARK = -30.0
+"""Logarithm of the flux of a light that is not there."""
+FAINTEST = 1e-3
+"""Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
+LOBE_POINTS = 512
+LOBE_DEGREES = 2.0
+"""Points and radius of a lobe of size 1."""
+LOG_SIZES = (-6.0, 3.0)
+"""Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
+MOST_LOG_FLUX = 30.0
+"""Logarithms of fluxes are cut there: e^30 is 1e13."""
+_LEAST_SINE = 1e-8
+_SNAP = 2e-4  # texels; of wide maps as many as float32 rounds an azimuth by
+_SNAP_SHARE = 4e-7
+_OFF_POLE = 1e-4  # texels: as far from a pole the texels of its row are taken to lie, each with its azimuth
+_WIDEST = 2.0  # half-width of a tent in widths of the map: there it is even all around
+_BITS = 40
+
+
+class Lights:
+    """The lights of a map at one resolution, as points.
+
+    Parameters
+    ----------
+    lights : list of Light
+        Of a :class:`.separation.Separation`.
+    rows : (int, int)
+        First row of the image that the lights' texels refer to in its map, and the rows of that map.
+    width : int
+        Its columns.
+
+    Attributes
+    ----------
+    count : int
+        Lights, spare ones included.
+    centres : ndarray (count, 3)
+        Directions of unmoved lights; spare ones are at the zenith.
+    flux : ndarray (count, 3)
+        Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, at least
+        :data:`FAINTEST` of it in every channel, or 1.
+    """
+
+    def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
+        first, total = rows
+        self.count, self.width, self.total = len(lights) + SPARE, width, total
+        omega = latlong.lookup_solid_angles(total, width)
+        directions, fluxes, which, sines = [], [], [], []
+        for i, light in enumerate(lights):
+            row, column = first + light.texels // width, light.texels % width
+            directions.append(points(row, column, total, width))
+            fluxes.append(light.radiance * omega[row][:, None])
+            which.append(np.full(len(row), i))
+            sines.append(np.sin(np.pi * row / max(total - 1, 1)))
+        own = np.array([f.sum(axis=0) for f in fluxes]).reshape(-1, 3)
+        spare = own.mean(axis=0) if len(own) else np.ones(3)
+        spare = np.maximum(spare, FAINTEST * spare.max())
+        for i in range(SPARE):
+            d, weight, spacing = lobe()
+            directions.append(d)
+            fluxes.append(weight[:, None] * spare)
+            which.append(np.full(len(d), len(lights) + i))
+            sines.append(np.full(len(d), spacing / (2 * math.pi / width)))
+        self.centres = np.array([light.direction for light in lights] + [[0.0, 1.0, 0.0]] * SPARE)
+        self.flux = np.concatenate([own, np.repeat(spare[None], SPARE, axis=0)])
+        self._point = dr.opaque(mi.Vector3f(np.concatenate(directions).T.astype(np.float32)))
+        self._flux = dr.opaque(mi.Color3f(np.concatenate(fluxes).T.astype(np.float32)))
+        self._which = dr.opaque(mi.UInt32(np.concatenate(which).astype(np.uint32)))
+        # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
+        owner = np.concatenate(which)[:, None] == np.arange(self.count)
+        self._owner = tensor(owner)
+        self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
+        self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
+        self._glow = [
+            None if light.glow is None else dr.opaque(mi.Float(light.glow.astype(np.float32).ravel()))
+            for light in lights
+        ]
+
+    @property
+    def glowing(self) -> bool:
+        """Whether any light has a glow."""
+        return any(glow is not None for glow in self._glow)
+
+    def core(self, turn, log_flux, log_size, shape: tuple[int, int], rows: tuple[int, int]) -> mi.TensorXf:
+        """Render the cores.
+
+        Parameters
+        ----------
+        turn : TensorXf (count, 3)
+            Rotation vectors: axis times angle in radians, from where the light was.
+        log_flux : TensorXf (count, 3)
+            Logarithm of the flux over that of :attr:`flux`.
+        log_size : TensorXf (count, 1)
+            Logarithm of the size over what it was.
+        shape : (int, int)
+            Rows and columns wanted.
+        rows : (int, int)
+            First row in the map, and the rows of the map, at that resolution.
+
+        Returns
+        -------
+        TensorXf (rows, W, 3)
+            Linear radiance; what falls on rows that are not wanted is lost.
+        """
+        centre = dr.gather(mi.Vector3f, self._centre, self._which)
+        size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, *LOG_SIZES))
+        turn = dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array)
+        flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
+        finer = shape[1] / self.width
+        spread = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
+        places = placed(self._point, centre, turn, size, self._sine, finer, (rows[1], shape[1]))
+        return shared_out(*places, flux, spread, shape, rows)
+
+    def glow(self, turn, log_flux, d: mi.Vector3f) -> mi.Color3f:
+        """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.
+
+        s_l is the factor of the light's flux: a glow is put out with its light.
+        """
+        factor = mi.Color3f(1)
+        for i, table in enumerate(self._glow):
+            if table is None:
+                continue
+            index = dr.opaque(mi.UInt32, i)
+            centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
+            factor *= 1 + _glow_of(table, dr.dot(d, centre)) * _exp(_colour(log_flux, index))
+        return factor
+
+
+def placed(point, centre, turn, size, sine, finer: float, grid: tuple[int, int]):
+    """Return where points of lights come to lie: row, column and half-width in columns, each Float (n,).
+
+    Parameters
+    ----------
+    point, centre, turn : Vector3f (n,)
+        Direction of a point, centre and rotation vector of its light.
+    size : Float
+        Size of the light over what it was.
+    sine : Float (n,)
+        Sine of the polar angle of the texel that the point came from.
+    finer : float
+        Columns of the grid over columns of the map that the points came from.
+    grid : (int, int)
+        Rows and columns of the whole map.
+    """
+    total, width = grid
+    along = dr.dot(point, centre)
+    scaled = dr.normalize(point + (point - centre * along) * (size - 1))
+    d = rotate(turn, scaled)
+    # As in latlong.texel_position; the horizontal part is held off 0, where a column is not defined.
+    across = dr.sqrt(dr.maximum(d.x * d.x + d.z * d.z, _LEAST_SINE**2))
+    row = dr.atan2(across, d.y) * dr.opaque(mi.Float, (total - 1) / math.pi)
+    column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, width / (2 * math.pi)) - 0.5
+    snap = max(_SNAP, _SNAP_SHARE * width)
+    row, column = _snapped(row, snap), _snapped(column, snap)
+    half = dr.clip(sine * size / across * finer, 1, _WIDEST * width)
+    half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
+    return row, column, half
+
+
+def shared_out(row, column, half, flux, half_row: float, shape, rows) -> mi.TensorXf:
+    """Share points out among the texels around them.
+
+    Parameters
+    ----------
+    row, column, half : Float (n,)
+        As :func:`placed` returns them.
+    flux : Color3f (n,)
+        Radiance times steradian.
+    half_row : float
+        Half-width of a tent in rows, at least 1.
+    shape, rows : (int, int)
+        As in :meth:`Lights.core`.
+
+    Returns
+    -------
+    TensorXf (rows, W, 3)
+        Linear radiance; what falls on rows that are not wanted is lost.
+    """
+    return dr.custom(_Share, row, column, half, flux, half_row, shape, rows)
+
+
+def points(row: np.ndarray, column: np.ndarray, total: int, width: int) -> np.ndarray:
+    """Return the directions (n, 3) of texels; those of the poles' rows each keep their azimuth."""
+    theta = np.pi * np.clip(row, _OFF_POLE, total - 1 - _OFF_POLE) / max(total - 1, 1)
+    phi = 2 * np.pi * (column + 0.5) / width
+    return latlong.on_sphere(theta, phi)
+
+
+def rotate(v: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+    """Rotate ``d`` by the rotation vector ``v`` (Rodrigues), smooth at v = 0."""
+    angle = dr.sqrt(dr.squared_norm(v) + 1e-14)
+    sinc, half = dr.sin(angle) / angle, dr.sin(0.5 * angle) / (0.5 * angle)
+    return d * dr.cos(angle) + dr.cross(v, d) * sinc + v * (dr.dot(v, d) * (0.5 * half * half))
+
+
+def rotation_vector(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the rotation vector that takes one direction to another and keeps what was upright upright.
+
+    About the vertical by the difference in azimuth, then tilted by the difference in elevation.
+    """
+    frames = []
+    for d in (start, end):
+        d = np.asarray(d, np.float64) / np.linalg.norm(d)
+        level = np.hypot(d[0], d[2])
+        east = np.array([-d[2], 0.0, d[0]]) / level if level > 1e-6 else np.array([1.0, 0.0, 0.0])
+        frames.append(np.stack([east, np.cross(d, east), d], axis=1))
+    r = frames[1] @ frames[0].T
+    # Through the quaternion: well defined for half turns too.
+    q = np.linalg.eigh(
+        np.array(
+            [
+                [np.trace(r), r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+                [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+                [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+                [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+            ]
+        ),
+        UPLO="U",
+    )[1][:, -1]
+    q = q if q[0] >= 0 else -q
+    sine = np.linalg.norm(q[1:])
+    return 2 * math.atan2(sine, q[0]) * q[1:] / sine if sine > 1e-12 else np.zeros(3)
+
+
+def lobe():
+    """Return the points of a Gaussian lobe: directions around the zenith, weights, and spacing in radians."""
+    k = np.arange(LOBE_POINTS) + 0.5
+    radius = math.radians(LOBE_DEGREES)
+    angle = radius * np.sqrt(-2 * np.log(1 - k / (LOBE_POINTS + 0.5)))
+    turn = k * math.pi * (3 - math.sqrt(5))
+    d = np.stack([np.sin(angle) * np.cos(turn), np.cos(angle), np.sin(angle) * np.sin(turn)], axis=1)
+    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), 3 * radius / math.sqrt(LOBE_POINTS)
+
+
+def _vector(tensor, i):
+    return mi.Vector3f(*(dr.gather(mi.Float, tensor.array, i * 3 + k) for k in range(3)))
+
+
+def _colour(tensor, i):
+    return mi.Color3f(*(dr.gather(mi.Float, tensor.array, i * 3 + k) for k in range(3)))
+
+
+def _exp(x):
+    return dr.select(x <= DARK, 0, dr.exp(dr.minimum(x, MOST_LOG_FLUX)))
+
+
+def flux_factor(log_flux: np.ndarray) -> np.ndarray:
+    """Return what a flux is multiplied by; the same on the host as :meth:`Lights.core` has it."""
+    return np.where(log_flux <= DARK, 0, np.exp(np.minimum(log_flux, MOST_LOG_FLUX)))
+
+
+def size_factor(log_size) -> np.ndarray:
+    """Return what a size is multiplied by; likewise."""
+    return np.exp(np.clip(log_size, *LOG_SIZES))
+
+
+def _sign(x):
+    # Not dr.sign, which is 1 at 0: on a texel's centre the mean of both sides' derivatives.
+    return dr.select(x > 0, 1, dr.select(x < 0, -1, mi.Float(0)))
+
+
+def _snapped(place, snap):
+    """Move a place that is a whole number but for rounding onto it: 1e-5 of a sun is bright."""
+    whole = dr.round(place)
+    return dr.replace_grad(dr.select(dr.abs(place - whole) < snap, whole, place), place)
+
+
+def _glow_of(table, cosine):
+    """Interpolate a table over GLOW_DEGREES at an angle; level within the first node, 0 beyond the last."""
+    step, last = float(GLOW_DEGREES[1]), len(GLOW_DEGREES) - 1
+    # The derivative of acos is infinite at 1: held off by less than the level part.
+    angle = dr.acos(dr.clip(cosine, -1 + 1e-6, 1 - 1e-6)) * (180 / math.pi / step)
+    node = dr.clip(mi.UInt32(angle), 0, last - 1)
+    part = angle - node
+    low, high = (dr.gather(mi.Color3f, table, node + k) for k in (0, 1))
+    return dr.select(angle < last, low + (high - low) * part, 0)
+
+
+class _Share(dr.CustomOp):
+    """Share points out among texels; see the module's docstring."""
+
+    def eval(self, row, column, half, flux, half_row, shape, rows):
+        first, total = rows
+        self.args = row, column, half, flux
+        omega = latlong.lookup_solid_angles(total, shape[1]).astype(np.float32)
+        self.geometry = (
+            dr.opaque(mi.Float(1 / omega)),
+            dr.opaque(mi.Float, half_row),
+            dr.opaque(mi.Int32, shape[1]),
+            dr.opaque(mi.Int32, first),
+            dr.opaque(mi.Int32, shape[0]),
+            dr.opaque(mi.Int32, total),
+        )
+        self.shape = shape
+        texels = shape[0] * shape[1]
+        # Of the largest radiance that can come about, so many bits are kept.
+        most = dr.max(dr.maximum(dr.maximum(flux.x, flux.y), flux.z)) * float(1 / omega.min())
+        most = dr.minimum(most, dr.largest(mi.Float))  # infinite, it would put all lights out
+        scale = dr.select(most > 0, 2.0**_BITS / dr.maximum(most, 1e-25), 0)
+        sums = dr.zeros(mi.Int64, texels * 3)
+        _scatter(sums, row, column, half, flux, scale, *self.geometry)
+        dr.eval(sums)
+        lit = mi.Float(mi.Float64(sums) * dr.select(scale > 0, 1 / mi.Float64(scale), 0))
+        # Summed in double precision: many bright points are no infinity.
+        bad = ~dr.isfinite(dr.sum(mi.Float64(flux.x) + flux.y + flux.z + row + column + half))
+        return mi.TensorXf(dr.select(bad, dr.nan, lit), (*shape, 3))
+
+    def backward(self):
+        row, column, half, flux = _pull(self.grad_out().array, *self.args, *self.geometry)
+        self.set_grad_in("row", row)
+        self.set_grad_in("column", column)
+        self.set_grad_in("half", half)
+        self.set_grad_in("flux", flux)
+
+    def name(self):
+        return "share points out"
+
+
+# Flux F at (row, column), texels apart, spreads over a tent of half-widths h and half (in columns):
+#
+#     L[r, c] += F t_r t_c / (R C omega_r),   t_r = 1 - |r - row| / h,   t_c = 1 - |c - column| / half,
+#     R = sum of t_r,   C = sum of t_c
+#
+# dt_r/drow = sign(r - row) / h and dt_c/dhalf = |c - column| / half^2; the quotient rule adds -t R'/R and
+# -t C'/C.
+
+
+@dr.syntax
+def _total(place, half, low, high):
+    """Sum of the tent around ``place`` over whole numbers within [low, high], and of its derivatives."""
+    k = dr.maximum(mi.Int32(dr.ceil(place - half)), low)
+    stop = dr.minimum(mi.Int32(dr.floor(place + half)), high)
+    total, slope, widening = mi.Float(0), mi.Float(0), mi.Float(0)
+    while k <= stop:
+        x = mi.Float(k) - place
+        total += 1 - dr.abs(x) / half
+        slope += _sign(x) / half
+        widening += dr.abs(x) / (half * half)
+        k += 1
+    return total, slope, widening
+
+
+@dr.syntax
+def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, first, height, total):
+    rows, _, _ = _total(row, half_row, mi.Int32(0), total - 1)
+    columns, _, _ = _total(column, half, mi.Int32(-1 << 20), mi.Int32(1 << 20))
+    r = dr.maximum(mi.Int32(dr.ceil(row - half_row)), first)
+    last = dr.minimum(mi.Int32(dr.floor(row + half_row)), first + height - 1)
+    while r <= last:
+        share = (1 - dr.abs(mi.Float(r) - row) / half_row) / rows * dr.gather(mi.Float, per_omega, r)
+        c = mi.Int32(dr.ceil(column - half))
+        stop = mi.Int32(dr.floor(column + half))
+        while c <= stop:
+            # The scale first: of a light of 1e-30 it is larger than a share leaves room for.
+            value = flux * scale * (share * (1 - dr.abs(mi.Float(c) - column) / half) / columns)
+            place = ((r - first) * width + (c % width + width) % width) * 3
+            for channel in range(3):
+                v = value[channel]
+                dr.scatter_add(sums, mi.Int64(v), mi.UInt32(place + channel), v != 0)
+            c += 1
+        r += 1
+
+
+@dr.syntax
+def _pull(grad, row, column, half, flux, per_omega, half_row, width, first, height, total):
+    rows, rows_slope, _ = _total(row, half_row, mi.Int32(0), total - 1)
+    columns, columns_slope, columns_widening = _total(column, half, mi.Int32(-1 << 20), mi.Int32(1 << 20))
+    all_, d_row, d_column, d_half = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
+    d_flux = mi.Color3f(0)
+    r = dr.maximum(mi.Int32(dr.ceil(row - half_row)), first)
+    last = dr.minimum(mi.Int32(dr.floor(row + half_row)), first + height - 1)
+    while r <= last:
+        y = mi.Float(r) - row
+        per = dr.gather(mi.Float, per_omega, r)
+        share = (1 - dr.abs(y) / half_row) / rows
+        within, slope, widening = mi.Float(0), mi.Float(0), mi.Float(0)
+        c = mi.Int32(dr.ceil(column - half))
+        stop = mi.Int32(dr.floor(column + half))
+        while c <= stop:
+            x = mi.Float(c) - column
+            place = mi.UInt32((r - first) * width + (c % width + width) % width)
+            pulled = dr.gather(mi.Color3f, grad, place) * per
+            part = (1 - dr.abs(x) / half) / columns
+            d_flux += pulled * (share * part)
+            g = pulled.x * flux.x + pulled.y * flux.y + pulled.z * flux.z
+            within += g * part
+            slope += g * _sign(x)
+            widening += g * dr.abs(x)
+            c += 1
+        all_ += share * within
+        d_column += share * slope / (half * columns)
+        d_half += share * widening / (half * half * columns)
+        d_row += within * _sign(y) / (half_row * rows)
+        r += 1
+    d_row -= all_ * rows_slope / rows
+    d_column -= all_ * columns_slope / columns
+    d_half -= all_ * columns_widening / columns
+    return d_row, d_column, d_half, d_flux

@@ -1,0 +1,432 @@
+"""Separation of a map into lights and background: which texels are lights, and what they do to the sky.
+
+A map is told apart as E = B * prod(1 + G_l) + sum(C_l). The **core** C_l of a light is the radiance that
+stands out: a sun's disc, a lamp, a softbox. Its **glow** G_l is what the light does to the sky around it, as
+a factor that falls with the angle to the light: when the sun moves, the clouds stay and their lighting
+changes. What is left is the background B, the map as it would be without its lights.
+
+All steps are in angles and shares of the light, not in texels or radiance: they mean the same for a map of
+any resolution and exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.color import LUMINANCE
+
+CONTRAST = 4.0
+"""A light is this many times as bright as the median of its surroundings."""
+SURROUNDINGS = 20.0
+"""Radius of the surroundings, degrees: more than that of a sun's aureole or a softbox."""
+LEAST_SHARE = 0.005
+"""Share of the map's irradiance below which something bright is no light."""
+MOST_LIGHTS = 8
+"""Lights that are told apart, those with most flux; weaker ones stay in the background."""
+DETECT_WIDTH = 512
+"""Lights are looked for in a copy of at most this width: what is smaller has no flux."""
+RING_SHARE = (0.1, 0.5)
+"""Part of a ring around a light, by luminance, that tells its glow: clouds and the horizon are brighter."""
+FARTHEST = 90.0
+"""Largest radius of a glow, degrees."""
+FLAT = 1.05
+"""A glow ends where its ring is at most this many times as bright as the darkest ring farther out."""
+LEAST_EXPLAINED = 0.2
+"""Share of the variance of log luminance that a glow must explain to be believed."""
+GLOW_DEGREES = np.arange(0.0, 121.0)
+"""Angles at which a glow is tabulated; 0 from the last on."""
+_RINGS = np.concatenate(
+    [[0, 1, 1.5], np.arange(2.0, 10), np.arange(10.0, 20, 2), np.arange(20.0, 121, 5)]
+)  # edges, degrees
+_MEDIAN_WIDTH = 64
+
+
+@dataclass(frozen=True)
+class Light:
+    """One light of a map.
+
+    Attributes
+    ----------
+    direction : ndarray (3,)
+        Unit vector to the centre of its flux, in the emitter's frame.
+    texels : ndarray of int64 (n,)
+        Its texels, row * W + column.
+    radiance : ndarray (n, 3)
+        Radiance of the core in them.
+    glow : ndarray (len(GLOW_DEGREES), 3) or None
+        Factor by which it brightens the sky, less 1, at :data:`GLOW_DEGREES` from its centre.
+    share : float
+        Its share of the map's irradiance.
+    """
+
+    direction: np.ndarray
+    texels: np.ndarray
+    radiance: np.ndarray
+    glow: np.ndarray | None
+    share: float
+
+
+@dataclass(frozen=True)
+class Separation:
+    """A map told apart; ``background * glow + core`` is the map to float precision.
+
+    Attributes
+    ----------
+    background, glow, core : ndarray (rows, W, 3) float64
+        B, the product of 1 + G over all lights, and the sum of all cores.
+    lights : list of Light
+        Those with most flux first.
+    survey : Survey or None
+        Where the lights were found, to tell the same lights in another resolution of the map; None without.
+    """
+
+    background: np.ndarray
+    glow: np.ndarray
+    core: np.ndarray
+    lights: list[Light] = field(default_factory=list)
+    survey: Survey | None = None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the small copy of a map tells of its lights: all that does not depend on the map's resolution.
+
+    Attributes
+    ----------
+    label : ndarray of int64 (h, w)
+        Index in :attr:`Separation.lights` of the light that a texel of the copy belongs to, or -1.
+    below : ndarray (h, w, 3)
+        The background of the copy, filled in under the lights.
+    rows : (int, int)
+        First row of the copy in its map, and the rows of that map.
+    centres, glows, shares : lists
+        Direction, :attr:`Light.glow` and share of the irradiance of each light.
+    """
+
+    label: np.ndarray
+    below: np.ndarray
+    rows: tuple[int, int]
+    centres: list[np.ndarray]
+    glows: list[np.ndarray | None]
+    shares: list[float]
+
+
+def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separation:
+    """Tell the lights of a map from its background.
+
+    Parameters
+    ----------
+    image : ndarray (rows, W, 3)
+        Linear radiance, finite and not negative.
+    rows : (int, int), optional
+        First row of the image in its map, and the rows of that map; None: the image is a whole map.
+
+    Returns
+    -------
+    Separation
+        Without lights where nothing stands out: the background is the image then, bit for bit.
+    """
+    image = np.asarray(image, np.float64)
+    first, total = rows or (0, image.shape[0])
+    height, width = image.shape[:2]
+    small = _reduced(image, first, total)
+    found = _survey(small)
+    if found is None:
+        return Separation(image, np.ones_like(image), np.zeros_like(image), [])
+
+    # The same at the map's own resolution.
+    toward = latlong.directions(total, width)[first : first + height]
+    glow = np.ones_like(image)
+    for table, centre in zip(found.glows, found.centres, strict=True):
+        if table is not None:
+            glow *= 1 + glow_at(table, toward @ centre)
+    here = small.at(found.label, height, width)
+    lit = here >= 0
+    base = small.upsampled(found.below, height, width)
+    core = np.where(lit[..., None], np.maximum(image - base * glow, 0), 0)
+    background = np.where(lit[..., None], (image - core) / glow, image / glow)
+    lights, kept = [], np.full(len(found.centres) + 1, -1)
+    for i, centre in enumerate(found.centres):
+        texels = np.flatnonzero((here == i).ravel() & (core > 0).any(axis=2).ravel())
+        if len(texels):
+            kept[i] = len(lights)
+            radiance = core.reshape(-1, 3)[texels]
+            lights.append(Light(centre, texels, radiance, found.glows[i], float(found.shares[i])))
+        else:
+            core.reshape(-1, 3)[(here == i).ravel()] = 0
+    found = replace(found, label=kept[found.label])  # the last, -1, for texels of none
+    return Separation(background, glow, core, lights, found)
+
+
+def _survey(small: _Small) -> Survey | None:
+    """Find lights, the background under them and the glow of each on the small copy; None without lights."""
+    label, count, shares = _find(small)
+    if not count:
+        return None
+    cores = label >= 0
+    free = filled(small.image, cores)
+    glows, centres = [], []
+    for i in range(count):
+        centre = small.centre(label == i)
+        table = _glow(free, small, cores, centre)
+        if table is not None:
+            free = free / (1 + glow_at(table, small.directions @ centre))
+        glows.append(table)
+        centres.append(centre)
+    return Survey(label, filled(free, cores), small.rows, centres, glows, shares)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Finding
+
+
+@dataclass(frozen=True)
+class _Small:
+    """The copy of an image in which lights are looked for.
+
+    ``first`` and ``total`` tell the image's own rows in its map, ``rows`` the same of the copy.
+    """
+
+    image: np.ndarray
+    directions: np.ndarray
+    omega: np.ndarray
+    first: int
+    total: int
+    rows: tuple[int, int]
+
+    def centre(self, mask):
+        """Direction of the flux of the brighter part of a light."""
+        lum = np.where(mask, self.image @ LUMINANCE, 0)
+        flux = np.where(lum > 0.1 * lum.max(), lum * self.omega, 0)
+        centre = (self.directions * flux[..., None]).sum(axis=(0, 1))
+        size = np.linalg.norm(centre)
+        return centre / size if size else centre
+
+    def at(self, values, height, width):
+        """Values of the nearest texels at the image's own resolution."""
+        r, c = self._places(height, width)
+        row = np.clip(np.rint(r).astype(np.int64), 0, values.shape[0] - 1)
+        return values[row][:, np.rint(c).astype(np.int64) % values.shape[1]]
+
+    def upsampled(self, values, height, width):
+        """Interpolate values at the image's own resolution."""
+        if values.shape[:2] == (height, width):
+            return values
+        r, c = self._places(height, width)
+        r = np.clip(r, 0, values.shape[0] - 1)
+        top, left = np.floor(r).astype(np.int64), np.floor(c).astype(np.int64)
+        down, right = (r - top)[:, None, None], (c - left)[None, :, None]
+        bottom = np.minimum(top + 1, values.shape[0] - 1)
+        a, b = left % values.shape[1], (left + 1) % values.shape[1]
+        upper = values[top][:, a] * (1 - right) + values[top][:, b] * right
+        lower = values[bottom][:, a] * (1 - right) + values[bottom][:, b] * right
+        return upper * (1 - down) + lower * down
+
+    def _places(self, height, width):
+        """Fractional rows and columns of the small copy at the centres of the image's texels."""
+        start, small_total = self.rows
+        scale = (small_total - 1) / max(self.total - 1, 1)
+        rows = (np.arange(height) + self.first) * scale - start
+        return rows, (np.arange(width) + 0.5) * (self.image.shape[1] / width) - 0.5
+
+
+def _reduced(image, first, total):
+    """Copy an image at no more than the width of detection."""
+    height, width = image.shape[:2]
+    if width > DETECT_WIDTH:
+        h, w = max(round(total * DETECT_WIDTH / width), 3), DETECT_WIDTH
+        start = min(round(first * h / total), h - 1)
+        stop = max(round((first + height) * h / total), start + 1)
+        whole = np.zeros((total, width, 4), np.float32)
+        whole[first : first + height, :, :3], whole[first : first + height, :, 3] = image, 1
+        whole = latlong.resize(whole, h, w).astype(np.float64)[start:stop]
+        small = whole[..., :3] / np.maximum(whole[..., 3:], 1e-6)
+    else:
+        small, h, w, start, stop = image, total, width, first, first + height
+    toward = latlong.directions(h, w)[start:stop]
+    omega = np.repeat(latlong.solid_angles(h, w)[start:stop, None], w, axis=1)
+    return _Small(small, toward, omega, first, total, (start, h))
+
+
+def _find(small: _Small):
+    """Label the texels of each light: (label or -1, count, shares), the light with most flux first."""
+    lum = small.image @ LUMINANCE
+    total = (lum * small.omega).sum()
+    nothing = np.full(lum.shape, -1), 0, []
+    if not total > 0:
+        return nothing
+    base = _local_median(lum, *small.rows)
+    parts = _components(lum > np.maximum(CONTRAST * base, 1e-12 * lum.max()))
+    excess = np.maximum(lum - base, 0) * small.omega
+    names, inverse = np.unique(parts, return_inverse=True)
+    flux = np.bincount(inverse.ravel(), excess.ravel()) / total
+    order = [i for i in np.argsort(-flux) if names[i] >= 0 and flux[i] >= LEAST_SHARE][:MOST_LIGHTS]
+    label = nothing[0]
+    for i, part in enumerate(order):
+        # One texel more to every side: a lens and a resampling spread light.
+        grown = _grown(parts == names[part])
+        label = np.where(grown & (label < 0), i, label)
+    return label, len(order), [flux[i] for i in order]
+
+
+def _local_median(lum, first, total):
+    """Median luminance, by solid angle, of the disc around every texel, found on a coarse grid."""
+    height, width = lum.shape
+    w = min(_MEDIAN_WIDTH, width)
+    h = max(w // 2, 3)
+    whole = np.zeros((total, width, 2), np.float32)
+    whole[first : first + height, :, 0], whole[first : first + height, :, 1] = lum, 1
+    coarse = latlong.resize(whole, h, w).astype(np.float64).reshape(-1, 2)
+    known = coarse[:, 1] > 1e-6
+    value = coarse[known, 0] / coarse[known, 1]
+    d = latlong.directions(h, w).reshape(-1, 3)
+    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * coarse[known, 1]
+    order = np.argsort(value, kind="stable")
+    value, weight, others = value[order], weight[order], d[known][order]
+    median = np.zeros(len(d))
+    for start in range(0, len(d), 256):
+        inside = (d[start : start + 256] @ others.T > np.cos(np.radians(SURROUNDINGS))) * weight
+        sums = np.cumsum(inside, axis=1)
+        place = (sums < 0.5 * sums[:, -1:]).sum(axis=1)
+        median[start : start + 256] = value[np.minimum(place, len(value) - 1)]
+    grid = median.reshape(h, w, 1)
+    return latlong.resize(grid, total, width)[first : first + height, :, 0].astype(np.float64)
+
+
+def _neighbours(values, outside):
+    """Yield an array shifted to each of the 8 neighbours, columns periodic."""
+    padded = np.pad(values, ((1, 1), (0, 0)), constant_values=outside)
+    for row in (0, 1, 2):
+        band = padded[row : row + values.shape[0]]
+        for column in (-1, 0, 1):
+            if (row, column) != (1, 0):
+                yield np.roll(band, column, axis=1)
+
+
+def _grown(mask):
+    """Add every neighbour of a mask."""
+    for shifted in list(_neighbours(mask, False)):
+        mask = mask | shifted
+    return mask
+
+
+def grown(label: np.ndarray) -> np.ndarray:
+    """Give texels of no light (-1) that touch one the largest label around them; columns are periodic."""
+    most = np.maximum.reduce(list(_neighbours(label, -1)))
+    return np.where(label < 0, most, label)
+
+
+def _components(mask):
+    """Return a number for each connected part of a mask, -1 outside; columns are periodic."""
+    far = mask.size
+    label = np.where(mask, np.arange(far).reshape(mask.shape), far)
+    while True:
+        least = label
+        for shifted in _neighbours(label, far):
+            least = np.minimum(least, shifted)
+        least = np.where(mask, least, far)
+        if np.array_equal(least, label):
+            return np.where(mask, label, -1)
+        # A part takes the least number that any of its texels has met: few rounds for large ones.
+        met = np.arange(far + 1)
+        np.minimum.at(met, label.ravel(), least.ravel())
+        label = np.where(mask, met[least], far)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Glow and background
+
+
+def _glow(image, small: _Small, cores, centre):
+    """Measure the glow around a centre: a table as :attr:`Light.glow`; None where none is believed."""
+    angle = np.degrees(np.arccos(np.clip(small.directions @ centre, -1, 1)))
+    lum = image @ LUMINANCE
+    ring = np.digitize(angle, _RINGS) - 1
+    middle, colour = [], []
+    for i in range(len(_RINGS) - 1):
+        inside = (ring == i) & ~cores
+        if inside.sum() < 4:
+            continue
+        values = lum[inside]
+        low, high = np.quantile(values, RING_SHARE)
+        middle.append((_RINGS[i] + _RINGS[i + 1]) / 2)
+        colour.append(image[inside][(values >= low) & (values <= high)].mean(axis=0))
+    middle, colour = np.array(middle), np.array(colour).reshape(-1, 3)
+    bright = colour @ LUMINANCE
+    for last in range(_end(middle, bright), 2, -1):
+        far = np.maximum(colour[last], 1e-3 * colour[last].max())
+        if not far.min() > 0:
+            continue
+        factor = np.minimum.accumulate(np.maximum(colour[: last + 1] / far - 1, 0), axis=0)
+        table = np.stack([np.interp(GLOW_DEGREES, middle[: last + 1], f) for f in factor.T], axis=1)
+        inside = (angle < middle[last]) & ~cores & (lum > 0)
+        before = np.log(lum[inside])
+        after = before - np.log(1 + glow_at(table, np.cos(np.radians(angle[inside]))) @ LUMINANCE)
+        if len(before) and after.var() < (1 - LEAST_EXPLAINED) * before.var():
+            return table
+    return None
+
+
+def _end(middle, bright):
+    """Return the first ring from which on no ring is darker, or which is too far out."""
+    for i, value in enumerate(bright):
+        if value <= FLAT * bright[i:].min() or middle[i] > FARTHEST:
+            return i
+    return len(bright) - 1
+
+
+def glow_at(table: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Interpolate a :attr:`Light.glow` at angles given by their cosines; returns (..., 3)."""
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return np.stack([np.interp(angle, GLOW_DEGREES, f, right=0.0) for f in table.T], axis=-1)
+
+
+def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Replace texels by a smooth surface through those around them: a membrane in log radiance.
+
+    Coarse to fine: unknown texels start from the mean of known ones at the next coarser level, and are then
+    relaxed towards the mean of their neighbours. Columns are periodic.
+
+    Parameters
+    ----------
+    image : ndarray (rows, W, 3)
+        Linear radiance, not negative.
+    mask : ndarray of bool (rows, W)
+        Texels to replace.
+    """
+    if not mask.any():
+        return image
+    if mask.all():
+        return np.zeros_like(image)
+    small = max(1e-6 * float(image[~mask].max()), 1e-30)
+    surface = np.exp(_membrane(np.log(image + small), mask)) - small
+    return np.where(mask[..., None], np.maximum(surface, 0), image)
+
+
+_RELAXATIONS = 30
+
+
+def _membrane(values, mask):
+    height, width = mask.shape
+    if not mask.any():
+        return values
+    if min(height, width) <= 2:
+        return np.where(mask[..., None], values[~mask].mean(axis=0) if (~mask).any() else 0, values)
+    known = (~mask).astype(np.float64)[..., None]
+    rows, columns = height + height % 2, width + width % 2
+    pad = ((0, rows - height), (0, columns - width), (0, 0))
+    weight = np.pad(known, pad).reshape(rows // 2, 2, columns // 2, 2, 1).sum(axis=(1, 3))
+    total = np.pad(values * known, pad).reshape(rows // 2, 2, columns // 2, 2, -1).sum(axis=(1, 3))
+    coarse = _membrane(total / np.maximum(weight, 1), weight[..., 0] == 0)
+    guess = coarse.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+    values = np.where(mask[..., None], guess, values)
+    r, c = np.nonzero(mask)
+    up, down = np.maximum(r - 1, 0), np.minimum(r + 1, height - 1)
+    left, right = (c - 1) % width, (c + 1) % width
+    values = values.copy()
+    for _ in range(_RELAXATIONS):
+        values[r, c] = (values[up, c] + values[down, c] + values[r, left] + values[r, right]) / 4
+    return values

@@ -1,0 +1,59 @@
+"""A map as the weights of a network: SIREN, and R-SIREN where it was fitted robustly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from envedit import config
+from envedit.core.arrays import tensor
+from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.representations.base import Params
+from envedit.representations.siren import fit
+
+
+class Siren:
+    """The weights of a SIREN fitted to the image (Eq. 1-3); robust (R-SIREN) when fitted with awp_gamma > 0.
+
+    ``rows`` tells which rows of a map the images are: (first row, rows of the whole map); None: all of it.
+    ``fitted`` tells, after :meth:`encode`, how well the network reproduces the image.
+    """
+
+    lr = 5e-5
+    models_edit, separation = False, None
+
+    def __init__(
+        self,
+        network: config.Representation,
+        settings: config.Fit,
+        folder: Path | None = None,
+        progress: Callable[[int, int, float], None] | None = None,
+        rows: tuple[int, int] | None = None,
+    ):
+        self.network, self.settings, self.folder, self.progress = network, settings, folder, progress
+        self.fitted: fit.Fitted | None = None
+        self._rows, self._shape, self._points = rows, None, {}
+
+    def encode(self, image: np.ndarray, seed: int = 0) -> Params:
+        """Fit the network, or take an earlier fit of the same image from disk."""
+        require_radiance(image, "siren", (self._rows or (0,))[0], BRIGHTEST)
+        self.fitted = fit.fit(
+            image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
+        )
+        self._shape, self._points = image.shape[:2], {}
+        return {name: tensor(value) for name, value in self.fitted.params.items()}
+
+    def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:
+        """Evaluate the network at the resolution of the image, or at any other ``shape``."""
+        shape = tuple(shape or self._shape)
+        if shape not in self._points:
+            first, total = self._rows or (0, self._shape[0])
+            finer = shape[0] / self._shape[0]
+            above, below = (round(n * finer) for n in (first, total - first - self._shape[0]))
+            rows = above, above + shape[0] + below
+            self._points[shape] = fit.points(self.network, shape, rows)
+        normalisation = self.fitted.normalisation
+        return fit.evaluate(params, normalisation, self._points[shape], shape, self.network.omega)

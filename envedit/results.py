@@ -1,0 +1,97 @@
+"""What a run found: maps, renderings, figures, and what the map was decoded from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config, inputs
+from envedit.export import full_resolution
+from envedit.images import images
+from envedit.representations import Representation
+from envedit.representations.layers.separation import Separation
+from envedit.solve.feasibility import Reach
+
+
+@dataclass
+class Result:
+    """What a run found.
+
+    Attributes
+    ----------
+    envmap : ndarray (H, W, 3)
+        The edited map; rows outside the active ones are the original's, bit for bit, and so are frozen texels
+        but where layers move a light or its glow across them.
+    renders, maps : dict
+        ``initial``, ``target``, ``edited``; linear radiance. ``maps["target"]`` is None where it is unknown.
+    metrics : dict
+        As in metrics.json.
+    history : list of dict
+        A row an iteration.
+    notes, warnings : list of str
+        What was chosen automatically; what the user should know.
+    influence : ndarray (H, W), optional
+        T' 1, how much each texel adds to the picture; None where the renderer does not know.
+    frozen : ndarray of bool (H, W), optional
+        Active texels that were kept, as this view does not determine them; None as above.
+    separation : separate.Separation, optional
+        Lights and background of the active rows, where the representation has them.
+    scene : Path, optional
+        The scene's file.
+    reach : reach.Reach, optional
+        How much of a painted request any light can do; None where T is not at hand or nothing was painted.
+    found : Found, optional
+        What the map was decoded from, for :func:`at_full_resolution`.
+    """
+
+    envmap: np.ndarray
+    renders: dict
+    maps: dict
+    metrics: dict
+    history: list
+    notes: list[str]
+    warnings: list[str]
+    influence: np.ndarray | None = None
+    frozen: np.ndarray | None = None
+    separation: Separation | None = None
+    scene: Path | None = None
+    reach: Reach | None = None
+    found: Found | None = None
+
+    @property
+    def render(self) -> np.ndarray:
+        """The rendering under the edited map, by Mitsuba with fresh samples."""
+        return self.renders["edited"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`."""
+
+    representation: Representation
+    params: dict
+    first_row: int
+    free: np.ndarray | None
+
+
+def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
+    """Carry a result to the resolution of its input's file; None where that has no more texels.
+
+    Raises
+    ------
+    InputError, NumericalError
+        If the file cannot be read any more, or the carried map is not finite.
+    """
+    if settings.envmap == "sunsky":
+        return None
+    source, _ = images.load_envmap(settings.envmap, None, settings.repair)
+    if source.shape[1] <= settings.width:
+        return None
+    found, before = result.found, result.maps["initial"]
+    first, last = inputs.active_rows(settings.rows, before.shape[0])
+    rows = first, last - first + 1
+    return full_resolution.carry(
+        found.representation, found.params, before, result.envmap, source, rows, found.free
+    )

@@ -1,0 +1,1 @@
+"""A Mitsuba scene with one replaceable environment map."""

@@ -1,0 +1,269 @@
+"""Changes to the nodes of a parsed Mitsuba scene before it is built, and the digest of what they hold.
+
+Each function takes the parser's ``state`` or one of its ``nodes`` and changes it in place; ``where`` is what
+errors call the scene. What is changed and why is told in :mod:`envedit.scene.scene`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core.errors import ConfigError, InputError
+
+# Emitters at infinity that shine from every direction, with the rotation that brings an envmap's zenith (+y)
+# to theirs. Mitsuba's sky models stand upright on z.
+_UPRIGHT_ON_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+_ENVIRONMENTS = {
+    "envmap": np.eye(3),
+    "constant": np.eye(3),
+    "sky": _UPRIGHT_ON_Z,
+    "sunsky": _UPRIGHT_ON_Z,
+    "timed_sunsky": _UPRIGHT_ON_Z,
+}
+_SMOOTH = {"roughconductor": "conductor", "roughplastic": "plastic", "roughdielectric": "dielectric"}
+_SMALLEST_ALPHA = 1e-4  # Mitsuba's own clamp
+_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+_MESHES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}
+_MOST_WIDTH_PER_HEIGHT = 1.5
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Words for errors
+
+
+def told(where: str, call, /, *arguments, **filled):
+    """Call the parser, and say in one line what it says in many."""
+    try:
+        return call(*arguments, **filled)
+    except (RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
+        text = re.sub(r"\[[A-Za-z][\w.]*(:\d+)?\] ", "", str(error))
+        text = " ".join(text.split())
+        for prefix in (f"At {where} ", f"Error while loading {where} ", f"While loading {where} ",
+                       f"Parsing of XML file {where} failed: ", f'Parsing of XML file "{where}" failed: ',
+                       'At dictionary node "root": '):  # fmt: skip
+            text = text.replace(prefix, "")
+        raise InputError(f"{where}: {text if len(text) <= 300 else text[:297] + '...'}") from None
+
+
+def place_of(state, node, where: str) -> str:
+    """Say where a node stands: file and line, or its name in a dict."""
+    return mi.parser.file_location(state, node) if state.files else f"{where}, {node.props.id()}"
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Changes
+
+
+def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
+    """Put an ``envmap`` in place of the one environment emitter; return its properties and rotation."""
+    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter]
+    found = [n for n in nodes if n.props.plugin_name() in _ENVIRONMENTS]
+    if len(found) != 1:
+        kinds = ", ".join(n.props.plugin_name() for n in found)
+        what = f"{len(found)} environment emitters ({kinds})" if found else "no environment emitter"
+        raise InputError(f'{where}: {what}; wanted exactly one, such as <emitter type="constant"/>')
+    node, plugin = found[0], found[0].props.plugin_name()
+    matrix = np.eye(4)
+    if plugin != "constant" and "to_world" in node.props:
+        matrix = _matrix(node.props["to_world"], place_of(state, node, where))
+    rotation = matrix[:3, :3]
+    proper = np.isfinite(rotation).all() and np.linalg.det(rotation) > 0
+    if not proper or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
+        raise InputError(
+            f"{place_of(state, node, where)}: to_world of the environment emitter scales, shears or mirrors; "
+            "wanted a rotation (the axis of <rotate> has length 1)"
+        )
+    rotation = rotation @ _ENVIRONMENTS[plugin]
+    matrix = np.eye(4)  # where an environment stands has no meaning: a translation is dropped
+    matrix[:3, :3] = rotation
+    taken = {n.props.id() for n in state.nodes if n is not node}
+    emitter = mi.Properties("envmap")
+    emitter.set_id(next(name for i in range(len(taken) + 1) if (name := f"envmap{i or ''}") not in taken))
+    emitter["to_world"] = mi.ScalarTransform4d(matrix)
+    node.props = emitter
+    return node.props, rotation
+
+
+def set_film(state, where: str, width: int, height: int) -> None:
+    """Give the first sensor's film the asked size and float32 RGB pixels."""
+    sensors = [n for n in state.nodes if n.type == mi.ObjectType.Sensor]
+    if not sensors:
+        raise InputError(f'{where}: the scene has no sensor; add <sensor type="perspective">')
+    inside = [
+        state.nodes[v.index()]
+        for _, v in sensors[0].props.items()
+        if isinstance(v, mi.Properties.ResolvedReference)
+    ]
+    films = [n for n in inside if n.type == mi.ObjectType.Film]
+    if not films or films[0].props.plugin_name() != "hdrfilm":
+        raise InputError(f'{place_of(state, sensors[0], where)}: the sensor needs a <film type="hdrfilm">')
+    film = films[0].props
+    own = [film.get("width", 768), film.get("height", 576)]  # Mitsuba's defaults
+    if not all(isinstance(n, int) and n > 0 for n in own):
+        place = place_of(state, films[0], where)
+        raise InputError(f"{place}: the film is {own[0]} x {own[1]}, wanted whole numbers above 0")
+    if width or height:
+        if any(str(name).startswith("crop_") for name, _ in film.items()):
+            raise ConfigError(
+                f"scene.width: the film of {where} is cropped and takes no other size; remove the crop"
+            )
+        if not height:
+            height = max(1, round(width * own[1] / own[0]))
+        if not width:
+            width = max(1, round(height * own[0] / own[1]))
+        film["width"], film["height"] = width, height
+    film["pixel_format"], film["component_format"] = "rgb", "float32"
+
+
+def set_sampler(state, plugin: str) -> None:
+    """Give the first sensor a sampler of the asked kind, unless it has another than ``independent``.
+
+    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+    """
+    sensor = next(n for n in state.nodes if n.type == mi.ObjectType.Sensor)
+    for _, value in sensor.props.items():
+        if isinstance(value, mi.Properties.ResolvedReference):
+            node = state.nodes[value.index()]
+            if node.type == mi.ObjectType.Sampler:
+                if node.props.plugin_name() == "independent":
+                    node.props.set_plugin_name(plugin)
+                return
+    # Before the append, which moves the nodes: references to them, ``sensor`` too, are void after it.
+    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes))
+    node = mi.parser.SceneNode()
+    node.type, node.props = mi.ObjectType.Sampler, mi.Properties(plugin)
+    state.nodes.append(node)
+
+
+def find_files(state, where: str, folders) -> None:
+    """Make every file name absolute; the environment's own bitmap is already gone and need not exist."""
+    for node in state.nodes:
+        if "filename" not in node.props or not isinstance(name := node.props["filename"], str):
+            continue
+        found = [f / name for f in folders if os.path.isfile(f / name)]
+        if not found:
+            kind = str(node.type).rpartition(".")[2].lower()
+            raise InputError(
+                f"{place_of(state, node, where)}: the {kind} names a missing file: {name or '(empty)'}\n"
+                f"looked in {' and '.join(dict.fromkeys(map(str, folders)))}"
+            )
+        node.props["filename"] = str(found[0])
+
+
+def smooth_limit(state, node) -> None:
+    """Turn a rough BSDF whose alpha is at most 1e-4 into the smooth one; refuse a negative roughness."""
+    props = node.props
+    if node.type != mi.ObjectType.BSDF or props.plugin_name() not in _SMOOTH:
+        return
+    alphas = [k for k in ("alpha", "alpha_u", "alpha_v") if isinstance(props.get(k, None), float | int)]
+    for key in alphas:
+        if not props[key] >= 0:
+            where = place_of(state, node, "scene")
+            raise ConfigError(f"{where}: roughness {key} is {props[key]}, wanted 0 or more")
+    if alphas and all(props[k] <= _SMALLEST_ALPHA for k in alphas):
+        for key in (*alphas, "distribution", "sample_visible"):
+            if key in props:
+                del props[key]
+        props.set_plugin_name(_SMOOTH[props.plugin_name()])
+
+
+def fit_to_stage(state, node) -> None:
+    """Set a shape that carries ``fit_height`` on the plane y = 0, centred and scaled; see the module."""
+    props = node.props
+    if node.type != mi.ObjectType.Shape or "fit_height" not in props:
+        return
+    where = place_of(state, node, "scene")
+    target, up = props["fit_height"], str(props.get("fit_up", "y")).lower()
+    for key in ("fit_height", "fit_up"):
+        if key in props:
+            del props[key]
+    if not (isinstance(target, int | float) and np.isfinite(target) and target > 0):
+        raise ConfigError(f"{where}: fit_height is {target}, wanted a positive number")
+    if up.removeprefix("-") not in _AXES:
+        raise ConfigError(f"{where}: the up axis is {up!r}, wanted x, y, z, -x, -y or -z")
+    filename = str(props.get("filename", ""))
+    if filename:
+        if (suffix := Path(filename).suffix.lower()) not in _MESHES:
+            raise InputError(f"{filename}: cannot read a mesh of this kind; wanted {', '.join(_MESHES)}")
+        props.set_plugin_name(_MESHES[suffix])
+
+    # First the mesh's own up to +y, then the author's to_world (a turn about y, say), then size and place.
+    transform = np.eye(4)
+    transform[:3, :3] = _upright(up)
+    if "to_world" in props:
+        transform = _matrix(props["to_world"], where) @ transform
+    props["to_world"] = mi.ScalarTransform4d(transform)
+    probe = {k: v for k, v in props.items() if not isinstance(v, mi.Properties.ResolvedReference)}
+    box = told(where, mi.load_dict, {"type": props.plugin_name(), **probe}).bbox()
+    low, high = (np.array(v, np.float64).ravel() for v in (box.min, box.max))
+    extent = high - low
+    if not (np.isfinite(extent).all() and extent[1] > 0):
+        raise InputError(f"{filename or where}: the mesh has no height along its up axis {up}")
+    scale = min(target / extent[1], _MOST_WIDTH_PER_HEIGHT * target / max(extent[0], extent[2], 1e-30))
+    place = np.eye(4)
+    place[:3, :3] *= scale
+    place[:3, 3] = -scale * np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    props["to_world"] = mi.ScalarTransform4d(place @ transform)
+
+
+def _matrix(transform, where: str) -> np.ndarray:
+    """Return a transformation's matrix (4, 4)."""
+    if not hasattr(transform, "matrix"):
+        raise InputError(f"{where}: to_world is {str(transform)[:60]!r}, wanted a <transform>")
+    return np.array(transform.matrix, np.float64).reshape(4, 4)
+
+
+def _upright(up: str) -> np.ndarray:
+    """Return the rotation ``(3, 3)`` about a coordinate axis that brings an axis to +y."""
+    a = np.array(_AXES[up.removeprefix("-")], float) * (-1 if up.startswith("-") else 1)
+    y = np.array([0.0, 1, 0])
+    v, c = np.cross(a, y), a @ y
+    if c < -0.5:
+        return np.diag([1.0, -1, -1])
+    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + c)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Digest
+
+
+def hash_node(digest, node) -> None:
+    """Add all that a node holds to a digest, the content of files in place of their names."""
+    digest.update(f"{node.type}|{node.props.plugin_name()}\n".encode())
+    for key, value in node.props.items():
+        digest.update(f"{key}=".encode())
+        if key == "filename":
+            try:
+                digest.update(hashlib.sha256(Path(value).read_bytes()).digest())
+            except OSError as error:
+                raise InputError(f"{value}: cannot be read ({error.strerror})") from None
+        else:
+            _hash_value(digest, value)
+
+
+def _hash_value(digest, value) -> None:
+    if isinstance(value, bool | int | float | str):
+        digest.update(repr(value).encode())
+    elif isinstance(value, mi.Properties.ResolvedReference):
+        digest.update(f"@{value.index()}".encode())
+    elif hasattr(value, "matrix"):
+        digest.update(np.array(value.matrix, np.float64).tobytes())
+    elif hasattr(value, "wavelengths"):
+        digest.update(repr((list(value.wavelengths), list(value.values))).encode())
+    elif isinstance(value, mi.Object) and not isinstance(value, mi.Bitmap):
+        digest.update(type(value).__name__.encode())
+        for key, inner in mi.traverse(value).items():
+            digest.update(key.rpartition(".")[2].encode())
+            _hash_value(digest, inner)
+    else:
+        array = np.array(value)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.tobytes() if array.dtype != object else repr(value).encode())
+    digest.update(b"\n")

@@ -1,0 +1,407 @@
+"""Load a Mitsuba scene lit by one environment emitter, and render it under any map: the reference renderer.
+
+A scene comes from an XML file, a dict or the name of a shipped scene. Mitsuba's parser turns it into a list
+of nodes, and four things are changed there before anything is built, so that a broken reference in a part
+that is not used cannot get in the way:
+
+- the environment emitter, whatever its kind, becomes an ``envmap`` with the same orientation whose texels
+  are set by :meth:`Scene.set_envmap`;
+- the film gets the asked size and float32 RGB; its reconstruction filter stays the author's;
+- a rough BSDF whose alpha is at most 1e-4, which Mitsuba would clamp, becomes its limit, the smooth one;
+- a shape with the properties ``fit_height`` (and ``fit_up``, one of x, y, z with or without a minus) is
+  centred on the y axis, set on the plane y = 0 and scaled to that height, or to 1.5 times it in width.
+
+With scene and camera fixed a rendering is I = T E + I_0: linear in the map E, plus a constant I_0 where the
+scene has lamps besides its environment, which stay as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import hashlib
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong, shipped
+from envedit.core.color import tonemap
+from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
+from envedit.scene import parser
+
+__all__ = ["Scene", "load"]
+
+"""Names of the scenes that come with the package."""
+
+QUIET_DECIBELS = 48.0
+"""PSNR of a rendering that is quiet, against one without noise: beyond what an edit reaches under a sun."""
+QUIET_LEAST, QUIET_MOST = 256, 768
+"""Samples a pixel between which a rendering of "auto" ends."""
+_QUIET_PASS = 64  # samples a pixel
+_PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The scene
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene under one replaceable environment map; made by :func:`load`.
+
+    Attributes
+    ----------
+    mi : mitsuba.Scene
+        The scene itself; its environment is an ``envmap``, other lamps stay.
+    path : Path or None
+        The XML file, None for a dict.
+    width, height : int
+        Size of a rendering in pixels.
+    envmap_key : str
+        Name of the texels in ``params``; their layout is :func:`envedit.core.latlong.to_envmap_data`'s.
+    to_world : array (3, 3) float64
+        Rotation from the emitter's frame to the scene's.
+    digest : str
+        SHA-256 (hex) of all that a rendering depends on but the map: objects, files they name, camera, film.
+        Comments and the place of the files do not count.
+    params : mitsuba.SceneParameters
+        ``mi.traverse`` of the scene.
+    """
+
+    mi: mi.Scene
+    path: Path | None
+    width: int
+    height: int
+    envmap_key: str
+    to_world: np.ndarray
+    digest: str
+    params: mi.SceneParameters
+
+    def set_envmap(self, image) -> None:
+        """Light the scene by a map.
+
+        Parameters
+        ----------
+        image : array (H, W, 3)
+            Linear radiance, finite and not negative; any resolution, also another than before.
+
+        Raises
+        ------
+        InputError
+            If the shape is not that of a map.
+        NumericalError
+            If a texel is not finite or is negative in float32; one such texel spoils every lit pixel.
+        """
+        image = np.asarray(image)
+        if image.ndim != 3 or image.shape[2] != 3 or not np.issubdtype(image.dtype, np.number):
+            what = f"shape {image.shape} of {image.dtype}"
+            raise InputError(f"environment map: came {what}, wanted (H, W, 3) numbers")
+        with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
+            image = image.astype(np.float32)
+        if not (good := np.isfinite(image) & (image >= 0)).all():
+            row, column, channel = np.argwhere(~good)[0]
+            bad = np.count_nonzero(~good.all(axis=2))
+            raise NumericalError(
+                f"environment map: {bad} texels are not finite or are negative, "
+                f"the first at row {row}, column {column}: {image[row, column, channel]} in {'RGB'[channel]}"
+            )
+        self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
+        self.params.update()
+
+    def render(self, image, spp: int = 64, seed: int = 0, max_depth: int = -1) -> np.ndarray:
+        """Render the scene under a map by Mitsuba's ``path`` integrator, with fresh samples.
+
+        The samples are split into passes of at most 2^22, each with its own seed derived from ``seed``, and
+        averaged in float64.
+
+        Parameters
+        ----------
+        image : array (H, W, 3)
+            Linear radiance.
+        spp : int
+            Samples per pixel.
+        seed : int
+            The same seed gives the same samples.
+        max_depth : int
+            Longest path in segments, as Mitsuba counts them: 2 is direct light; -1 has no bound.
+
+        Returns
+        -------
+        array (height, width, 3) float32
+            Linear radiance.
+
+        Raises
+        ------
+        ConfigError
+            If ``spp``, ``seed`` or ``max_depth`` is out of range.
+        InputError, NumericalError
+            As :meth:`set_envmap`; also NumericalError if a pixel comes out non-finite.
+        """
+        spp = _whole("spp", spp, 1)
+        seed = _whole("seed", seed, 0)
+        max_depth = _whole("max_depth", max_depth, -1)
+        self.set_envmap(image)
+        most = self._pass_samples()
+        counts = [most] * (spp // most) + ([spp % most] if spp % most else [])
+        total = np.zeros((self.height, self.width, 3))
+        for i, count in enumerate(counts):
+            total += count / spp * self._pass(count, seed, i, max_depth)
+        return self._checked(total)
+
+    def sampled(self, image, spp: int | str = "auto", seed: int = 0):
+        """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
+
+        Passes of 64 samples a pixel are added until the error of their mean, told by how much their display
+        values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at least,
+        768 at most.
+
+        Parameters
+        ----------
+        image : array (H, W, 3)
+            The map, linear radiance.
+        spp : int or "auto"
+            Samples a pixel.
+        seed : int
+            Of every random choice.
+
+        Returns
+        -------
+        picture : array (height, width, 3) float32
+            Linear radiance.
+        spp : int
+            Samples a pixel that were taken.
+        noise : array (height, width) float64 or None
+            Standard error of display values, RMS over channels; None where samples were given.
+
+        Raises
+        ------
+        ConfigError, InputError, NumericalError
+            As :meth:`render`.
+        """
+        if spp != "auto":
+            return self.render(image, spp, seed), spp, None
+        seed = _whole("seed", seed, 0)
+        self.set_envmap(image)
+        count = min(self._pass_samples(), _QUIET_PASS)
+        total, shown, power = 0.0, 0.0, 0.0
+        for i in range(QUIET_MOST // count):
+            picture = self._pass(count, seed, i, -1)
+            display = tonemap(picture)
+            total, shown, power = total + picture, shown + display, power + display**2
+            n = i + 1
+            if n * count >= QUIET_LEAST:
+                variance = np.maximum(power / n - (shown / n) ** 2, 0).mean(axis=2) / max(n - 1, 1)
+                if variance.mean() < 10 ** (-QUIET_DECIBELS / 10):
+                    break
+        return self._checked(total / n), n * count, np.sqrt(variance)
+
+    def _pass_samples(self):
+        """Most samples a pixel of one pass, a power of four.
+
+        So no pixel is split between threads, which would add its samples in any order, and the sampler has as
+        many strata across as down.
+        """
+        return 4 ** (max(0, (_PASS_SAMPLES // (self.width * self.height)).bit_length() - 1) // 2)
+
+    def _pass(self, count, seed, i, max_depth):
+        """Render one pass, float64."""
+        integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": False})
+        pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+        picture = mi.render(self.mi, integrator=integrator, spp=count, seed=pass_seed)
+        return np.array(picture, dtype=np.float64)
+
+    def _checked(self, total):
+        """Round to float32, refusing what is not finite."""
+        with np.errstate(over="ignore"):
+            result = total.astype(np.float32)
+        if (bad := ~np.isfinite(result).all(axis=2)).any():
+            raise NumericalError(
+                f"rendering of {self.path or 'the scene'}: {bad.sum()} pixels are not finite, "
+                f"the first at {place_of(bad)}; look for broken materials or too much light"
+            )
+        return result
+
+
+@contextlib.contextmanager
+def _two_threads():
+    """Lend Dr.Jit a second thread: on one, Mitsuba waits for ever for an EXR texture."""
+    threads = dr.thread_count()
+    if threads < 2:
+        dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if threads < 2:
+            dr.set_thread_count(threads)
+
+
+def load(file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter") -> Scene:
+    """Load a scene and make its environment emitter replaceable.
+
+    Parameters
+    ----------
+    file : path, str or dict
+        A Mitsuba XML file, the name of a shipped scene (:func:`.shipped.scenes`, with or without ``.xml``; a
+        file of that name in the working folder comes first), or a dict as ``mi.load_dict`` takes it.
+    width, height : int, optional
+        Size of the rendering in pixels. None or 0: the scene's own, or by its aspect if one of both is given.
+    parameters : dict, optional
+        Values for the ``$names`` of the XML.
+    base : path, optional
+        Folder for relative file names that are not beside the XML, such as a mesh in ``parameters``.
+        Default: the working folder.
+    sampler : str
+        Sampler of Mitsuba's renderings, where the scene asks for none or for ``independent``. Stratified
+        samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
+
+    Returns
+    -------
+    Scene
+        Lit by a grey map until :meth:`Scene.set_envmap` or :meth:`Scene.render` sets another. If the scene
+        has several sensors its first one is used, as Mitsuba does.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter is unknown, missing or unusable, or the size is.
+    InputError
+        If a file is missing or damaged, or the scene is not lit by exactly one environment emitter.
+    """
+    if not (mi.variant() or "").endswith("_rgb"):
+        raise ConfigError(f"variant: came {mi.variant()}, wanted one that ends in _rgb, such as llvm_ad_rgb")
+    width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = False  # shapes keep their names
+    config.unused_parameters = mi.LogLevel.Debug  # checked here, with the nearest name
+    base = Path(base or ".").absolute()
+    if isinstance(file, dict):
+        if parameters:
+            raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
+        path, where, folders = None, "scene dict", (base,)
+        state = parser.told(where, mi.parser.parse_dict, config, file)
+    else:
+        path = find(file)
+        where, folders = str(path), (path.parent, base, *_search_paths(path))
+        filled = _check_parameters(path, parameters or {})
+        state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
+    parser.told(where, mi.parser.transform_all, config, state)
+
+    emitter, to_world = parser.replace_environment(state, where)
+    digest = hashlib.sha256(b"envedit scene 1")
+    parser.set_film(state, where, width, height)
+    parser.find_files(state, where, folders)
+    for node in state.nodes:
+        parser.smooth_limit(state, node)
+        parser.fit_to_stage(state, node)
+        parser.hash_node(digest, node)
+    emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
+    own = str(emitter.id())
+    parser.set_sampler(state, sampler)  # after the digest: light transport has its own samples
+    # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
+    for node in state.nodes:
+        for name in node.props.keys():  # noqa: SIM118 (no dict)
+            node.props.mark_queried(name, False)
+
+    with _two_threads():
+        built = parser.told(where, mi.parser.instantiate, config, state)
+    scene = built[0] if isinstance(built, list | tuple) else built
+    if scene.environment() is None or scene.environment().id() != own:
+        raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
+    params = mi.traverse(scene)
+    key = next(k for k, _ in params if k.split(".")[-2:] == [own, "data"])
+    columns, rows = (int(n) for n in scene.sensors()[0].film().crop_size())
+    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Files and parameters
+
+
+def find(file) -> Path:
+    """Return the XML file meant by a path or by the bare name of a shipped scene."""
+    path = Path(file)
+    if os.path.isfile(path):  # False, and no error, in a folder that may not be entered
+        return path.absolute()
+    name = path.name.removesuffix(".xml")
+    bare, names = path.name == str(file), shipped.scenes()
+    if bare and name in names:
+        return shipped.folder() / f"{name}.xml"
+    if os.path.isdir(path):
+        raise InputError(f"scene {file}: this is a folder, wanted a Mitsuba XML file")
+    close = difflib.get_close_matches(name, names, 1) if bare else []
+    wanted = f"wanted a Mitsuba XML file or one of {', '.join(names) or 'none: install envedit again'}"
+    hint = f"did you mean {close[0]}?" if close else wanted
+    raise InputError(f"scene {file}: no such file; {hint}")
+
+
+def _check_parameters(path: Path, parameters: dict) -> dict[str, str]:
+    """Return the parameters as text, after comparing their names with the ``$names`` of the XML."""
+    used, defaults = _names(path, set())
+    for name in parameters:
+        if name not in used | defaults:
+            close = difflib.get_close_matches(str(name), used | defaults, 1)
+            known = ", ".join(sorted(used | defaults)) or "none"
+            raise ConfigError(
+                f"scene.parameters: {path.name} has no parameter {name}"
+                + (f"; did you mean {close[0]}?" if close else "")
+                + f" (known: {known})"
+            )
+    if missing := sorted(used - defaults - parameters.keys()):
+        raise ConfigError(
+            f"scene.parameters: {path.name} needs {', '.join(missing)}, which has no default; "
+            f"write parameters = {{ {missing[0]} = ... }}"
+        )
+    filled = {}
+    for name, value in parameters.items():
+        if isinstance(value, bool):
+            value = "true" if value else "false"
+        elif isinstance(value, float | np.floating) and not np.isfinite(value):
+            raise ConfigError(f"scene.parameters: {name} is {value}, wanted a finite number")
+        elif not isinstance(value, str | os.PathLike | int | float | np.integer | np.floating):
+            kind = type(value).__name__
+            raise ConfigError(f"scene.parameters: {name} is a {kind}, wanted text or a number")
+        filled[name] = str(value)
+    return filled
+
+
+def _names(path: Path, seen: set) -> tuple[set, set]:
+    """Return the ``$names`` used in an XML file and those with a default, included files too."""
+    seen.add(path)
+    text = _without_comments(path)
+    used = set(re.findall(r"\$\{?([A-Za-z_]\w*)", text))
+    defaults = set()
+    for tag in re.findall(r"<default\b[^>]*>", text):
+        defaults |= set(re.findall(r"\bname\s*=\s*[\"']([^\"']*)", tag))
+    for tag in re.findall(r"<include\b[^>]*>", text):
+        for name in re.findall(r"\bfilename\s*=\s*[\"']([^\"'$]+)[\"']", tag):
+            included = path.parent / name
+            if included not in seen and included.is_file():
+                more = _names(included, seen)
+                used, defaults = used | more[0], defaults | more[1]
+    return used, defaults
+
+
+def _without_comments(path: Path) -> str:
+    """Return the text of an XML file without its comments."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"scene {path}: {error.strerror or error}") from None
+    return re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+
+
+def _search_paths(path: Path) -> list[Path]:
+    """Return the folders of ``<path value="...">`` in an XML file, in which files are looked for too."""
+    tags = "".join(re.findall(r"<path\b[^>]*>", _without_comments(path)))
+    return [path.parent / value for value in re.findall(r"\bvalue\s*=\s*[\"']([^\"'$]+)[\"']", tags)]
+
+
+def _whole(name: str, value, low: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
+        raise ConfigError(f"{name}: came {value!r}, wanted a whole number of at least {low}")
+    return int(value)

@@ -1,0 +1,1 @@
+"""From a target to the parameters of an edit: search, solver, loop."""

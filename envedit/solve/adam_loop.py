@@ -1,0 +1,300 @@
+"""The one optimisation loop: find parameters whose map renders to the target (Eq. 10, Sec. 6.2).
+
+The loop knows neither what the parameters mean nor how the picture is made: it decodes, renders, compares,
+pulls the gradient back, and lets Adam step. Where loss or gradient is not finite no step is taken: the
+parameters go back to the last ones that had both, as the step from there may have been too long, the
+learning rate is halved, and the bad step is counted. Good steps win the learning rate back.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit import config
+from envedit.core.arrays import tensor
+from envedit.core.errors import NumericalError
+from envedit.losses import losses, optimizer
+from envedit.losses.display_curve import to_display
+from envedit.losses.ssim import Ssim
+
+MOST_BAD_STEPS = 20
+"""Non-finite steps in a row after which the loop gives up."""
+RECOVERY = 10
+"""Good steps that win back one halving of the learning rate: a rare bad sample must not end all progress."""
+READ_EVERY, READ_SECONDS = 10, 1.0
+"""Losses are read back after so many steps or seconds: every read-back waits for the device."""
+
+
+class Objective:
+    """The weighted sum of Eq. 10 for one target and one original map.
+
+    Parameters
+    ----------
+    weights : config.Loss
+        A number or a (start, end) ramp for every term; terms of weight 0 are not computed.
+    picture : ndarray (h, w, 3)
+        Target, linear radiance.
+    pixel_weight : ndarray (h, w, 1) or None
+        How much each pixel counts.
+    original : ndarray (rows, W, 3)
+        The active rows of the original map.
+    iterations : int
+        Length of the run, over which ramps are walked.
+    dists : perceptual.Dists, optional
+        The term of that name, between display values of the map and the original; None: it is off.
+    """
+
+    def __init__(self, weights: config.Loss, picture, pixel_weight, original, iterations: int, dists=None):
+        self.iterations = iterations
+        self.ramps = {
+            name: value if isinstance(value, tuple) else (value, value)
+            for name, value in vars(weights).items()
+            if value and (name != "dists" or dists)
+        }
+        self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
+        self._weight = None if pixel_weight is None else tensor(pixel_weight)
+        self._original = tensor(original)
+        self._ssim = Ssim(self._target, self._weight)
+        self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
+
+    def __call__(self, rendering, crop, step: int):
+        """Weigh a rendering and the active rows of its map.
+
+        Returns
+        -------
+        total : Float
+            The weighted sum, a size-1 array.
+        terms : dict
+            Its weighted terms by name, size-1 arrays.
+        """
+        terms = {}
+        shown = to_display(rendering)
+        for name, (start, end) in self.ramps.items():
+            if name == "ssim":
+                term = self._ssim(shown)
+            elif name == "dists":
+                term = self._dists(to_display(crop))
+            elif name in ("image_l1", "image_l2"):
+                term = losses.LOSSES[name](shown, self._target, self._weight)
+            else:
+                term = losses.LOSSES[name](crop, self._original)
+            terms[name] = term * dr.opaque(mi.Float, optimizer.ramp(start, end, step, self.iterations))
+        return sum(terms.values()), terms
+
+
+@dataclass
+class State:
+    """Everything a run needs to continue: what a checkpoint holds."""
+
+    step: int = 0
+    bad_steps: int = 0
+    bad_in_a_row: int = 0
+    slowdown: float = 1.0
+    history: list[dict] = field(default_factory=list)
+
+
+def place_rows(original: mi.TensorXf, crop: mi.TensorXf, first: int) -> mi.TensorXf:
+    """Replace rows ``first`` ... of a map (H, W, 3) by ``crop``, differentiably in the crop."""
+    if crop.shape[0] == original.shape[0]:
+        return crop
+    return dr.custom(_PlaceRows, crop, dr.detach(original), first * original.shape[1] * 3)
+
+
+class _PlaceRows(dr.CustomOp):
+    """The gradient of the crop is a slice.
+
+    Written out, because the adjoint of ``dr.gather`` adds with atomics, which drop NaN on LLVM: a bad step
+    would look good.
+    """
+
+    def eval(self, crop, original, start):
+        self.start, self.shape = dr.opaque(mi.UInt32, start), crop.shape
+        i = dr.arange(mi.UInt32, len(original.array))
+        inside = (i >= self.start) & (i < self.start + len(crop.array))
+        edited = dr.gather(mi.Float, crop.array, i - self.start, inside)
+        return mi.TensorXf(dr.select(inside, edited, original.array), original.shape)
+
+    def backward(self):
+        index = dr.arange(mi.UInt32, self.shape[0] * self.shape[1] * 3) + self.start
+        self.set_grad_in("crop", mi.TensorXf(dr.gather(mi.Float, self.grad_out().array, index), self.shape))
+
+    def name(self):
+        return "place rows"
+
+
+class _Slopes:
+    """Notes, on the way back, whether gradients are finite; made anew for every step.
+
+    The parameters' own do not tell: what lies in between may add gradients with atomics, which drop NaN on
+    LLVM. Mitsuba's path tracer does.
+    """
+
+    def __init__(self):
+        self.flags = []
+
+    def pass_on(self, x):
+        """Return a tensor as it is; its gradient is looked at."""
+        return dr.custom(_Slope, x, self)
+
+    def finite(self) -> bool:
+        """Say whether all gradients that came by were finite."""
+        return not any(flag[0] for flag in self.flags)
+
+
+class _Slope(dr.CustomOp):
+    def eval(self, x, slopes):
+        self.slopes = slopes
+        return mi.TensorXf(x)
+
+    def backward(self):
+        slope, flag = self.grad_out(), dr.opaque(mi.UInt32, 0)
+        dr.scatter(flag, mi.UInt32(1), mi.UInt32(0), ~dr.isfinite(slope.array))
+        self.slopes.flags.append(flag)
+        self.set_grad_in("x", slope)
+
+    def name(self):
+        return "finite gradient"
+
+
+class _Keep:
+    """Put a map's own texels, (rows, W, 3), where it may not change; differentiable in the crop."""
+
+    def __init__(self, original, free):
+        self._original = dr.opaque(mi.Float(np.ascontiguousarray(original, np.float32).ravel()))
+        self._free = dr.opaque(mi.Bool(np.repeat(free.ravel(), 3)))
+
+    def __call__(self, crop):
+        return mi.TensorXf(dr.select(self._free, crop.array, self._original), crop.shape)
+
+
+def adam_for(representation, params, settings: config.Optimizer) -> optimizer.Adam:
+    """Make the optimiser that a configuration asks for."""
+    return optimizer.Adam(params, _rate(representation, settings), (0.9, settings.beta2))
+
+
+def _rate(representation, settings):
+    """Learning rate at the start; "auto" is the representation's own."""
+    return representation.lr if settings.lr == "auto" else settings.lr
+
+
+def optimise(
+    representation,
+    params,
+    renderer,
+    objective: Objective,
+    envmap: np.ndarray,
+    first_row: int,
+    settings: config.Optimizer,
+    *,
+    free: np.ndarray | None = None,
+    adam: optimizer.Adam | None = None,
+    state: State | None = None,
+    after_step: Callable[[State, optimizer.Adam], None] | None = None,
+) -> tuple[dict, State]:
+    """Run the loop.
+
+    Parameters
+    ----------
+    representation : object
+        ``decode(params)`` gives the active rows (rows, W, 3).
+    params : dict
+        Where to start.
+    renderer : object
+        ``render(envmap, step)``.
+    objective : Objective
+        What to minimise.
+    envmap : ndarray (H, W, 3)
+        The original; rows outside the active ones stay as they are.
+    first_row : int
+        First active row.
+    settings : config.Optimizer
+        Iterations and learning rate.
+    free : ndarray of bool (rows, W), optional
+        Texels of the active rows that may change; the others stay the original's, whatever the parameters.
+    adam, state : optional
+        To continue an earlier run; changed in place.
+    after_step : callable, optional
+        Called with state and optimiser whenever the losses have been read back, and at the end: progress and
+        checkpoints. What it raises ends the run.
+
+    Returns
+    -------
+    params, state
+        Parameters after the last good step, which nothing was computed from yet; ``adam.take_back()``
+        returns to those before it.
+
+    Raises
+    ------
+    NumericalError
+        After :data:`MOST_BAD_STEPS` non-finite steps in a row; ``adam`` has the last parameters whose loss
+        and gradients were finite.
+    """
+    adam, state = adam or adam_for(representation, params, settings), state or State()
+    lr = _rate(representation, settings)
+    fixed = tensor(envmap)
+    keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
+    waiting, last_read = [], time.perf_counter()
+    while state.step < settings.iterations:
+        start = time.perf_counter()
+        leaves, slopes = adam.leaves(), _Slopes()
+        with dr.isolate_grad():
+            crop = representation.decode(leaves)
+            crop = slopes.pass_on(keep(crop) if keep else crop)
+            rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
+            rendering = slopes.pass_on(rendering)
+            total, terms = objective(rendering, crop, state.step)
+            dr.backward(total)
+        dr.eval(total, terms, slopes.flags)
+        grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
+        finite = bool(dr.isfinite(total)[0]) and slopes.finite()
+        rate = optimizer.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr
+        rate *= state.slowdown
+        if finite and adam.step(grads, lr=rate):
+            state.bad_in_a_row = 0
+            state.slowdown = min(1.0, state.slowdown * 2 ** (1 / RECOVERY))
+        else:
+            adam.take_back()
+            state.bad_steps += 1
+            state.bad_in_a_row += 1
+            state.slowdown *= 0.5
+            if state.bad_in_a_row >= MOST_BAD_STEPS:
+                _read_back(waiting, state)
+                raise NumericalError(
+                    f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not "
+                    "finite; the last good map is kept; lower [optimizer] lr or look at the target for "
+                    "extreme pixels"
+                )
+        waiting.append(
+            (
+                state.step,
+                dr.detach(total),
+                {k: dr.detach(v) for k, v in terms.items()},
+                rate,
+                1000 * (time.perf_counter() - start),
+            )
+        )
+        state.step += 1
+        now = time.perf_counter()
+        if len(waiting) >= READ_EVERY or now - last_read > READ_SECONDS or state.step == settings.iterations:
+            _read_back(waiting, state)
+            last_read = now
+            if after_step:
+                after_step(state, adam)
+    return adam.params, state
+
+
+def _read_back(waiting, state):
+    for step, total, terms, lr, ms in waiting:
+        row = {
+            "iteration": step,
+            "loss": float(total[0]),
+            **{name: float(term[0]) for name, term in terms.items()},
+        }
+        state.history.append({**row, "lr": lr, "step_ms": round(ms, 3)})
+    waiting.clear()

@@ -1,0 +1,88 @@
+"""A run's state on disk, so that a killed run resumes to the same result.
+
+One ``checkpoint.npz``: the optimiser's parameters and moments, the loop's counters and history, the exact
+columns that the light transport had traced, the target's picture, and a digest of what the run was asked to
+do. It is written to a temporary name and renamed: a file that is there is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config
+from envedit.core.atomic_files import replacing
+from envedit.core.errors import InputError
+from envedit.solve.adam_loop import State
+
+NAME = "checkpoint.npz"
+_FORMAT = 3  # raise when what is stored, or what the loop makes of it, changes
+
+
+def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:
+    """Hash what decides a run's result: its configuration but for the folder, scene and pixels."""
+    text = "\n".join(line for line in config.to_toml(settings).splitlines() if not line.startswith("dir ="))
+    sha = hashlib.sha256(f"{_FORMAT}\n{text}\n{scene}".encode())
+    for array in inputs:
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()
+
+
+def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict, picture) -> None:
+    """Write ``checkpoint.npz`` into a folder."""
+    arrays = {f"optimiser/{k}": v for k, v in optimiser.items()} | {
+        f"renderer/{k}": v for k, v in renderer.items()
+    }
+    text = json.dumps({"digest": what, "state": asdict(state)})
+    with replacing(folder / NAME) as temporary, open(temporary, "wb") as file:
+        np.savez(file, meta=np.frombuffer(text.encode(), np.uint8), target=picture, **arrays)
+
+
+def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None:
+    """Read ``checkpoint.npz`` back; None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it is damaged or belongs to another configuration or other input files.
+    """
+    path = folder / NAME
+    if not path.exists():
+        return None
+    try:
+        # Opened here: np.load leaves a file open that is no archive.
+        with open(path, "rb") as file, np.load(file) as stored:
+            meta, picture = json.loads(stored["meta"].tobytes()), stored["target"]
+            parts = {
+                part: {
+                    k.removeprefix(f"{part}/"): stored[k] for k in stored.files if k.startswith(f"{part}/")
+                }
+                for part in ("optimiser", "renderer")
+            }
+        if not all(
+            isinstance(a, np.ndarray)
+            for a in (picture, *parts["optimiser"].values(), *parts["renderer"].values())
+        ):
+            raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
+        state, found = State(**meta["state"]), meta["digest"]
+    except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
+        reason = " ".join(str(error).split())[:160]
+        reason = reason if reason.isprintable() else ascii(reason)
+        raise InputError(
+            f"{path}: the checkpoint cannot be read ({reason}): delete it, or run without --resume"
+        ) from error
+    if found != what:
+        raise InputError(
+            f"{path}: belongs to another configuration or other input files, or to an older envedit: "
+            "run without --resume to start afresh"
+        )
+    return state, parts["optimiser"], parts["renderer"], picture
+
+
+def remove(folder: Path) -> None:
+    """Delete the checkpoint of a finished run."""
+    (folder / NAME).unlink(missing_ok=True)

@@ -1,0 +1,223 @@
+"""An edit in progress: its loop with checkpoints, Ctrl-C, and which of several starts to take."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config
+from envedit.core.errors import NumericalError, place_of
+from envedit.losses import optimizer
+from envedit.scene import scene
+from envedit.solve import adam_loop, checkpoint
+from envedit.targets import target
+
+TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
+"""Steps after which the better of two starts is chosen, and by which share of the loss it must be better."""
+
+
+class Interrupted(Exception):
+    """Ctrl-C during the edit, after the checkpoint was written; ``envmap`` is the map so far."""
+
+    def __init__(self, envmap: np.ndarray, step: int):
+        super().__init__(f"interrupted at iteration {step}")
+        self.envmap, self.step = envmap, step
+
+
+class Stopped(NumericalError):
+    """The optimisation could not go on; ``envmap`` is the last good map."""
+
+    def __init__(self, message: str, envmap: np.ndarray):
+        super().__init__(message)
+        self.envmap = envmap
+
+
+@dataclass
+class Watch:
+    """What a run tells while it works.
+
+    ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one.
+    """
+
+    stage: Callable[[str], None] = lambda text: None
+    progress: Callable[[int, int, str], None] = lambda done, total, text: None
+
+
+@dataclass
+class Job:
+    """One edit in progress.
+
+    Attributes
+    ----------
+    settings : config.Config
+        What is carried out.
+    lit : scene.Scene
+        The scene.
+    original : ndarray (H, W, 3)
+        The map.
+    first : int
+        Its first active row.
+    free : ndarray of bool (rows, W), optional
+        Active texels that may change; None: all.
+    wanted : target.Target
+        What the renderer is to make.
+    representation, renderer : object
+        As :func:`.adam_loop.optimise` takes them.
+    folder : Path, optional
+        Of the checkpoint.
+    watch : Watch
+        Told of progress.
+    dists : perceptual.Dists, optional
+        As for :class:`.adam_loop.Objective`.
+    """
+
+    settings: config.Config
+    lit: scene.Scene
+    original: np.ndarray
+    first: int
+    free: np.ndarray | None
+    wanted: target.Target
+    representation: object
+    renderer: object
+    folder: Path | None
+    watch: Watch
+    dists: object = None
+
+    def decode(self, params) -> np.ndarray:
+        """Parameters to a whole map on the host, refusing what is not finite."""
+        crop = self.representation.decode(params).numpy()
+        rows = slice(self.first, self.first + crop.shape[0])
+        if self.free is not None:
+            crop = np.where(self.free[..., None], crop, self.original[rows])
+        if (bad := ~np.isfinite(crop)).any():
+            where = place_of(bad, self.first)
+            raise NumericalError(f"the edited map is not finite at {where}: lower [optimizer] lr")
+        edited = self.original.copy()
+        edited[rows] = crop
+        return edited
+
+    def last_good(self, adam: optimizer.Adam) -> np.ndarray:
+        """Return the last map that is finite: after the last step, before it, or else the original."""
+        for _ in range(2):
+            try:
+                return self.decode(adam.params)
+            except NumericalError:
+                adam.take_back()
+        return self.original.copy()
+
+    def best(self, starts, crop):
+        """Return the start, (parameters, notes), that gets farthest in a few steps."""
+        if len(starts) == 1:
+            return starts[0]
+        reached = []
+        for params, _ in starts:
+            few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
+            wanted = self.wanted.aim, self.wanted.weight
+            objective = adam_loop.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
+            try:
+                _, state = self._loop(params, objective, few)
+                loss = state.history[-1]["loss"]
+                reached.append(loss if np.isfinite(loss) else np.inf)
+            except NumericalError:  # a start that goes nowhere is no reason to stop
+                reached.append(np.inf)
+        least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
+        losses = ", ".join(f"{loss:.3g}" for loss in reached)
+        chosen = [
+            *starts[least][1],
+            f"start {least + 1} of {len(starts)}: losses after {TRIAL_STEPS} steps {losses}",
+        ]
+        return starts[least][0], chosen
+
+    def optimise(self, params, crop, resume):
+        """Run the loop from the start, or from the checkpoint; returns parameters and state."""
+        chosen, wanted = self.settings.optimizer, self.wanted
+        adam, state = adam_loop.adam_for(self.representation, params, chosen), adam_loop.State()
+        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
+        if self.folder and resume and (found := checkpoint.load(self.folder, what)):
+            state, optimiser, traced, picture = found
+            adam.load_state_dict(optimiser)
+            self.renderer.restore(traced)
+            # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
+            wanted = self.wanted = wanted.aimed_at(picture)
+        asked = wanted.aim, wanted.weight, crop, chosen.iterations, self.dists
+        objective = adam_loop.Objective(self.settings.loss, *asked)
+        saved = time.perf_counter()
+
+        with ctrl_c() as interrupt:
+
+            def after_step(state, adam):
+                nonlocal saved
+                self.watch.progress(state.step, chosen.iterations, f"loss {state.history[-1]['loss']:.4g}")
+                stop, due = interrupt.is_set(), time.perf_counter() - saved >= chosen.checkpoint_s
+                due |= state.step == chosen.iterations  # what follows may be interrupted too
+                if self.folder and (stop or due):
+                    traced = self.renderer.state()
+                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.aim)
+                    saved = time.perf_counter()
+                if stop:
+                    raise Interrupted(self.last_good(adam), state.step)
+
+            try:
+                self._loop(params, objective, chosen, adam=adam, state=state, after_step=after_step)
+                self._look_at_the_last(adam, state)
+            except NumericalError as error:
+                raise Stopped(str(error), self.last_good(adam)) from error
+        return adam.params, state
+
+    def _look_at_the_last(self, adam, state):
+        """Take the last step back if it led to no map: the loop sees only what a next step starts from."""
+        try:
+            self.decode(adam.params)
+        except NumericalError:
+            state.bad_steps += 1
+            adam.take_back()
+            self.decode(adam.params)
+
+    def _loop(self, params, objective, chosen, **more):
+        return adam_loop.optimise(
+            self.representation,
+            params,
+            self.renderer,
+            objective,
+            self.original,
+            self.first,
+            chosen,
+            free=self.free,
+            **more,
+        )
+
+
+@contextlib.contextmanager
+def keeping(envmap: np.ndarray):
+    """Let numbers that fail after the loop carry the map that it found: Stopped for NumericalError."""
+    try:
+        yield
+    except NumericalError as error:
+        raise Stopped(str(error), envmap) from error
+
+
+@contextlib.contextmanager
+def ctrl_c():
+    """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def handle(number, frame):
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,200 @@
+"""Where an edit with layers starts: how fine its gain is, which pixels count, where lights are looked for.
+
+Two recordings of T, independent of each other, tell what is seen from what is noise. Where they show that
+the picture tells detail of the sky, as a mirror does, the gain gets finer grids, and pixels that are mostly
+noise count less. Then lights are searched for, in the picture or in what was painted on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import mitsuba as mi
+import numpy as np
+
+from envedit import config, renderers
+from envedit.representations.layers.gain import CYCLES, Octave
+from envedit.representations.layers.layers import Layers
+from envedit.scene import scene
+from envedit.solve import gain_bandwidth, light_search, painted_change, pixel_confidence
+from envedit.targets.target import Target
+from envedit.transport import recording
+from envedit.transport.light_transport import LightTransport
+
+AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
+"""Added to the run's seed for the second recording of T, which tells its noise; its most samples a pixel and
+exact columns."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """What :func:`find` looks through.
+
+    Attributes
+    ----------
+    transport : LightTransport
+        T; the one that the run renders through, where it does.
+    second : LightTransport or None
+        Another recording of T, where detail is asked about.
+    octaves : list of Octave
+        Detail that the picture tells; see :func:`.gain_bandwidth.octaves`.
+    notes : list of str
+        What was found and chosen.
+    """
+
+    transport: LightTransport
+    second: LightTransport | None = None
+    octaves: list[Octave] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Starts:
+    """What :func:`find` found.
+
+    Attributes
+    ----------
+    starts : list of (dict, list of str)
+        Parameters, and notes on them; one is to be taken (:meth:`.edit_job.Job.best`).
+    wanted : Target
+        The target; its pixels may be weighed.
+    notes : list of str
+        What was chosen, whichever start is taken.
+    """
+
+    starts: list[tuple[dict, list[str]]]
+    wanted: Target
+    notes: list[str] = field(default_factory=list)
+
+
+def recordings(
+    settings: config.Config,
+    lit: scene.Scene,
+    shape,
+    layers: Layers,
+    wanted: Target,
+    traced: LightTransport | None,
+    progress=None,
+) -> Recordings:
+    """Trace what :func:`find` looks through: T, and a second recording where detail is asked about.
+
+    Where the picture tells detail, a gain fine enough for it follows the noise of T: a large picture, whose
+    pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the
+    map gains 1.6 dB over eight maps; without detail, pixels make up for each other.
+
+    Parameters
+    ----------
+    settings : config.Config
+        Of the run.
+    lit : scene.Scene
+        The scene.
+    shape : (int, int)
+        Rows and columns of the maps.
+    layers : Layers
+        The representation, after :meth:`.Layers.encode`.
+    wanted : Target
+        What the picture should be. What is painted need not be what any light does: detail would follow it.
+    traced : LightTransport, optional
+        T, where the run renders through it; of no use any more if another one is returned.
+    progress : callable, optional
+        Told of blocks of pixels done, and in all.
+    """
+
+    def trace(seed, **changed):
+        return renderers.trace(
+            replace(settings, seed=seed, renderer=replace(settings.renderer, **changed)), lit, shape, progress
+        )
+
+    # A path tracer's samples a pixel are not meant for T.
+    transport = traced or trace(settings.seed, spp="auto")
+    fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
+    if not fits or wanted.coverage is not None or settings.representation.cycles != "auto":
+        return Recordings(transport)
+    pixels, few = lit.width * lit.height, min(AGAIN_SPP, transport.spp)
+    second = trace(
+        (settings.seed + AGAIN_SEED) % 2**32,
+        spp=few,
+        max_depth=transport.bounces + 1,
+        memory_gb=recording.gigabytes(pixels, few, min(AGAIN_COLUMNS, transport.capacity) + 1),
+        refresh=0,
+    )
+    asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
+    told = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
+    shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
+    notes = [f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"]
+    if told and traced and settings.renderer.spp == "auto":
+        most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
+        if most > transport.spp:
+            notes.append(f"{most} paths a pixel in place of {transport.spp}: detail would follow their noise")
+            transport.release()
+            transport = trace(settings.seed, spp=most)
+    # Columns of both are compared: their paths are in the ratio of the samples.
+    second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
+    return Recordings(transport, second, told, notes)
+
+
+def find(
+    layers: Layers, params: dict, recordings: Recordings, wanted: Target, original: np.ndarray
+) -> Starts:
+    """Find where to start; ``layers`` may get finer grids.
+
+    Parameters
+    ----------
+    layers, params : Layers, dict
+        The representation and its parameters, of :meth:`.Layers.encode`.
+    recordings : Recordings
+        Of :func:`recordings`; their bright columns may change.
+    wanted : Target
+        What the picture should be.
+    original : ndarray (H, W, 3)
+        The map.
+    """
+    transport, notes = recordings.transport, list(recordings.notes)
+    params = layers.refine(params, recordings.octaves)
+    starts = _searched(layers, params, transport, wanted, original)
+    if recordings.octaves:  # a mirror: images of lights, and caustics, are where the lights are now found
+        first = layers.rows[0]
+        began = original.copy()
+        began[first : first + layers.shape[0]] = layers.decode(starts[0][0]).numpy()
+        weight, said = _trusted(began, recordings, wanted)
+        if weight is not None:
+            notes.append(said)
+            wanted = replace(wanted, weight=weight)
+            starts = _searched(layers, params, transport, wanted, original)
+    return Starts(starts, wanted, notes)
+
+
+def _trusted(envmap, recordings, wanted):
+    """Weigh a rendered target's pixels by what is known of them; returns weights, or None, and a note."""
+    pictures, both = [], (recordings.transport, recordings.second)
+    for one in both:
+        one.resolve(envmap)
+        pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
+    share = recordings.second.spp / recordings.transport.spp
+    weight = pixel_confidence.weights(*pictures, share, wanted.picture, wanted.noise)
+    if weight is None:
+        return None, ""
+    noisy = 100 * float((weight < 0.5).mean())
+    said = f"{noisy:.3g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
+    weight = weight if wanted.weight is None else weight * wanted.weight
+    if not weight.any():  # a mask around nothing but noise: better that than nothing
+        return None, ""
+    return (weight / max(float(weight.mean()), 1e-30)).astype(np.float32), said
+
+
+def _searched(layers, params, transport, wanted, original):
+    """List the starts of the searches, (parameters, notes)."""
+    asked = wanted.picture, wanted.weight, original
+    if wanted.coverage is None:
+        return [light_search.start(layers, params, transport, *asked)]
+    begin = layers, params, transport, wanted.initial, *asked
+    daring = (False, True) if (wanted.coverage < 1).any() else (False,)
+    found = [painted_change.start(*begin, bold=bold) for bold in daring]
+    if layers.separation.lights:
+        found.append(painted_change.softened(layers, params))
+    return [one for i, one in enumerate(found) if not any(_same(one, other) for other in found[:i])]
+
+
+def _same(one, other):
+    """Say whether two starts place the lights alike, in turn and flux, to a thousandth of their units."""
+    return all(np.allclose(*(p[name].numpy() for p, _ in (one, other)), 0, 1e-3) for name in ("turn", "flux"))

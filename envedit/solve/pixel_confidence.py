@@ -1,0 +1,71 @@
+"""How far each pixel is to be trusted: less where the target or T is mostly noise.
+
+A caustic of a small sun, or its image in a facet of a mirror, falls on few of a pixel's samples. Which, is
+chance: in the target other pixels are hit than in T, and a loss that compares them pulls the map to nothing.
+Both noises are measured, that of T by a second recording, and such pixels count less.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.losses.display_curve import to_display
+
+TRUSTED = 0.007
+"""Standard error of display values, beyond what is usual in the picture, at which a pixel counts half."""
+AROUND = 2
+"""Pixels to each side over which noise is told: paths that have hit nothing yet do not know theirs."""
+USUAL = 4.0
+"""Multiples of the picture's median variance that are nothing special."""
+SHOWS_LIGHT = 3.0
+"""Multiples of the target's median brightness from which on a noisy pixel shows a light itself."""
+LIT = 0.01
+"""Multiples of the target's mean brightness from which on a pixel counts in medians: not a black backdrop."""
+
+
+def weights(first, second, share: float, picture, noise=None) -> np.ndarray | None:
+    """Weigh pixels by what is known of them.
+
+    Parameters
+    ----------
+    first, second : ndarray (h, w, 3)
+        The same picture through T and through a second recording, linear radiance.
+    share : float
+        Samples of the second recording over the first's, n2 / n1. As Var(d1 - d2) = v1 (1 + n1 / n2), the
+        first's variance v1 is (d1 - d2)^2 share / (1 + share).
+    picture : ndarray (h, w, 3)
+        The target, linear radiance.
+    noise : ndarray (h, w), optional
+        Standard error of the target's display values.
+
+    Returns
+    -------
+    ndarray (h, w, 1) or None
+        s^2 / (s^2 + v), s = :data:`TRUSTED`, v the variance around a pixel beyond :data:`USUAL` times its
+        median, and 0 at those over or beside :data:`SHOWS_LIGHT`; medians are over pixels that are
+        :data:`LIT`. None where no pixel is below 1/2, or none that is lit is above 0.
+    """
+    shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
+    variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
+    if noise is not None:
+        variance += np.square(noise)
+    around = _windows(variance, AROUND).mean(axis=(2, 3))
+    brightness = picture.max(axis=2)
+    lit = brightness > LIT * brightness.mean(dtype=np.float64)
+    if not lit.any():
+        return None
+    beyond = np.maximum(around - USUAL * np.median(around[lit]), 0)
+    trust = TRUSTED**2 / (TRUSTED**2 + beyond)
+    if trust.min() >= 0.5:
+        return None
+    brightest = _windows(brightness, 1).max(axis=(2, 3))
+    shows_light = (brightest >= SHOWS_LIGHT * np.median(picture[lit])) & (beyond > 0)
+    trust = np.where(shows_light, 0, trust)
+    return trust[..., None].astype(np.float32) if trust[lit].any() else None
+
+
+def _windows(values, reach):
+    """Windows around each pixel: (h, w, 2 reach + 1, 2 reach + 1)."""
+    size = 2 * reach + 1
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="edge"), (size, size))

@@ -1,0 +1,1 @@
+"""What the picture should be: under another light, painted, under strokes."""

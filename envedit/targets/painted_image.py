@@ -1,0 +1,373 @@
+"""A painted picture: what it asks for, where it was painted, and the rendering to paint on.
+
+A picture tells nothing where it is clipped, and asks for nothing where it was not painted. The latter is seen
+by comparing it with the initial rendering, in display values, as that would look in the picture's own format.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config
+from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
+from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.images import images
+from envedit.scene.scene import Scene
+from envedit.targets.paint_detection import differs
+
+SEED = 8_000_009
+"""Apart from the seeds of all other renderings; a run renders the exported picture again."""
+ENDINGS = (".exr", ".png")
+"""What the initial rendering can be exported as; a JPEG would not keep it."""
+
+NEARLY_ALL = 0.9
+
+
+@dataclass(frozen=True)
+class Painted:
+    """A painted picture.
+
+    Attributes
+    ----------
+    picture : ndarray (h, w, 3) float32
+        Linear radiance; where nothing was painted the initial rendering's own, if that is known.
+    coverage : ndarray (h, w, 1) float32
+        How much each pixel was painted, in [0, 1].
+    excluded : ndarray of bool (h, w)
+        Pixels that tell nothing: clipped, or transparent over nothing.
+    warnings : tuple of str
+        What the user should know.
+    """
+
+    picture: np.ndarray
+    coverage: np.ndarray
+    excluded: np.ndarray
+    warnings: tuple[str, ...]
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The rendering to paint on
+
+
+def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
+    """Render the picture to paint on, (h, w, 3): the scene under the map as it is, at [target] spp."""
+    picture, _, _ = lit.sampled(envmap, settings.target.spp, settings.seed + SEED)
+    return picture
+
+
+def check_export(file) -> None:
+    """Refuse a file that :func:`export` should not write.
+
+    Raises
+    ------
+    ConfigError
+        If its ending says neither OpenEXR nor PNG.
+    InputError
+        If it exists, or its folder does not.
+    """
+    file = Path(os.fsdecode(file))
+    if file.suffix.lower() not in ENDINGS:
+        raise ConfigError(f"--export-initial: came {str(file)!r}, wanted a name that ends in .exr or .png")
+    if os.path.lexists(file):
+        raise InputError(f"{file}: exists and is not overwritten: name another file, or move it away")
+    if not os.path.isdir(file.parent):
+        raise InputError(f"{file}: cannot be written (its folder does not exist)")
+
+
+def export(file, picture: np.ndarray, settings: config.Config) -> list[str]:
+    """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG under [target] tonemap.
+
+    The file says which tonemap that is, and what it was rendered from.
+
+    Parameters
+    ----------
+    file : path-like
+        Ends in .exr or .png, and is not there yet.
+    picture : ndarray (h, w, 3)
+        Linear radiance, of :func:`initial`.
+    settings : config.Config
+        What it was made from.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    ConfigError, InputError
+        As :func:`check_export`, or if the file cannot be written.
+    """
+    check_export(file)
+    linear = Path(os.fsdecode(file)).suffix.lower() == ".exr"
+    name = settings.target.tonemap
+    facts = {
+        "envedit.tonemap": "linear" if linear else name,
+        "envedit.scene": Path(settings.scene.file).name,
+        "envedit.envmap": Path(settings.input.envmap).name,
+        "envedit.seed": settings.seed,
+        "envedit.spp": settings.target.spp,
+    }
+    if linear:
+        images.write_exr(file, picture, facts, panorama=False)
+        return []
+    shown = tonemap(picture, name)
+    images.write_png(file, shown, 16, facts)
+    share = float((shown >= 1 - 0.5 / 65535).any(axis=2).mean())
+    if share < 0.001:
+        return []
+    return [
+        f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and tell nothing "
+        'when they come back: export an .exr, or set [target] tonemap = "log"'
+    ]
+
+
+# ----------------------------------------------------------------------------------------------------------
+# The picture that comes back
+
+
+def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask="") -> Painted:
+    """Read a painted picture.
+
+    - Float files are linear radiance. Others are undone by the tonemap that they were painted under; the one
+      that the file names goes before ``tonemap_name``.
+    - Where a PNG or JPEG is white in a channel, the picture says "at least so bright": such pixels are
+      excluded, but for those that were neither painted nor clipped before. Black is no such limit: there is
+      nothing below it.
+    - With alpha, colour counts as laid over the initial rendering; without that the colour is taken as it
+      is, and coverage is alpha.
+
+    Parameters
+    ----------
+    file : path-like
+        OpenEXR, Radiance, PNG or JPEG.
+    shape : tuple
+        (h, w) of the rendering.
+    tonemap_name : str
+        Declared tonemap, one of ``tonemap.TONEMAPS``.
+    initial : ndarray (h, w, 3), optional
+        Linear radiance of what was painted on. Without it every pixel counts as painted.
+    mask : path-like, optional
+        White where it was painted, in place of comparing; see :func:`read_mask`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is of another size, holds values that are not finite, is grey where the
+        rendering is not, or shows nothing painted.
+    """
+    pixels, info = images.read_stored(file)
+    file = info["path"]
+    _check_size(file, pixels.shape, shape)
+    _check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
+    warnings = [f"{file}: {line}" for line in info["warnings"]]
+    name = _tonemap_of(file, info, tonemap_name, warnings)
+    values, alpha, top = _planes(file, pixels, warnings)
+    before = None
+    if initial is not None:
+        if pixels.shape[2] < 3 and not mask and _coloured(initial, name):
+            raise InputError(f"{file}: is grey, the rendering is in colour: save it as RGB, or give a mask")
+        before = np.asarray(initial, np.float64) if info["hdr"] else tonemap(np.float64(initial), name)
+
+    clipped = np.zeros(shape[:2], bool)
+    if not info["hdr"]:
+        clipped = (values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)).any(axis=2) & (alpha > 0)
+    if (alpha < 1).any():
+        values = _laid_over(values, alpha[..., None], before, info["hdr"])
+        over = "laid over the initial rendering" if before is not None else "taken as it is"
+        warnings.append(
+            f"{file}: {(alpha == 0).sum()} pixels are transparent and count as not painted; "
+            f"the colour of {((alpha < 1) & (alpha > 0)).sum()} half transparent ones is {over}"
+        )
+    painted = alpha > 0
+    if before is not None:
+        painted &= differs(values, before, info, top)
+        if not mask:
+            _check_painted(file, painted, before, values, info, top, name, initial, warnings)
+    coverage = alpha * (read_mask(mask, shape)[..., 0] if mask else painted)
+    if not coverage.any():
+        raise InputError(f"{file}: nothing of it is painted; paint on it, or give a mask that is white there")
+    excluded = clipped | (alpha == 0)
+    if before is not None:
+        excluded = clipped & ((coverage > 0) | (before >= 1 - 0.5 / top).any(axis=2))
+    if count := int((excluded & (coverage > 0)).sum()):
+        if (excluded | (coverage == 0)).all():
+            raise InputError(
+                f"{file}: all that is painted is clipped, and says only 'at least so bright': "
+                'paint below white, or on an .exr, or under [target] tonemap = "log"'
+            )
+        warnings.append(f"{file}: {count} painted pixels are clipped ('at least so bright'): left out")
+
+    picture = values if info["hdr"] else inverse_tonemap(values, name)
+    if initial is not None:  # to the last bit, not as the file has rounded it
+        picture = np.where((painted & (coverage > 0))[..., None], picture, initial)
+    picture = np.minimum(picture, np.finfo(np.float32).max).astype(np.float32)
+    return Painted(picture, coverage[..., None].astype(np.float32), excluded, tuple(warnings))
+
+
+def given(picture, shape, initial: np.ndarray, mask: np.ndarray | None = None) -> Painted:
+    """Take a painted picture from arrays.
+
+    Parameters
+    ----------
+    picture : array (h, w, 3)
+        Linear radiance; negative values become 0.
+    shape : tuple
+        (h, w) of the rendering.
+    initial : ndarray (h, w, 3)
+        What was painted on. Pixels that differ by less than a half float rounds were not painted.
+    mask : array (h, w) or (h, w, 1), optional
+        How much each pixel was painted, in [0, 1], in place of comparing.
+
+    Raises
+    ------
+    InputError
+        If the sizes differ, a value is not finite, or nothing is painted.
+    """
+    picture = np.asarray(picture, np.float64)
+    if picture.shape != (*shape, 3):
+        raise InputError(f"target: the picture has shape {picture.shape}, the rendering {(*shape, 3)}")
+    _check_finite("target", picture, "repair it where it comes from")
+    picture = np.maximum(picture, 0)
+    if mask is None:
+        coverage = differs(picture, np.asarray(initial, np.float64), {"hdr": True, "format": "exr"}, 1)
+    else:
+        coverage = np.asarray(mask, np.float64)
+        if coverage.size != shape[0] * shape[1] or coverage.shape[:2] != tuple(shape):
+            raise InputError(f"mask: has shape {coverage.shape}, the rendering {tuple(shape)}")
+        coverage = coverage.reshape(shape)
+        _check_finite("mask", coverage[..., None], "it is how much each pixel was painted, from 0 to 1")
+        coverage = np.clip(coverage, 0, 1)
+    if not coverage.any():
+        raise InputError("target: nothing of the picture is painted")
+    picture = np.where(coverage[..., None] > 0, np.minimum(picture, np.finfo(np.float32).max), initial)
+    return Painted(
+        picture.astype(np.float32), coverage[..., None].astype(np.float32), np.zeros(shape, bool), ()
+    )
+
+
+def read_mask(file, shape) -> np.ndarray:
+    """Read a mask as the weight of each pixel: white counts, black does not, greys in between.
+
+    Half grey is meant as a half, whatever curve the file has; transparent is black; float values are cut to
+    [0, 1]. Returns (h, w, 1) float32.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is not (h, w), is not finite, or is black everywhere.
+    """
+    pixels, info = images.read_stored(file)
+    file, rows, columns = info["path"], *pixels.shape[:2]
+    if (rows, columns) != tuple(shape[:2]):
+        raise InputError(
+            f"{file}: is {columns}x{rows} pixels, the target is {shape[1]}x{shape[0]}: "
+            "the mask must have the target's size"
+        )
+    _check_finite(file, pixels, "paint the mask in black and white")
+    values = pixels if info["hdr"] else pixels / np.iinfo(pixels.dtype).max
+    if values.shape[2] in (2, 4):
+        alpha = 1 if info["hdr"] else values[..., -1:]  # OpenEXR is premultiplied
+        values = values[..., :-1] * alpha
+    weight = np.clip(values.mean(axis=2, keepdims=True), 0, 1)
+    if info["format"] == "jpeg":  # its black and white are not quite
+        weight = np.clip((weight - 0.02) / 0.96, 0, 1)
+    if not weight.any():
+        raise InputError(f"{file}: is black everywhere: paint white where the target counts")
+    return weight.astype(np.float32)
+
+
+def _check_size(file, size, shape):
+    (rows, columns), (height, width) = size[:2], shape[:2]
+    if (rows, columns) == (height, width):
+        return
+    sizes = f"{file}: is {columns}x{rows} pixels, the rendering is {width}x{height}: "
+    if abs(columns * height - rows * width) > max(height, width):
+        raise InputError(sizes + "another aspect; paint on the picture that --export-initial writes")
+    raise InputError(sizes + "export it at that size, or set [scene] width and height to the picture's")
+
+
+def _check_finite(file, pixels, advice):
+    if (bad := ~np.isfinite(pixels)).any():
+        raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
+
+
+def _tonemap_of(file, info, declared, warnings):
+    """Return the tonemap of the file's values; what it says about itself goes before the configuration."""
+    said = str(info["metadata"].get("envedit.tonemap", "") or declared)
+    if info["hdr"]:
+        if "envedit.tonemap" in info["metadata"] and said != "linear":
+            warnings.append(f"{file}: says that it is under {said[:40]!a}; it is read as linear radiance")
+        return declared
+    if said not in TONEMAPS:
+        warnings.append(
+            f"{file}: says that it is under {said[:40]!a}, which is unknown: '{declared}' is used"
+        )
+    elif said != declared:
+        warnings.append(f"{file}: was written under the '{said}' tonemap: used instead of '{declared}'")
+        return said
+    else:
+        warnings.append(f"{file}: read as a picture under the '{declared}' tonemap")
+    return declared
+
+
+def _planes(file, pixels, warnings):
+    """Return values (h, w, 3) and alpha (h, w), float64, and the largest code; codes become [0, 1]."""
+    top = 1 if pixels.dtype == np.float32 else int(np.iinfo(pixels.dtype).max)
+    values = pixels.astype(np.float64) / top
+    if top == 65535 and not (pixels % 257).any():
+        top = 255  # 8 bits that were written as 16
+    alpha = np.ones(pixels.shape[:2])
+    if pixels.shape[2] in (2, 4):
+        values, alpha = values[..., :-1], np.clip(values[..., -1], 0, 1)
+    if values.shape[2] == 1:
+        values = values.repeat(3, axis=2)
+        warnings.append(f"{file}: read as grey")
+    if (negative := (values < 0).any(axis=2)).any():
+        where = f"the first at {place_of(negative)}"
+        warnings.append(f"{file}: {negative.sum()} pixels are negative, {where}: set to 0")
+    return np.maximum(values, 0), alpha, top
+
+
+def _coloured(picture, name):
+    shown = tonemap(picture, name)
+    return bool((np.ptp(shown, axis=2) > 4 / 255).mean() > 0.001)
+
+
+def _laid_over(values, alpha, before, premultiplied):
+    """Composite in the space that editors composite in: the file's own."""
+    values = np.where(alpha > 0, values, 0)  # colour without alpha would be light that is added
+    if before is None:
+        return values / np.where(alpha > 0, alpha, 1) if premultiplied else values
+    return (values if premultiplied else alpha * values) + (1 - alpha) * before
+
+
+def _check_painted(file, painted, before, values, info, top, name, initial, warnings):
+    """Warn where paint is recognised badly: in a JPEG, and where nearly all would be paint."""
+    if info["format"] == "jpeg":
+        warnings.append(f"{file}: paint is found but roughly in a JPEG, faint paint not at all: save a PNG")
+    telling = ~((before == 0) | ((before >= 1 - 0.5 / top) & (not info["hdr"]))).all(axis=2)
+    share = float(painted[telling].mean()) if telling.any() else 0.0
+    if share < NEARLY_ALL:
+        return
+    line = f"{file}: {100 * share:.0f} % of the pixels differ from the initial rendering"
+    if not info["hdr"]:
+        error = {key: _median_error(values, initial, key, telling) for key in TONEMAPS}
+        best = min(error, key=error.get)
+        if error[best] < error[name] / 4:
+            warnings.append(f"{line}, but not under '{best}': set [target] tonemap = \"{best}\"")
+            return
+    facts = {k[8:]: v for k, v in info["metadata"].items() if k.startswith("envedit.")}
+    made = f" (it was made with {', '.join(f'{k} {v}' for k, v in facts.items())})" if facts else ""
+    warnings.append(
+        f"{line}: unless all of it was painted, it is of another rendering{made}; "
+        "export that again with --export-initial, or give a mask"
+    )
+
+
+def _median_error(values, initial, name, where):
+    return float(np.median(np.abs(values - tonemap(np.float64(initial), name)).max(axis=2)[where]))

@@ -1,0 +1,171 @@
+"""What the rendering should look like: under another light, as a painted picture, or under strokes.
+
+A picture that was painted asks two things: that the pixels under the paint become as painted, and that all
+others stay as they are. Each of the two has a weight of its own, shared among its pixels, so that a small
+stroke is not outvoted by the many pixels around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from envedit import config
+from envedit.core import latlong
+from envedit.core.errors import InputError
+from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.images import images
+from envedit.scene.scene import Scene
+from envedit.targets import painted_image, strokes
+
+SEED = 7_000_003
+"""Apart from the seeds of all other renderings, so that no noise is shared between question and answer."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """The picture wanted.
+
+    Attributes
+    ----------
+    picture : ndarray (h, w, 3)
+        Linear radiance.
+    weight : ndarray (h, w, 1) or None
+        How much each pixel counts; None: all the same.
+    envmap : ndarray (H, W, 3) or None
+        The map that makes the picture, where it is known.
+    source : str
+        One line for the report.
+    warnings : tuple of str
+        What the user should know about the picture.
+    initial : ndarray (h, w, 3) or None
+        What was painted on: the rendering under the map as it is; None where nothing was painted.
+    coverage : ndarray (h, w, 1) or None
+        How much each pixel was painted; None likewise.
+    asked : tuple of ndarray
+        What the target was made from beside the configuration, for a checkpoint to know it by. Not the
+        rendering that was painted on: rendered anew, it may differ in its last bits.
+    noise : ndarray (h, w) or None
+        Standard error of the picture's display values; None where it is not known.
+    compared : ndarray (h, w, 3) or None
+        What the loop compares T E with, linear radiance; None: the picture. Of paint, the picture as T sees
+        it: what was not painted is then matched exactly by the map as it is.
+    """
+
+    picture: np.ndarray
+    weight: np.ndarray | None
+    envmap: np.ndarray | None
+    source: str
+    warnings: tuple[str, ...] = ()
+    initial: np.ndarray | None = None
+    coverage: np.ndarray | None = None
+    asked: tuple[np.ndarray, ...] = ()
+    noise: np.ndarray | None = None
+    compared: np.ndarray | None = None
+
+    @property
+    def aim(self) -> np.ndarray:
+        """The picture that the loop compares with, (h, w, 3)."""
+        return self.picture if self.compared is None else self.compared
+
+    def aimed_at(self, picture: np.ndarray) -> Target:
+        """Return the target with another :attr:`aim`."""
+        return replace(self, **{"picture" if self.compared is None else "compared": picture})
+
+
+def make(
+    settings: config.Config,
+    scene: Scene,
+    envmap: np.ndarray,
+    picture: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
+) -> Target:
+    """Make the target of a configuration.
+
+    Parameters
+    ----------
+    settings : config.Config
+        What is wanted: its target, and seed and repair of the input.
+    scene : Scene
+        The scene that it is a picture of.
+    envmap : ndarray (H, W, 3)
+        The map that will be edited; turned by ``rotate_degrees`` where the target names no file.
+    picture : ndarray (h, w, 3), optional
+        A painted picture, linear radiance, in place of what the configuration names.
+    mask : ndarray (h, w), optional
+        How much each pixel of it was painted, in [0, 1]; None: seen by comparing with the initial rendering.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, a picture does not fit the film, or the other map is brighter than
+        :data:`.radiance.BRIGHTEST`. A picture that is so bright is cut there, with a warning.
+    """
+    chosen = settings.target
+    if picture is None and chosen.kind == "envmap":
+        return _rendered(settings, scene, envmap)
+    shape = scene.height, scene.width
+    initial, asked = painted_image.initial(scene, envmap, settings), ()
+    if picture is not None:
+        found = painted_image.given(picture, shape, initial, mask)
+        source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
+    elif chosen.kind == "image":
+        found = painted_image.read(chosen.file, shape, chosen.tonemap, initial, chosen.mask)
+        files = [chosen.file, *([chosen.mask] if chosen.mask else [])]
+        source, asked = f"painted: {chosen.file}", tuple(np.fromfile(file, np.uint8) for file in files)
+    else:
+        made = strokes.paint(initial, chosen.strokes, chosen.tonemap)
+        if not made.coverage.any():
+            raise InputError(f"target.strokes: {'; '.join(made.warnings) or 'none of them paints anything'}")
+        found = painted_image.Painted(made.picture, made.coverage, np.zeros(shape, bool), made.warnings)
+        source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
+    picture, warnings = found.picture, tuple(found.warnings)
+    if over := int((picture > BRIGHTEST).any(axis=2).sum()):
+        # Squares and sums of what is more would leave single precision; on a display it is as white.
+        picture = np.minimum(picture, np.float32(BRIGHTEST))
+        warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
+    untold = found.excluded & (found.coverage[..., 0] > 0)  # what was not painted has the initial value
+    weight = pixel_weight(found.coverage, untold, chosen.paint, chosen.hold)
+    share = 100 * float((found.coverage > 0).mean())
+    source += (
+        f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
+    )
+    return Target(picture, weight, None, source, warnings, initial, found.coverage, asked)
+
+
+def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
+    """Share the weights of paint and rest among their pixels: (h, w, 1) float32, 1 on average.
+
+    weight = paint c / sum(c) + hold (1 - c) / sum(1 - c), where c is coverage, over the pixels that are not
+    ``excluded``.
+    """
+    told = ~np.asarray(excluded, bool)[..., None]
+    weight = np.zeros(told.shape)
+    for share, part in ((paint, coverage * told), (hold, (1 - coverage) * told)):
+        total = part.sum(dtype=np.float64)
+        if total > 0:
+            weight += share * part / total
+    if not weight.any():
+        raise InputError(
+            "target: no pixel counts: set target.paint above 0, or target.hold if pixels are left unpainted"
+        )
+    return (weight / weight.mean()).astype(np.float32)
+
+
+def _rendered(settings, scene, envmap):
+    """Render the scene under another map."""
+    chosen = settings.target
+    if chosen.file:
+        true, info = images.load_envmap(chosen.file, envmap.shape[1], settings.input.repair)
+        require_radiance(true, str(chosen.file), brightest=BRIGHTEST)
+        source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
+    else:
+        true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
+        source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
+    true = np.ascontiguousarray(true, np.float32)
+    picture, spp, noise = scene.sampled(true, chosen.spp, settings.seed + SEED)
+    weight = painted_image.read_mask(chosen.mask, picture.shape[:2]) if chosen.mask else None
+    asked = (true,) if weight is None else (true, weight)
+    source += f", {spp} samples a pixel"
+    return Target(picture, weight, true, source, warnings, asked=asked, noise=noise)

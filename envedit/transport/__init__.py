@@ -1,0 +1,1 @@
+"""Light transport: the linear map from an environment map to a rendering, stored."""

@@ -1,0 +1,89 @@
+"""The light transport at a glance: blocks of pixels against cells of texels, few enough to look at them all.
+
+Samples that are too few for a texel are many for a cell of some degrees: the overview tells, for a light
+anywhere on the sphere, roughly what it does to the picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit.core import latlong
+
+CELLS = 64
+"""Cells around the horizon: 5.6 degrees each."""
+BLOCKS = 32
+"""Blocks along the longer side of the picture."""
+
+
+@dataclass(frozen=True)
+class Overview:
+    """T between blocks and cells.
+
+    Attributes
+    ----------
+    matrix : ndarray (3, blocks, cells) float32
+        Mean over the pixels of a block, for a radiance of 1 in all texels of a cell.
+    block_of : ndarray of int64 (h * w,)
+        Block of every pixel.
+    cell_of : ndarray of int64 (H * W,)
+        Cell of every texel.
+    directions : ndarray (cells, 3)
+        Unit vectors to the cells' centres.
+    omega : ndarray (cells,)
+        Solid angle of each cell, as a rendering receives it.
+    """
+
+    matrix: np.ndarray
+    block_of: np.ndarray
+    cell_of: np.ndarray
+    directions: np.ndarray
+    omega: np.ndarray
+
+    def to_blocks(self, picture: np.ndarray) -> np.ndarray:
+        """Average a picture (h, w, c) over blocks: (blocks, c)."""
+        return _means(picture.reshape(-1, picture.shape[2]), self.block_of, np.ones(len(self.block_of)))
+
+    def to_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Average a map (H * W, c) over cells, weighted: (cells, c)."""
+        return _means(values, self.cell_of, weight)
+
+
+def make(matrix, shape: tuple[int, int], grid: tuple[int, int]) -> Overview:
+    """Sum up the entries of a transport.
+
+    Parameters
+    ----------
+    matrix : sparse.ColourMatrix
+        T, pixels by texels.
+    shape, grid : (int, int)
+        Height and width of the picture and of the map.
+    """
+    block_of, blocks = _tiles(*shape, max(1, -(-max(shape) // BLOCKS)))
+    cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
+    rows, columns, weights = matrix.coordinates()
+    key = block_of[rows] * cells + cell_of[columns]
+    count = np.bincount(block_of, minlength=blocks)
+    dense = np.stack(
+        [np.bincount(key, w, blocks * cells).reshape(blocks, cells) / count[:, None] for w in weights.T]
+    )
+    omega = np.repeat(latlong.lookup_solid_angles(*grid), grid[1])
+    toward = _means(latlong.directions(*grid).reshape(-1, 3), cell_of, omega)
+    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
+    size = np.bincount(cell_of, omega, cells)
+    return Overview(dense.astype(np.float32), block_of, cell_of, toward, size)
+
+
+def _tiles(height, width, size):
+    """Return the number of every pixel's square tile, and the count of tiles."""
+    across = -(-width // size)
+    tile = (np.arange(height) // size)[:, None] * across + np.arange(width) // size
+    return tile.ravel(), -(-height // size) * across
+
+
+def _means(values, group, weight):
+    total = np.bincount(group, weight)
+    sums = [np.bincount(group, v * weight, len(total)) for v in values.T]
+    return np.stack(sums, axis=1) / np.maximum(total, 1e-30)[:, None]

@@ -1,0 +1,322 @@
+"""Exact columns of the light transport: one ray from every path vertex towards the very texel.
+
+Recorded samples are spread over the whole map, so that a single bright texel is hit by few of them. A column
+holds, for one texel, its contribution to every pixel, from as many rays towards it as there are path
+vertices. Columns lie in a bounded store, packed as (r, g, b, unused) and interleaved in slices of 8 pixels,
+so that both the product and its adjoint read neighbouring memory. Their number is an argument of the
+kernels, not a part of them: more columns compile nothing.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.scene import camera_paths
+from envedit.transport.recording import LANES, bsdf_weight, connect
+from envedit.transport.sparse_matrix import SLICE, merge
+from envedit.transport.texel_sampling import Grid
+
+_SEGMENTS = 16
+
+
+class ExactColumns:
+    """Columns of T for some texels of a grid, traced on demand.
+
+    Parameters
+    ----------
+    scene : envedit.scene.Scene
+        Scene, camera and film.
+    grid : Grid
+        The texels.
+    bounces : int
+        Surface points along a path.
+    capacity : int
+        Most columns that will ever be held; their memory is taken at once, 16 bytes a pixel and column.
+
+    Attributes
+    ----------
+    texels : ndarray of int64 (n,)
+        Texels that have a column, in the order of their slots.
+    slot_of : ndarray of int64 (H * W,)
+        Slot of each texel's column; -1: none.
+    paths_of : ndarray of int64 (H * W,)
+        Camera paths a pixel that each texel's column was traced with; 0: none.
+    mask : Float (H * W,)
+        0 for texels with a column, 1 for others: what is left to the coarse tier.
+    """
+
+    def __init__(self, scene, grid: Grid, bounces: int, capacity: int):
+        self.scene, self.grid, self.bounces, self.capacity = scene, grid, bounces, capacity
+        self.pixels = scene.width * scene.height
+        self.texels = np.zeros(0, np.int64)
+        self.slot_of = np.full(grid.texels, -1, np.int64)
+        self.paths_of = np.zeros(grid.texels, np.int64)
+        self.mask = dr.full(mi.Float, 1, grid.texels)
+        self._store = dr.zeros(mi.Float, _slices(self.pixels) * max(capacity, 1) * SLICE * 4)
+        self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
+        self._count = dr.opaque(mi.UInt32, 0)
+        self._lost = dr.opaque(mi.UInt32, 0)
+        dr.make_opaque(self._store, self._texel_of, self.mask)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the store."""
+        return 4 * len(self._store)
+
+    @property
+    def lost(self) -> int:
+        """Contributions that were not finite, and were left out."""
+        return int(self._lost[0])
+
+    @property
+    def room(self) -> int:
+        """Columns that can still be added."""
+        return self.capacity - len(self.texels)
+
+    # ------------------------------------------------------------------ tracing
+
+    def trace(self, texels: np.ndarray, count: int, seed: int, keep: np.ndarray | None = None, blocks=None):
+        """Trace columns; one that was there is replaced.
+
+        Parameters
+        ----------
+        texels : ndarray of int64
+            Distinct texels, no more of them new than there is :attr:`room` and columns to give up.
+        count : int
+            Camera paths a pixel.
+        seed : int
+            Seed of every random choice.
+        keep : ndarray of int64, optional
+            Texels whose columns may not be given up for new ones; all by default.
+        blocks : int, optional
+            Trace only so many blocks of pixels: enough to have all kernels, but no column to be used.
+        """
+        self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
+        self.paths_of[texels] = count
+        self._clear(self.slot_of[texels])
+
+        grid = self.grid
+        traced = np.full(grid.texels, -1, np.int32)
+        traced[texels] = self.slot_of[texels]
+        traced = dr.opaque(mi.Int32(traced))
+        areas = np.diff(latlong.row_edges(grid.height)) / grid.width
+        uniform = grid.width * max(grid.height - 1, 1)  # density over (u, v) of one sample in every texel
+        block = max(SLICE, LANES // count // SLICE * SLICE)
+        per_pixel = dr.opaque(mi.UInt32, count)
+        for start in range(0, self.pixels, block)[:blocks]:
+            some = np.arange(start, min(start + block, self.pixels), dtype=np.uint32)
+            lane = dr.arange(mi.UInt32, len(some) * count)
+            path = lane % per_pixel
+            pixel = lane // per_pixel + dr.opaque(mi.UInt32, start)
+            place = _first_place(pixel, self.capacity)
+            first_of_pixel = dr.gather(mi.UInt32, place, dr.arange(mi.UInt32, len(some)) * per_pixel)
+            dr.eval(place, first_of_pixel)
+            for event in camera_paths.trace(self.scene.mi, some, count, self.bounces, seed + 7919):
+                if isinstance(event, camera_paths.Escape):
+                    self._add_escapes(event, traced, place, uniform, count)
+                    continue
+                for texel in texels:
+                    row, column = divmod(int(texel), grid.width)
+                    key = dr.opaque(mi.UInt32, (int(texel) + seed * 31 + event.bounce) & 0xFFFFFFFF)
+                    u = camera_paths.lattice(path, mi.sample_tea_32(pixel, key)[0])
+                    place_in_map = dr.opaque(mi.UInt32, row), dr.opaque(mi.UInt32, column)
+                    direction, jacobian = grid.direction(*place_in_map, u)
+                    value = connect(self.scene.mi, event, direction, jacobian, uniform / jacobian)
+                    value *= dr.opaque(mi.Float, float(areas[row])) * jacobian / mi.Float(per_pixel)
+                    value = self._finite(value, True)
+                    target = first_of_pixel + dr.opaque(mi.UInt32, int(self.slot_of[texel])) * SLICE
+                    for c in range(3):
+                        dr.scatter_add(self._store, dr.block_sum(value[c], count), target * 4 + c)
+                    dr.eval(self._store)
+        self._publish()
+
+    def _take_slots(self, fresh, texels, keep):
+        """Give slots to texels without one: new ones first, then those of columns that nobody keeps."""
+        new = min(len(fresh), self.room)
+        slots = len(self.texels) + np.arange(new)
+        self.texels = np.concatenate([self.texels, np.zeros(new, np.int64)])
+        if new < len(fresh):
+            kept = np.zeros(self.grid.texels, bool)
+            kept[texels] = True
+            kept[self.texels[: len(self.texels) - new] if keep is None else keep] = True
+            older = np.arange(len(self.texels) - new)
+            given_up = older[~kept[self.texels[older]]][: len(fresh) - new]
+            gone = self.texels[given_up]
+            self.slot_of[gone], self.paths_of[gone] = -1, 0
+            slots = np.concatenate([slots, given_up])
+        self.texels[slots], self.slot_of[fresh] = fresh, slots
+
+    def retrace(self, seed: int) -> None:
+        """Trace every column again with other samples, each with as many paths as before."""
+        paths_of = self.paths_of[self.texels]
+        for count in np.unique(paths_of)[::-1]:
+            self.trace(self.texels[paths_of == count], int(count), seed)
+
+    def _publish(self):
+        """Bring what the kernels read in line with the list of texels."""
+        padded = np.zeros(max(self.capacity, 1), np.uint32)
+        padded[: len(self.texels)] = self.texels
+        self._texel_of = dr.opaque(mi.UInt32(padded))
+        mask = np.ones(self.grid.texels, np.float32)
+        mask[self.texels] = 0
+        self.mask = dr.opaque(mi.Float(mask))
+        self._count = dr.opaque(mi.UInt32, len(self.texels))
+
+    def _add_escapes(self, event, slot_of, place, uniform, count):
+        """Add paths that left the scene towards the traced texels.
+
+        Few do; they are summed on the host, in a fixed order.
+        """
+        taps, _, jacobian = self.grid.locate(event.direction)
+        weight = bsdf_weight(event.pdf, uniform / jacobian) / count
+        targets, values = [], []
+        for texel, share in taps:
+            slot = dr.gather(mi.Int32, slot_of, texel)
+            wanted = event.active & (slot >= 0) & (weight * share > 0)
+            value = self._finite(event.throughput * (weight * share), wanted)
+            target = place + mi.UInt32(slot) * SLICE
+            # Else what is left to compute, and so the kernel, depends on who was hit.
+            dr.eval(value, target, wanted)
+            keep = np.flatnonzero(wanted.numpy()).astype(np.uint32)
+            if len(keep):
+                index = _on_device(mi.UInt32, keep)
+                targets.append(dr.gather(mi.UInt32, target, index).numpy()[: len(keep)])
+                # Channel by channel: a Color3f is interleaved by a kernel that has its length in it.
+                rgb = [dr.gather(mi.Float, value[c], index).numpy()[: len(keep)] for c in range(3)]
+                values.append(np.stack(rgb, axis=1))
+        if not targets:
+            return
+        rows = np.zeros(sum(map(len, targets)), np.uint32)
+        _, target, value = merge(rows, np.concatenate(targets), np.concatenate(values), len(self._store) // 4)
+        place = _on_device(mi.UInt32, target) * 4
+        real = dr.arange(mi.UInt32, len(place)) < dr.opaque(mi.UInt32, len(target))
+        for c in range(3):
+            dr.scatter_add(self._store, _on_device(mi.Float, value[:, c]), place + c, real)
+        dr.eval(self._store)
+
+    def _finite(self, value, active):
+        """Leave out, and count, what is not finite: one sample must not cost the picture."""
+        finite = dr.all(dr.isfinite(value))
+        dr.scatter_add(self._lost, dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0), active & ~finite)
+        return dr.select(finite, value, 0)
+
+    def _clear(self, slots):
+        """Set the columns in ``slots`` to zero."""
+        clear = np.zeros(max(self.capacity, 1), bool)
+        clear[slots] = True
+        i = dr.arange(mi.UInt32, len(self._store))
+        gone = dr.gather(mi.Bool, dr.opaque(mi.Bool(clear)), (i // (4 * SLICE)) % max(self.capacity, 1))
+        self._store = dr.select(gone, 0, self._store)
+        dr.eval(self._store)
+
+    # ------------------------------------------------------------------ using
+
+    def product(self, packets: mi.Float) -> mi.Color3f:
+        """Multiply with a map: sum over columns of column * E[texel], one colour a pixel.
+
+        Parameters
+        ----------
+        packets : Float
+            The map, 4 floats a texel, (r, g, b, unused), flat.
+        """
+        return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity)
+
+    def read(self, texels: np.ndarray) -> np.ndarray:
+        """Return the columns of texels that have one: (n, pixels, 3)."""
+        store = self._store.numpy().reshape(_slices(self.pixels), self.capacity, SLICE, 4)
+        columns = store[:, self.slot_of[texels], :, :3].transpose(1, 0, 2, 3)
+        return columns.reshape(len(texels), -1, 3)[:, : self.pixels]
+
+    def add_adjoint(self, flat: mi.Float, packets: mi.Float) -> None:
+        """Put the adjoint, the sum over pixels of column * I, in the places of the texels that have a column.
+
+        Parameters
+        ----------
+        flat : Float
+            The map that is being pulled back to, H * W * 3; its values at the columns' texels are replaced.
+        packets : Float
+            The picture, 4 floats a pixel, (r, g, b, unused), flat.
+        """
+        if not self.capacity:
+            return
+        part = _adjoint_parts(self._store, packets, self._count, self.pixels, self.capacity)
+        dr.eval(part)
+        slot, total = dr.arange(mi.UInt32, self.capacity), mi.Color3f(0)
+        for segment in range(_SEGMENTS):
+            total += dr.gather(mi.Color3f, part, slot + dr.opaque(mi.UInt32, segment * self.capacity))
+        slot = dr.arange(mi.UInt32, self.capacity)
+        dr.scatter(flat, total, dr.gather(mi.UInt32, self._texel_of, slot), slot < self._count)
+
+    def state(self) -> dict:
+        """Return which texels have a column, in the order of their slots, and the paths of each."""
+        return {"columns": self.texels, "paths": self.paths_of[self.texels]}
+
+    def restore(self, state: dict, seed: int) -> None:
+        """Trace the columns of an earlier :meth:`state` again."""
+        # The same slots as before: the order of a sum is part of its result.
+        self.slot_of[:], self.paths_of[:] = -1, 0
+        self.texels = state["columns"].astype(np.int64)
+        self.slot_of[self.texels] = np.arange(len(self.texels))
+        self.paths_of[self.texels] = state["paths"]
+        self.retrace(seed)
+
+
+# ---------------------------------------------------------------------- kernels
+
+
+def _on_device(kind, values: np.ndarray):
+    """Copy an array to the device, with its first element repeated where there is but one.
+
+    A copy, for numpy's memory is not aligned, and two elements at least, for one would be a scalar: either
+    makes another kernel.
+    """
+    return dr.opaque(kind(np.ascontiguousarray(values if len(values) > 1 else np.repeat(values, 2))))
+
+
+def _slices(n: int) -> int:
+    """Count the slices that ``n`` pixels fill."""
+    return (n + SLICE - 1) // SLICE
+
+
+def _first_place(pixel, capacity):
+    """Packet of a pixel's entry in slot 0; those of the next slots follow at a distance of SLICE packets."""
+    return (pixel // SLICE) * dr.opaque(mi.UInt32, capacity * SLICE) + pixel % SLICE
+
+
+@dr.syntax
+def _product(store, packets, texel_of, count, pixels, capacity):
+    place = _first_place(dr.arange(mi.UInt32, pixels), capacity)
+    slot = dr.zeros(mi.UInt32, pixels)
+    total = mi.Color3f(0)
+    while slot < count:
+        weight = dr.gather(mi.Vector4f, store, place)
+        value = dr.gather(mi.Vector4f, packets, dr.gather(mi.UInt32, texel_of, slot))
+        total += mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z)
+        place += SLICE
+        slot += 1
+    return total
+
+
+@dr.syntax
+def _adjoint_parts(store, packets, count, pixels, capacity):
+    """Sum of column * picture over the pixels of each segment; segments occupy every core."""
+    # Neighbouring lanes are neighbouring columns: their weights for a pixel lie 8 packets apart and share
+    # cache lines with the next 7 pixels.
+    lane = dr.arange(mi.UInt32, capacity * _SEGMENTS)
+    size = dr.opaque(mi.UInt32, capacity)
+    slot, segment = lane % size, lane // size
+    each = _slices((pixels + _SEGMENTS - 1) // _SEGMENTS) * SLICE
+    pixel = segment * dr.opaque(mi.UInt32, each)
+    stop = dr.minimum(pixel + dr.opaque(mi.UInt32, each), dr.opaque(mi.UInt32, pixels))
+    stop = dr.select(slot < count, stop, 0)
+    stride = size * SLICE
+    total = mi.Color3f(0)
+    while pixel < stop:
+        weight = dr.gather(mi.Vector4f, store, (pixel // SLICE) * stride + slot * SLICE + pixel % SLICE)
+        value = dr.gather(mi.Vector4f, packets, pixel)
+        total += mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z)
+        pixel += 1
+    return total

@@ -1,0 +1,482 @@
+"""Light transport T: a rendering is linear in the environment map, I = T E + I_0.
+
+T is traced once for a scene, its camera and a texel grid, without looking at any map; then rendering is a
+matrix product and its adjoint is exact. Nothing changes from step to step, so no Monte Carlo noise bends the
+objective (see docs/architecture.md).
+
+Two tiers, both unbiased:
+
+* the **coarse** tier is a sparse matrix of recorded samples (``recording.py``), spread evenly over
+  directions; it renders the smooth part of a map with little error, but a single bright texel is hit by few
+  samples;
+* the **exact** tier holds columns of T (``exact_columns.py``), one ray per path vertex to that very texel.
+  :meth:`LightTransport.resolve` adds them for the texels that are bright in a given map.
+
+T E = T_coarse (E outside the columns) + T_exact (E inside them). What it costs follows the light, not the
+grid.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.array_cache import DiskCache
+from envedit.core.errors import ConfigError
+from envedit.core.radiance import require_radiance
+from envedit.transport import block_transport as overviews
+from envedit.transport import bright_texels
+from envedit.transport.exact_columns import ExactColumns
+from envedit.transport.influence import determined
+from envedit.transport.recording import (
+    allowed,
+    choose_bounces,
+    choose_samples,
+    left_out,
+    other_light,
+    pilot,
+    record_all,
+    row_mass,
+)
+from envedit.transport.sparse_matrix import ColourMatrix, scale_packets, to_packets
+from envedit.transport.texel_sampling import Grid
+
+COLUMN_TOLERANCE = 0.03
+"""Relative error of the coarse tier above which columns are added."""
+COLUMN_PATHS = (8, 48, 320)
+"""Paths a pixel of a column, by its texel's share of the picture's light (:data:`COLUMN_SHARES`)."""
+FEW_PATHS, FEW_TOLERANCE = (8, 48, 48), 0.08
+"""Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
+COLUMN_SHARES = (0.0, 0.01, 0.1)
+"""Shares of the picture's light from which on a column has so many paths."""
+RESOLVE_EVERY = 10
+"""Steps after which a renderer looks for texels that have grown bright."""
+LASTING_LOOKS = 5
+"""Looks in a row at which a texel must have been a main light before a renderer spends most paths on it."""
+COLUMNS_A_LOOK = 32
+"""Columns that a renderer traces at one look, the brightest: speckle comes and goes, and is not chased."""
+TYPICAL_PIXELS = 128 * 128
+"""Beyond so many pixels the predicted error is the picture's: those of neighbours are independent."""
+_RECORDING = 1  # raise when the same scene, grid and seed give another recording, or other arrays of it
+
+
+class LightTransport:
+    """T for one scene, camera and texel grid; built by :meth:`build`.
+
+    Attributes
+    ----------
+    influence : ndarray (H, W)
+        T' 1: how much a unit of radiance in each texel adds to the picture, summed over pixels and averaged
+        over channels.
+    shape : (int, int)
+        Height and width of the picture.
+    spp, bounces, capacity : int
+        Paths a pixel of the coarse tier, surface points along a path, most exact columns.
+    depth_error : float
+        Share of the picture under a white sky that comes from deeper paths.
+    epoch : int
+        Number of the present recording; only a ``refresh`` raises it.
+    cached : bool
+        The first recording was found on disk.
+    paths, tolerance : (int, int, int), float
+        Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
+    """
+
+    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices):
+        self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
+        self.spp, self.bounces, self.capacity, self.refresh = spp, bounces, capacity, refresh
+        self.epoch, self._base_seed, self._choices, self._lost = 0, seed, choices, 0
+        self.cached, self.depth_error = False, 0.0
+        self.paths, self.tolerance = COLUMN_PATHS, COLUMN_TOLERANCE
+        self._looks = np.zeros(grid.texels, np.uint8)
+        self._overview: overviews.Overview | None = None
+        self._stored = DiskCache(None), {}
+        self._exact = ExactColumns(scene, grid, bounces, capacity)
+
+    # ------------------------------------------------------------------ building
+
+    @classmethod
+    def build(
+        cls,
+        scene,
+        height: int,
+        width: int,
+        *,
+        spp="auto",
+        max_depth="auto",
+        seed: int = 0,
+        memory_gb=2.0,
+        refresh: int = 0,
+        few: bool = False,
+        folder: Path | None = None,
+        progress=None,
+    ) -> LightTransport:
+        """Trace T.
+
+        Parameters
+        ----------
+        scene : envedit.scene.Scene
+            Scene, camera and film.
+        height, width : int
+            Texel grid of the maps that T will be applied to.
+        spp : int or "auto"
+            Texel samples a pixel of the coarse tier.
+        max_depth : int or "auto"
+            Mitsuba's path depth (1: sky seen directly, 2: direct light). "auto" stops where further
+            bounces add less than :data:`.recording.DEPTH_TOLERANCE` of the picture under a white sky.
+        seed : int
+            Seed of the recording.
+        memory_gb : float or "auto"
+            Bound on the memory of T; "auto": 2.
+        refresh : int
+            Steps after which :meth:`render` records T afresh; 0: never.
+        few : bool
+            The maps have few parameters: exact columns need fewer paths, and fewer texels have one.
+        folder : Path, optional
+            Where recordings are kept under a hash of all they depend on; None: nowhere. Recordings made by
+            ``refresh`` are not kept: they are there to be new.
+        progress : callable, optional
+            Called with (done, total) pixel blocks.
+
+        Raises
+        ------
+        ConfigError
+            ``spp`` or ``max_depth`` is below 1.
+        InputError
+            No pixel receives light from the environment, T does not fit into ``memory_gb``, or the grid is
+            smaller than Mitsuba takes.
+        """
+        latlong.check_envmap_size(height, width)
+        memory_gb = allowed(memory_gb)
+        for name, value in (("spp", spp), ("max_depth", max_depth)):
+            if value != "auto" and not value >= 1:
+                raise ConfigError(
+                    f"renderer.{name}: came {value}, wanted a whole number of at least 1, or auto"
+                )
+        cache = DiskCache(folder)
+        origin = {
+            "version": [_RECORDING, mi.__version__, mi.variant()],
+            "scene": [scene.digest, scene.width, scene.height],
+            "grid": [height, width, np.asarray(scene.to_world).tolist()],
+            "seed": seed,
+        }
+        sphere = latlong.solid_angles(height, width)
+        light = cache.load(origin | {"part": "pilot"})
+        if light is None:
+            by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
+            light = {"by_row": by_row, "by_bounce": by_bounce}
+            cache.store(origin | {"part": "pilot"}, light)
+        bounces, choices = choose_bounces(scene, max_depth, light["by_bounce"])
+        mass = row_mass(sphere, light["by_row"])
+        spp, capacity, choice = choose_samples(scene, spp, height * width, memory_gb)
+        grid = Grid(height, width, scene.to_world, mass)
+        transport = cls(scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice])
+        if few:
+            transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
+        transport.depth_error = left_out(light["by_bounce"], bounces)
+        rows = hashlib.sha256(mass.tobytes()).hexdigest()
+        # The light of other lamps is constant: it need not be cut where no path depth is asked for.
+        lamps = (-1 if max_depth == "auto" else bounces + 1) if len(scene.mi.emitters()) > 1 else 0
+        key = origin | {
+            "part": "recording", "samples": spp, "bounces": bounces, "lamps": lamps, "rows": rows
+        }  # fmt: skip
+        transport._stored = cache, key | {"part": "overview"}
+        found = cache.load(key)
+        if found is None:
+            transport._trace(lamps, progress)
+            cache.store(key, transport._recording())
+        else:
+            transport._take(found)
+        return transport
+
+    def _trace(self, lamps, progress=None):
+        """Trace the first recording, and the light of other lamps up to a path depth."""
+        offset = other_light(self.scene, lamps, self._base_seed)
+        self._offset = dr.opaque(mi.Float, 0) if offset is None else dr.opaque(mi.Float(offset.ravel()))
+        self._record(progress)
+
+    def _record(self, progress=None):
+        """Trace the coarse tier with the seed of the present epoch."""
+        texels, pixels = self.grid.texels, self.shape[0] * self.shape[1]
+        rows, columns, weights, lost = record_all(
+            self.scene, self.grid, self.spp, self.bounces, self.seed, progress
+        )
+        self._lost += lost
+        self.forward = ColourMatrix(rows, columns, weights, (pixels, texels))
+        self.reverse = ColourMatrix(columns, rows, weights, (texels, pixels))
+        influence = np.bincount(columns, weights.astype(np.float64).mean(axis=1), minlength=texels)
+        self.influence = influence.reshape(self.grid.height, self.grid.width).astype(np.float32)
+
+    def _recording(self):
+        """Return the first recording as arrays, for :meth:`_take`."""
+        parts = {"forward": self.forward.arrays(), "reverse": self.reverse.arrays()}
+        return {
+            "influence": self.influence,
+            "lost": np.array(self._lost, np.int64),
+            "offset": self._offset.numpy(),
+            **{f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()},
+        }
+
+    def _take(self, arrays):
+        """Take the first recording from arrays."""
+        self.cached, self._lost = True, int(arrays["lost"])
+        self.influence = np.array(arrays["influence"])
+        self._offset = dr.opaque(mi.Float(arrays["offset"]))
+        for part in ("forward", "reverse"):
+            own = {k.removeprefix(f"{part}/"): a for k, a in arrays.items() if k.startswith(f"{part}/")}
+            setattr(self, part, ColourMatrix.from_arrays(own))
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def seed(self) -> int:
+        """Seed of the present recording."""
+        return self._base_seed + 1_000_003 * self.epoch
+
+    @property
+    def choices(self) -> list[str]:
+        """What was chosen automatically with the measurement that decided, and what was left out of T."""
+        count = self._lost + self._exact.lost
+        if not count:
+            return list(self._choices)
+        lost = f"light transport: {count} contributions of camera paths were not finite and are left out"
+        return [*self._choices, lost]
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Texels that have an exact column, int64 (n,), in the order in which they were added."""
+        return self._exact.texels
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes held by both tiers."""
+        return self.forward.bytes + self.reverse.bytes + self._exact.bytes
+
+    def summary(self) -> dict:
+        """Return what T consists of, by name, for metrics.json."""
+        return {
+            "cached": self.cached,
+            "entries": self.forward.entries,
+            "memory_bytes": self.memory_bytes,
+            "columns": len(self.columns),
+            "path_depth": self.bounces + 1,
+            "depth_error": self.depth_error,
+            "samples": self.spp,
+        }
+
+    def determined(self, rows: slice, threshold: float) -> np.ndarray:
+        """Say which texels this view determines, bool (H, W); see :func:`.influence.determined`."""
+        samples = self.forward.entries * self.grid.mass.numpy() / self.grid.width
+        return determined(self.influence, samples, rows, threshold)
+
+    def release(self) -> None:
+        """Let go of T's memory; nothing can be asked of it afterwards."""
+        del self.forward, self.reverse, self._exact
+
+    def overview(self) -> overviews.Overview:
+        """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
+        if self._overview is None:
+            cache, key = self._stored
+            stored = cache.load(key)
+            if stored is None:
+                made = overviews.make(self.forward, self.shape, (self.grid.height, self.grid.width))
+                cache.store(key, vars(made))
+                stored = vars(made)
+            self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
+        return self._overview
+
+    # ------------------------------------------------------------------ using
+
+    @property
+    def transport(self) -> LightTransport:
+        """Itself: what a renderer renders through, where that is a stored T."""
+        return self
+
+    def apply(self, envmap: mi.TensorXf) -> mi.TensorXf:
+        """Render: (H, W, 3) linear radiance to (h, w, 3), differentiable, T E + I_0."""
+        _check(envmap, (self.grid.height, self.grid.width, 3), "map")
+        return dr.custom(_Apply, self, envmap)
+
+    def linear(self, envmap: mi.TensorXf) -> mi.TensorXf:
+        """Render a map without the light of other lamps: T E, not differentiable."""
+        _check(envmap, (self.grid.height, self.grid.width, 3), "map")
+        return self._apply(envmap, offset=False)
+
+    def adjoint(self, image: mi.TensorXf) -> mi.TensorXf:
+        """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3)."""
+        _check(image, (*self.shape, 3), "picture")
+        return self._adjoint(image)
+
+    def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
+        """Render a map: the interface that all renderers share.
+
+        T does not depend on the step; but now and then it is checked whether the map has grown bright where
+        T is coarse, and with ``refresh`` everything is recorded again: a new, independent estimate of the
+        same T.
+        """
+        if self.refresh and step // self.refresh != self.epoch:
+            self.epoch = step // self.refresh
+            self._record()
+            self._exact.retrace(self.seed)
+        if step % RESOLVE_EVERY == 0:
+            self._warm_up()
+            self._look(dr.detach(envmap).numpy())
+        return self.apply(envmap)
+
+    def _look(self, envmap):
+        """Resolve a map that will change: a light on its way is not worth the paths of one that stays."""
+        is_main = self._shares(envmap) > COLUMN_SHARES[-1]
+        self._looks = np.where(is_main, np.minimum(self._looks, LASTING_LOOKS) + 1, 0).astype(np.uint8)
+        self.resolve(envmap, limit=COLUMNS_A_LOOK, lasting=self._looks >= LASTING_LOOKS)
+
+    def _warm_up(self):
+        """Trace one column of each kind in the first step: what grows bright later needs no other kernel."""
+        if len(self.columns) == 0 and self._exact.room:
+            most = np.array([int(self.influence.argmax())])
+            self._exact.trace(most, self.paths[-1], self.seed, blocks=1)
+            for count in self.paths[:-1]:
+                self._exact.trace(most, count, self.seed)
+
+    def state(self) -> dict:
+        """Return what a checkpoint must hold: the exact columns, their order and paths, looks, and epoch."""
+        return {**self._exact.state(), "looks": self._looks, "epoch": np.int64(self.epoch)}
+
+    def restore(self, state: dict) -> None:
+        """Trace the columns of an earlier :meth:`state`."""
+        if int(state["epoch"]) != self.epoch:
+            self.epoch = int(state["epoch"])
+            self._record()
+        self._looks = np.array(state["looks"], np.uint8)
+        self._exact.restore(state, self.seed)
+
+    def _apply(self, envmap, offset=True):
+        packets = to_packets(envmap.array, self.grid.texels)
+        coarse = self.forward.apply(scale_packets(packets, self._exact.mask, self.grid.texels))
+        exact = self._exact.product(packets)
+        flat = dr.ravel(coarse + exact)
+        return mi.TensorXf(flat + self._offset if offset else flat, (*self.shape, 3))
+
+    def _adjoint(self, image):
+        packets = to_packets(image.array, self.shape[0] * self.shape[1])
+        coarse = self.reverse.apply(packets) * self._exact.mask
+        flat = dr.ravel(coarse)
+        self._exact.add_adjoint(flat, packets)
+        return mi.TensorXf(flat, (self.grid.height, self.grid.width, 3))
+
+    # ------------------------------------------------------------------ which texels are exact
+
+    def probe(self, texels: np.ndarray) -> np.ndarray:
+        """Trace columns with the fewest paths, where there are none, and return them: (n, pixels, 3)."""
+        exact = self._exact
+        texels = np.asarray(texels, np.int64)
+        todo = texels[exact.slot_of[texels] < 0]
+        if len(todo):
+            exact.trace(todo, self.paths[0], self.seed, texels)
+        return exact.read(texels)
+
+    def resolve(
+        self,
+        envmap,
+        tolerance: float | None = None,
+        limit: int | None = None,
+        lasting: np.ndarray | None = None,
+    ) -> int:
+        """Trace exact columns for the texels that the coarse tier would render with too much error.
+
+        The brightest texels are taken out until the error that is predicted for the rest
+        (:mod:`.bright_texels`) stays under ``tolerance``.
+
+        Parameters
+        ----------
+        envmap : array_like (H, W, 3)
+            Map that is about to be rendered.
+        tolerance : float, optional
+            Relative error allowed for the coarse part; :attr:`tolerance` by default.
+        limit : int, optional
+            Trace at most so many new columns.
+        lasting : ndarray of bool (H * W,), optional
+            Texels that may have the most paths; all by default.
+
+        Returns
+        -------
+        int
+            Number of columns traced. Texels stay exact while there is room; then those that are not bright
+            any more make room for those that are.
+        """
+        envmap, exact = np.asarray(envmap), self._exact
+        wanted = self.bright_texels(envmap, tolerance)[: exact.capacity]
+        tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1
+        tier = np.maximum(tier, 0)
+        if lasting is not None:
+            # The last tier is for lights that have lasted; others stop one below.
+            tier = np.minimum(tier, np.where(lasting[wanted], len(self.paths), len(self.paths) - 2))
+        traced = 0
+        for i in reversed(range(len(self.paths))):
+            todo = wanted[(tier == i) & (exact.paths_of[wanted] < self.paths[i])]
+            todo = todo[: None if limit is None else limit - traced]
+            if len(todo):
+                exact.trace(todo, self.paths[i], self.seed, wanted)
+                traced += len(todo)
+        return traced
+
+    def _shares(self, envmap):
+        """Return the share of the picture's light that comes from each texel, (H * W,)."""
+        light = envmap.reshape(-1, 3).astype(np.float64).mean(axis=1) * self.influence.ravel()
+        total = light.sum()
+        return light / total if total > 0 else np.zeros_like(light)
+
+    def coarse_error(self, envmap) -> float:
+        """Predict the relative error of the coarse tier for a map, beside the columns that there are.
+
+        Raises
+        ------
+        InputError
+            If a texel is not finite or negative: no error can be told then.
+        """
+        require_radiance(envmap, "light transport")
+        rest = self._exact.slot_of < 0
+        return bright_texels.error(*self._radiance(np.asarray(envmap)), self._samples, rest)
+
+    @property
+    def _samples(self):
+        """Samples by which errors are told: those of a pixel, or of a typical picture's pixel if larger."""
+        return self.spp * max(1.0, self.shape[0] * self.shape[1] / TYPICAL_PIXELS)
+
+    def _radiance(self, envmap):
+        """List every texel's radiance, its largest channel, and solid angle; 0 where no light comes from."""
+        omega = np.repeat(latlong.solid_angles(self.grid.height, self.grid.width), self.grid.width)
+        # A texel that no sample has met may matter as much as its row: rows are told by many samples.
+        seen = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
+        return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen, omega * seen
+
+    def bright_texels(self, envmap: np.ndarray, tolerance: float | None = None) -> np.ndarray:
+        """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
+        tolerance = self.tolerance if tolerance is None else tolerance
+        return bright_texels.brightest(*self._radiance(envmap), self._samples, tolerance)
+
+
+def _check(tensor, shape, what):
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"light transport: the {what} must have shape {shape}, got {tuple(tensor.shape)}")
+
+
+class _Apply(dr.CustomOp):
+    """T as a differentiable operation; its reverse pass is the exact adjoint."""
+
+    def eval(self, transport, envmap):
+        self.transport = transport
+        return transport._apply(envmap)
+
+    def forward(self):
+        self.set_grad_out(self.transport._apply(self.grad_in("envmap"), offset=False))
+
+    def backward(self):
+        self.set_grad_in("envmap", self.transport._adjoint(self.grad_out()))
+
+    def name(self):
+        return "light transport"

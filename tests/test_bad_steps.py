@@ -1,5 +1,6 @@
 """Values that are not finite, put in at every stage of an edit: what is skipped, counted, stopped, kept."""
 
+import dataclasses
 import json
 import math
 import types
@@ -257,7 +258,7 @@ def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypat
         (6, "not finite at row 0, column 0"),
         (0, "row 0"),
     ):
-        few = settings.__class__(**{**vars(settings), "optimizer": config.Optimizer(iterations=iterations)})
+        few = dataclasses.replace(settings, optimizer=config.Optimizer(iterations=iterations))
         with pytest.raises(pipeline.Stopped, match=message) as stop:
             pipeline.run(few)
         assert stop.value.exit_code == 5 and stop.value.envmap.tobytes() == original.tobytes()

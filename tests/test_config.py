@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from envedit import config as cfg
+from envedit.config import schema
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 
@@ -228,7 +229,7 @@ def test_any_configuration_comes_back_equal(table):
 # ---- junk --------------------------------------------------------------------------------------------------
 
 known = [f.name for f in dataclasses.fields(cfg.Config)]
-keys = st.sampled_from(known + [k for t in cfg._TABLES.values() for k in t]) | st.text(max_size=5)
+keys = st.sampled_from(known + [k for t in schema._TABLES.values() for k in t]) | st.text(max_size=5)
 anything = st.recursive(
     st.none()
     | st.booleans()
@@ -262,9 +263,9 @@ def test_junk_tables_raise_nothing_but_config_errors(table):
 
 
 @quick
-@given(st.sampled_from(list(cfg._TABLES)), st.data())
+@given(st.sampled_from(list(schema._TABLES)), st.data())
 def test_junk_values_raise_nothing_but_config_errors(table, data):
-    key = data.draw(st.sampled_from(list(cfg._TABLES[table])))
+    key = data.draw(st.sampled_from(list(schema._TABLES[table])))
     only_config_errors(lambda: cfg.from_dict({table: {key: data.draw(anything)}}))
 
 

@@ -1,5 +1,6 @@
 """A run without a command line: what it returns, and that stopping and continuing changes no bit of it."""
 
+import dataclasses
 import inspect
 import json
 import signal
@@ -497,7 +498,7 @@ def test_another_seed_is_another_run(tmp_path, rng):
 
 def as_tables(settings):
     tables = ("input", "scene", "target", "representation", "fit", "optimizer", "renderer", "output")
-    return {name: vars(getattr(settings, name)) for name in tables}
+    return {name: dataclasses.asdict(getattr(settings, name)) for name in tables}
 
 
 def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng):

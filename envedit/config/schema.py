@@ -305,6 +305,14 @@ class Config(Table):
     def _name(self, key: str) -> str:
         return key
 
+    def _check_together(self) -> None:
+        """Put the preset's defaults in the place of what was not given, however the tables were made."""
+        tables = {name: getattr(self, name) for name in _TABLES}
+        given = {name: {key: getattr(table, key) for key in table.given} for name, table in tables.items()}
+        chosen = presets.defaults(self.preset, given)
+        for name, table in tables.items():
+            object.__setattr__(self, name, table.with_defaults(chosen.get(name, {})))
+
 
 _TOP = {f.name: f for f in fields(Config)}
 _TABLES: dict[str, dict[str, Any]] = {
@@ -446,7 +454,7 @@ def from_dict(
     if preset is not None:
         chosen = checked(_TOP["preset"], "preset", preset)
     given = presets.overlaid(file, assigned)
-    merged = presets.overlaid(presets.defaults(chosen, given), given) | {"preset": chosen}
+    merged = given | {"preset": chosen}
     merged["target"] = presets.one_target(merged, {name: file, "--set": assigned})
     try:
         presets.resolve_paths(merged, Path(base_dir).absolute(), Path(name).stem or "config")

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import field, fields
 from numbers import Integral, Real
 from os import PathLike, fspath
-from typing import Any
+from typing import Any, ClassVar
 
 from envedit.core.errors import ConfigError
 
@@ -179,7 +179,30 @@ def key(default: Any, check: Callable, doc: str) -> Any:
 
 
 class Table:
-    """Checks and normalises every field on construction, so also in ``dataclasses.replace``."""
+    """Checks and normalises every field on construction, so also in ``dataclasses.replace``.
+
+    Attributes
+    ----------
+    given : frozenset of str
+        Names of the fields that were passed to the constructor; the others have their defaults, in whose
+        place a preset may put its own (:meth:`with_defaults`).
+    """
+
+    given: ClassVar[frozenset[str]] = frozenset()
+
+    def __new__(cls, *values, **named):
+        """Note which fields are given."""
+        table = super().__new__(cls)
+        by_position = (f.name for f, _ in zip(fields(cls), values, strict=False))
+        object.__setattr__(table, "given", frozenset([*by_position, *named]))
+        return table
+
+    def with_defaults(self, values: dict[str, Any]) -> Table:
+        """Return the table with other defaults; what was given stays."""
+        own = {name: getattr(self, name) for name in self.given}
+        table = type(self)(**(values | own))
+        object.__setattr__(table, "given", self.given)
+        return table
 
     def __post_init__(self) -> None:
         for f in fields(self):

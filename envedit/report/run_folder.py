@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from pathlib import Path
@@ -41,12 +42,14 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
     text = config.to_toml(settings)
     atomic_files.write_atomically(folder / "config.toml", text.encode())
     manifest.write_history(folder / "history.csv", result.history)
+    weights = dataclasses.asdict(settings.perceptual)
+    del weights["network"]  # the only one that is no file
     named = {
         "envmap": settings.input.envmap,
         "scene": result.scene or "",
         "target": settings.target.file,
         "mask": settings.target.mask,
-        **{name: value for name, value in vars(settings.perceptual).items() if name != "network"},
+        **weights,
     }
     inputs = {role: path for role, path in named.items() if os.path.isfile(path)}
     facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -54,7 +54,7 @@ class Objective:
         self.iterations = iterations
         self.ramps = {
             name: value if isinstance(value, tuple) else (value, value)
-            for name, value in vars(weights).items()
+            for name, value in asdict(weights).items()
             if value and (name != "dists" or dists)
         }
         self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))

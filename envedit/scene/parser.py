@@ -60,6 +60,14 @@ def place_of(state, node, where: str) -> str:
 # Changes
 
 
+def lower_names(state) -> None:
+    """Write the names of plugins as Mitsuba 3 has them: older ones took ``Rectangle`` too."""
+    for node in state.nodes:
+        name = node.props.plugin_name()
+        if name != name.lower():
+            node.props.set_plugin_name(name.lower())
+
+
 def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     """Put an ``envmap`` in place of the one environment emitter; return its properties and rotation."""
     nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter]

@@ -291,6 +291,7 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
     parser.told(where, mi.parser.transform_all, config, state)
 
+    parser.lower_names(state)
     emitter, to_world = parser.replace_environment(state, where)
     digest = hashlib.sha256(b"envedit scene 1")
     parser.set_film(state, where, width, height)

@@ -9,16 +9,18 @@ kernels, not a part of them: more columns compile nothing.
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import latlong
-from envedit.scene import camera_paths
-from envedit.transport.recording import LANES, bsdf_weight, connect
+from envedit.transport import path_vertices
 from envedit.transport.sparse_matrix import SLICE, merge
 from envedit.transport.texel_sampling import Grid
 
+MOST_VALUES = 1 << 22
+"""Contributions of vertices to columns that are computed at once."""
 _SEGMENTS = 16
 
 
@@ -35,6 +37,8 @@ class ExactColumns:
         Surface points along a path.
     capacity : int
         Most columns that will ever be held; their memory is taken at once, 16 bytes a pixel and column.
+    paths_bytes : int
+        Memory that camera paths may take, kept for the columns that are traced later.
 
     Attributes
     ----------
@@ -48,7 +52,7 @@ class ExactColumns:
         0 for texels with a column, 1 for others: what is left to the coarse tier.
     """
 
-    def __init__(self, scene, grid: Grid, bounces: int, capacity: int):
+    def __init__(self, scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
         self.scene, self.grid, self.bounces, self.capacity = scene, grid, bounces, capacity
         self.pixels = scene.width * scene.height
         self.texels = np.zeros(0, np.int64)
@@ -59,12 +63,13 @@ class ExactColumns:
         self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
         self._count = dr.opaque(mi.UInt32, 0)
         self._lost = dr.opaque(mi.UInt32, 0)
+        self.paths_bytes, self._kept = paths_bytes, {}
         dr.make_opaque(self._store, self._texel_of, self.mask)
 
     @property
     def bytes(self) -> int:
-        """Bytes of the store."""
-        return 4 * len(self._store)
+        """Bytes of the store and of the paths that are kept."""
+        return 4 * len(self._store) + sum(b.bytes for kept in self._kept.values() for b in kept)
 
     @property
     def lost(self) -> int:
@@ -96,42 +101,46 @@ class ExactColumns:
         """
         self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
         self.paths_of[texels] = count
-        self._clear(self.slot_of[texels])
 
-        grid = self.grid
-        traced = np.full(grid.texels, -1, np.int32)
+        traced = np.full(self.grid.texels, -1, np.int32)
         traced[texels] = self.slot_of[texels]
         traced = dr.opaque(mi.Int32(traced))
-        areas = np.diff(latlong.row_edges(grid.height)) / grid.width
-        uniform = grid.width * max(grid.height - 1, 1)  # density over (u, v) of one sample in every texel
-        block = max(SLICE, LANES // count // SLICE * SLICE)
-        per_pixel = dr.opaque(mi.UInt32, count)
-        for start in range(0, self.pixels, block)[:blocks]:
-            some = np.arange(start, min(start + block, self.pixels), dtype=np.uint32)
-            lane = dr.arange(mi.UInt32, len(some) * count)
-            path = lane % per_pixel
-            pixel = lane // per_pixel + dr.opaque(mi.UInt32, start)
-            place = _first_place(pixel, self.capacity)
-            first_of_pixel = dr.gather(mi.UInt32, place, dr.arange(mi.UInt32, len(some)) * per_pixel)
-            dr.eval(place, first_of_pixel)
-            for event in camera_paths.trace(self.scene.mi, some, count, self.bounces, seed + 7919):
-                if isinstance(event, camera_paths.Escape):
-                    self._add_escapes(event, traced, place, uniform, count)
-                    continue
-                for texel in texels:
-                    row, column = divmod(int(texel), grid.width)
-                    key = dr.opaque(mi.UInt32, (int(texel) + seed * 31 + event.bounce) & 0xFFFFFFFF)
-                    u = camera_paths.lattice(path, mi.sample_tea_32(pixel, key)[0])
-                    place_in_map = dr.opaque(mi.UInt32, row), dr.opaque(mi.UInt32, column)
-                    direction, jacobian = grid.direction(*place_in_map, u)
-                    value = connect(self.scene.mi, event, direction, jacobian, uniform / jacobian)
-                    value *= dr.opaque(mi.Float, float(areas[row])) * jacobian / mi.Float(per_pixel)
-                    value = self._finite(value, True)
-                    target = first_of_pixel + dr.opaque(mi.UInt32, int(self.slot_of[texel])) * SLICE
-                    for c in range(3):
-                        dr.scatter_add(self._store, dr.block_sum(value[c], count), target * 4 + c)
-                    dr.eval(self._store)
+        for block in itertools.islice(self._paths(count, seed), blocks):
+            for some in _split(texels, max(1, MOST_VALUES // max(block.vertices, 1))):
+                self._add_vertices(block, some, count, seed)
+            if block.escapes:
+                self._add_escapes(block, traced)
         self._publish()
+
+    def _paths(self, count, seed):
+        """Yield blocks of the paths of a picture, kept from an earlier call where there is memory for it."""
+        if (count, seed) in self._kept:
+            yield from self._kept[count, seed]
+            return
+        self._kept = {key: kept for key, kept in self._kept.items() if key[1] == seed}
+        made, room = [], self.paths_bytes - sum(b.bytes for kept in self._kept.values() for b in kept)
+        traced = path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, seed + 7919)
+        for block in traced:
+            made.append(block)
+            room -= block.bytes
+            yield block
+            if room < 0:
+                made.clear()
+        if room >= 0:
+            self._kept[count, seed] = made
+
+    def _add_vertices(self, block, texels, count, seed):
+        """Add what a block of paths contributes to columns by way of its vertices."""
+        value, lost = path_vertices.contributions(self.scene.mi, self.grid, block, texels, count, seed)
+        self._lost += lost
+        slots = path_vertices.on_device(mi.UInt32, (self.slot_of[texels] * SLICE).astype(np.uint32))
+        lane, pixels = dr.arange(mi.UInt32, len(texels) * block.pixels), dr.opaque(mi.UInt32, block.pixels)
+        texel = lane // pixels
+        pixel = lane - texel * pixels + dr.opaque(mi.UInt32, block.first)
+        place = (_first_place(pixel, self.capacity) + dr.gather(mi.UInt32, slots, texel)) * 4
+        for c in range(3):  # whatever the column held before is overwritten
+            dr.scatter(self._store, value[c], place + c)
+        dr.eval(self._store, self._lost)
 
     def _take_slots(self, fresh, texels, keep):
         """Give slots to texels without one: new ones first, then those of columns that nobody keeps."""
@@ -165,24 +174,25 @@ class ExactColumns:
         self.mask = dr.opaque(mi.Float(mask))
         self._count = dr.opaque(mi.UInt32, len(self.texels))
 
-    def _add_escapes(self, event, slot_of, place, uniform, count):
+    def _add_escapes(self, block, slot_of):
         """Add paths that left the scene towards the traced texels.
 
         Few do; they are summed on the host, in a fixed order.
         """
-        taps, _, jacobian = self.grid.locate(event.direction)
-        weight = bsdf_weight(event.pdf, uniform / jacobian) / count
+        place = _first_place(block.at + dr.opaque(mi.UInt32, block.first), self.capacity)
         targets, values = [], []
-        for texel, share in taps:
+        for texel, share in block.taps:
             slot = dr.gather(mi.Int32, slot_of, texel)
-            wanted = event.active & (slot >= 0) & (weight * share > 0)
-            value = self._finite(event.throughput * (weight * share), wanted)
+            value, wanted = block.light * share, (slot >= 0) & (share > 0)
+            finite = dr.all(dr.isfinite(value))
+            dr.scatter_add(self._lost, dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0), wanted & ~finite)
+            wanted &= finite
             target = place + mi.UInt32(slot) * SLICE
             # Else what is left to compute, and so the kernel, depends on who was hit.
-            dr.eval(value, target, wanted)
+            dr.eval(value, target, wanted, self._lost)
             keep = np.flatnonzero(wanted.numpy()).astype(np.uint32)
             if len(keep):
-                index = _on_device(mi.UInt32, keep)
+                index = path_vertices.on_device(mi.UInt32, keep)
                 targets.append(dr.gather(mi.UInt32, target, index).numpy()[: len(keep)])
                 # Channel by channel: a Color3f is interleaved by a kernel that has its length in it.
                 rgb = [dr.gather(mi.Float, value[c], index).numpy()[: len(keep)] for c in range(3)]
@@ -191,25 +201,10 @@ class ExactColumns:
             return
         rows = np.zeros(sum(map(len, targets)), np.uint32)
         _, target, value = merge(rows, np.concatenate(targets), np.concatenate(values), len(self._store) // 4)
-        place = _on_device(mi.UInt32, target) * 4
+        place = path_vertices.on_device(mi.UInt32, target) * 4
         real = dr.arange(mi.UInt32, len(place)) < dr.opaque(mi.UInt32, len(target))
         for c in range(3):
-            dr.scatter_add(self._store, _on_device(mi.Float, value[:, c]), place + c, real)
-        dr.eval(self._store)
-
-    def _finite(self, value, active):
-        """Leave out, and count, what is not finite: one sample must not cost the picture."""
-        finite = dr.all(dr.isfinite(value))
-        dr.scatter_add(self._lost, dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0), active & ~finite)
-        return dr.select(finite, value, 0)
-
-    def _clear(self, slots):
-        """Set the columns in ``slots`` to zero."""
-        clear = np.zeros(max(self.capacity, 1), bool)
-        clear[slots] = True
-        i = dr.arange(mi.UInt32, len(self._store))
-        gone = dr.gather(mi.Bool, dr.opaque(mi.Bool(clear)), (i // (4 * SLICE)) % max(self.capacity, 1))
-        self._store = dr.select(gone, 0, self._store)
+            dr.scatter_add(self._store, path_vertices.on_device(mi.Float, value[:, c]), place + c, real)
         dr.eval(self._store)
 
     # ------------------------------------------------------------------ using
@@ -267,13 +262,9 @@ class ExactColumns:
 # ---------------------------------------------------------------------- kernels
 
 
-def _on_device(kind, values: np.ndarray):
-    """Copy an array to the device, with its first element repeated where there is but one.
-
-    A copy, for numpy's memory is not aligned, and two elements at least, for one would be a scalar: either
-    makes another kernel.
-    """
-    return dr.opaque(kind(np.ascontiguousarray(values if len(values) > 1 else np.repeat(values, 2))))
+def _split(values, most):
+    """Cut an array into parts of at most so many."""
+    return [values[i : i + most] for i in range(0, len(values), most)]
 
 
 def _slices(n: int) -> int:

@@ -37,6 +37,7 @@ from envedit.transport.recording import (
     allowed,
     choose_bounces,
     choose_samples,
+    gigabytes,
     left_out,
     other_light,
     pilot,
@@ -87,7 +88,7 @@ class LightTransport:
         Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
     """
 
-    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices):
+    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices, paths_bytes=0):
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
         self.spp, self.bounces, self.capacity, self.refresh = spp, bounces, capacity, refresh
         self.epoch, self._base_seed, self._choices, self._lost = 0, seed, choices, 0
@@ -96,7 +97,7 @@ class LightTransport:
         self._looks = np.zeros(grid.texels, np.uint8)
         self._overview: overviews.Overview | None = None
         self._stored = DiskCache(None), {}
-        self._exact = ExactColumns(scene, grid, bounces, capacity)
+        self._exact = ExactColumns(scene, grid, bounces, capacity, paths_bytes)
 
     # ------------------------------------------------------------------ building
 
@@ -175,7 +176,10 @@ class LightTransport:
         mass = row_mass(sphere, light["by_row"])
         spp, capacity, choice = choose_samples(scene, spp, height * width, memory_gb)
         grid = Grid(height, width, scene.to_world, mass)
-        transport = cls(scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice])
+        left = memory_gb - gigabytes(scene.width * scene.height, spp, capacity)
+        transport = cls(
+            scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice], int(1e9 * max(left, 0))
+        )
         if few:
             transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
         transport.depth_error = left_out(light["by_bounce"], bounces)

@@ -89,7 +89,7 @@ def _parser():
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "config", metavar="CONFIG", nargs="?", help="a TOML file, or the name of a shipped configuration"
+        "config", metavar="CONFIG", nargs="?", help="a file, CONFIG.toml, or the name of a shipped one"
     )
     parser.add_argument(
         "--out",
@@ -100,7 +100,7 @@ def _parser():
     parser.add_argument(
         "--preset",
         choices=("draft", "standard", "paper"),
-        help="named set of defaults: standard, draft (a third of its time) or paper (its method, minutes)",
+        help="named set of defaults: standard; draft, in a third of the time; paper, the paper's method",
     )
     parser.add_argument(
         "--set",

@@ -1,6 +1,6 @@
 """One run from configuration to result: load, prepare, optimise, judge.
 
-Nothing here prints or writes but the checkpoint; ``run.py`` does, with what this returns.
+Nothing here prints or writes but the checkpoint; ``cli`` and ``report`` do, with what this returns.
 """
 
 from __future__ import annotations

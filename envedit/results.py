@@ -36,11 +36,11 @@ class Result:
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
         Active texels that were kept, as this view does not determine them; None as above.
-    separation : separate.Separation, optional
+    separation : separation.Separation, optional
         Lights and background of the active rows, where the representation has them.
     scene : Path, optional
         The scene's file.
-    reach : reach.Reach, optional
+    reach : feasibility.Reach, optional
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
     found : Found, optional
         What the map was decoded from, for :func:`at_full_resolution`.

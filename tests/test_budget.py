@@ -77,13 +77,13 @@ def test_times_are_read(text, value):
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "s", "1h", "1e9", "nan", "30 40", "2ms"])
 def test_what_is_no_time_is_refused(text):
-    with pytest.raises(ConfigError, match="--budget: came .*, wanted seconds or minutes"):
+    with pytest.raises(ConfigError, match="--budget: got .*, expected seconds or minutes"):
         run._seconds(text)
 
 
 @pytest.mark.parametrize("table", [{"representation": {"kind": "pixels"}}, {"renderer": {"kind": "path"}}])
 def test_only_what_times_are_known_of_is_budgeted(table):
-    with pytest.raises(ConfigError, match="--budget: wanted .*layers.*transport"):
+    with pytest.raises(ConfigError, match="--budget: got .*expected .*layers.*transport"):
         budget.apply(config.from_dict(table), 60)
 
 

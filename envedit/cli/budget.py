@@ -157,8 +157,9 @@ def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Pa
     """
     if settings.representation.kind != "layers" or settings.renderer.kind != "transport":
         raise ConfigError(
-            '--budget: wanted [representation] kind = "layers" and [renderer] kind = "transport", came '
-            f'"{settings.representation.kind}" and "{settings.renderer.kind}": only their times are known'
+            f'--budget: got [representation] kind = "{settings.representation.kind}" and [renderer] kind = '
+            f'"{settings.renderer.kind}", expected "layers" and "transport", whose times are known: '
+            "run without --budget"
         )
     _check_pixels(settings.target)
     begun = time.perf_counter()

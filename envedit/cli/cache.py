@@ -1,38 +1,70 @@
-"""``envedit cache``: what is kept between runs, where, how large; and emptying it."""
+"""``envedit cache``: show or delete what is kept on disk between runs."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-KINDS = {"transport": "light transports of scenes", "fits": "networks fitted to maps"}
+KINDS = {"transport": "light transports of scenes", "fits": "SIRENs fitted to maps"}
 
 
 def main(argv: list[str] | None = None) -> int:
     """Say what the cache holds, or empty it; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="envedit cache",
-        description="Show what envedit keeps between runs. Everything in it can be made again.",
-        epilog="example: envedit cache --empty",
+        description="Show what envedit keeps on disk between runs, or delete it. A later run computes again\n"
+        "what it needs. The cache lies in ~/.cache/envedit, or in $XDG_CACHE_HOME/envedit.",
+        epilog="examples:\n  envedit cache\n  envedit cache --empty",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--empty", action="store_true", help="delete all entries")
+    parser.add_argument("--empty", action="store_true", help="delete all entries, and nothing else")
     arguments = parser.parse_args(argv)
-    from envedit.core.array_cache import DiskCache, cache_folder
-
     code = 0
     for kind, what in KINDS.items():
-        cache = DiskCache(cache_folder(kind))
-        files, size = cache.files(), 0
-        for file in files:
-            try:
-                size += file.stat().st_size
-                if arguments.empty:
-                    file.unlink()
-            except FileNotFoundError:  # another process was quicker
-                continue
-            except OSError as error:
-                print(f"envedit: {file}: cannot be deleted ({error.strerror})", file=sys.stderr)
-                code = 3
-        entries = f"{len(files)} {'entry' if len(files) == 1 else 'entries'}, {size / 1e6:.1f} MB"
-        print(f"{cache.folder}: {what}: {entries}{', deleted' if arguments.empty and files else ''}")
+        folder, count, size, failed = _visit(kind, arguments.empty)
+        entries = f"{count} {'entry' if count == 1 else 'entries'}, {size / 1e6:.1f} MB"
+        print(f"{folder}: {what}: {entries}{' deleted' if arguments.empty else ''}")
+        if failed is not None:
+            where = failed.filename or folder
+            print(f"envedit: {where}: {failed.strerror}; check its permissions", file=sys.stderr)
+            code = 3
+    if not arguments.empty:
+        print("to delete all entries: envedit cache --empty")
     return code
+
+
+def _visit(kind, empty):
+    """Count the entries of a kind, or delete them.
+
+    Returns
+    -------
+    folder : Path
+        Where they lie.
+    count, size : int
+        Entries and their bytes.
+    failed : OSError or None
+        The last thing that could not be read or deleted.
+    """
+    from envedit.core.array_cache import DiskCache, cache_folder
+
+    cache, count, size, failed = DiskCache(cache_folder(kind)), 0, 0, None
+    try:
+        files = cache.files()
+    except OSError as error:
+        return cache.folder, 0, 0, error
+    for file in files:
+        try:
+            bytes_ = file.stat().st_size
+            if empty:
+                file.unlink()
+        except FileNotFoundError:  # another process deleted it first
+            continue
+        except OSError as error:
+            failed = error
+            continue
+        count, size = count + 1, size + bytes_
+    return cache.folder, count, size, failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -6,7 +6,7 @@ child process is the one to try: it selects the variant, traces a white environm
 radiance is the plane's albedo, and reports step by step on its standard output. What it managed to say before
 it died, and its last words, are the diagnosis.
 
-    python -m envedit.doctor [--variant llvm_ad_rgb]        # exit code 0, or 4 with the remedy
+    envedit doctor [--variant llvm_ad_rgb]        # exit code 0, or 4 with the remedy
 
 :func:`ensure` is for programs: it remembers a success in the user's cache folder until mitsuba, drjit or the
 LLVM library changes, so that later runs pay a millisecond.
@@ -165,7 +165,7 @@ def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple
             name = signal.Signals(-code).name
         words = next((": " + line[:60] for line in errors if "LLVM ERROR" in line), "")
         return f"{backend} stops the process at the first rendering ({name}{words})", _MEND
-    return f"the self test failed with {backend}: {_last(errors)}", "see python -m envedit.doctor"
+    return f"the self test failed with {backend}: {_last(errors)}", "to see more, run: envedit doctor"
 
 
 def _backend(variant: str, versions: dict) -> str:
@@ -289,9 +289,16 @@ def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
 
 def main(arguments=None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
-    about = "Say whether this machine can run envedit, and what is missing where it cannot."
-    parser = argparse.ArgumentParser(prog="python -m envedit.doctor", description=about)
-    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        prog="envedit doctor",
+        description="Check whether this machine can run envedit: exit code 0, or 4 and what to do.",
+        epilog="example: envedit doctor --variant cuda_ad_rgb",
+    )
+    parser.add_argument(
+        "--variant",
+        default="llvm_ad_rgb",
+        help=f"Mitsuba variant: {' or '.join(_VARIANTS)} (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
     print(f"python    {platform.python_version()} ({sys.executable})")
     for package in ("mitsuba", "drjit", "OpenEXR", "numpy"):
@@ -303,7 +310,8 @@ def main(arguments=None) -> int:
     if "llvm" in versions:
         print(f"llvm      {versions['llvm']} ({versions['llvm_path'] or 'path unknown'})")
     if "radiance" in versions:
-        print(f"render    {versions['radiance']:.5f} for {ALBEDO} in {versions['render_s']} s with compiling")
+        seconds = f"{versions['render_s']} s with compilation"
+        print(f"render    {versions['radiance']:.5f}, expected {ALBEDO}; {seconds}")
     if "gflops" in versions:
         print(f"matmul    {versions['gflops']} GFLOP/s (256 x 256, float32)")
     missing = [name for name in ("OpenEXR", "numpy") if _version(name) is None]

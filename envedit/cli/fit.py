@@ -1,4 +1,4 @@
-"""The command line of the fit: ``python -m envedit.fit MAP [--out DIR] [--preset NAME] [--set ...]``."""
+"""``envedit fit MAP``: fit a SIREN to a map, without an edit."""
 
 from __future__ import annotations
 
@@ -22,13 +22,27 @@ def main(argv: list[str] | None = None) -> int:
     """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="envedit fit",
-        description="Fit a SIREN to an HDR map.",
-        epilog="example: envedit fit sky.hdr --preset draft",
+        description="Fit a SIREN to an HDR map, and say how well it reproduces the map.\n"
+        "Leaves fitted.exr, preview.png and fit.json.",
+        epilog="examples:\n  envedit fit sky.hdr --preset draft\n"
+        "  envedit fit sunsky --set input.elevation=10 --set fit.epochs=500",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("map", metavar="MAP", help="EXR, Radiance HDR, or sunsky")
-    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: MAP_fit, here)")
-    parser.add_argument("--preset", choices=config.preset_names())
-    parser.add_argument("--set", metavar="table.key=value", action="append", default=[], dest="overrides")
+    parser.add_argument(
+        "map", metavar="MAP", help="an EXR or Radiance HDR file, or sunsky, Mitsuba's analytic sky"
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for the results (default: MAP_fit in the working folder)"
+    )
+    parser.add_argument("--preset", choices=config.preset_names(), help="named set of defaults")
+    parser.add_argument(
+        "--set",
+        metavar="table.key=value",
+        action="append",
+        default=[],
+        dest="overrides",
+        help="change one key of the configuration, such as fit.epochs=500; may be repeated",
+    )
     arguments = parser.parse_args(argv)
     try:
         with unwrapped():

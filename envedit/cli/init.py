@@ -3,54 +3,69 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import sys
 from pathlib import Path
 
+from envedit.core import shipped
+
+# Lines of "setting  # comment"; the comments are aligned when the settings are known.
 TEMPLATE = """\
-# {command}
-# Every key and its meaning: envedit/config/schema.py; paths are relative to this file.
-preset = "standard"         # draft: a third of the time; paper: the method of the paper, minutes
+# envedit run {name}
+# All keys with their meaning: envedit/config/schema.py. Paths are relative to this file.
+preset = "standard"  # or "draft", a third of the time; "paper", the method of the paper, minutes
 
 [input]
-envmap = {envmap}           # .hdr or .exr, lat-long; "sunsky": Mitsuba's analytic sky
-# azimuth = 90.0            # sunsky: of the sun, degrees
-# elevation = 35.0
-width = 256                 # working resolution; the result is carried to the file's own
+envmap = {envmap}  # an EXR or Radiance HDR file, lat-long; or "sunsky", Mitsuba's analytic sky
+# azimuth = 90.0  # sunsky: of the sun, degrees
+# elevation = 35.0  # sunsky: of the sun above the horizon, degrees
+width = 256  # texels while editing; afterwards the edit is carried to the size of the file
 
 [scene]
-file = {scene}              # a Mitsuba XML file, or one of: {shipped}
-width = 128                 # of the rendering while editing, pixels
-# parameters = {{ roughness = 0.3 }}      # values for the scene's <default>s
+file = {scene}  # a Mitsuba XML file, or one of {shipped}
+width = 128  # of the rendering while editing, pixels
+# parameters = {{ roughness = 0.3 }}  # values for the <default>s of the scene
 
+# The target: how the rendering should look. Keep one of three.
 [target]
-kind = "envmap"             # how the rendering should look: lit by another map,
-rotate_degrees = 60.0       # here the same one turned; or file = "another.hdr"
-# kind = "image"            # or painted: envedit run {file} --export-initial paint_me.png
-# file = "paint_me.png"
-# kind = "strokes"          # or as strokes, see docs/painting.md
-# strokes = [{{ type = "shadow", polygon = [[0.1, 0.6], [0.4, 0.6], [0.4, 0.9], [0.1, 0.9]] }}]
+kind = "envmap"  # 1. lit by another map:
+rotate_degrees = 60.0  # the same one, turned about the vertical; or file = "another.hdr"
+# kind = "image"  # 2. painted: envedit run {name} --export-initial paint_me.png
+# file = "paint_me.png"  # and paint on that picture
+# kind = "strokes"  # 3. strokes, in fractions of the picture, as in the shipped edits/warmer
+# strokes = [{{ type = "shadow", ellipse = [0.6, 0.8, 0.1, 0.05] }}]
 
 [representation]
-kind = "layers"             # layers | siren | pixels | log-pixels
+kind = "layers"  # or "siren", the paper's; "pixels"; "log-pixels"
 """
+WIDEST = 48
+"""A setting that is wider than this, as with a long path, is not counted when comments are aligned."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Write a configuration; returns the exit code."""
-    from envedit.core import shipped
-
+    scenes = ", ".join(shipped.scenes())
     parser = argparse.ArgumentParser(
         prog="envedit init",
         description="Write a commented configuration to start from.",
-        epilog="example: envedit init my_scene.xml --envmap sky.hdr",
+        epilog="examples:\n  envedit init\n"
+        "  envedit init my_scene.xml --envmap sky.hdr --out my_edit.toml\n\n"
+        f"shipped scenes: {scenes}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    known = ", ".join(shipped.scenes())
     parser.add_argument(
-        "scene", metavar="SCENE", nargs="?", default="sphere", help=f"Mitsuba XML file, or one of: {known}"
+        "scene",
+        metavar="SCENE",
+        nargs="?",
+        default="sphere",
+        help="a Mitsuba XML file, or the name of a shipped scene (default: sphere)",
     )
     parser.add_argument(
-        "--envmap", metavar="MAP", default="sunsky", help="EXR or Radiance HDR (default: sunsky)"
+        "--envmap",
+        metavar="MAP",
+        default="sunsky",
+        help="an EXR or Radiance HDR file, or sunsky, Mitsuba's analytic sky (default: sunsky)",
     )
     parser.add_argument(
         "--out", metavar="FILE", default="edit.toml", help="file to write (default: edit.toml)"
@@ -59,37 +74,59 @@ def main(argv: list[str] | None = None) -> int:
     from envedit.core.errors import EnveditError
 
     try:
-        _write(arguments, known)
+        _write(arguments)
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code
-    print(f"{arguments.out}: written; next: envedit run {arguments.out}")
+    print(f"{arguments.out}: written; edit it, then: envedit run {arguments.out}")
     return 0
 
 
-def _write(arguments, known):
+def _write(arguments):
     from envedit import config
-    from envedit.core import shipped
     from envedit.core.atomic_files import write_atomically
-    from envedit.core.errors import ConfigError, InputError
+    from envedit.core.errors import ConfigError
 
     file = Path(arguments.out)
     if os.path.lexists(file):
-        raise ConfigError(f"{file}: exists already; remove it, or give another name with --out")
-
-    def named(value, bare):
-        if value in bare:
-            return config.quote(value)
-        if not os.path.isfile(value):
-            raise InputError(f"{value}: no such file; give a file, or one of {', '.join(bare)}")
-        return config.quote(os.path.relpath(value, file.parent))
-
+        raise ConfigError(f"{file}: exists already; delete it, or give another name with --out")
+    envmap = _named("--envmap", arguments.envmap, ("sunsky",), "an EXR or Radiance HDR file", file.parent)
+    scene = _named("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML file", file.parent)
     text = TEMPLATE.format(
-        command=f"envedit run {file.name}",
-        file=file.name,
-        envmap=named(arguments.envmap, ("sunsky",)),
-        scene=named(arguments.scene, shipped.scenes()),
-        shipped=known,
+        name=file.name,
+        envmap=config.quote(envmap),
+        scene=config.quote(scene),
+        shipped=", ".join(shipped.scenes()),
     )
+    text = _aligned(text)
     config.loads(text, file.absolute().parent, str(file))
     write_atomically(file, text.encode())
+
+
+def _named(option, value, names, kind, folder):
+    """Return what a configuration in a folder calls a file: a bare name as it is, a path relative to it."""
+    from envedit.core.errors import InputError
+
+    if value in names:
+        return value
+    if not os.path.isfile(value):
+        close = difflib.get_close_matches(value, names, 1)
+        hint = f"did you mean {close[0]}?" if close else "check the path"
+        raise InputError(
+            f"{option}: got {value}: no such file; expected {kind}, or {', '.join(names)}; {hint}"
+        )
+    return os.path.relpath(value, folder)
+
+
+def _aligned(text):
+    """Put the comments of all settings into one column."""
+    lines = [line.partition("  # ") for line in text.splitlines()]
+    width = max(len(setting) for setting, mark, _ in lines if mark and len(setting) <= WIDEST)
+    return "".join(
+        f"{setting:{width}}{mark}{comment}".rstrip() + "\n" if mark else f"{setting}\n"
+        for setting, mark, comment in lines
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,43 +1,60 @@
-"""The command ``envedit``: run, fit, doctor, cache, init."""
+"""The command ``envedit``: run, fit, init, doctor, cache."""
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import sys
 
 COMMANDS = {
     "run": "carry out the edit that a configuration describes",
-    "fit": "fit a SIREN to a map",
+    "fit": "fit a SIREN to a map, without an edit",
     "init": "write a commented configuration to start from",
-    "doctor": "say whether this machine can run envedit",
-    "cache": "show or empty what is kept between runs",
+    "doctor": "check whether this machine can run envedit",
+    "cache": "show or delete what is kept on disk between runs",
 }
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
+    given = sys.argv[1:] if argv is None else argv
+    parser = _parser()
+    if not given:
+        parser.print_help(sys.stderr)
+        return 2
+    chosen = parser.parse_args(given[:1]).command
+    if chosen not in COMMANDS:
+        close = difflib.get_close_matches(chosen, COMMANDS, 1)
+        known = f"did you mean {close[0]}?" if close else "see envedit --help"
+        parser.error(f"got command {chosen!r}, expected one of {', '.join(COMMANDS)}; {known}")
+    try:
+        return importlib.import_module(f"envedit.cli.{chosen}").main(given[1:])
+    except KeyboardInterrupt:
+        print("envedit: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser():
     from envedit import __version__
     from envedit.core import shipped
 
     commands = "\n".join(f"  {name:<8}{about}" for name, about in COMMANDS.items())
     parser = argparse.ArgumentParser(
         prog="envedit",
-        usage="envedit COMMAND ... | --version",
+        usage="envedit COMMAND ... | --help | --version",
         description="Edit HDR environment maps by inverse rendering.",
         epilog=f"commands:\n{commands}\n\n"
         "examples:\n  envedit run quickstart\n"
         "  envedit init sphere --envmap sky.hdr && envedit run edit.toml\n\n"
         f"shipped configurations: {', '.join(shipped.configurations())}\n"
         f"shipped scenes: {', '.join(shipped.scenes())}\n\n"
-        "envedit COMMAND --help says more.",
+        "envedit COMMAND --help lists the options of a command.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"envedit {__version__}")
-    parser.add_argument("command", metavar="COMMAND", choices=tuple(COMMANDS), help=argparse.SUPPRESS)
-    given = sys.argv[1:] if argv is None else argv
-    chosen = parser.parse_args(given[:1]).command
-    return importlib.import_module(f"envedit.cli.{chosen}").main(given[1:])
+    parser.add_argument("command", metavar="COMMAND", help=argparse.SUPPRESS)
+    return parser
 
 
 if __name__ == "__main__":

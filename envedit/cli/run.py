@@ -1,12 +1,10 @@
-"""The command line: parse, call, print, write, exit code.
-
-``python -m envedit.run CONFIG.toml`` carries out an edit and leaves the map, renderings, metrics and a report
-in a folder.
-"""
+"""``envedit run CONFIG``: carry out an edit; leaves the map, renderings, metrics and a report in a folder."""
 
 from __future__ import annotations
 
 import argparse
+import difflib
+import os
 import re
 import sys
 import time
@@ -20,7 +18,11 @@ def main(argv: list[str] | None = None) -> int:
     start = time.perf_counter()
     from envedit.core.errors import EnveditError, unwrapped
 
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.config is None:
+        known = ", ".join(shipped.configurations())
+        parser.error(f"got no CONFIG, expected a file, such as CONFIG.toml, or one of {known}")
     try:
         with unwrapped():
             return _run(arguments, start)
@@ -33,36 +35,80 @@ def main(argv: list[str] | None = None) -> int:
         return 130
 
 
-def _configuration(name):
-    """Return the file of a configuration: a path, or the name of a shipped one."""
-    return Path(name) if Path(name).exists() else shipped.configuration(name) or Path(name)
+def _load(name, preset, overrides):
+    """Read a configuration, given as a path or as the name of a shipped one.
+
+    Returns
+    -------
+    settings : config.Config
+        Results of a shipped configuration go to ``runs/NAME`` in the working folder.
+    file : Path
+        The configuration's.
+    base : Path
+        Folder that relative paths start from: the file's; the working folder where the name was given.
+    """
+    from envedit import config
+    from envedit.core.errors import ConfigError
+
+    by_name = None if os.path.isfile(name) else shipped.configuration(name)
+    file = by_name or Path(name)
+    if _missing(file):
+        close = difflib.get_close_matches(name, shipped.configurations(), 1)
+        hint = f"did you mean the shipped {close[0]}?" if close else "to write one: envedit init"
+        raise ConfigError(f"{name}: no such configuration file; {hint}")
+    if shipped.holds(file):
+        results = Path.cwd() / "runs" / file.stem
+        overrides = [f"output.dir={config.quote(str(results))}", *overrides]
+    if by_name is None:
+        return config.load(file, preset, overrides), file, file.absolute().parent
+    text = file.read_text(encoding="utf-8")
+    return config.loads(text, Path.cwd(), str(file), preset, overrides), file, Path.cwd()
+
+
+def _missing(file):
+    """Tell whether a file is not there; False where it cannot be looked at, which reading it will explain."""
+    try:
+        os.stat(file)
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError):
+        pass
+    return False
 
 
 def _parser():
-    about = "Edit an HDR environment map by inverse rendering."
-    known = f"configurations: {', '.join(shipped.configurations())}\nscenes: {', '.join(shipped.scenes())}"
     parser = argparse.ArgumentParser(
         prog="envedit run",
-        description=about,
-        epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n\n"
-        f"shipped {known}",
+        description="Edit an HDR environment map so that a scene renders like a target.",
+        epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n"
+        "  envedit run edits/move_shadow --out shadow --preset draft\n\n"
+        f"shipped configurations: {', '.join(shipped.configurations())}\n"
+        f"shipped scenes, for [scene] file: {', '.join(shipped.scenes())}\n\n"
+        "exit codes: 0 done; 2 bad configuration or usage; 3 bad image or scene file; 4 this machine cannot\n"
+        "run it; 5 the optimisation could not proceed; 130 interrupted, after writing a checkpoint",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("config", metavar="CONFIG.toml", help="what to do; or the name of a shipped one")
+    parser.add_argument(
+        "config", metavar="CONFIG", nargs="?", help="a file, CONFIG.toml, or the name of a shipped one"
+    )
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="folder for the results (default: CONFIG_out beside the configuration, "
-        "runs/NAME here for a shipped one)",
+        help="folder for the results (default: CONFIG_out beside the configuration; "
+        "for a shipped one runs/NAME in the working folder)",
     )
-    parser.add_argument("--preset", choices=("draft", "standard", "paper"), help="named set of defaults")
+    parser.add_argument(
+        "--preset",
+        choices=("draft", "standard", "paper"),
+        help="named set of defaults: standard; draft, in a third of the time; paper, the paper's method",
+    )
     parser.add_argument(
         "--set",
         metavar="table.key=value",
         action="append",
         default=[],
         dest="overrides",
-        help="change one key of the configuration; may be repeated",
+        help="change one key of the configuration, such as optimizer.iterations=50; may be repeated",
     )
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
@@ -71,12 +117,13 @@ def _parser():
     instead.add_argument(
         "--export-initial",
         metavar="FILE",
-        help="only write the rendering to paint on: float .exr, or 16-bit .png under [target] tonemap",
+        help="only write the initial rendering, to paint on: linear .exr, or 16-bit .png under "
+        "[target] tonemap",
     )
     instead.add_argument(
         "--budget",
-        metavar="SECONDS",
-        help="choose widths, steps and samples so that the run ends in time; 30, 30s or 2m",
+        metavar="TIME",
+        help="choose widths, steps and samples so that the run ends within 30, 30s or 2m",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
@@ -86,14 +133,10 @@ def _run(arguments, start):
     from envedit import config
     from envedit.report import output_folder
 
-    overrides, file = list(arguments.overrides), _configuration(arguments.config)
-    if shipped.holds(file):
-        results = Path.cwd() / "runs" / file.stem
-        overrides.insert(0, f"output.dir={config.quote(str(results))}")
+    overrides = list(arguments.overrides)
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
-    settings = config.load(file, arguments.preset, overrides)
-    arguments.config = file
+    settings, arguments.config, arguments.base = _load(arguments.config, arguments.preset, overrides)
     allowed = None if arguments.budget is None else _seconds(arguments.budget)
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)
@@ -126,7 +169,7 @@ def _edit(settings, arguments, folder, allowed, start):
     import_s = time.perf_counter() - start
     from envedit.cli.progress import Progress
 
-    said, base = [], Path(arguments.config).absolute().parent
+    said, base = [], arguments.base
     if allowed is not None:
         from envedit.cli import budget
 
@@ -178,7 +221,7 @@ def _seconds(text):
     found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
     value = float(found[1]) * (60 if found[2].startswith("m") else 1) if found else 0
     if not 0 < value < 1e6:
-        raise ConfigError(f"--budget: came {text!r}, wanted seconds or minutes, such as 30s or 2m")
+        raise ConfigError(f"--budget: got {text!r}, expected seconds or minutes, such as 30s or 2m")
     return value
 
 
@@ -200,7 +243,7 @@ def _export_initial(settings, arguments):
     with Progress(quiet=arguments.quiet) as progress:
         progress.stage("rendering the picture to paint on")
         envmap, warnings = inputs.load_map(settings.input)
-        lit = inputs.load_scene(settings.scene, Path(arguments.config).absolute().parent)
+        lit = inputs.load_scene(settings.scene, arguments.base)
         warnings += painted_image.export(file, painted_image.initial(lit, envmap, settings), settings)
     for line in warnings:
         print(f"envedit: warning: {line}", file=sys.stderr)

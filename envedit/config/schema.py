@@ -107,7 +107,7 @@ class Target(Table):
         "", string, "image that is white where the target counts; kind image: where it was painted"
     )
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted")
-    strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes: list of tables, see envedit.strokes")
+    strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes: list of tables, see docs/painting.md")
     paint: float = _key(1.0, number(0), "kinds image, strokes: weight of all that was painted together")
     hold: float = _key(1.0, number(0), "kinds image, strokes: weight of all pixels that were not painted")
     spp: int | str = _key(

@@ -73,7 +73,7 @@ def psnr(a, b, data_range: float = 1.0) -> float:
 
 
 def ssim(a, b, data_range: float = 1.0) -> float:
-    """Compute the mean structural similarity of ``envedit.ssim.Ssim``, in double precision.
+    """Compute the mean structural similarity of ``envedit.losses.ssim.Ssim``, in double precision.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def compare(a, b, tonemap: str = "gamma", lpips=None) -> dict:
     a, b : array (H, W, 3)
         Linear radiance.
     tonemap : str
-        A name of `envedit.tonemap.TONEMAPS`.
-    lpips : perceptual.Lpips, optional
+        A name of `envedit.core.color.TONEMAPS`.
+    lpips : distances.Lpips, optional
         What measures LPIPS of the display values.
 
     Returns

@@ -232,15 +232,15 @@ def write_report(
     renders, maps : dict of str to array or None
         As for `preview`. Differences are drawn between the names ``initial``, ``target`` and ``edited``.
     influence, frozen : array (H, W), optional
-        As for `envedit.preview.influence_image`.
-    separation : envedit.separate.Separation, optional
+        As for `envedit.report.preview.influence_image`.
+    separation : separation.Separation, optional
         Lights and background of the rows that were edited.
     unreachable : array (h, w, 3), optional
-        Display values of `envedit.reach.unreachable`.
+        Display values of `envedit.solve.feasibility.unreachable`.
     warnings, notes : sequence of str
         What the user should know, and the choices made for settings left at "auto".
     tonemap : str
-        A name of `envedit.tonemap.TONEMAPS`, for the pictures.
+        A name of `envedit.core.color.TONEMAPS`, for the pictures.
 
     Raises
     ------

@@ -117,7 +117,7 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0) -> 
         ``edited``. A map stands under the rendering of the same name; one that is missing or None (the true
         map is not always known) leaves a grey rectangle. Maps are drawn 2:1.
     tonemap : str
-        A name of `envedit.tonemap.TONEMAPS`.
+        A name of `envedit.core.color.TONEMAPS`.
     labels : bool
         Write the names above the columns.
     exposure : float
@@ -183,7 +183,7 @@ def difference_image(a, b, kind="tonemapped", tonemap="gamma", scale=None):
         ``"stops"``: log2 of the ratio of luminances, for maps, whose sun the tonemap clips; both are
         lifted by a thousandth of b's median so that a black texel is dark and not minus infinity.
     tonemap : str
-        A name of `envedit.tonemap.TONEMAPS`, for ``"tonemapped"``.
+        A name of `envedit.core.color.TONEMAPS`, for ``"tonemapped"``.
     scale : float, optional
         Difference drawn in full red or blue. By default the 99.5th percentile, rounded up to 1, 2 or 5
         times a power of ten, and at least 0.01 (tonemapped) or 0.1 (stops): rounding is no edit.

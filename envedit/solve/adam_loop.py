@@ -46,7 +46,7 @@ class Objective:
         The active rows of the original map.
     iterations : int
         Length of the run, over which ramps are walked.
-    dists : perceptual.Dists, optional
+    dists : distances.Dists, optional
         The term of that name, between display values of the map and the original; None: it is off.
     """
 

@@ -74,7 +74,7 @@ class Job:
         Of the checkpoint.
     watch : Watch
         Told of progress.
-    dists : perceptual.Dists, optional
+    dists : distances.Dists, optional
         As for :class:`.adam_loop.Objective`.
     """
 

@@ -148,7 +148,7 @@ def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask
     shape : tuple
         (h, w) of the rendering.
     tonemap_name : str
-        Declared tonemap, one of ``tonemap.TONEMAPS``.
+        Declared tonemap, one of ``color.TONEMAPS``.
     initial : ndarray (h, w, 3), optional
         Linear radiance of what was painted on. Without it every pixel counts as painted.
     mask : path-like, optional

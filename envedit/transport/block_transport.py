@@ -56,7 +56,7 @@ def make(matrix, shape: tuple[int, int], grid: tuple[int, int]) -> Overview:
 
     Parameters
     ----------
-    matrix : sparse.ColourMatrix
+    matrix : sparse_matrix.ColourMatrix
         T, pixels by texels.
     shape, grid : (int, int)
         Height and width of the picture and of the map.

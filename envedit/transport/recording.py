@@ -58,7 +58,7 @@ def connect(scene: mi.Scene, vertex: camera_paths.Vertex, direction, jacobian, s
     ----------
     scene : mi.Scene
         What may block the ray.
-    vertex : paths.Vertex
+    vertex : camera_paths.Vertex
         Surface points.
     direction : Vector3f
         Unit vectors in the world, one a lane.

@@ -5,7 +5,7 @@ The network learns the normalised logarithm of the map (Eq. 1), with a loss in l
 d_l for every weight matrix l, where d is the direction in which a proxy Adam would make the SSIM worse (Eq.
 5; Algorithm 1), and the gradient is applied to theta.
 
-``python -m envedit.fit MAP.exr`` fits a map, writes what the network makes of it, and says how good it is.
+``envedit fit MAP.exr`` fits a map, writes what the network makes of it, and says how good it is.
 """
 
 from __future__ import annotations

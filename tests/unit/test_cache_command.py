@@ -1,0 +1,84 @@
+"""``envedit cache``: sizes of what is kept, emptied without touching anything else."""
+
+import numpy as np
+import pytest
+
+from envedit.cli import cache
+from envedit.core.array_cache import DiskCache, cache_folder
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "envedit"
+
+
+def keep(kind, count, floats):
+    store = DiskCache(cache_folder(kind))
+    for index in range(count):
+        store.store({"number": index}, {"a": np.zeros(floats, np.float32)})
+    return store.files()
+
+
+def lines(capsys, *arguments, code=0):
+    assert cache.main([*arguments]) == code
+    return capsys.readouterr().out.splitlines()
+
+
+def test_nothing_kept(home, capsys):
+    said = lines(capsys)
+    assert said[0] == f"{home}/transport: light transports of scenes: 0 entries, 0.0 MB"
+    assert said[1] == f"{home}/fits: SIRENs fitted to maps: 0 entries, 0.0 MB"
+    assert said[2] == "to delete all entries: envedit cache --empty" and not home.exists()
+    assert lines(capsys, "--empty")[0].endswith("0 entries, 0.0 MB deleted") and not home.exists()
+
+
+def test_entries_and_sizes(home, capsys):
+    files = keep("transport", 2, 1_000_000) + keep("fits", 1, 250_000)
+    said = lines(capsys)
+    assert said[0].endswith("2 entries, 8.0 MB") and said[1].endswith("1 entry, 1.0 MB")
+    assert len(files) == 3 and all(file.is_file() for file in files)
+
+
+def test_empty_deletes_the_entries_and_nothing_else(home, capsys):
+    files = keep("transport", 2, 10) + keep("fits", 1, 10)
+    foreign = [
+        home / "doctor-0123456789abcdef.json",
+        home / "transport" / "notes.txt",
+        home / "transport" / ("0" * 32 + ".arrays.bak"),
+        home / "fits" / "more" / ("0" * 32 + ".arrays"),
+        home / "others" / ("0" * 32 + ".arrays"),
+    ]
+    for file in foreign:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("mine")
+    said = lines(capsys, "--empty")
+    assert said == [
+        f"{home}/transport: light transports of scenes: 2 entries, 0.0 MB deleted",
+        f"{home}/fits: SIRENs fitted to maps: 1 entry, 0.0 MB deleted",
+    ]
+    assert not any(file.exists() for file in files)
+    assert all(file.read_text() == "mine" for file in foreign)
+    assert lines(capsys)[0].endswith("0 entries, 0.0 MB")
+
+
+def test_what_is_kept_after_emptying_is_used_again(home):
+    keep("fits", 1, 10)
+    assert cache.main(["--empty"]) == 0 and DiskCache(cache_folder("fits")).load({"number": 0}) is None
+    keep("fits", 1, 10)
+    assert DiskCache(cache_folder("fits")).load({"number": 0}).keys() == {"a"}
+
+
+@pytest.mark.parametrize("what", ["unlink", "iterdir"])
+def test_what_cannot_be_deleted_or_read_is_named(what, home, capsys, monkeypatch):
+    file = keep("transport", 1, 10)[0]
+
+    def refuse(self, *_):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(type(file), what, refuse)
+    assert cache.main(["--empty"]) == 3
+    out, err = capsys.readouterr()
+    where = file if what == "unlink" else file.parent
+    assert err == f"envedit: {where}: Permission denied; check its permissions\n" and file.is_file()
+    assert out.splitlines()[0].endswith("0 entries, 0.0 MB deleted")

@@ -1,0 +1,132 @@
+"""``envedit init``: the file that it writes loads, names its inputs from where it lies, and replaces none."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from envedit import config
+from envedit.cli import init
+from envedit.core import shipped
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_file_loads_to_the_defaults_that_it_spells_out(here, capsys):
+    assert init.main([]) == 0
+    assert capsys.readouterr().out == "edit.toml: written; edit it, then: envedit run edit.toml\n"
+    written = config.load("edit.toml")
+    assert written == config.from_dict({}, here, "edit.toml")
+    assert set(tomllib.loads((here / "edit.toml").read_text())) == {
+        "preset", "input", "scene", "target", "representation",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", shipped.scenes())
+def test_every_shipped_scene_is_taken_by_its_name(name):
+    assert init.main([name]) == 0
+    assert config.load("edit.toml").scene.file == name
+
+
+def test_paths_are_relative_to_the_file_that_is_written(here):
+    for folder in ("maps", "scenes", "jobs/first"):
+        (here / folder).mkdir(parents=True)
+    (here / "maps" / "a sky.hdr").touch()
+    (here / "scenes" / "mine.xml").touch()
+    arguments = ["scenes/mine.xml", "--envmap", str(here / "maps" / "a sky.hdr")]
+    assert init.main([*arguments, "--out", "jobs/first/edit.toml"]) == 0
+    text = (here / "jobs/first/edit.toml").read_text()
+    assert str(here) not in text
+    assert tomllib.loads(text)["input"]["envmap"] == "../../maps/a sky.hdr"
+    settings = config.load("jobs/first/edit.toml")
+    for path, file in (
+        (settings.input.envmap, "maps/a sky.hdr"),
+        (settings.scene.file, "scenes/mine.xml"),
+    ):
+        assert (here / file).samefile(path)
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "dangling link"])
+def test_nothing_is_overwritten(kind, here, capsys):
+    out = here / "edit.toml"
+    if kind == "file":
+        out.write_text("mine")
+    elif kind == "folder":
+        out.mkdir()
+    else:
+        out.symlink_to("nowhere")
+    assert init.main([]) == 2
+    assert "edit.toml: exists already; delete it, or give another name with --out" in capsys.readouterr().err
+    assert [p.name for p in here.iterdir()] == ["edit.toml"]
+    assert kind != "file" or out.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["sphre"], ["SCENE: got sphre: no such file", "sphere, statue", "did you mean sphere?"]),
+        (["my.xml"], ["SCENE: got my.xml: no such file", "sphere, statue", "check the path"]),
+        (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "or sunsky"]),
+        (["--envmap", "sunski"], ["did you mean sunsky?"]),
+        (["--out", "none/edit.toml"], ["none/edit.toml: cannot be written", "folder does not exist"]),
+    ],
+)
+def test_what_is_not_there(arguments, says, here, capsys):
+    assert init.main(arguments) == 3
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("envedit: ") and err.count("\n") == 1
+    assert all(words in err for words in says), err
+    assert not list(here.iterdir())
+
+
+def test_comments_are_aligned_and_lines_fit():
+    assert init.main([]) == 0
+    lines = Path("edit.toml").read_text().splitlines()
+    settings = [line for line in lines if re.match(r"(# )?\w+ = .*\S  +# ", line)]
+    assert len(settings) >= 12 and len({line.rindex("  # ") for line in settings}) == 1
+    assert max(map(len, lines)) <= 120 and not any(line.endswith(" ") for line in lines)
+
+
+def test_a_long_path_does_not_move_the_other_comments(here):
+    (here / ("long" * 20 + ".hdr")).touch()
+    assert init.main(["--out", "short.toml"]) == 0
+    assert init.main(["--envmap", "long" * 20 + ".hdr", "--out", "long.toml"]) == 0
+    short, long = ((here / name).read_text().splitlines()[1:] for name in ("short.toml", "long.toml"))
+    moved = [before for before, after in zip(short, long, strict=True) if before != after]
+    assert len(moved) == 2 and moved[0].startswith("envmap = ") and "--export-initial" in moved[1]
+
+
+def uncommented(text, *keys):
+    """Activate commented settings, each the first of its kind, in place of the active one."""
+    for key, value in keys:
+        text = re.sub(rf"(?m)^{key} = .*\n", "", text)
+        text, found = re.subn(rf"(?m)^# ({key} = {re.escape(value)})", r"\1", text, count=1)
+        assert found == 1, (key, value)
+    return text
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        [("kind", '"image"'), ("file", '"paint_me.png"')],
+        [("kind", '"strokes"'), ("strokes", "[{")],
+        [("azimuth", "90.0"), ("elevation", "35.0")],
+        [("parameters", "{ roughness")],
+    ],
+)
+def test_what_stands_in_comments_loads_too(keys):
+    assert init.main([]) == 0
+    before, after = Path("edit.toml").read_text().split("[target]")
+    target, rest = after.split("[representation]")
+    if keys[0][0] == "kind":
+        target = uncommented(target, *keys)
+    else:
+        before = uncommented(before, *keys)
+    settings = config.loads(f"{before}[target]{target}[representation]{rest}")
+    if keys[0][0] == "kind":
+        assert settings.target.kind == keys[0][1].strip('"')

@@ -1,0 +1,135 @@
+"""Presets act from Python as they do from TOML, and ``dataclasses.replace`` keeps what was given."""
+
+import itertools
+from dataclasses import replace
+
+import pytest
+
+from envedit import config
+from envedit.config import Config, Fit, Input, Loss, Optimizer, Output, Representation, Scene, Target
+
+PRESETS = config.preset_names()
+KINDS = ("layers", "siren", "pixels", "log-pixels")
+STROKE = {"type": "shadow", "ellipse": [0.5, 0.5, 0.1, 0.1]}
+TARGETS = {
+    "turned": {},
+    "other map": {"file": "/other.exr"},
+    "image": {"kind": "image", "file": "/painted.png"},
+    "strokes": {"kind": "strokes", "strokes": [STROKE]},
+}
+OUT = {"dir": "/out"}
+
+
+@pytest.mark.parametrize(("preset", "kind", "target"), [*itertools.product(PRESETS, KINDS, TARGETS)])
+def test_tables_from_python_and_from_toml_are_equal(preset, kind, target):
+    written = {"preset": preset, "output": OUT, "representation": {"kind": kind}, "target": TARGETS[target]}
+    made = Config(
+        preset=preset,
+        output=Output(**OUT),
+        representation=Representation(kind),
+        target=Target(**TARGETS[target]),
+    )
+    assert made == config.from_dict(written)
+    assert made == config.loads(config.to_toml(made), "/")
+
+
+@pytest.mark.parametrize(("preset", "target"), [*itertools.product(PRESETS, TARGETS)])
+def test_a_preset_names_the_kind_where_none_is_given(preset, target):
+    made = Config(preset=preset, output=Output(**OUT), target=Target(**TARGETS[target]))
+    assert made == config.from_dict({"preset": preset, "output": OUT, "target": TARGETS[target]})
+    assert made.representation.kind == ("siren" if preset == "paper" else "layers")
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind", "iterations", "ssim"),
+    [
+        ("draft", "layers", 200, 0.1),
+        ("draft", "siren", 150, 1.0),
+        ("standard", "layers", 100, 0.1),
+        ("standard", "siren", 600, 1.0),
+        ("standard", "log-pixels", 600, 1.0),
+        ("paper", "siren", 400, (1.0, 1e4)),
+    ],
+)
+def test_the_numbers_of_preset_and_representation(preset, kind, iterations, ssim):
+    made = Config(preset=preset, representation=Representation(kind))
+    assert (made.optimizer.iterations, made.loss.ssim) == (iterations, ssim)
+
+
+@pytest.mark.parametrize("target", ["image", "strokes"])
+def test_the_numbers_of_a_painted_target(target):
+    changes = {preset: Config(preset=preset, target=Target(**TARGETS[target])).loss for preset in PRESETS}
+    assert {preset: loss.change for preset, loss in changes.items()} == {
+        "draft": 0.01, "standard": 0.01, "paper": 0.0,
+    }  # fmt: skip
+    assert changes["paper"].luminance == (1e-5, 1e-9)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_is_given_goes_before_the_preset(preset):
+    made = Config(
+        preset=preset,
+        input=Input(width=40),
+        scene=Scene(width=9),
+        representation=Representation("siren", hidden=17),
+        fit=Fit(epochs=3),
+        loss=Loss(ssim=0.25),
+        optimizer=Optimizer(iterations=5),
+    )
+    given = (made.input.width, made.scene.width, made.representation.hidden, made.fit.epochs)
+    assert given == (40, 9, 17, 3) and (made.loss.ssim, made.optimizer.iterations) == (0.25, 5)
+
+
+def test_what_is_given_and_equal_to_the_default_goes_before_the_preset_too():
+    assert Config(preset="draft", scene=Scene(width=128)).scene.width == 128
+    assert Config(preset="draft", scene=Scene("sphere", 128)).scene.width == 128
+
+
+# ---- replace -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("before", "after"), [*itertools.permutations(PRESETS, 2)])
+def test_replacing_the_preset_is_making_it_with_the_other_one(before, after):
+    tables = {"scene": Scene(parameters={"roughness": 0.3}), "optimizer": Optimizer(lr=0.5), "seed": 3}
+    assert replace(Config(preset=before, **tables), preset=after) == Config(preset=after, **tables)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_replacing_the_representation_brings_its_defaults_and_keeps_what_was_given(preset):
+    tables = {"optimizer": Optimizer(iterations=7), "input": Input(width=64)}
+    other = Representation("pixels")
+    replaced = replace(Config(preset=preset, **tables), representation=other)
+    assert replaced == Config(preset=preset, representation=other, **tables)
+    assert replaced.optimizer.iterations == 7 and replaced.input.width == 64
+    assert replaced.loss.ssim == (1.0 if preset != "paper" else (1.0, 1e4))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_replacing_one_key_of_a_table_keeps_all_others(preset):
+    made = Config(preset=preset, target=Target(**TARGETS["strokes"]))
+    for name in ("input", "scene", "representation", "fit", "loss", "optimizer", "renderer", "output"):
+        table = getattr(made, name)
+        assert replace(made, **{name: replace(table)}) == made
+    other = replace(made, optimizer=replace(made.optimizer, lr=0.25))
+    assert replace(other, optimizer=made.optimizer) == made and other.optimizer.lr == 0.25
+    assert other.optimizer.iterations == made.optimizer.iterations
+
+
+def test_replacing_what_no_preset_knows_changes_nothing_else():
+    made = Config(preset="draft", representation=Representation("siren"))
+    other = replace(made, seed=9)
+    assert other.seed == 9 and replace(other, seed=0) == made and other.optimizer.iterations == 150
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_was_read_from_toml_is_replaced_alike(preset):
+    read = config.loads(f'preset = "{preset}"\n[output]\ndir = "/out"\n[optimizer]\niterations = 7\n')
+    replaced = replace(read, representation=Representation("pixels"))
+    assert replaced == config.from_dict(
+        {
+            "preset": preset,
+            "output": OUT,
+            "optimizer": {"iterations": 7},
+            "representation": {"kind": "pixels"},
+        }
+    )

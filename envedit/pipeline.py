@@ -239,7 +239,17 @@ def run(
         scene=lit.path,
         reach=within,
         found=Found(representation, params, first, free),
+        deviation=_whole(job.deviation, original, rows),
     )
+
+
+def _whole(deviation, original, rows):
+    """Put the active rows' standard deviation into a picture of the whole map; 0 where nothing changes."""
+    if deviation is None:
+        return None
+    whole = np.zeros(original.shape[:2], np.float32)
+    whole[rows] = deviation
+    return whole
 
 
 def _as_seen(traced, original, wanted):

@@ -42,6 +42,8 @@ class Result:
         The scene's file.
     reach : feasibility.Reach, optional
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
+    deviation : ndarray (H, W), optional
+        Standard deviation of the sky's log luminance gain, given the target; None where it is not known.
     found : Found, optional
         What the map was decoded from, for :func:`at_full_resolution`.
     """
@@ -59,6 +61,7 @@ class Result:
     scene: Path | None = None
     reach: Reach | None = None
     found: Found | None = None
+    deviation: np.ndarray | None = None
 
     @property
     def render(self) -> np.ndarray:

@@ -40,7 +40,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "ssim": (1.0, 1e4), "luminance": (1e-4, 1e-8), "l1": (1e-4, 1e-8), "dists": 0.6,
             "tv": 0.0, "change": 0.0, "image_l1": 0.0, "image_l2": 0.0,
         },
-        "optimizer": {"iterations": 400, "lr": 5e-6, "beta2": 0.999, "schedule": "constant"},
+        "optimizer": {"kind": "adam", "iterations": 400, "lr": 5e-6, "beta2": 0.999, "schedule": "constant"},
         "renderer": {"kind": "path", "spp": 16, "refresh": 1},
     },
 }  # fmt: skip

@@ -225,9 +225,14 @@ class Perceptual(Table):
 
 @dataclass(frozen=True)
 class Optimizer(Table):
-    """The edit loop's Adam."""
+    """How the parameters are found."""
 
-    iterations: int = _key(100, integer(0, 10**7), "steps of the edit")
+    kind: str = _key(
+        "auto",
+        choice("auto", "gauss-newton", "adam"),
+        "gauss-newton (layers through a stored transport) or adam; auto: the first where it can be had",
+    )
+    iterations: int = _key(100, integer(0, 10**7), "most steps of the edit")
     lr: float | str = _key(
         "auto", or_auto(number(0, positive=True)), 'learning rate, or "auto": what suits the representation'
     )
@@ -312,6 +317,12 @@ class Config(Table):
         chosen = presets.defaults(self.preset, given)
         for name, table in tables.items():
             object.__setattr__(self, name, table.with_defaults(chosen.get(name, {})))
+        able = self.representation.kind == "layers" and self.renderer.kind == "transport"
+        if self.optimizer.kind == "gauss-newton" and not able:
+            raise ConfigError(
+                'optimizer.kind: came "gauss-newton", wanted adam or auto: it solves for layers '
+                "(representation.kind) through a stored transport (renderer.kind)"
+            )
 
 
 _TOP = {f.name: f for f in fields(Config)}

@@ -7,7 +7,7 @@ from envedit.report.manifest import columns
 
 _PALETTE = ("#22223b", "#c8553d", "#2a7f9e", "#588157", "#b5838d", "#8d6a9f", "#d4a017", "#6c757d")
 _TIMES = ("_s", "_ms", "time", "seconds")
-_NOT_LOSSES = ("iteration", "step", "epoch", "lr", "non_finite", "skipped")
+_NOT_LOSSES = ("iteration", "step", "epoch", "lr", "damping", "sigma", "non_finite", "skipped")
 
 
 def curves_svg(rows: list[dict], width=860, height=340) -> str:

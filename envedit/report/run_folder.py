@@ -97,6 +97,8 @@ def _maps(settings, folder, result):
         images.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
         preview.influence(folder / "influence.png", result.influence, result.frozen)
         layers["influence"] = result.influence
+    if result.deviation is not None:
+        layers["deviation"] = result.deviation
     layered_exr.write(folder / "edited_layers.exr", layers)
     if result.reach is not None:
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))

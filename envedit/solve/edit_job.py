@@ -15,12 +15,14 @@ import numpy as np
 from envedit import config
 from envedit.core.errors import NumericalError, place_of
 from envedit.losses import optimizer
+from envedit.representations.layers.gain import LEVELS
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint
+from envedit.solve import adam_loop, checkpoint, gauss_newton
 from envedit.targets import target
 
-TRIAL_STEPS, TRIAL_GAIN = 30, 0.05
-"""Steps after which the better of two starts is chosen, and by which share of the loss it must be better."""
+TRIAL_STEPS, NEWTON_TRIAL, TRIAL_GAIN = 30, 6, 0.05
+"""Steps of Adam and of Gauss-Newton after which the better of two starts is chosen, and by which share of the
+loss it must be better."""
 
 
 class Interrupted(Exception):
@@ -76,6 +78,8 @@ class Job:
         Told of progress.
     dists : distances.Dists, optional
         As for :class:`.adam_loop.Objective`.
+    deviation : ndarray (rows, W), optional
+        Standard deviation of the sky's log gain, where :meth:`optimise` knows it.
     """
 
     settings: config.Config
@@ -89,6 +93,14 @@ class Job:
     folder: Path | None
     watch: Watch
     dists: object = None
+    deviation: np.ndarray | None = None
+
+    @property
+    def newton(self) -> bool:
+        """Whether Gauss-Newton steps are made: for layers through T, without grids of detail."""
+        if not self.representation.models_edit or self.renderer.transport is None:
+            return False
+        return self.settings.optimizer.kind != "adam" and len(self.representation.gain.sizes) == LEVELS
 
     def decode(self, params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
@@ -116,8 +128,11 @@ class Job:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         if len(starts) == 1:
             return starts[0]
-        reached = []
+        reached, trials = [], NEWTON_TRIAL if self.newton else TRIAL_STEPS
         for params, _ in starts:
+            if self.newton:
+                reached.append(gauss_newton.solve(self._problem(), params, self._sigma, trials).loss)
+                continue
             few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
             wanted = self.wanted.aim, self.wanted.weight
             objective = adam_loop.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
@@ -131,12 +146,14 @@ class Job:
         losses = ", ".join(f"{loss:.3g}" for loss in reached)
         chosen = [
             *starts[least][1],
-            f"start {least + 1} of {len(starts)}: losses after {TRIAL_STEPS} steps {losses}",
+            f"start {least + 1} of {len(starts)}: losses after {trials} steps {losses}",
         ]
         return starts[least][0], chosen
 
     def optimise(self, params, crop, resume):
-        """Run the loop from the start, or from the checkpoint; returns parameters and state."""
+        """Optimise from the start, or from the checkpoint; returns parameters and state."""
+        if self.newton:
+            return self._solve(params, resume)
         chosen, wanted = self.settings.optimizer, self.wanted
         adam, state = adam_loop.adam_for(self.representation, params, chosen), adam_loop.State()
         what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
@@ -170,6 +187,47 @@ class Job:
             except NumericalError as error:
                 raise Stopped(str(error), self.last_good(adam)) from error
         return adam.params, state
+
+    def _problem(self):
+        wanted = self.wanted.aim, self.wanted.weight, self.representation.free
+        return gauss_newton.Problem(self.representation, self.renderer.transport, self.original, *wanted)
+
+    @property
+    def _sigma(self):
+        """Standard error of display values: what was measured of the target, but not below the usual."""
+        noise = self.wanted.noise
+        return gauss_newton.SIGMA if noise is None else max(gauss_newton.SIGMA, float(np.median(noise)))
+
+    def _solve(self, params, resume):
+        """Make Gauss-Newton steps from the start, or from the checkpoint."""
+        chosen, run = self.settings.optimizer, None
+        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *self.wanted.asked])
+        if self.folder and resume and (found := checkpoint.load(self.folder, what)):
+            state, arrays, traced, picture = found
+            self.renderer.restore(traced)
+            self.wanted = self.wanted.aimed_at(picture)
+            run = gauss_newton.Run.of_arrays(arrays, state.history)
+        saved = time.perf_counter()
+
+        with ctrl_c() as interrupt:
+
+            def after_step(run, point):
+                nonlocal saved
+                done, last = len(run.history), run.history[-1]["loss"]
+                self.watch.progress(done, chosen.iterations, f"loss {last:.4g}")
+                due = time.perf_counter() - saved >= chosen.checkpoint_s
+                if self.folder and (due or interrupt.is_set()):
+                    state = adam_loop.State(step=done, history=run.history)
+                    asked = self.folder, what, state, run.arrays(), self.renderer.state(), self.wanted.aim
+                    checkpoint.save(*asked)
+                    saved = time.perf_counter()
+                if interrupt.is_set():
+                    raise Interrupted(point.edited, done)
+
+            most = min(chosen.iterations, gauss_newton.ITERATIONS)
+            found = gauss_newton.solve(self._problem(), params, self._sigma, most, after_step, run)
+        self.deviation = found.deviation
+        return found.params, adam_loop.State(step=len(found.history), history=found.history)
 
     def _look_at_the_last(self, adam, state):
         """Take the last step back if it led to no map: the loop sees only what a next step starts from."""

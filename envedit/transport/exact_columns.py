@@ -182,21 +182,20 @@ class ExactColumns:
         place = _first_place(block.at + dr.opaque(mi.UInt32, block.first), self.capacity)
         targets, values = [], []
         for texel, share in block.taps:
-            slot = dr.gather(mi.Int32, slot_of, texel)
-            value, wanted = block.light * share, (slot >= 0) & (share > 0)
-            finite = dr.all(dr.isfinite(value))
-            dr.scatter_add(self._lost, dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0), wanted & ~finite)
-            wanted &= finite
-            target = place + mi.UInt32(slot) * SLICE
-            # Else what is left to compute, and so the kernel, depends on who was hit.
-            dr.eval(value, target, wanted, self._lost)
+            wanted = (dr.gather(mi.Int32, slot_of, texel) >= 0) & (share > 0)
             keep = np.flatnonzero(wanted.numpy()).astype(np.uint32)
             if len(keep):
                 index = path_vertices.on_device(mi.UInt32, keep)
-                targets.append(dr.gather(mi.UInt32, target, index).numpy()[: len(keep)])
+                slot = dr.gather(mi.UInt32, mi.UInt32(slot_of), dr.gather(mi.UInt32, texel, index))
+                target = dr.gather(mi.UInt32, place, index) + slot * SLICE
+                value = dr.gather(mi.Color3f, block.light, index) * dr.gather(mi.Float, share, index)
+                dr.eval(target, value)
                 # Channel by channel: a Color3f is interleaved by a kernel that has its length in it.
-                rgb = [dr.gather(mi.Float, value[c], index).numpy()[: len(keep)] for c in range(3)]
-                values.append(np.stack(rgb, axis=1))
+                rgb = np.stack([value[c].numpy()[: len(keep)] for c in range(3)], axis=1)
+                finite = np.isfinite(rgb).all(axis=1)
+                self._lost += int((~finite).sum())
+                targets.append(target.numpy()[: len(keep)][finite])
+                values.append(rgb[finite])
         if not targets:
             return
         rows = np.zeros(sum(map(len, targets)), np.uint32)

@@ -311,6 +311,34 @@ class LightTransport:
         _check(envmap, (self.grid.height, self.grid.width, 3), "map")
         return self._apply(envmap, offset=False)
 
+    def pictures(self, maps: np.ndarray, rows: slice) -> np.ndarray:
+        """Render maps that are black but for few texels, without the light of other lamps.
+
+        Costs what their texels cost, not what T does.
+
+        Parameters
+        ----------
+        maps : ndarray (k, rows, W, 3)
+            Radiance in some rows, of any sign.
+        rows : slice
+            Which rows.
+
+        Returns
+        -------
+        ndarray (k, h, w, 3) float32
+        """
+        flat = maps.reshape(len(maps), -1, 3)
+        some = np.flatnonzero(flat.any(axis=(0, 2)))
+        texels, values = some + rows.start * self.grid.width, flat[:, some]
+        exact = self._exact.slot_of[texels] >= 0
+        total = np.zeros((len(maps), self.shape[0] * self.shape[1], 3), np.float32)
+        if exact.any():
+            columns = self._exact.read(texels[exact])
+            for c in range(3):
+                total[..., c] = values[:, exact, c] @ columns[..., c]
+        total += self.reverse.transposed(texels[~exact], values[:, ~exact])
+        return total.reshape(len(maps), *self.shape, 3)
+
     def adjoint(self, image: mi.TensorXf) -> mi.TensorXf:
         """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3)."""
         _check(image, (*self.shape, 3), "picture")

@@ -95,6 +95,36 @@ class ColourMatrix:
         real = (rows >= 0) & packed[:, :3].any(axis=1)
         return rows[real], packed[real, 3].copy().view(np.uint32), packed[real, :3]
 
+    def transposed(self, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Multiply the transpose with vectors that are zero but for some rows.
+
+        Parameters
+        ----------
+        rows : ndarray of integers (n,)
+            Distinct rows.
+        values : ndarray (k, n, 3)
+            Their colours.
+
+        Returns
+        -------
+        ndarray (k, columns, 3) float32
+        """
+        total = np.zeros((len(values), self.shape[1], 3), np.float32)
+        if not len(rows):
+            return total
+        packed = self._packed.numpy().reshape(-1, 4)
+        lane = self._lane.numpy()[rows]
+        start = self._start.numpy()[lane].astype(np.int64)
+        length = (self._stop.numpy()[lane].astype(np.int64) - start) // SLICE
+        row = np.repeat(np.arange(len(rows)), length)
+        within = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
+        entries = packed[start[row] + within * SLICE]
+        column = entries[:, 3].copy().view(np.uint32)
+        for one, colours in zip(total, values, strict=True):
+            for c in range(3):
+                one[:, c] = np.bincount(column, entries[:, c] * colours[row, c], self.shape[1])
+        return total
+
     def apply(self, x: mi.Float) -> mi.Color3f:
         """Multiply with a vector of colours.
 

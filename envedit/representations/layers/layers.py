@@ -86,7 +86,7 @@ class Layers:
         self.shape = image.shape[:2]
         core = self.separation.core
         base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)
-        self._base = np.maximum(base, 0).astype(np.float32)
+        self.base = np.maximum(base, 0).astype(np.float32)
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1])
         self.scales = SCALES | self.gain.scales()
         self._prepared = {}
@@ -145,7 +145,7 @@ class Layers:
         if (first, total) != (0, height):
             rows = round(first * finer), round(total * finer)
         d = latlong.directions(rows[1], shape[1])[rows[0] : rows[0] + shape[0]]
-        base = self._base
+        base = self.base
         if shape != self.shape:
             whole = np.repeat(base[-1:], total, axis=0)
             whole[first : first + height] = base

@@ -381,7 +381,8 @@ def _end(middle, bright):
 def glow_at(table: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """Interpolate a :attr:`Light.glow` at angles given by their cosines; returns (..., 3)."""
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    return np.stack([np.interp(angle, GLOW_DEGREES, f, right=0.0) for f in table.T], axis=-1)
+    # A view of channels apart: who asks for many angles takes them one by one.
+    return np.moveaxis(np.stack([np.interp(angle, GLOW_DEGREES, f, right=0.0) for f in table.T]), 0, -1)
 
 
 def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

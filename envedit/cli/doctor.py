@@ -290,7 +290,7 @@ def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
 def main(arguments=None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
     about = "Say whether this machine can run envedit, and what is missing where it cannot."
-    parser = argparse.ArgumentParser(prog="python -m envedit.doctor", description=about)
+    parser = argparse.ArgumentParser(prog="envedit doctor", description=about)
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     options = parser.parse_args(arguments)
     print(f"python    {platform.python_version()} ({sys.executable})")

@@ -113,6 +113,7 @@ def killed_at(patch, number):
             patch.setattr(Path, "unlink", unlink)
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_it_writes_any_file_is_resumed_to_the_same_bytes(tmp_path, whole, monkeypatch):
     path, reference = whole
     killed, number = [], 0
@@ -200,6 +201,7 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
 # ---- killed for good -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("draw", [0, 1])
 def test_a_process_killed_at_a_random_moment_is_resumed_to_the_same_bytes(draw, tmp_path, whole, monkeypatch):
@@ -225,6 +227,7 @@ def test_a_process_killed_at_a_random_moment_is_resumed_to_the_same_bytes(draw, 
 # ---- no space, no folder ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_at_any_file_is_told_and_costs_no_work(tmp_path, whole, monkeypatch, capsys):
     """Every file in turn, and the run goes on from its checkpoint as soon as there is room."""
     path, reference = whole

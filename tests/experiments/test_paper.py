@@ -527,6 +527,7 @@ def test_the_true_map_is_the_map_turned_or_the_other_one(maps, tmp_path):
     assert measured.pictures(tmp_path, cell)["true_map"] is None
 
 
+@pytest.mark.slow
 def test_every_table_and_figure_is_drawn_and_printed(maps, tmp_path, capsys):
     out = tmp_path / "out"
     for name in KINDS:
@@ -645,6 +646,7 @@ def test_titles_are_words():
 # ---- what the true map itself scores -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_ceiling_is_the_noise_of_two_renderings(tmp_path, capsys):
     sun = np.full((8, 16, 3), 0.2, np.float32)
     sun[2, 5] = 2000.0

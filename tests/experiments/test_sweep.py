@@ -687,6 +687,7 @@ def test_the_table_has_a_line_for_each_job():
 # ---- the real run ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_real_run_is_made(tmp_path):
     tiny = {
         "input": {"width": 16}, "scene": {"width": 16}, "target": {"spp": 8}, "optimizer": {"iterations": 2},

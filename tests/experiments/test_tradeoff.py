@@ -170,6 +170,7 @@ def python(text, *more):
     return [sys.executable, "-S", "-c", text, *map(str, more)]
 
 
+@pytest.mark.slow
 def test_cost_is_that_of_the_process(home):
     # A child is a copy of this process for a moment, and told as no smaller.
     here = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
@@ -355,6 +356,7 @@ def cell(folder):
     return plan.Cell("sunny", "matte", folder / "sunny.exr")
 
 
+@pytest.mark.slow
 def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(cell, tmp_path):
     judge = tiny(tmp_path, width=96)
     true, wanted = judge.true(cell)
@@ -401,6 +403,7 @@ def leave(folder, edited, full=None):
     return folder
 
 
+@pytest.mark.slow
 def test_runs_are_judged_by_the_map_at_full_resolution_once(cell, tmp_path):
     judge = tiny(tmp_path)
     true = latlong.rotate(images.read(cell.file)[0], plan.ANGLE)
@@ -596,6 +599,7 @@ def made_up():
     return {"runs": runs, "cells": bounds}
 
 
+@pytest.mark.slow
 def test_tables_and_pictures_are_drawn_from_results_alone(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     (tmp_path / "results.json").write_text(json.dumps(made_up()))

@@ -142,6 +142,7 @@ def test_paint_takes_longer_to_search():
     assert budget.choose(HERE, between, 0.0, PAINTED)[0] != level
 
 
+@pytest.mark.slow
 def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, capsys):
     tiny = dataclasses.replace(LEVELS[0], name="tiny", map=32, film=24, iterations=2, spp=16)
     monkeypatch.setattr(budget, "LEVELS", (tiny,))

@@ -15,6 +15,7 @@ import pytest
 
 from tests.oracles import ROOT
 from tests.oracles.runs import call, changed, differing, pixels, world
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
@@ -64,7 +65,7 @@ def configured(folder, rng, kind, renderer="transport"):
     return world(folder, rng, **tables)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_but(KINDS, "layers"))
 def test_transport_gives_the_same_files_on_any_number_of_threads(kind, tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, kind)
     one, again, two = (carried_out(path, count) for count in (1, 1, 2))
@@ -73,6 +74,7 @@ def test_transport_gives_the_same_files_on_any_number_of_threads(kind, tmp_path,
     assert pixels(one / "edited.exr").tobytes() != pixels(tmp_path / "map.exr").tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_path_tracing_gives_the_same_files_on_one_thread(kind, tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, kind, "path")
@@ -81,6 +83,7 @@ def test_path_tracing_gives_the_same_files_on_one_thread(kind, tmp_path, rng, ca
     assert error(one, two) < BOUND
 
 
+@pytest.mark.slow
 def test_a_wide_pixel_filter_gives_the_same_files_on_one_thread(tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, "log-pixels")
     scene = tmp_path / "scene.xml"
@@ -90,6 +93,7 @@ def test_a_wide_pixel_filter_gives_the_same_files_on_one_thread(tmp_path, rng, c
     assert error(one, two) < BOUND
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["transport", "path"])
 def test_another_seed_gives_other_bytes(renderer, tmp_path, rng, carried_out):
     """So that the same bytes mean something: what is compared depends on the samples."""
@@ -99,6 +103,7 @@ def test_another_seed_gives_other_bytes(renderer, tmp_path, rng, carried_out):
     assert error(one, other) > BOUND
 
 
+@pytest.mark.slow
 def test_another_process_gives_the_same_files(tmp_path, rng, carried_out):
     """With another order of sets and dicts of strings, and with as many threads as there are cores."""
     path = configured(tmp_path, rng, "layers")

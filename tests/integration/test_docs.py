@@ -3,12 +3,14 @@
 import runpy
 
 import numpy as np
+import pytest
 
 from tests.oracles import ROOT
 
 DOCS = ROOT / "docs"
 
 
+@pytest.mark.slow
 def test_painting_in_python(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     found = runpy.run_path(str(DOCS / "paint_in_python.py"))

@@ -24,6 +24,7 @@ SMALL = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, light_moves", [("layers", False), ("siren", True), ("pixels", True), ("log-pixels", False)]
 )
@@ -55,6 +56,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
     assert columns[-1] > columns[1] or not light_moves
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_over_400_iterations(monkeypatch):
     settings = config.loads(
         "",

@@ -42,6 +42,7 @@ from tests.oracles.runs import (
     small_world,
     world,
 )
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
@@ -249,7 +250,7 @@ def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share
 
 
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
-@pytest.mark.parametrize("renderer", ["transport", "path"])
+@pytest.mark.parametrize("renderer", slow_but(["transport", "path"], "transport"))
 def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path, rng):
     path = world(tmp_path, rng)
     settings = changed(representation__kind=kind, renderer__kind=renderer, optimizer__iterations=2)
@@ -580,6 +581,7 @@ def stop_at_checkpoint(process, file, number):
     return process.returncode, out, err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng):
     """Ctrl-C, then SIGKILL, each in a process of its own; the third process, this one, ends it."""

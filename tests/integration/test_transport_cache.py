@@ -9,6 +9,7 @@ from envedit.scene import scene
 from envedit.transport import light_transport, recording
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
 
 LAMP = """<shape type="sphere"><point name="center" x="0" y="3" z="0"/><float name="radius" value="0.3"/>
     <emitter type="area"><rgb name="radiance" value="6, 3, 12"/></emitter></shape>"""
@@ -97,7 +98,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("name", slow_but(CHANGES, "seed"))
 def test_another_recording_is_not_taken_for_this_one(name, lit, tmp_path):
     build(tmp_path, lit)
     other = build(tmp_path, lit, **CHANGES[name])
@@ -105,6 +106,7 @@ def test_another_recording_is_not_taken_for_this_one(name, lit, tmp_path):
     assert build(tmp_path, lit).cached and build(tmp_path, lit, **CHANGES[name]).cached
 
 
+@pytest.mark.slow
 def test_another_scene_is_not_taken_for_this_one(tmp_path):
     """Colour, camera, film, turn of the emitter, a parameter of the scene: each makes its own recording."""
     ball = BALL.replace("0.2, 0.4, 0.6", "$red, 0.4, 0.6")
@@ -125,6 +127,7 @@ def test_another_scene_is_not_taken_for_this_one(tmp_path):
     assert build(tmp_path, scene.load(write_scene(tmp_path / "there", red, *parts["first"]))).cached
 
 
+@pytest.mark.slow
 def test_a_mesh_is_known_by_its_content(tmp_path):
     def load():
         return scene.load(write_scene(tmp_path, SENSOR, '<shape type="obj"><string name="filename" value='

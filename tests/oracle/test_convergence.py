@@ -69,6 +69,7 @@ def transport_errors(s, wanted, samples=SAMPLES):
     return [rmse([picture(build(s, spp=n, seed=seed), image) for seed in range(4)], wanted) for n in samples]
 
 
+@pytest.mark.slow
 def test_error_of_the_transport_falls_faster_than_that_of_random_samples(matte, wanted, monkeypatch):
     # Measured: 16.3 % to 1.08 %, slope -0.66; with random numbers in the lattice's place 23 % to 2.8 %,
     # -0.50. An integrand with edges (what is lit, what is in a pixel) keeps a lattice in four dimensions or
@@ -87,6 +88,7 @@ def test_error_of_the_transport_falls_faster_than_that_of_random_samples(matte, 
     assert stratified[-1] < 0.5 * independent[-1]  # as four times the random samples would have it
 
 
+@pytest.mark.slow
 def test_error_of_a_rough_mirror_falls_as_fast(wanted):
     # Measured: slope -0.64, 18 % to 1.3 %: light found by the BSDF's samples, and by those of texels.
     s = scene.load("sphere", 12, 12)
@@ -94,6 +96,7 @@ def test_error_of_a_rough_mirror_falls_as_fast(wanted):
     assert -0.72 < slope(SAMPLES, errors) < -0.56
 
 
+@pytest.mark.slow
 def test_error_of_a_column_falls_with_its_paths(matte):
     # Measured: 5.7 % at 8 paths, 2.8 % at 32, 1.1 % at 128, slope -0.59: other light than the coarse tier's,
     # one ray from every path's vertex to the texel itself.
@@ -111,6 +114,7 @@ def test_error_of_a_column_falls_with_its_paths(matte):
     assert errors[0] < 0.1
 
 
+@pytest.mark.slow
 def test_fresh_renderings_fall_as_their_sampler_lets_them(wanted):
     # What judges a result: Mitsuba's path tracer. Measured: -0.52 independent, -0.71 multijitter.
     image, found = smooth_sky(), {}
@@ -125,6 +129,7 @@ def test_fresh_renderings_fall_as_their_sampler_lets_them(wanted):
     assert -0.8 < found["multijitter"] < -0.62
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, least, most", [("smooth", 0.3, 0.8), ("every texel another", 1.0, 2.2)])
 def test_predicted_error_is_the_error_within_a_factor(matte, wanted, rng, kind, least, most):
     # The prediction takes a pixel for an average over the sphere by independent samples. Measured over it:
@@ -142,6 +147,7 @@ def test_predicted_error_is_the_error_within_a_factor(matte, wanted, rng, kind, 
 # ---- bias --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_mean_of_many_recordings_has_no_error_that_stays(matte, wanted):
     # Independent and unbiased: the error of the mean of K falls as K^(-1/2), measured -0.51, 5.9 % to 0.70 %.
     # A bias would stay: one of 1 % would make the last 1.2 %.
@@ -164,6 +170,7 @@ def z_scores(pictures, theirs, size=4):
     return (ours - reference.mean(axis=0)) / np.sqrt(variance)
 
 
+@pytest.mark.slow
 def test_a_stored_transport_is_off_by_its_noise_and_no_more(tmp_path):
     # Both tiers, from disk. Its error does not change from step to step, so that it is a bias for whoever
     # optimises through it: this bounds it by the noise of a recording, block by block.
@@ -203,6 +210,7 @@ def irradiance(radiance, steps=1000):
     return float((radiance(d)[..., 0] * ring * up).sum() * (np.pi / 2 / steps) * (np.pi / steps))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["sampled", "averaged"])
 def test_error_of_the_grid_falls_with_the_square_of_its_width(how):
     # Second order: interpolation between texels is exact for linear functions, and so are averages over them.
@@ -252,6 +260,7 @@ WALL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", ["pair", "ball and wall"])
 def test_what_a_path_depth_leaves_out_falls_by_a_constant_factor(shown):
     # Every bounce loses what surfaces absorb and what leaves the scene. Measured at depths 2 to 5: 12.8, 3.1,

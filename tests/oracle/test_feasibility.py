@@ -202,14 +202,11 @@ def test_colours_show_sign_and_size():
 
 def test_sentences():
     blank = np.zeros((1, 1, 3), np.float32)
-    assert (
-        feasibility.Reach(0.829, blank, blank, blank).note
-        == "82 % of the request is within reach of some map"
-    )
+    assert "82 %" in feasibility.Reach(0.829, blank, blank, blank).note  # rounded down
     assert feasibility.Reach(0.5, blank, blank, blank).warning is None
     warning = feasibility.Reach(0.499, blank, blank, blank, too_dark=0.8).warning
-    assert warning.startswith("only 49 % of the request") and "brighter" in warning
-    assert warning.endswith("see unreachable.png") and "\n" not in warning
+    assert "49 %" in warning and "brighter" in warning
+    assert "unreachable.png" in warning and "\n" not in warning
 
 
 # ---- the edges ---------------------------------------------------------------------------------------------
@@ -328,6 +325,7 @@ def requests(initial, turned, rng):
 REQUESTS = ("turned", "shadow far from all things", "checks")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REQUESTS)
 def test_what_is_promised_is_seen_in_a_fresh_rendering(name, matte, rng):
     """A solution that fits the noise of T promises what no rendering keeps.

@@ -36,6 +36,7 @@ from tests.oracles.scenes import (
     sun,
 )
 from tests.oracles.statistics import LEVEL, disagreement
+from tests.oracles.tiers import slow_but
 
 # ---- scenes ------------------------------------------------------------------------------------------------
 
@@ -60,10 +61,15 @@ def test_every_shipped_scene_is_compared():
     assert {value[0] for value in SCENES.values() if isinstance(value, tuple)} == set(shipped.scenes())
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_pictures_are_those_of_mitsuba(name):
-    s = load(name)
-    transports = [build(s, seed=seed) for seed in range(SEEDS)]
+@pytest.fixture(scope="module", params=slow_but(SCENES, "matte"))
+def recorded(request):
+    """Return a scene's name, the scene, and independent transports of it."""
+    s = load(request.param)
+    return request.param, s, [build(s, seed=seed) for seed in range(SEEDS)]
+
+
+def test_pictures_are_those_of_mitsuba(recorded):
+    name, s, transports = recorded
     wrong, unseen, some = {}, {}, noise(2, *transports[0].shape)
 
     def compare(what, image, theirs, sees=1.03):
@@ -108,16 +114,19 @@ def test_pictures_are_those_of_mitsuba(name):
 SURFACES = [name for name in SCENES if name not in ("turned and cropped", "in the air", "mitchell filter")]
 
 
-@pytest.mark.parametrize("name, file", [*((name, "sunny sky") for name in SURFACES), ("pair", "city")])
-def test_pictures_under_a_real_map_are_those_of_mitsuba(name, file, data):
-    s, (image, _) = load(name), load_envmap(data / MAPS[file], WIDTH)
-    transports = [build(s, seed=seed) for seed in range(SEEDS)]
-    assert all(1 <= t.resolve(image, limit=8) <= 8 for t in transports)  # both tiers take part
-    ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image, spp=128)
-    assert disagreement(ours, theirs) == ""
-    assert disagreement(1.03 * ours, theirs) != ""  # negative control
+@pytest.mark.slow
+@pytest.mark.parametrize("recorded", SURFACES, indirect=True)
+def test_pictures_under_a_real_map_are_those_of_mitsuba(recorded, data):
+    name, s, transports = recorded
+    for file in ("sunny sky", "city") if name == "pair" else ("sunny sky",):
+        image, _ = load_envmap(data / MAPS[file], WIDTH)
+        assert all(1 <= t.resolve(image, limit=8) <= 8 for t in transports)  # both tiers take part
+        ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image, spp=128)
+        assert disagreement(ours, theirs) == "", file
+        assert disagreement(1.03 * ours, theirs) != "", file  # negative control
 
 
+@pytest.mark.slow
 def test_comparison_sees_one_percent():
     s = load("matte")
     ours = np.stack([picture(build(s, seed=seed), noise()) for seed in range(SEEDS)])
@@ -127,6 +136,7 @@ def test_comparison_sees_one_percent():
 ALL_EXACT = ["sphere", "sphere, alpha 0.02", "mirror", "glass", "red wall and a lamp"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL_EXACT)
 def test_exact_columns_of_the_whole_map_give_the_picture(name):
     s, image = load(name), noise(1, 4, 8)
@@ -140,7 +150,7 @@ def test_exact_columns_of_the_whole_map_give_the_picture(name):
     assert disagreement(1.01 * ours, theirs) != ""  # negative control
 
 
-@pytest.mark.parametrize("depth", [1, 2, 3])
+@pytest.mark.parametrize("depth", slow_but([1, 2, 3], 2))
 def test_depth_means_what_it_means_to_mitsuba(depth):
     film = {"width": 24, "height": 24}
     # Low and level, so that the sky is in view; the light of the lamp is cut at the same depth.
@@ -152,6 +162,7 @@ def test_depth_means_what_it_means_to_mitsuba(depth):
         assert disagreement(ours, references(s, image, depth=depth)) == ""
 
 
+@pytest.mark.slow
 def test_sky_seen_directly_converges_with_every_seed():
     # Were jitter within the pixel and choice among four texels correlated, more samples would not help.
     s = scene.load(stage(film={"width": 12, "height": 12}, origin=(0, 1.2, 7), up=(0, 1, 0)))
@@ -169,17 +180,17 @@ def test_sky_seen_directly_converges_with_every_seed():
 # ---- integrals ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("row, column", [(0, 3), (1, 0), (4, WIDTH - 1), (7, 20), (8, 11)])
+@pytest.mark.parametrize("row, column", slow_but([(0, 3), (1, 0), (4, WIDTH - 1), (7, 20), (8, 11)], 4))
 def test_plane_under_one_texel_receives_its_irradiance(row, column):
     # I = albedo / pi * integral of cos(theta) times the texel's tent over the upper hemisphere.
     image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     image[row, column] = (1e5, 2e5, 3e5)
-    v = (np.arange(3000) + 0.5) / 6000  # midpoints; the error is of the order of the step squared
+    v = (np.arange(1500) + 0.5) / 3000  # midpoints; the error is of the order of the step squared
     phi = 2 * np.pi * (np.arange(640) + 0.5) / 640
     theta = np.pi * v[:, None]
     ring = np.sin(theta)
     d = np.stack([ring * np.sin(phi), np.cos(theta) + 0 * phi, -ring * np.cos(phi)], axis=-1)
-    measure = np.cos(theta) * np.sin(theta) * (np.pi / 6000) * (2 * np.pi / 640)
+    measure = np.cos(theta) * np.sin(theta) * (np.pi / 3000) * (2 * np.pi / 640)
     expected = 0.5 / np.pi * (latlong.lookup(image, d) * measure[..., None]).sum(axis=(0, 1))
 
     s = scene.load(stage(origin=(0, 5, 0), up=(0, 0, -1)))
@@ -433,6 +444,7 @@ def test_state_brings_back_the_same_bytes(lamp_scene):
     assert (drawn != build(lamp_scene, spp=32).render(image, 5).numpy()).any()
 
 
+@pytest.mark.slow
 def test_refreshed_transport_is_another_estimate_of_the_same(lamp_scene):
     t = build(lamp_scene, spp=32, refresh=1)
     # Seeds far apart and many: a refreshed run visits hundreds of epochs.
@@ -470,6 +482,7 @@ def test_probing_a_texel_that_has_a_better_column_keeps_it(lamp_scene):
     assert t._exact.paths_of[texels].tolist() == [COLUMN_PATHS[-1], COLUMN_PATHS[0]]
 
 
+@pytest.mark.slow
 def test_probes_are_mitsubas_pictures_of_one_texel(lamp_scene):
     image, depth = 100 * one_hot(4 * WIDTH + 12), {"max_depth": DEPTH}
     lamp = np.stack([lamp_scene.render(black(), spp=2048, seed=k, **depth) for k in range(2)]).mean(axis=0)
@@ -546,6 +559,7 @@ def test_overview_is_the_picture_of_cells_averaged_over_blocks(wide, rng):
     np.testing.assert_allclose(told, drawn, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_overview_does_not_depend_on_columns(wide):
     before = wide.overview()
     fresh = build(wide.scene, 80, 160, spp=16)
@@ -554,6 +568,7 @@ def test_overview_does_not_depend_on_columns(wide):
     assert wide.overview() is before  # summed up once
 
 
+@pytest.mark.slow
 def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
     first = build(lamp_scene, spp=32, folder=tmp_path).overview()
     with monkeypatch.context() as patch:
@@ -611,6 +626,7 @@ def test_wrong_shapes_are_refused(lit):
         lit.adjoint(dr.ones(mi.TensorXf, (23, 17, 3)))
 
 
+@pytest.mark.slow
 def test_too_little_memory_is_told_with_what_to_do(lamp_scene):
     text = r"needs .* GB for 23x17 pixels at 4096 samples.*0.01.*memory_gb.*spp"
     with pytest.raises(InputError, match=text):

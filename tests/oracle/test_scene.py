@@ -94,6 +94,7 @@ def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, mon
     assert not np.array_equal(loaded.render(image, spp=10, seed=1), split)
 
 
+@pytest.mark.slow
 def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
     """A lone bright texel over a rough ball is noisier than an even sky."""
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))

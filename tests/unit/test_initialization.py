@@ -105,7 +105,7 @@ def test_where_detail_is_told_a_large_picture_gets_more_samples(
     assert found.transport.spp == wanted and asked[1:] == [(2**32 - 1, wanted)]  # the run's own seed
     assert not first.held, "there is no memory for both"
     assert found.second.paths == (8 * 32 // wanted, 48 * 32 // wanted, 48 * 32 // wanted)
-    assert f"{wanted} paths a pixel in place of {spp}" in found.notes[-1]
+    assert str(wanted) in found.notes[-1] and str(spp) in found.notes[-1]
 
 
 def test_no_detail_is_looked_for_that_a_small_map_cannot_hold(monkeypatch):

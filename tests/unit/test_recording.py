@@ -1,5 +1,7 @@
 """Samples of the light transport: those that are not finite, and how samples and path depth are chosen."""
 
+import re
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -55,12 +57,16 @@ def test_transport_says_how_many_were_left_out(monkeypatch):
 
     monkeypatch.setattr(recording, "contributions", spoiled)
     t = LightTransport.build(s, 4, 8, **options)
-    assert [line for line in t.choices if "not finite" in line] == [
-        "light transport: 3 contributions of camera paths were not finite and are left out"
-    ]
+    assert left_out(t) == [3]
     assert np.isfinite(t.apply(dr.ones(mi.TensorXf, (4, 8, 3))).numpy()).all()
     t.render(dr.ones(mi.TensorXf, (4, 8, 3)), 1)  # another recording: one line still, with the sum
-    assert [line[:18] for line in t.choices if "not finite" in line] == ["light transport: 6"]
+    assert left_out(t) == [6]
+
+
+def left_out(transport):
+    """Return the numbers in the lines about what was not finite."""
+    said = [line for line in transport.choices if "not finite" in line]
+    return [int(number) for line in said for number in re.findall(r"\b\d+\b", line)]
 
 
 def test_depth_follows_the_light_by_bounce():
@@ -68,7 +74,7 @@ def test_depth_follows_the_light_by_bounce():
     light = np.zeros(recording.MAX_BOUNCES + 1)
     light[:4] = 0.5, 0.4, 0.0985, 0.0015
     bounces, (line,) = recording.choose_bounces(s, "auto", light)
-    assert bounces == 2 and line.startswith("path depth 3: further bounces add 0.15 %")
+    assert bounces == 2 and "depth 3" in line and "0.15 %" in line
     assert recording.choose_bounces(s, 4, light) == (3, [])
     light[:] = 1
     assert recording.choose_bounces(s, "auto", light)[0] == recording.MAX_BOUNCES
@@ -112,8 +118,7 @@ def test_exact_columns_leave_out_and_count_what_is_not_finite(monkeypatch):
     monkeypatch.setattr(exact_columns, "connect", connect)
     spoiled.resolve(sky, tolerance=0)
     assert len(spoiled.columns) == len(clean.columns) > 0
-    (said,) = [line for line in spoiled.choices if "not finite" in line]
-    assert said.startswith(f"light transport: {len(calls)} contributions")
+    assert left_out(spoiled) == [len(calls)]
     wanted, got = (t.apply(mi.TensorXf(sky)).numpy() for t in (clean, spoiled))
     assert np.isfinite(got).all() and (got != wanted).any()
     np.testing.assert_allclose(got.sum(), wanted.sum(), rtol=0.2)

@@ -369,7 +369,7 @@ def test_strokes_that_paint_nothing_say_so():
     )
     assert found.coverage.max() == 0 and found.picture.tobytes() == picture.tobytes()
     outside, also, unseen, all_of_it, far = found.warnings
-    assert outside == "target.strokes[0] (shadow): lies outside the 16x8 picture, nothing was painted"
+    assert "target.strokes[0] (shadow)" in outside and "outside the 16x8 picture" in outside
     assert "target.strokes[1] (light)" in also and "target.strokes[4]" in far
     assert "opacity 0" in unseen and "target.strokes[3] (erase-shadow): covers the whole picture" in all_of_it
 

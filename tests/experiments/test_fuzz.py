@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.fuzz import documents, drive, headers, mutate, pictures, run
+from tests.oracles.tiers import slow_but
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
 
@@ -17,7 +18,11 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
 @linux
 @pytest.mark.parametrize(
     ("what", "cases"),
-    [("exr", 90), ("hdr", 90), ("toml", 90), ("painted", 60), ("weights", 60), ("checkpoint", 40)],
+    slow_but(
+        [("exr", 90), ("hdr", 90), ("toml", 90), ("painted", 60), ("weights", 60), ("checkpoint", 40)],
+        "exr",
+        "toml",
+    ),
 )
 def test_damaged_files_are_read_or_refused(what, cases):
     tally = drive.fuzz(what, range(cases))
@@ -28,6 +33,7 @@ def test_damaged_files_are_read_or_refused(what, cases):
     assert set(tally.kinds) == {"ConfigError" if what == "toml" else "InputError"}
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("name", ["ours.exr", "flat.hdr", "rgb8.png"])
 def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
@@ -115,20 +121,25 @@ def read(path, index):
 @linux
 @pytest.mark.parametrize(
     ("kind", "outcome", "words"),
-    [
-        ("crashed", "crashed", "SIGSEGV"),
-        ("hung", "hung", "of processor time"),
-        ("stuck", "hung", "of wall time"),
-        ("traceback", "traceback", "KeyError"),
-        ("nameless", "unclear", "does not name the file"),
-        ("control", "unclear", "control characters"),
-        ("lengthy", "unclear", "1 lines, "),
-        ("wrong", "wrong", "not finite"),
-        ("memory", "memory", "MiB for 0 bytes"),
-        ("address", "memory", "not enough memory"),
-        ("printed", "printed", "from C"),
-        ("warned", "printed", "from Python"),
-    ],
+    slow_but(
+        [
+            ("crashed", "crashed", "SIGSEGV"),
+            ("hung", "hung", "of processor time"),
+            ("stuck", "hung", "of wall time"),
+            ("traceback", "traceback", "KeyError"),
+            ("nameless", "unclear", "does not name the file"),
+            ("control", "unclear", "control characters"),
+            ("lengthy", "unclear", "1 lines, "),
+            ("wrong", "wrong", "not finite"),
+            ("memory", "memory", "MiB for 0 bytes"),
+            ("address", "memory", "not enough memory"),
+            ("printed", "printed", "from C"),
+            ("warned", "printed", "from Python"),
+        ],
+        "crashed",
+        "memory",
+        "printed",
+    ),
 )
 def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words):
     (tmp_path / "bad.py").write_text(BAD)

@@ -135,6 +135,7 @@ def test_a_run_killed_while_it_writes_any_file_is_resumed_to_the_same_bytes(tmp_
     assert sum(name.endswith(".arrays") for name in caches) >= 3  # the fit, the transport
 
 
+@pytest.mark.slow
 def test_a_run_killed_after_its_last_file_is_resumed_too(tmp_path, whole, monkeypatch):
     path, reference = whole
 
@@ -149,6 +150,7 @@ def test_a_run_killed_after_its_last_file_is_resumed_too(tmp_path, whole, monkey
     check_resumed(path, tmp_path / "out", reference)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [0, 1, 5, len(COMPLETE) - 1])
 def test_a_run_killed_while_it_moves_earlier_results_loses_none(moved, tmp_path, whole, monkeypatch):
     path, reference = whole
@@ -277,6 +279,7 @@ def stopping(sampled):
     return stop
 
 
+@pytest.mark.slow
 def test_caches_without_room_cost_nothing_but_time(tmp_path, whole, monkeypatch):
     path, reference = whole
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -293,6 +296,7 @@ def test_caches_without_room_cost_nothing_but_time(tmp_path, whole, monkeypatch)
     assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["editing", "writing"])
 def test_a_folder_that_is_gone_is_told(stage, tmp_path, whole, monkeypatch, capsys):
     path, _ = whole
@@ -377,6 +381,7 @@ def test_the_experiment_compares_metrics_without_what_a_cache_changes(tmp_path):
     assert first == second and first["fit"] == {"peak": 1.0}
 
 
+@pytest.mark.slow
 def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
     _, reference = whole
     folder = tmp_path / "out"

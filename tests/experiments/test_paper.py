@@ -584,6 +584,7 @@ def test_the_stock_network_s_last_layer_is_linear_and_so_is_its_gradient(rng):
     np.testing.assert_allclose(got["2.bias"].numpy(), weight.sum(axis=0), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaled", [False, True])
 def test_a_stock_network_learns_radiance_beyond_what_a_sigmoid_reaches(scaled):
     r, c = np.mgrid[:6, :12]

@@ -172,6 +172,7 @@ def test_jobs_are_done_once_and_leave_their_folders(stub):
     assert rows[1].split("\t") == ["job 0", "skipped", "0.0", jobs[0].key, ""]
 
 
+@pytest.mark.slow
 @linux
 def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub):
     stub.block("hold", 1, 2)
@@ -234,6 +235,7 @@ def test_a_failed_job_is_reported_by_its_last_words_and_does_not_stop_the_others
     assert stub.counts("begin", 3) == [1, 3, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, number):
     stub.block("hold", 0)

@@ -296,6 +296,7 @@ def stub(folder, monkeypatch):
     return "{python}", "-S", str(folder / "stub.py"), "{folder}", "{threads}"
 
 
+@pytest.mark.slow
 def test_what_is_done_is_skipped_and_what_failed_is_tried_again(folder, stub, monkeypatch, capsys):
     monkeypatch.setattr(run.time, "strftime", lambda *_: "first")
     given = arguments(folder, "--quick", "--paper", "none")

@@ -19,6 +19,7 @@ from envedit.solve import adam_loop, edit_job
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.matrix_renderer import arrays, case, same
 from tests.oracles.runs import call, changed, measured, names, pixels, settings_of, sunny, world
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_cache")
 
@@ -93,9 +94,9 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 # ---- the loop --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", BAD_VALUES)
+@pytest.mark.parametrize("value", slow_but(BAD_VALUES, math.nan))
 @pytest.mark.parametrize("stage", STAGES)
-def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):  # noqa: F811
+def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):
     arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
     seen.append(arrays(arguments[1]))
     params, state = adam_loop.optimise(
@@ -128,7 +129,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
 
 @pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("part", ["_m", "_v"])
-def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):  # noqa: F811
+def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):
     """One bad element, as a faulty memory makes it. An infinite v alone would give steps of zero for ever."""
     arguments, _ = case(np.random.default_rng(0), iterations=60)
     adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), adam_loop.State()
@@ -266,6 +267,7 @@ def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypat
         assert stop.value.exit_code == 5 and stop.value.envmap.tobytes() == original.tobytes()
 
 
+@pytest.mark.slow
 def test_the_path_tracer_hides_no_bad_slope(tmp_path, rng, monkeypatch):
     """It adds gradients with atomics, which drop NaN on LLVM: the parameters' gradients are all finite."""
     weigh = adam_loop.Objective.__call__
@@ -291,7 +293,7 @@ def spoil_renderer(monkeypatch, steps):
     monkeypatch.setattr(LightTransport, "render", spoiled)
 
 
-@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
+@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
 def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
     path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
@@ -315,6 +317,7 @@ def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch,
     assert names(out) == {"edited.exr"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["judged rendering", "metrics", "transport's error"])
 def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"

@@ -155,6 +155,7 @@ def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, c
     assert "level 'tiny'" in (out / "metrics.json").read_text()
 
 
+@pytest.mark.slow
 def test_a_budget_that_cannot_be_kept_ends_before_anything_is_made(small, capsys):
     out = small.parent / "out"
     assert run.main([str(small), "--budget", "0.1s", "--out", str(out)]) == 2

@@ -13,6 +13,7 @@ from envedit.images import images
 from tests.oracles import ROOT
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 from tests.oracles.runs import FILES, SKY, call, changed, names, pixels, small_world, world
+from tests.oracles.tiers import slow_but
 
 ENSURE = doctor.ensure
 
@@ -183,7 +184,7 @@ def test_a_map_that_is_not_two_to_one_or_too_small(height, width, path, capsys, 
     assert "map.exr" in said and f"{width} x {height}" in said
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", slow_but([np.nan, np.inf, -np.inf], np.nan))
 def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
     picture = sky(rng) + 0.1
     picture[3, 7, 1] = picture[6, 2, 0] = value
@@ -317,6 +318,7 @@ def test_a_machine_without_llvm(path, tmp_path):
     assert not names(tmp_path / "c_out")
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_gpu(path, capsys, monkeypatch):
     monkeypatch.setattr(doctor, "ensure", ENSURE)
     if doctor.check("cuda_ad_rgb").ok:

@@ -65,7 +65,7 @@ def configured(folder, rng, kind, renderer="transport"):
     return world(folder, rng, **tables)
 
 
-@pytest.mark.parametrize("kind", slow_but(KINDS, "layers"))
+@pytest.mark.parametrize("kind", slow_but(KINDS, "pixels"))
 def test_transport_gives_the_same_files_on_any_number_of_threads(kind, tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, kind)
     one, again, two = (carried_out(path, count) for count in (1, 1, 2))

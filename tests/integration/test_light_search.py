@@ -14,7 +14,6 @@ from envedit.solve import light_search, matching_pursuit, painted_change
 from envedit.transport import texel_sampling
 from envedit.transport.block_transport import Overview
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.tiers import slow_but
 
 HEIGHT, WIDTH, ROWS = 32, 64, 16
 PIXELS = 96  # at half of it the recording is too coarse to tell where a sun near the zenith is
@@ -108,7 +107,8 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize("where", slow_but(PLACES, "across the seam"))
+@pytest.mark.slow
+@pytest.mark.parametrize("where", PLACES)
 def test_a_sun_is_found_wherever_it_went(where, transport):
     place = PLACES[where]
     moved = degrees_apart(DIRECTIONS[place], DIRECTIONS[SUN])
@@ -143,6 +143,7 @@ def test_the_map_that_is_found_gives_the_picture(transport):
 # ---- lights that stay, go and come -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_there_already_changes_nothing(transport):
     image = sky(SUN)
     found = Start(transport(), image, picture(transport(), image))
@@ -152,6 +153,7 @@ def test_a_picture_that_is_there_already_changes_nothing(transport):
     assert (found.flux[1:] < 1e-9).all() and len(found.notes) == 1
 
 
+@pytest.mark.slow
 def test_a_sun_that_the_picture_does_not_show_disappears(transport):
     found = Start(transport(), sky(SUN), picture(transport(), sky()))
     assert len(found.notes) == 1 and (found.flux < 1e-3).all()
@@ -185,6 +187,7 @@ def test_nothing_is_born_in_a_sky_that_is_right(transport):
 # ---- pictures that say little ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_mask_that_excludes_everything_leaves_the_sky(transport):
     wanted = picture(transport(), sky((6, 52)))
     found = Start(transport(), sky(SUN), wanted, np.zeros((PIXELS, PIXELS, 1), np.float32))
@@ -347,6 +350,7 @@ def painted(transport, image, wanted):
     return Start(transport, image, picture(transport, wanted), initial=initial)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [(6, 52), (5, 62), (9, 0)])
 def test_a_painted_shadow_elsewhere_moves_the_sun(place, transport):
     found = painted(transport(), sky(SUN), sky(place))
@@ -355,6 +359,7 @@ def test_a_painted_shadow_elsewhere_moves_the_sun(place, transport):
     assert (found.flux[1:] < 1e-9).all() and len(found.notes) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suns", [(), (SUN,)])
 def test_a_painted_light_is_born_beside_those_that_stay(suns, transport):
     place = (7, 44)
@@ -367,6 +372,7 @@ def test_a_painted_light_is_born_beside_those_that_stay(suns, transport):
         np.testing.assert_allclose(found.flux[i], 1, atol=0.25)
 
 
+@pytest.mark.slow
 def test_softened_lights_keep_their_flux_and_place(transport):
     """The loss decides whether a start with lobes in place of the lights is the better one."""
     image = sky(SUN)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from envedit import __version__, config
-from envedit.cli import cache, doctor, init, main
+from envedit.cli import cache, init, main, run
 from envedit.core import array_cache, shipped
 from tests.oracles import ROOT
-from tests.oracles.runs import TINY, changed, measured
 
 
 def test_every_command_is_told_and_has_its_own_help(capsys):
@@ -43,14 +42,13 @@ def test_the_package_is_the_command(module):
 # ---- a shipped configuration -------------------------------------------------------------------------------
 
 
-def test_a_shipped_configuration_is_run_by_its_name(tmp_path, monkeypatch, own_cache):
-    """And leaves its results where the command was called, not beside the configuration."""
+def test_results_of_a_shipped_configuration_lie_where_the_command_was_called(tmp_path, monkeypatch):
+    asked = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(doctor, "ensure", lambda variant: None)
-    small = {f"{table}__{key}": value for table, keys in TINY.items() for key, value in keys.items()}
-    assert main.main(["run", "quickstart", "--quiet", *changed(**small)]) == 0
-    assert measured(tmp_path / "runs" / "quickstart")["iterations"] == 4
-    assert {path.name for path in tmp_path.iterdir()} == {"runs", "cache"}
+    monkeypatch.setattr(run, "_edit", lambda settings, arguments, folder, *_: asked.append(folder) or 0)
+    assert main.main(["run", "quickstart"]) == main.main(["run", "edits/warmer"]) == 0
+    assert main.main(["run", "quickstart", "--out", "mine"]) == 0
+    assert asked == [tmp_path / name for name in ("runs/quickstart", "runs/warmer", "mine")]
 
 
 def test_every_shipped_configuration_loads():

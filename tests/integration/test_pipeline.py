@@ -88,6 +88,7 @@ def test_the_true_map_is_the_input_turned(tmp_path, rng):
     assert found.metrics["sun_offset_texels"] == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_a_better_map_is_found_for_the_target(tmp_path, rng):
     """The end of it all: the rendering gets nearer to the target, as judged by Mitsuba.
 
@@ -134,6 +135,7 @@ def test_the_sky_is_made_at_the_working_width():
     assert picture.shape == (16, 32, 3) and warnings == []
 
 
+@pytest.mark.slow
 def test_pictures_that_are_compared_share_no_seed(tmp_path, rng, monkeypatch):
     """Target and both judged pictures draw samples of their own."""
     seeds = []
@@ -165,6 +167,7 @@ PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
     </transform></shape>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels"])
 def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
@@ -201,6 +204,7 @@ def plated(folder, picture, **tables):
     return settings
 
 
+@pytest.mark.slow
 def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
     """The sun goes from one place that the plate sees to another; behind it no bit changes.
 
@@ -258,7 +262,8 @@ def test_layers_are_traced_with_few_paths(kind, few, tmp_path, rng, monkeypatch)
     assert asked == ([few, few] if few else [few]), "layers look at T a second time"
 
 
-@pytest.mark.parametrize("mask", slow_but([None, "mask.exr"], "mask.exr"))
+@pytest.mark.slow
+@pytest.mark.parametrize("mask", [None, "mask.exr"])
 def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
     """Painted: the ball under a sun elsewhere, a black bar across it, which the mask leaves out."""
     picture, wanted = np.full((16, 32, 3), 0.3, np.float32), np.full((16, 32, 3), 0.3, np.float32)
@@ -288,6 +293,7 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
         assert error("edited") > 0.02 * error("initial")
 
 
+@pytest.mark.slow
 def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, rng):
     tables = {"optimizer": {"iterations": 0}}  # the start of layers is the same to the bit
     # Layers need an overview too, which is summed up and kept; it is no other recording.
@@ -303,6 +309,7 @@ def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, r
     assert len(list((tmp_path / "cache" / "envedit" / "transport").iterdir())) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
 def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp_path, rng, monkeypatch):
     places, plain = [], representations.make
@@ -459,6 +466,7 @@ def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path
     np.testing.assert_allclose(resumed.envmap, whole.envmap, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_run(tmp_path, rng):
     picture = sunny(rng)
     first = pipeline.run(settings_of(tmp_path, picture, optimizer={"iterations": 3}, **PIXELS))
@@ -493,6 +501,7 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng):
     pipeline.run(settings_of(tmp_path, picture, optimizer={"iterations": 4}), folder=folder)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_scene_is_refused(tmp_path, rng):
     """Where the target is painted nothing but the scene itself tells that it has changed."""
     folder = tmp_path / "run"
@@ -507,6 +516,7 @@ def test_a_checkpoint_of_another_scene_is_refused(tmp_path, rng):
         pipeline.run(settings, folder=folder, resume=True)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_mask_is_refused(tmp_path, rng):
     folder = tmp_path / "run"
     folder.mkdir()
@@ -523,6 +533,7 @@ def test_a_checkpoint_of_another_mask_is_refused(tmp_path, rng):
         pipeline.run(settings, folder=folder, resume=True)
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng, monkeypatch):
     """Mitsuba adds samples in any order where the pixel filter is wider than a box, as its default is.
 
@@ -587,6 +598,7 @@ def test_a_transport_that_does_not_fit_is_refused_before_anything_is_rendered(tm
         pipeline.run(settings)
 
 
+@pytest.mark.slow
 def test_paint_on_a_black_map_is_followed(tmp_path):
     painted = {"kind": "strokes", "strokes": STROKES}
     black = np.zeros((HEIGHT, WIDTH, 3), np.float32)

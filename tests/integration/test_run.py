@@ -182,7 +182,9 @@ def test_rows_that_are_not_active_come_back_bit_for_bit(done):
     assert (after[:4] != before[:4]).any()
 
 
-@pytest.mark.parametrize("rows, active", [("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])])
+@pytest.mark.parametrize(
+    "rows, active", slow_but([("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])], "all")
+)
 def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
     path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows})
     assert call(path, "--quiet") == 0
@@ -215,6 +217,7 @@ def test_without_a_report_neither_page_nor_preview_is_written(tmp_path, rng):
 # ---- what is computed ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path, rng, monkeypatch):
     """The transport is made wrong by a factor; the picture that is judged does not know it.
 
@@ -262,6 +265,7 @@ def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path,
     assert (found["transport"] is None) == (renderer == "path") and found["choices"]
 
 
+@pytest.mark.slow
 def test_a_painted_target_has_no_known_map(tmp_path, rng):
     path = world(tmp_path, rng, target={"kind": "image", "file": "painted.exr", "mask": "mask.png"})
     images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
@@ -275,6 +279,7 @@ def test_a_painted_target_has_no_known_map(tmp_path, rng):
     assert set(inputs) == {"envmap", "scene", "target", "mask"}
 
 
+@pytest.mark.slow
 def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
     path = world(tmp_path, rng, input={"envmap": "sunsky", "width": 16}, scene={"file": "matte"})
     assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
@@ -283,7 +288,7 @@ def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
     assert inputs["scene"]["sha256"] == hashlib.sha256(shipped.read_bytes()).hexdigest()
 
 
-@pytest.mark.parametrize("value", [0.0, 1e-30])
+@pytest.mark.parametrize("value", slow_but([0.0, 1e-30], 0.0))
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
     path = world(tmp_path, rng, representation={"kind": kind})
@@ -293,7 +298,7 @@ def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, 
     assert np.isfinite(pixels(tmp_path / "c_out" / "edited.exr")).all()
 
 
-@pytest.mark.parametrize("value", [65504.0, 1e6, 1e30])
+@pytest.mark.parametrize("value", slow_but([65504.0, 1e6, 1e30], 1e30))
 def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
     path = world(tmp_path, rng)
     bright = sky(rng)
@@ -323,6 +328,7 @@ def one_sun(row, column):
     return picture
 
 
+@pytest.mark.slow
 def test_the_initial_rendering_has_few_samples(tmp_path, rng, monkeypatch):
     seen, render = [], scene.Scene.render
 
@@ -379,7 +385,7 @@ def test_presets_and_overrides_take_effect(tmp_path, rng, capsys):
     assert json.loads((out / "manifest.json").read_text())["seeds"] == {"seed": 5}
 
 
-@pytest.mark.parametrize("name", ["with space", "é ü", "😀", 'a"b', "back\\slash"])
+@pytest.mark.parametrize("name", slow_but(["with space", "é ü", "😀", 'a"b', "back\\slash"], "😀"))
 def test_out_may_have_any_name(name, tmp_path, rng):
     path = world(tmp_path / "in", rng)
     assert call(path, "--quiet", "--out", tmp_path / name, *changed(optimizer__iterations=0)) == 0
@@ -409,6 +415,7 @@ def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
     assert names(out / "earlier-1") == FILES | INFLUENCE
 
 
+@pytest.mark.slow
 def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path, rng, monkeypatch):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
@@ -488,6 +495,7 @@ def test_resume_in_an_empty_folder_is_a_run(tmp_path, rng):
     assert names(tmp_path / "c_out") >= FILES
 
 
+@pytest.mark.slow
 def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, optimizer={"iterations": 4, "checkpoint_s": 0.0}), tmp_path / "c_out"
     save = checkpoint.save
@@ -511,6 +519,7 @@ def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypat
     assert names(out / "earlier-1") == {"checkpoint.npz"} and "checkpoint.npz" not in names(out)
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
@@ -627,6 +636,7 @@ def test_help_needs_no_renderer(tmp_path):
         assert option in found.stdout
 
 
+@pytest.mark.slow
 def test_doctor_finds_this_machine_well():
     found = subprocess.run([sys.executable, "-m", "envedit.doctor"], cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr

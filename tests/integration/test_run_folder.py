@@ -12,6 +12,7 @@ from envedit.cli import doctor, run
 from envedit.core import latlong
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
 
 WIDTH = 64
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
@@ -57,7 +58,7 @@ def carried_out(folder, picture, *arguments, **tables):
     return folder / "c_out"
 
 
-@pytest.mark.parametrize("kind", ["layers", "log-pixels"])
+@pytest.mark.parametrize("kind", slow_but(["layers", "log-pixels"], "log-pixels"))
 def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     picture = source(rng)
     out = carried_out(tmp_path, picture, representation={"kind": kind}, input={"width": 32})
@@ -114,6 +115,7 @@ def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     np.testing.assert_array_equal(planes["influence.Y"], influence[..., 0])
 
 
+@pytest.mark.slow
 def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, capsys):
     target = {"kind": "strokes", "strokes": [STROKE]}
     out = carried_out(tmp_path, source(rng), target=target)
@@ -128,6 +130,7 @@ def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, c
     np.testing.assert_allclose(wanted[8:10, 10:14], 0.5 * initial[8:10, 10:14], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_less_than_half_within_reach_is_a_warning(tmp_path, rng, capsys):
     """A chequered patch in the middle of a matte ball: no light does that."""
     strokes = [

@@ -43,7 +43,7 @@ def nothing_is_traced(monkeypatch):
     monkeypatch.setattr(scene.Scene, "render", refuse)
 
 
-@pytest.mark.parametrize("lamp", [True, False])
+@pytest.mark.parametrize("lamp", slow_but([True, False], True))
 def test_a_second_build_traces_nothing_and_gives_the_same_bits(lamp, tmp_path, rng, monkeypatch):
     """Under a lamp the light that is not the map's is kept as well."""
     s = scene.load(write_scene(tmp_path, SENSOR, BALL, *([LAMP] if lamp else []), LIGHT))
@@ -64,6 +64,7 @@ def test_a_second_build_traces_nothing_and_gives_the_same_bits(lamp, tmp_path, r
     assert (np.abs(first.apply(dr.zeros(mi.TensorXf, (8, 16, 3))).numpy()).max() > 0) == lamp
 
 
+@pytest.mark.slow
 def test_exact_columns_beside_a_recording_from_disk_are_the_same(lit, tmp_path, rng):
     sun = np.full((8, 16, 3), 0.1, np.float32)
     sun[2, 5] = 500
@@ -75,6 +76,7 @@ def test_exact_columns_beside_a_recording_from_disk_are_the_same(lit, tmp_path, 
     assert made[0] == made[1]
 
 
+@pytest.mark.slow
 def test_what_was_lost_is_told_from_disk_as_well(lit, tmp_path, monkeypatch):
     real = recording.contributions
 
@@ -140,6 +142,7 @@ def test_a_mesh_is_known_by_its_content(tmp_path):
     assert not build(tmp_path, load()).cached
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lamp", [True, False])
 def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp_path):
     """But under a lamp, whose light is cut only where a depth is asked for."""
@@ -168,6 +171,7 @@ def test_damaged_files_are_traced_again(lit, tmp_path, rng):
     assert build(tmp_path, lit).cached
 
 
+@pytest.mark.slow
 def test_recordings_of_a_refresh_are_not_kept(lit, tmp_path, rng):
     image = mi.TensorXf(np.ones((8, 16, 3), np.float32))
     first = build(tmp_path, lit, refresh=1)

@@ -14,22 +14,25 @@ from envedit.targets import painted_image, target
 from tests.oracles import ROOT, extremes
 from tests.oracles.extremes_stages import transport, write_plain
 from tests.oracles.runs import settings_of
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-@pytest.mark.parametrize(("name", "stage"), extremes.CELLS)
+@pytest.mark.parametrize(("name", "stage"), slow_but(extremes.CELLS, "1e30", "NaN", "sun at the seam"))
 def test_cell(name, stage, tmp_path):
     outcome = extremes.observe(extremes.STAGES[stage], extremes.MAPS[name], tmp_path)
     extremes.agree(extremes.expected(name, stage), *outcome)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", extremes.TARGETS)
 def test_target(name, tmp_path):
     act, outcome = extremes.TARGETS[name]
     extremes.agree(outcome, *extremes.observe(act, tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", extremes.SCENES)
 def test_scene(name, tmp_path):
     act, outcome = extremes.SCENES[name]
@@ -81,6 +84,7 @@ def test_pixels_hold_what_logarithms_cannot():
         LogPixels().encode(m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "error", "says"), [
     (1e10, None, ""),
     (1e30, NumericalError, "not finite"),

@@ -10,6 +10,7 @@ from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.statistics import disagreement
+from tests.oracles.tiers import slow_but
 
 HEIGHT, WIDTH, DEPTH, STEPS = 6, 12, 3, 8
 
@@ -52,6 +53,7 @@ def adjoints(matte, weights):
     return np.stack([t.adjoint(y).numpy() for t in transports])
 
 
+@pytest.mark.slow
 def test_gradient_is_the_adjoint_of_light_transport(gradients, adjoints):
     # A texel's gradient sums over all pixels, so that its noise is normal.
     assert disagreement(gradients, adjoints, sizes=(1, 2, 0)) == ""
@@ -102,7 +104,9 @@ def test_choices_are_named(matte):
     assert "samples a pixel" in text and "path depth" in text
 
 
-@pytest.mark.parametrize("spp, taken", [(1, 1), (2, 2), (3, 3), (7, 8), (16, 16), (128, 132), (1000, 1023)])
+@pytest.mark.parametrize(
+    "spp, taken", slow_but([(1, 1), (2, 2), (3, 3), (7, 8), (16, 16), (128, 132), (1000, 1023)], 7, 1000)
+)
 def test_samples_fill_the_sampler_s_grid_and_are_told(spp, taken, matte, capfd):
     tracer = PathTracer(matte, spp=spp, max_depth=1)
     assert tracer.spp == taken and f"{taken} samples" in tracer.choices[0]

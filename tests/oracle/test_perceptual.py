@@ -182,6 +182,7 @@ def test_features_match_plain_numpy(backbones, kind, pooling, size, rng):
         assert (a > 0).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, pooling, size", LAYOUTS)
 def test_features_pull_back_what_they_push_forward(backbones, kind, pooling, size, rng):
     """The sum of taps times directions, and its gradient, against a central difference."""
@@ -197,6 +198,7 @@ def test_features_pull_back_what_they_push_forward(backbones, kind, pooling, siz
     assert np.sum(back * step) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_features_in_bands_are_the_same(backbones, monkeypatch, rng):
     for kind, pooling, size in (LAYOUTS[1], LAYOUTS[2]):
         x = rng.normal(size=(*size, 3))
@@ -307,6 +309,7 @@ def test_lpips_matches_plain_numpy(lpips, kind):
     assert lpips[kind](single(x), y.astype(np.float32)) == found
 
 
+@pytest.mark.slow
 def test_lpips_with_the_published_heads(backbones, data):
     for kind in KINDS:
         x, y, _ = drawn.images(*SMALL[kind])
@@ -351,6 +354,7 @@ def test_measures_keep_the_digits_of_near_images(dists, lpips):
         assert against(single(y))(single(x))[0] == pytest.approx(exact, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_descent_along_the_gradient_approaches_the_reference(dists):
     x, y, _ = drawn.images(9, 14)
     to_reference, values = dists.against(single(y)), []
@@ -364,6 +368,7 @@ def test_descent_along_the_gradient_approaches_the_reference(dists):
 # ---- extremes ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [None, 0.0, 0.5, 1.0, -3.0, 65504.0, 1e-30])
 def test_identical_images_are_at_distance_zero(dists, lpips, value):
     image = drawn.images(32, 31)[0] if value is None else np.full((32, 31, 3), value)
@@ -374,6 +379,7 @@ def test_identical_images_are_at_distance_zero(dists, lpips, value):
     assert lpips["vgg"](image, image) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a, b", [(0.0, 1.0), (0.5, 0.5001), (0.0, 1e-30), (0.0, 65504.0), (-1.0, 1e6)])
 def test_constant_and_far_images_have_finite_distances_and_gradients(dists, lpips, a, b):
     x, y = (np.full((32, 32, 3), value) for value in (a, b))
@@ -406,6 +412,7 @@ def test_features_whose_squares_are_zero(folder):
     assert np.isfinite(value) and np.isfinite(slope).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_not_hidden(dists, lpips, bad):
     x, y, _ = drawn.images(33, 36)

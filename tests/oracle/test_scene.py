@@ -16,6 +16,7 @@ from envedit.images import images
 from envedit.scene import scene
 from tests.oracles import ROOT
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
+from tests.oracles.tiers import slow_but
 
 SCENES = ROOT / "scenes"
 
@@ -53,6 +54,7 @@ def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
     np.testing.assert_allclose(picture[5:7, 7:9].mean(axis=(0, 1)), [0.2, 0.4, 0.6], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_resolution_may_change_between_renderings(tmp_path, rng):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     small, large = sky(rng), sky(rng, 32, 64)
@@ -74,6 +76,7 @@ def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
     np.testing.assert_allclose(albedo, [0.2, 0.4, 0.6], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, monkeypatch):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     image = sky(rng)
@@ -274,7 +277,7 @@ def test_names_are_found_in_included_files(tmp_path):
 # ---- shipped scenes and the statue -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", shipped.scenes())
+@pytest.mark.parametrize("name", slow_but(shipped.scenes(), "mesh"))
 def test_shipped_scenes_render(name, rng):
     parameters = {"mesh": "statue.ply"} if name == "mesh" else None
     loaded = scene.load(name, parameters=parameters)

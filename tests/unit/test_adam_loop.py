@@ -400,6 +400,7 @@ def test_no_new_kernel_after_the_third_iteration(kind, rng):
     assert first_kernels and launched(lambda: run(9)) <= first_kernels
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_iterations(rng):
     arguments, _ = case(rng, iterations=400)
     peaks = []

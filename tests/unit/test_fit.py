@@ -285,6 +285,7 @@ def test_small_fit_reaches_a_good_picture(rng):
     assert metrics.peak_ratio(got, image) == fitted.peak_ratio
 
 
+@pytest.mark.slow
 def test_robust_fit_loses_less_to_noise_in_its_weights(rng):
     """What the perturbation is for (paper, Sec. 4): moving the weights moves the picture less."""
     image, network = sky(rng), config.Representation(hidden=32, depth=1)
@@ -315,6 +316,7 @@ def sunny(height=24, width=48, sun=1e4):
     return image
 
 
+@pytest.mark.slow
 def test_the_recipe_keeps_the_light_of_a_sun_of_one_texel():
     image, network, rows = sunny(), config.Representation(hidden=48, depth=2), (0, 48)
     ratios = []
@@ -613,6 +615,7 @@ def killed_at(epoch, told=None):
     return progress
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
 @pytest.mark.parametrize("begun", ["whole", "damaged", "none"])
 def test_a_killed_fit_goes_on_to_the_same_weights(tmp_path, monkeypatch, gamma, begun, rng):

@@ -346,6 +346,7 @@ def test_means_are_those_of_the_edited_map(edit, rng):
     assert np.abs(small(source) - edited).max() > 0.1  # negative control
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", range(8, 12))
 def test_bands_do_not_show_beside_a_lamp_that_is_put_out(row, monkeypatch):
     source = sky(256, 512)
@@ -421,6 +422,7 @@ def irradiance(m, normals):
     return np.maximum(normals @ d.T, 0) @ (np.float64(m) * omega).reshape(-1, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kloofendal_48d_partly_cloudy", "rustig_koppie"])
 def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
     source, _ = images.load_envmap(data / f"puresky/{name}_puresky_1k.hdr")

@@ -1,6 +1,7 @@
 """How fine a gain a picture can tell: a mirror's, a matte thing's, and one of noise alone."""
 
 import numpy as np
+import pytest
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
@@ -68,12 +69,14 @@ def test_detail_is_told_only_where_it_is_seen():
     assert seen.mean() > 0.5 and unseen.max() == 0
 
 
+@pytest.mark.slow
 def test_a_matte_thing_tells_nothing_fine():
     shares = {octave.cycles: octave.share for octave in told(matte())}
     assert shares.get(16, 0) < 0.1 and 32 not in shares
     assert {octave.cycles: octave.share for octave in told(mirror())}[16] > 0.5
 
 
+@pytest.mark.slow
 def test_noise_of_samples_is_not_taken_for_detail():
     exact = matte()
     first, second = sampled(exact, 1), sampled(exact, 2)
@@ -89,6 +92,7 @@ def test_pixels_that_do_not_count_tell_nothing():
     assert told(Dense(np.zeros((FILM * FILM, 32 * WIDTH)))) == []
 
 
+@pytest.mark.slow
 def test_a_highlight_tells_less_than_the_dark():
     dark, bright = (told(mirror(), value=value) for value in (0.05, 50.0))
     assert len(bright) < len(dark) == 4

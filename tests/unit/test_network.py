@@ -11,6 +11,7 @@ from envedit.core import latlong
 from envedit.representations.siren import network as siren
 from tests.oracles.kernels import launched, own
 from tests.oracles.plain import numpy_forward, numpy_layers
+from tests.oracles.tiers import slow_but
 
 OMEGA = 30.0
 
@@ -105,7 +106,7 @@ def test_network_of_directions_has_three_inputs(depth, rng):
     assert differ(ours(params, x, own(weight)), gradient(plain_forward, params, x, own(weight))) == []
 
 
-@pytest.mark.parametrize("count", POINTS)
+@pytest.mark.parametrize("count", slow_but(POINTS, 1, 7, 1023))
 @pytest.mark.parametrize(("hidden", "depth"), [(7, 7), (129, 1)])
 def test_gradient_counts_every_point_once(count, hidden, depth, rng):
     params, x = siren.init(count, hidden, depth), points(rng, count)
@@ -300,6 +301,7 @@ def test_no_new_kernel_after_the_third_step(count, through_the_graph):
     assert first and launched(lambda: training.steps(4)) <= first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("through_the_graph", [False, True])
 def test_memory_does_not_grow(through_the_graph):
     training = Training(4997, through_the_graph)

@@ -132,6 +132,7 @@ def test_a_mesh_that_cannot_stand_is_refused(tmp_path):
         scene.load("mesh", parameters={"mesh": "gone.ply"}, base=tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, up", [("bunny_watertight.ply", "z"), ("spot.obj", "y"), ("horse_quad.obj", "y")]
 )

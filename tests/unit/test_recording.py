@@ -103,6 +103,7 @@ def test_an_index_into_the_exact_columns_fits_into_32_bits(size):
     assert 4 * (size * size + 7) * capacity < 2**32 and (capacity == 256 or size > 1024)
 
 
+@pytest.mark.slow
 def test_exact_columns_leave_out_and_count_what_is_not_finite(monkeypatch):
     s, sky = scene.load("matte", 8, 8), np.ones((4, 8, 3), np.float32)
     sky[1, 3] = 300
@@ -124,6 +125,7 @@ def test_exact_columns_leave_out_and_count_what_is_not_finite(monkeypatch):
     np.testing.assert_allclose(got.sum(), wanted.sum(), rtol=0.2)
 
 
+@pytest.mark.slow
 def test_light_of_lamps_is_cut_only_where_a_path_depth_is_asked_for():
     eye = mi.ScalarTransform4d().look_at([0, 2, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}

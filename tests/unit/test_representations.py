@@ -94,6 +94,7 @@ def halved(image):
     return image.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coordinates", POINTS)
 @pytest.mark.parametrize("first", [None, 0, 6, 16])
 def test_siren_at_another_resolution_is_the_same_picture_resized(coordinates, first):

@@ -225,6 +225,7 @@ def test_extreme_values_stay_finite(value):
 # ---- crops, sizes, exposures -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [(0, 32), (10, 40), (19, 21)])
 @pytest.mark.parametrize("scale", [1, 5])
 def test_a_crop_has_the_light_where_the_map_has_it(rows, scale):
@@ -272,6 +273,7 @@ def test_lights_do_not_depend_on_the_exposure(factor):
     np.testing.assert_allclose(other.background, one.background * factor, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_lights_do_not_depend_on_the_resolution():
     where = [toward(40, 0.2), toward(-20, 120), toward(15, 250)]
     lamps = zip(where, (1.2, 8, 4), (3e4, 300, 600), strict=True)
@@ -439,6 +441,7 @@ def real(data, name, width=256):
     return images.load_envmap(data / path, width)[0].astype(np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SUNNY)
 def test_a_sunny_sky_has_its_sun_and_no_ghost_of_it(name, data):
     m = real(data, name)
@@ -462,6 +465,7 @@ def test_an_overcast_sky_has_no_light(name, data):
     assert checked(real(data, name)).lights == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, least", [("studio_small_03", 2), ("dikhololo_night", 1), ("venice_sunset", 1)]
 )
@@ -471,6 +475,7 @@ def test_lamps_of_a_studio_a_night_and_a_town(name, least, data):
     assert lights[0].share > 0.01
 
 
+@pytest.mark.slow
 def test_a_real_map_has_the_same_sun_at_another_resolution(data):
     (a,), (b,) = (checked(real(data, "sunflowers", w)).lights for w in (1024, 256))
     assert angle(a.direction, b.direction) < 1 and b.share == pytest.approx(a.share, rel=0.05)

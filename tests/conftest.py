@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.register_assert_rewrite("tests.oracles")
+
 
 def pytest_configure(config):
     import mitsuba as mi
@@ -41,3 +43,26 @@ def threads_stay():
     before = dr.thread_count()
     yield
     assert dr.thread_count() == before
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """Keep what is cached on disk to this test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def isolated(tmp_path_factory):
+    """Keep caches to this test, and do not probe a machine that runs these very tests."""
+    from tests.oracles.runs import small_world
+
+    with small_world(tmp_path_factory.mktemp("cache")):
+        yield
+
+
+@pytest.fixture
+def every_step(monkeypatch):
+    """Let ``after_step`` be called after every step."""
+    from envedit.solve import adam_loop
+
+    monkeypatch.setattr(adam_loop, "READ_EVERY", 1)

@@ -25,7 +25,7 @@ from . import skies
 from .kinds import KINDS
 from .methods import FITS, ONLY_OURS
 
-EDITS = Path(scene.__file__).parents[1] / "scenes" / "edits"
+EDITS = Path(__file__).parents[2] / "scenes" / "edits"
 SUNSKY = "sunsky"
 
 

@@ -1,0 +1,225 @@
+"""Damaged files of every kind end well; and the harness sees each way in which they could end badly."""
+
+import json
+import struct
+import sys
+
+import numpy as np
+import pytest
+
+from experiments.fuzz import documents, drive, headers, mutate, pictures, run
+from tests.oracles.tiers import slow_but
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
+
+# ---- the package -------------------------------------------------------------------------------------------
+
+
+@linux
+@pytest.mark.parametrize(
+    ("what", "cases"),
+    slow_but(
+        [("exr", 90), ("hdr", 90), ("toml", 90), ("painted", 60), ("weights", 60), ("checkpoint", 40)],
+        "exr",
+        "toml",
+    ),
+)
+def test_damaged_files_are_read_or_refused(what, cases):
+    tally = drive.fuzz(what, range(cases))
+    assert not tally.faults
+    assert tally.counts["read"] + tally.counts["refused"] == cases
+    # Not all of the damage is found at the door, and not all of it is harmless.
+    assert tally.counts["read"] > 0 and tally.counts["refused"] > cases / 4
+    assert set(tally.kinds) == {"ConfigError" if what == "toml" else "InputError"}
+
+
+@pytest.mark.slow
+@linux
+@pytest.mark.parametrize("name", ["ours.exr", "flat.hdr", "rgb8.png"])
+def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
+    """Here without the room that small files have, so that the multiple itself is tested."""
+    shape = (512, 1024)
+    if name == "ours.exr":
+        from envedit.images import images
+
+        images.write_exr(tmp_path / name, np.tile(pictures.radiance(), (32, 32, 1)))
+    elif name == "flat.hdr":
+        pixels = np.tile(pictures.shared_exponent(), (32, 32, 1))
+        (tmp_path / name).write_bytes(b"#?RADIANCE\n\n-Y 512 +X 1024\n" + pixels.tobytes())
+    else:
+        (tmp_path / name).write_bytes(pictures.png(np.tile(pictures.codes(), (32, 32, 1)), 2))
+    data = (tmp_path / name).read_bytes()
+    declared = headers.declared(data)
+    assert declared >= 12 * shape[0] * shape[1]
+    small = {"ours.exr": "exr", "flat.hdr": "hdr", "rgb8.png": "painted"}[name]
+    with drive.Worker("hdr") as process:
+        for warm, raw in drive.seeds(small):
+            if warm == name:
+                (tmp_path / f"small-{name}").write_bytes(raw)
+                process.read(tmp_path / f"small-{name}", 0, len(raw), limited=False)
+        answer = process.read(tmp_path / name, 0, declared)
+    assert answer["outcome"] == "read", answer
+    assert declared / 2 < answer["peak"] < 8 * declared
+
+
+@linux
+@pytest.mark.parametrize("field", ["dataWindow", "displayWindow", "both"])
+def test_an_image_two_billion_texels_wide_takes_no_memory(tmp_path, field):
+    raw = bytearray(dict(drive.seeds("exr"))["ours.exr"])
+    for name in ("dataWindow", "displayWindow"):
+        if field in (name, "both"):
+            at = raw.index(name.encode() + b"\0box2i\0") + len(name) + 11
+            struct.pack_into("<4i", raw, at, 0, 0, 2**31 - 2, 15)
+    (tmp_path / "wide.exr").write_bytes(raw)
+    with drive.Worker("exr") as process:
+        answer = process.read(tmp_path / "wide.exr", 0, 0)
+    assert answer["outcome"] == "refused" and answer["peak"] < 8 << 20, answer
+
+
+# ---- the harness -------------------------------------------------------------------------------------------
+
+BAD = """
+import ctypes, os, sys, time, warnings
+from envedit.core.errors import InputError
+from experiments.fuzz.readers import WrongError
+
+def read(path, index):
+    kind = path.read_text()
+    if kind == "crashed":
+        ctypes.string_at(0)
+    elif kind == "hung":
+        while True:
+            pass
+    elif kind == "stuck":
+        time.sleep(60)
+    elif kind == "traceback":
+        {}["key"]
+    elif kind == "nameless":
+        raise InputError("cannot be read")
+    elif kind == "control":
+        raise InputError(f"{path}: \\x1b[31m")
+    elif kind == "lengthy":
+        raise InputError(f"{path}: " + 1000 * "a")
+    elif kind == "wrong":
+        raise WrongError("not finite")
+    elif kind == "memory":
+        bytearray(b"1") * (100 << 20)
+    elif kind == "address":
+        try:
+            bytearray(1 << 30)
+        except MemoryError:
+            raise InputError(f"{path}: not enough memory")
+    elif kind == "printed":
+        os.write(1, b"from C")
+    elif kind == "warned":
+        warnings.warn("from Python")
+    elif kind == "refused":
+        raise InputError(f"{path}: damaged")
+"""
+
+
+@linux
+@pytest.mark.parametrize(
+    ("kind", "outcome", "words"),
+    slow_but(
+        [
+            ("crashed", "crashed", "SIGSEGV"),
+            ("hung", "hung", "of processor time"),
+            ("stuck", "hung", "of wall time"),
+            ("traceback", "traceback", "KeyError"),
+            ("nameless", "unclear", "does not name the file"),
+            ("control", "unclear", "control characters"),
+            ("lengthy", "unclear", "1 lines, "),
+            ("wrong", "wrong", "not finite"),
+            ("memory", "memory", "MiB for 0 bytes"),
+            ("address", "memory", "not enough memory"),
+            ("printed", "printed", "from C"),
+            ("warned", "printed", "from Python"),
+        ],
+        "crashed",
+        "memory",
+        "printed",
+    ),
+)
+def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words):
+    (tmp_path / "bad.py").write_text(BAD)
+    (tmp_path / "case").write_text(kind)
+    (tmp_path / "good").write_text("refused")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    # A new process is to be up within the patience, on a busy machine too.
+    with drive.Worker("bad:read", seconds=0.5, patience=12 if kind == "stuck" else 40) as process:
+        answer = process.read(tmp_path / "case", 0, 0)
+        assert answer["outcome"] == outcome and words in answer["error"]
+        assert process.read(tmp_path / "good", 1, 0)["outcome"] == "refused"  # and the next one is read
+
+
+@linux
+def test_failing_cases_are_kept_and_counted(tmp_path, monkeypatch):
+    (tmp_path / "bad.py").write_text(
+        "def read(path, index):\n    if index == 1:\n        raise KeyError('a')\n    if index == 2:\n"
+        "        import os\n        os.abort()\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    tally = drive.fuzz("hdr", range(4), keep=tmp_path / "kept", reader="bad:read")
+    assert [(i, o) for i, o, _ in tally.faults] == [(1, "traceback"), (2, "crashed")]
+    assert dict(tally.counts) == {"read": 2, "traceback": 1, "crashed": 1}
+    kept = sorted(path.name for path in (tmp_path / "kept").iterdir())
+    name, data = drive.case("hdr", drive.seeds("hdr"), 0, 2)
+    assert len(kept) == 4 and f"hdr-0-2-crashed-{name}" in kept
+    assert (tmp_path / "kept" / f"hdr-0-2-crashed-{name}").read_bytes() == data
+
+
+def test_a_case_is_the_same_file_every_time():
+    for what in ("hdr", "toml", "weights"):
+        whole = drive.seeds(what)
+        one, again = (
+            [drive.case(what, whole, 0, i) for i in order] for order in (range(30), range(29, -1, -1))
+        )
+        assert one == again[::-1]
+        other = [drive.case(what, whole, 1, i) for i in range(30)]
+        assert sum(a == b for a, b in zip(one, other, strict=True)) < 3
+        assert sum(data == dict(whole)[name] for name, data in one) < 6  # nearly all are damaged
+
+
+def test_pieces_of_a_run_add_up(tmp_path):
+    tally = drive.Tally()
+    for index, outcome in enumerate(("read", "refused", "hung")):
+        tally.add(index, {"outcome": outcome, "kind": "InputError", "peak": 3 << 20}, 1 << 20)
+    for first in (0, 3, 3):  # the last takes the place of the one before
+        sums = run.recorded(tmp_path / "sub" / "record.json", {"exr": (range(first, first + 3), 0, tally)})
+    assert sums["exr"].counts == {"read": 2, "refused": 2, "hung": 2} and len(sums["exr"].faults) == 2
+    row = [cell.strip() for cell in run.table(sums).splitlines()[2].split("|")]
+    assert row[1:7] == ["exr", "6", "2", "2 InputError", "0", "2"] and row[-2] == "2.0 MiB"
+    file = tmp_path / "sub" / "record.json"
+    assert json.loads(file.read_text())
+    for cases, seed, twice in [((0, 6), 0, True), ((2, 4), 0, True), ((5, 9), 0, True), ((3, 6), 0, False),
+                               ((6, 9), 0, False), ((0, 6), 1, False)]:  # fmt: skip
+        assert bool(run.counted_twice(file, "exr", range(*cases), seed)) == twice
+    assert "holds cases 3 to 5 of exr" in run.counted_twice(file, "exr", range(5, 9), 0)
+    assert not run.counted_twice(file, "hdr", range(6), 0)
+    with pytest.raises(SystemExit):
+        run.main(["--record", str(file), "--what", "exr", "--cases", "5"])
+
+
+def test_headers_are_understood_apart_from_the_readers():
+    files = dict(drive.seeds("exr")) | dict(drive.seeds("hdr")) | dict(drive.seeds("painted"))
+    texels = 16 * 32
+    for name, data in files.items():
+        found = headers.declared(data)
+        assert 12 * texels <= found <= (6 * 4 + 16) * texels * 2, name
+        assert len(headers.sites(data)) > 5, name
+    hdr = files["new.hdr"].replace(b"+X 32", b"+X 2147483647")
+    assert headers.declared(hdr) == headers.declared(hdr.replace(b"2147483647", b"0")) == 0
+    raw = files["ours.exr"]
+    window = raw.index(b"dataWindow\0box2i\0") + 17
+    assert {window + i for i in range(0, 20, 4)} <= {site.offset for site in headers.sites(raw)}
+    for data in (b"", b"#?", b"\x76\x2f\x31\x01", b"\x89PNG", b"\xff\xd8", b"PK\x03\x04", b"\0" * 8 + b"{"):
+        headers.sites(data), headers.declared(data)
+
+
+def test_damage_never_fails_and_stays_small():
+    rng = np.random.default_rng(0)
+    for data in (b"", b"a", b"[a]\n", documents.WRITTEN.encode()):
+        for _ in range(100):
+            for damage in (mutate.mutated, documents.mutated):
+                assert len(damage(data, rng)) <= mutate.MOST_BYTES

@@ -1,0 +1,428 @@
+"""Runs that are killed, run out of disk or lose their folder: what is left is whole, and --resume ends them.
+
+A kill is simulated in this process where it is to come at a certain file: nothing that follows it is done,
+not even what would clean up. Two runs are killed for good, at moments drawn by lot.
+"""
+
+import contextlib
+import errno
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envedit import pipeline
+from envedit.cli.progress import Progress
+from envedit.core import array_cache, atomic_files
+from envedit.core.errors import InputError
+from envedit.images import images, layered_exr
+from envedit.report import manifest, output_folder, preview
+from envedit.scene import scene
+from envedit.solve import adam_loop, checkpoint
+from experiments.interruption import run as kills
+from tests.oracles import ROOT
+from tests.oracles.runs import FILES, INFLUENCE, call, differing, names, pictures, small_world, world
+
+pytestmark = pytest.mark.usefixtures("isolated")
+
+COMPLETE = FILES | INFLUENCE
+TABLES = {
+    "representation": {"kind": "siren", "hidden": 16, "depth": 1},  # it keeps a fit
+    "optimizer": {"iterations": 25, "checkpoint_s": 0.0},  # checkpoints after 10, 20 and 25
+}
+
+
+class Killed(BaseException):
+    """Nothing catches it."""
+
+
+@pytest.fixture(autouse=True)
+def steady(monkeypatch):
+    """Let checkpoints come by the count of steps alone."""
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", 1e9)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Return the configuration of a run and the folder of an undisturbed one."""
+    folder = tmp_path_factory.mktemp("whole")
+    path = world(folder, np.random.default_rng(0), **TABLES)
+    with small_world(folder / "cache"):
+        assert call(path, "--quiet") == 0
+    assert names(folder / "c_out") == COMPLETE
+    return path, folder / "c_out"
+
+
+def check_visible(folder, reference):
+    """What can be seen in a folder of results is whole, whatever happened."""
+    for name in names(folder) if folder.exists() else ():
+        file = folder / name
+        if name.startswith("."):
+            continue
+        if name.endswith(".json"):
+            json.loads(file.read_text())
+        elif name == checkpoint.NAME:
+            with np.load(file) as stored:
+                assert all(stored[key] is not None for key in stored.files)
+        elif name in pictures(reference):
+            assert file.read_bytes() == (reference / name).read_bytes(), name
+        elif name == "report.html":
+            assert file.read_text().rstrip().endswith("</html>")
+        elif name in ("config.toml", "history.csv"):
+            assert kills.look(folder, reference)["half"] == []
+
+
+def check_resumed(path, folder, reference):
+    """Resuming ends the run with the same pictures, and leaves nothing else."""
+    assert call(path, "--quiet", "--resume", "--out", folder) == 0
+    assert names(folder) == names(reference) == COMPLETE
+    assert differing(folder, reference) == set()
+    mine, theirs = (json.loads((f / "metrics.json").read_text()) for f in (folder, reference))
+    assert mine["render"] == theirs["render"] and mine["iterations"] == theirs["iterations"]
+
+
+# ---- killed at a file ------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def killed_at(patch, number):
+    """Kill at the n-th renaming of a temporary file, which is cut in half; yields what was renamed."""
+    seen, replace, unlink = [], os.replace, Path.unlink
+
+    def cut(source, target):
+        seen.append(Path(target).name)
+        if len(seen) - 1 == number:
+            os.truncate(source, os.path.getsize(source) // 2)
+            patch.setattr(Path, "unlink", lambda *a, **k: None)  # the dead do not clean up
+            raise Killed
+        replace(source, target)
+
+    with patch.context() as inner:
+        inner.setattr(atomic_files.os, "replace", cut)
+        try:
+            yield seen
+        finally:
+            patch.setattr(Path, "unlink", unlink)
+
+
+@pytest.mark.slow
+def test_a_run_killed_while_it_writes_any_file_is_resumed_to_the_same_bytes(tmp_path, whole, monkeypatch):
+    path, reference = whole
+    killed, number = [], 0
+    while True:
+        folder = tmp_path / f"out-{number}"
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / f"cache-{number}"))
+        try:
+            with killed_at(monkeypatch, number) as seen:
+                assert call(path, "--quiet", "--out", folder) == 0
+            break  # no file is left to be killed at
+        except Killed:
+            killed.append(seen[-1])
+        check_visible(folder, reference)
+        assert sum(name.startswith(".") for name in names(folder)) == (killed[-1] in output_folder.RESULTS)
+        check_resumed(path, folder, reference)
+        number += 1
+    assert set(killed) >= COMPLETE and killed.count(checkpoint.NAME) == 3
+    caches = [name for name in killed if name not in output_folder.RESULTS]
+    assert sum(name.endswith(".arrays") for name in caches) >= 3  # the fit, the transport
+
+
+@pytest.mark.slow
+def test_a_run_killed_after_its_last_file_is_resumed_too(tmp_path, whole, monkeypatch):
+    path, reference = whole
+
+    def kill(folder):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "remove", kill)
+        with pytest.raises(Killed):
+            call(path, "--quiet", "--out", tmp_path / "out")
+    assert names(tmp_path / "out") == COMPLETE | {checkpoint.NAME}
+    check_resumed(path, tmp_path / "out", reference)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moved", [0, 1, 5, len(COMPLETE) - 1])
+def test_a_run_killed_while_it_moves_earlier_results_loses_none(moved, tmp_path, whole, monkeypatch):
+    path, reference = whole
+    folder = tmp_path / "out"
+    shutil.copytree(reference, folder)
+    # As its configuration says, so that it is the same run.
+    text = (folder / "config.toml").read_text().replace(str(reference), str(folder))
+    (folder / "config.toml").write_text(text)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    rename, count = Path.rename, []
+
+    def kill(self, target):
+        count.append(self)
+        if len(count) > moved:
+            raise Killed
+        return rename(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", kill)
+        with pytest.raises(Killed):
+            call(path, "--quiet", "--out", folder)
+    kept = {file.name: file.read_bytes() for file in (folder / "earlier-1").iterdir()}
+    assert len(kept) == moved and kept | {f.name: f.read_bytes() for f in folder.glob("*.*")} == before
+    assert call(path, "--quiet", "--resume", "--out", folder) == 0
+    moved_on = [f"earlier-{n}" for n in (1, 2)][: 1 + (moved > 0)]
+    assert names(folder) == COMPLETE | set(moved_on)
+    kept = {file.name: file.read_bytes() for name in moved_on for file in (folder / name).iterdir()}
+    assert kept == (before if moved else {})
+    assert all((folder / name).read_bytes() == data for name, data in pictures(reference).items())
+
+
+def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    left = {f".edited.exr.{gone.pid}.exr", f".metrics.json.{os.getpid()}", f".checkpoint.npz.{gone.pid}"}
+    left |= {".edited.exr.99999999999999999999.exr"}
+    others = {
+        f".edited.exr.{os.getppid()}.exr",
+        ".edited.exr.note",
+        f".mine.exr.{gone.pid}.exr",
+        "edited.exr",
+    }
+    for name in left | others:
+        (tmp_path / name).write_bytes(b"half")
+    output_folder.tidy(tmp_path)
+    assert names(tmp_path) == others
+    output_folder.tidy(tmp_path / "nowhere")
+
+
+# ---- killed for good -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("draw", [0, 1])
+def test_a_process_killed_at_a_random_moment_is_resumed_to_the_same_bytes(draw, tmp_path, whole, monkeypatch):
+    """``python -m experiments.interruption.run`` does it twenty times, with every representation."""
+    path, reference = whole
+    cache = tmp_path / "cache"
+    command = [sys.executable, "-m", "envedit.run", str(path), "--out", str(tmp_path / "out")]
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    process = subprocess.Popen(command, cwd=ROOT, env=environment, text=True, stderr=subprocess.PIPE,
+                               stdout=subprocess.DEVNULL)  # fmt: skip
+    try:
+        process.stderr.readline()  # "loading": imported
+        time.sleep(np.random.default_rng(draw).uniform(0, 1.0))
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=60)
+    finally:
+        process.kill()
+    check_visible(tmp_path / "out", reference)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    check_resumed(path, tmp_path / "out", reference)
+
+
+# ---- no space, no folder ---------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_at_any_file_is_told_and_costs_no_work(tmp_path, whole, monkeypatch, capsys):
+    """Every file in turn, and the run goes on from its checkpoint as soon as there is room."""
+    path, reference = whole
+    folder, replace = tmp_path / "out", os.replace
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in (checkpoint.NAME, *sorted(COMPLETE)):
+        number = errno.ENOSPC if name != "metrics.json" else errno.EROFS
+
+        def full(source, target, name=name, number=number):
+            if Path(target).name == name:
+                raise OSError(number, os.strerror(number))
+            replace(source, target)
+
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            patch.setattr(atomic_files.os, "replace", full)
+            assert call(path, "--quiet", "--resume", "--out", folder) == 3
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) <= 2 and "Traceback" not in said
+        assert str(folder / name) in said and os.strerror(number) in said and "free space" in said
+        assert name not in names(folder) and "metrics.json" not in names(folder)
+        assert not any(found.startswith(".") for found in names(folder))
+        check_visible(folder, reference)
+        if name == checkpoint.NAME:
+            assert names(folder) == set()
+            assert call(path, "--quiet", "--resume", "--out", folder) == 0
+            for file in [*folder.iterdir()]:
+                file.unlink()
+            with monkeypatch.context() as patch:  # so that what follows has a checkpoint of the last step
+                patch.setattr(scene.Scene, "sampled", stopping(scene.Scene.sampled))
+                assert call(path, "--quiet", "--out", folder) == 130
+            continue
+        assert checkpoint.NAME in names(folder)
+        for file in folder.glob("[!c]*.*"):
+            file.unlink()
+    check_resumed(path, folder, reference)
+
+
+def stopping(sampled):
+    """Press Ctrl-C when the result is to be rendered."""
+
+    def stop(self, envmap, spp, seed):
+        if seed == pipeline.JUDGE_SEED + 1:
+            raise KeyboardInterrupt
+        return sampled(self, envmap, spp, seed)
+
+    return stop
+
+
+@pytest.mark.slow
+def test_caches_without_room_cost_nothing_but_time(tmp_path, whole, monkeypatch):
+    path, reference = whole
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    replace = os.replace
+
+    def full(source, target):
+        if Path(target).name not in output_folder.RESULTS:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr(atomic_files.os, "replace", full)
+    assert call(path, "--quiet", "--out", tmp_path / "out") == 0
+    assert differing(tmp_path / "out", reference) == set()
+    assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["editing", "writing"])
+def test_a_folder_that_is_gone_is_told(stage, tmp_path, whole, monkeypatch, capsys):
+    path, _ = whole
+    folder, begin = tmp_path / "out", Progress.stage
+
+    def remove(self, text):
+        begin(self, text)
+        if text == stage:
+            shutil.rmtree(folder)
+
+    monkeypatch.setattr(Progress, "stage", remove)
+    assert call(path, "--quiet", "--out", folder) == 3
+    said, name = capsys.readouterr().err, {"editing": checkpoint.NAME, "writing": "edited.exr"}[stage]
+    assert str(folder / name) in said and "its folder does not exist" in said and len(said.splitlines()) == 1
+
+
+@contextlib.contextmanager
+def largest_file(size):
+    """Let no file of this process grow beyond a size: the library's write comes short, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+PICTURE = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
+ROWS = [{"iteration": i, "loss": 1 / (i + 1)} for i in range(50)]
+STATE = adam_loop.State(3, history=ROWS)
+RESULT = {"renders": {"initial": PICTURE, "target": PICTURE, "edited": PICTURE}, "maps": {"initial": PICTURE}}
+WRITERS = {
+    "edited.exr": lambda path: images.write_exr(path, PICTURE),
+    "edited_layers.exr": lambda path: layered_exr.write(path, {"edited": PICTURE, "grey": PICTURE[..., 0]}),
+    "influence.png": lambda path: preview.influence(path, PICTURE[..., 0], None),
+    "preview.png": lambda path: preview.preview(path, RESULT["renders"], RESULT["maps"]),
+    "history.csv": lambda path: manifest.write_history(path, ROWS),
+    "metrics.json": lambda path: manifest.write_metrics(path, {"rows": ROWS}),
+    "config.toml": lambda path: atomic_files.write_atomically(path, b"# a comment\n" * 100),
+    "checkpoint.npz": lambda path: checkpoint.save(path.parent, "what", STATE, {"p": PICTURE}, {}, PICTURE),
+    "unreachable.png": lambda path: images.write_png(path, PICTURE[:8, :16]),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_write_that_comes_short_leaves_no_file(name, tmp_path):
+    """However little is missing; libraries that swallow the error would leave a half file for a whole one."""
+    path = tmp_path / name
+    WRITERS[name](path)
+    data = path.read_bytes()
+    path.unlink()
+    for size in (0, 100, len(data) // 2, len(data) - 100, len(data) - 1):
+        with (
+            pytest.raises(InputError, match=f"{name}: cannot be written .File too large."),
+            largest_file(size),
+        ):
+            WRITERS[name](path)
+        assert names(tmp_path) == set()
+    with largest_file(len(data)):
+        WRITERS[name](path)
+    assert len(path.read_bytes()) == len(data)
+
+
+def test_an_entry_of_a_cache_that_comes_short_is_none(tmp_path):
+    cache, key = array_cache.DiskCache(tmp_path), {"of": "a test"}
+    with largest_file(1000):
+        cache.store(key, {"a": PICTURE})
+    assert cache.load(key) is None and not names(tmp_path)
+    cache.store(key, {"a": PICTURE})
+    np.testing.assert_array_equal(cache.load(key)["a"], PICTURE)
+
+
+# ---- the long version ------------------------------------------------------------------------------------
+
+
+def test_the_experiment_compares_metrics_without_what_a_cache_changes(tmp_path):
+    made = [{"psnr": 3.0, "timing": seconds, "fit": {"cached": seconds < 2, "seconds": seconds, "peak": 1.0},
+             "transport": None} for seconds in (1.0, 9.0)]  # fmt: skip
+    for number, metrics in enumerate(made):
+        (tmp_path / f"{number}.json").write_text(json.dumps(metrics))
+    first, second = (kills.measured(tmp_path / f"{number}.json") for number in range(2))
+    assert first == second and first["fit"] == {"peak": 1.0}
+
+
+@pytest.mark.slow
+def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
+    _, reference = whole
+    folder = tmp_path / "out"
+    shutil.copytree(reference, folder)
+    assert kills.differing(folder, reference) == [] and kills.look(folder, reference)["half"] == []
+    for name in ("edited.exr", "report.html", "metrics.json", "influence.png"):
+        os.truncate(folder / name, os.path.getsize(folder / name) - 9)
+    (folder / checkpoint.NAME).write_bytes(b"PK\3\4 half")
+    (folder / ".render_target.exr.1.exr").touch()
+    for name in ("config.toml", "history.csv", "preview.png"):
+        os.truncate(folder / name, os.path.getsize(folder / name) // 2)
+    found = kills.look(folder, reference)
+    assert set(found["half"]) == {
+        "edited.exr",
+        "report.html",
+        "metrics.json",
+        "influence.png",
+        "checkpoint.npz",
+        "config.toml",
+        "history.csv",
+        "preview.png",
+    }
+    assert found["temporary"] == 1 and found["files"] == len(COMPLETE) + 1 and found["step"] is None
+    shutil.copy(reference / "metrics.json", folder)
+    assert set(kills.differing(folder, reference)) == {
+        "edited.exr", "influence.png", "preview.png", "checkpoint.npz", ".render_target.exr.1.exr",
+    }  # fmt: skip
+
+
+def test_the_experiment_tells_what_differs():
+    good = {
+        "asked": {"kind": "siren", "renderer": "path"},
+        "kills": [{"after_s": 1.5, "stage": "done before", "half": []}],
+    }
+    good |= {"differs": [], "good": True}
+    kill = {"after_s": 2.25, "stage": "editing", "step": 40, "files": 1, "temporary": 1, "half": []}
+    asked = {"kind": "layers", "renderer": "transport"}
+    bad = {"asked": asked, "kills": [kill, kill], "differs": ["edited.exr"]}
+    lines = kills.table([good, bad | {"good": False}]).splitlines()
+    assert lines[2] == "| 0 | siren | path | 1.5 s | done before | none | 0 / 0 / 0 | the same bytes |"
+    assert lines[3].startswith(
+        "| 1 | layers | transport | 2.25 s, 2.25 s | editing, editing | 40, 40 | 1 / 1 / 0,"
+    )
+    assert lines[3].endswith("| DIFFERS: edited.exr |")

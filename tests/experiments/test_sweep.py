@@ -1,0 +1,822 @@
+"""Sweeps: jobs and their hashes, locks, and real processes that are killed at bad moments."""
+
+import importlib.util
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envedit import config
+from envedit.core.errors import ConfigError, InputError
+from envedit.solve import adam_loop, checkpoint
+from experiments.sweep import COMMAND, drive, job, locks, process, read_jobs, run_job, sweep, table
+from experiments.sweep.__main__ import main
+from experiments.sweep.board import Board
+from experiments.sweep.process import Outcome
+from tests.oracles import ROOT
+from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+
+STUB = '''
+"""Stands for a run: notes what it does, and fails, waits or breaks off as files beside the notes say."""
+import os, pathlib, sys, time, tomllib
+
+folder, notes = map(pathlib.Path, sys.argv[1:3])
+seed = tomllib.loads((folder / "job.toml").read_text())["seed"]
+
+def note(what):
+    file = os.open(notes / "notes", os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.write(file, f"{seed} {what} {os.getpid()}\\n".encode())
+
+try:
+    note("begin")
+    print("out", flush=True)
+    if (notes / f"fail-{seed}").exists():
+        print("first words\\nthe last line", file=sys.stderr)
+        sys.exit(5)
+    if (folder / "checkpoint.npz").exists():
+        note("checkpoint")
+        if words := {"unusable": "the checkpoint cannot be read (why): delete it",
+                     "other": "belongs to another configuration or other input files",
+                     "full": "cannot be written (No space left on device)"}.get(
+                         (folder / "checkpoint.npz").read_text()):
+            print("envedit:", "/long" * 200 + "/checkpoint.npz:", words, file=sys.stderr)
+            sys.exit(3)
+    while (notes / f"hold-{seed}").exists():
+        time.sleep(0.01)
+except KeyboardInterrupt:
+    (folder / "checkpoint.npz").write_text("state")
+    note("interrupted")
+    sys.exit(130)
+(folder / "result").write_text(str(seed))
+note("end")
+'''
+
+
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    """The stand-in's command and its notes."""
+    monkeypatch.setattr(drive, "AGAIN", 0.05)
+    monkeypatch.setattr(drive, "POLL", 0.02)
+    return Stub(tmp_path)
+
+
+class Stub:
+    def __init__(self, folder):
+        self.folder, self.out, self.notes = folder, folder / "out", folder / "notes"
+        self.notes.mkdir()
+        (folder / "stub.py").write_text(STUB)
+        self.command = ("{python}", "-S", str(folder / "stub.py"), "{folder}", str(self.notes))
+
+    def jobs(self, count):
+        return [job(f"job {seed}", f"seed = {seed}") for seed in range(count)]
+
+    def written(self, count):
+        """Jobs in a file."""
+        tables = "\n".join(f'[jobs."job {seed}"]\nseed = {seed}' for seed in range(count))
+        (self.folder / "jobs.toml").write_text(f"[common]\nvariant = 'llvm_ad_rgb'\n{tables}")
+        return self.folder / "jobs.toml"
+
+    def block(self, what, *seeds):
+        for seed in seeds:
+            (self.notes / f"{what}-{seed}").touch()
+
+    def free(self):
+        for path in self.notes.glob("*-*"):
+            path.unlink()
+
+    def noted(self, what):
+        """Seeds and process ids of what was done, in order."""
+        try:
+            lines = (self.notes / "notes").read_text().splitlines()
+        except FileNotFoundError:
+            return []
+        return [(int(s), int(pid)) for s, did, pid in map(str.split, lines) if did == what]
+
+    def counts(self, what, jobs):
+        seeds = [seed for seed, _ in self.noted(what)]
+        return [seeds.count(seed) for seed in range(jobs)]
+
+    def driver(self, count, *options):
+        """A driver as a process of its own."""
+        text = (
+            # A shell starts what runs in its background with Ctrl-C ignored, and that is inherited.
+            "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+            "import sys; from experiments.sweep import drive; from experiments.sweep.__main__ import main;"
+            "drive.CONNECT = 1;"
+            f"sys.exit(main(sys.argv[1:], command={self.command!r}))"
+        )
+        arguments = [str(self.written(count)), "--out", str(self.out), *options]
+        return subprocess.Popen(
+            [sys.executable, "-c", text, *arguments],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def run(self, count=None, jobs=None, **options):
+        said = io.StringIO()
+        found = sweep(jobs or self.jobs(count), self.out, command=self.command, stream=said, **options)
+        return [one.state for one in found], said.getvalue()
+
+
+def until(true, seconds=20):
+    end = time.monotonic() + seconds
+    while not (value := true()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+    return value
+
+
+def files(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def dead(pid):
+    return locks._started(pid) is None
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only on Linux do jobs die with their driver")
+
+
+# ---- what is left, what is done again ----------------------------------------------------------------------
+
+
+def test_jobs_are_done_once_and_leave_their_folders(stub):
+    jobs = stub.jobs(3)
+    states, said = stub.run(jobs=jobs)
+    assert states == ["done"] * 3
+    for seed, one in enumerate(jobs):
+        folder = one.folder(stub.out)
+        assert files(folder) == ["done.json", "job.toml", "log.txt", "result"]
+        assert (folder / "result").read_text() == str(seed)
+        assert config.load(folder / "job.toml").seed == seed
+        assert (folder / "log.txt").read_text().splitlines()[1:] == ["out"]
+        about = json.loads((folder / "done.json").read_text())
+        assert about["name"] == f"job {seed}" and about["seconds"] >= 0 and about["resumed"] is False
+    assert said.splitlines()[0].startswith("3 jobs, 0 done before, 3 to run: 1 at a time")
+    states, said = stub.run(jobs=jobs)
+    assert states == ["skipped"] * 3 and said == ""
+    assert stub.counts("begin", 3) == [1, 1, 1]
+    rows = (stub.out / "sweep.tsv").read_text().splitlines()
+    assert rows[1].split("\t") == ["job 0", "skipped", "0.0", jobs[0].key, ""]
+
+
+@pytest.mark.slow
+@linux
+def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub):
+    stub.block("hold", 1, 2)
+    driver = stub.driver(5, "--workers", "2")
+    until(lambda: {seed for seed, _ in stub.noted("begin")} == {0, 1, 2} and stub.noted("end"))
+    jobs = stub.jobs(5)
+    until((jobs[0].folder(stub.out) / "done.json").exists)
+    driver.send_signal(signal.SIGKILL)
+    driver.communicate()
+    flying = [pid for seed, pid in stub.noted("begin") if seed in (1, 2)]
+    until(lambda: all(dead(pid) for pid in flying))
+    assert list((jobs[1].folder(stub.out)).glob("lock-*"))  # nobody was left to remove it
+    stub.free()
+    again = stub.driver(5)
+    said, _ = again.communicate()
+    assert again.returncode == 0, said
+    assert stub.counts("begin", 5) == [1, 2, 2, 1, 1]
+    assert stub.counts("end", 5) == [1] * 5
+    assert "5 jobs: 1 skipped, 4 done" in said
+    assert files(jobs[1].folder(stub.out)) == ["done.json", "job.toml", "log.txt", "result"]
+
+
+def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
+    stub.block("hold", 0)
+    driver = stub.driver(4)
+    (_, pid), *_ = until(lambda: stub.noted("begin"))
+    os.kill(pid, signal.SIGKILL)
+    said, _ = driver.communicate()
+    assert driver.returncode == 1
+    line = next(line for line in said.splitlines() if line.startswith("[1/4] job 0: failed"))
+    assert "killed by signal 9" in line and "log.txt" in line
+    jobs = stub.jobs(4)
+    assert "signal 9" in json.loads((jobs[0].folder(stub.out) / "failed.json").read_text())["error"]
+    assert not (jobs[0].folder(stub.out) / "done.json").exists()
+    stub.free()
+    assert stub.run(jobs=jobs)[0] == ["done", "skipped", "skipped", "skipped"]
+    assert stub.counts("begin", 4) == [2, 1, 1, 1] and stub.counts("end", 4) == [1] * 4
+    assert "failed.json" not in files(jobs[0].folder(stub.out))
+
+
+def test_a_failed_job_is_reported_by_its_last_words_and_does_not_stop_the_others(stub, capsys):
+    stub.block("fail", 1)
+    ask = [str(stub.written(3)), "--out", str(stub.out)]
+    assert main(ask, stub.command) == 1
+    said = capsys.readouterr()
+    line = next(line for line in said.err.splitlines() if "job 1" in line)
+    assert "exit code 5: the last line" in line and "1 failed" in line
+    shown = said.out.splitlines()
+    assert [row.split()[2] for row in shown[:3]] == ["done", "failed", "done"]
+    assert shown[1].endswith("exit code 5: the last line") and shown[3] == "3 jobs: 2 done, 1 failed"
+    folder = stub.jobs(3)[1].folder(stub.out)
+    assert json.loads((folder / "failed.json").read_text())["code"] == 5
+    assert "first words" in (folder / "log.txt").read_text()
+    assert main([*ask, "--quiet"], stub.command) == 1  # it is tried again
+    said = capsys.readouterr()
+    assert said.out == "" and "the last line" in said.err
+    stub.free()
+    assert main([*ask, "--quiet"], stub.command) == 0
+    assert capsys.readouterr() == ("", "")
+    assert stub.counts("begin", 3) == [1, 3, 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, number):
+    stub.block("hold", 0)
+    driver = stub.driver(2)
+    until(lambda: stub.noted("begin"))
+    time.sleep(0.1)
+    driver.send_signal(number)
+    said, _ = driver.communicate()
+    assert driver.returncode == 130 and "run again to continue" in said and "Traceback" not in said
+    assert stub.counts("interrupted", 2) == [1, 0] and stub.counts("begin", 2) == [1, 0]
+    folder = stub.jobs(2)[0].folder(stub.out)
+    assert files(folder) == ["checkpoint.npz", "job.toml", "log.txt"]
+    stub.free()
+    assert stub.run(2)[0] == ["done", "done"]
+    assert stub.counts("checkpoint", 2) == [1, 0]
+    assert json.loads((folder / "done.json").read_text())["resumed"] is True
+
+
+@pytest.mark.parametrize("state", ["unusable", "other"])
+def test_a_checkpoint_that_is_no_use_is_removed_for_a_second_try(state, stub):
+    one = stub.jobs(1)[0]
+    one.folder(stub.out).mkdir(parents=True)
+    (one.folder(stub.out) / "checkpoint.npz").write_text(state)
+    assert stub.run(1)[0] == ["done"]
+    assert stub.counts("begin", 1) == [2] and stub.counts("checkpoint", 1) == [1]
+
+
+def test_a_checkpoint_outlives_a_full_disk(stub):
+    """Any other input error ends with 3, too."""
+    one = stub.jobs(1)[0]
+    one.folder(stub.out).mkdir(parents=True)
+    (one.folder(stub.out) / "checkpoint.npz").write_text("full")
+    assert stub.run(1)[0] == ["failed"] and stub.counts("begin", 1) == [1]
+    assert (one.folder(stub.out) / "checkpoint.npz").read_text() == "full"
+    assert len(json.loads((one.folder(stub.out) / "failed.json").read_text())["error"]) < 350
+
+
+def test_what_a_checkpoint_that_is_no_use_is_told_by_is_what_envedit_says(tmp_path):
+    what = checkpoint.digest(config.from_dict({}), "", [])
+    (tmp_path / checkpoint.NAME).write_bytes(b"no archive")
+    with pytest.raises(InputError) as said:
+        checkpoint.load(tmp_path, what)
+    assert process._USELESS[0] in str(said.value)
+    checkpoint.save(tmp_path, what, adam_loop.State(), {}, {}, np.zeros((1, 1, 3), np.float32))
+    with pytest.raises(InputError) as said:
+        checkpoint.load(tmp_path, "other")
+    assert process._USELESS[1] in str(said.value)
+
+
+def test_two_drivers_do_not_do_the_same_job(stub):
+    stub.block("hold", 0)
+    driver = stub.driver(3)
+    until(lambda: stub.noted("begin"))
+    found = []
+    other = threading.Thread(target=lambda: found.append(stub.run(3, workers=1)))
+    other.start()
+    until(lambda: stub.counts("end", 3) == [0, 1, 1])  # what is not held is done meanwhile
+    stub.free()
+    other.join()
+    said, _ = driver.communicate()
+    assert driver.returncode == 0, said
+    states, said = found[0]
+    assert states[0] == "skipped" and f"job 0: waiting, process {driver.pid} on" in said
+    assert stub.counts("begin", 3) == stub.counts("end", 3) == [1, 1, 1]
+
+
+def test_a_failure_that_another_driver_met_is_not_repeated_by_the_one_that_waited(stub):
+    one = stub.jobs(1)[0]
+    stub.block("fail", 0)
+    assert stub.run(1)[0] == ["failed"]
+    found = run_job(one, stub.out, stub.command, 1, waited=True)
+    assert (found.state, found.error) == ("failed", "exit code 5: the last line")
+    assert stub.counts("begin", 1) == [1]
+
+
+def test_a_job_whose_lock_was_taken_away_is_ended(stub, monkeypatch):
+    monkeypatch.setattr(locks, "BEAT", 0.3)
+    one = stub.jobs(1)[0]
+    stub.block("hold", 0)
+    found = []
+    thread = threading.Thread(target=lambda: found.append(run_job(one, stub.out, stub.command, 1)))
+    thread.start()
+    (_, pid), *_ = until(lambda: stub.noted("begin"))
+    (lock,) = one.folder(stub.out).glob("lock-*")
+    until(lambda: [os.getpid(), pid] == [one for one, _ in json.loads(lock.read_text())["processes"]])
+    lock.unlink()
+    thread.join()
+    assert found[0].state == "held" and dead(pid)
+    assert files(one.folder(stub.out)) == ["job.toml", "log.txt"]
+
+
+def test_jobs_of_the_same_content_run_once(stub):
+    jobs = [job("a", "seed = 0"), job("b", "seed = 0\n[input]\nwidth = 256"), job("c", "seed = 1")]
+    assert stub.run(jobs=jobs)[0] == ["done"] * 3
+    assert stub.counts("begin", 2) == [1, 1]
+    with pytest.raises(ConfigError, match="two jobs are called a"):
+        stub.run(jobs=[jobs[0], jobs[0]])
+
+
+def test_a_folder_that_cannot_be_written_to_is_an_error_on_one_line(stub, capsys):
+    (stub.folder / "file").write_text("")
+    assert main([str(stub.written(1)), "--out", str(stub.folder / "file" / "x")], stub.command) == 3
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    one = stub.jobs(1)[0]
+    stub.out.mkdir()
+    one.folder(stub.out).write_text("")  # a job's folder is a file: that job fails, the others do not
+    states, said = stub.run(2)
+    assert states == ["failed", "done"] and "cannot be made" in said
+
+
+def test_a_command_that_does_not_exist_is_a_failure(stub):
+    stub.command = ("/no/such/program", "{folder}")
+    states, said = stub.run(1)
+    assert states == ["failed"] and "No such file" in said
+
+
+# ---- threads -----------------------------------------------------------------------------------------------
+
+
+def test_cores_are_divided_among_the_jobs(stub, monkeypatch):
+    monkeypatch.setattr(drive, "cores", lambda: 11)
+    stub.command = (
+        "{python}",
+        "-S",
+        "-c",
+        "import os, sys; print(*sys.argv[1:], os.environ['OMP_NUM_THREADS'])",
+    )
+    stub.command += ("{threads}",)
+    together = threading.Barrier(3)
+    took = []
+
+    def run(one, threads, stop, waited):
+        together.wait(20)
+        took.append(threads)
+        return run_job(one, stub.out, stub.command, threads, stop, waited)
+
+    engine = drive.Processes(run, 3, None)
+    jobs = stub.jobs(3)
+    try:
+        outcomes = [engine.outcome(one, f) for one, f in [(one, engine.submit(one)) for one in jobs]]
+    finally:
+        engine.close()
+    assert [one.state for one in outcomes] == ["done"] * 3
+    assert sorted(took) == [3, 4, 4]
+    said = [(one.folder(stub.out) / "log.txt").read_text().splitlines()[-1] for one in jobs]
+    assert sorted(said) == ["3 3", "4 4", "4 4"]
+
+
+def test_the_default_is_a_job_for_every_four_cores(stub, monkeypatch):
+    for number, said in (
+        (1, "1 at a time, 1 threads"),
+        (3, "1 at a time, 3 threads"),
+        (13, "3 at a time, 4.33"),
+    ):
+        monkeypatch.setattr(drive, "cores", lambda number=number: number)
+        seeds = [job(f"{number} {i}", f"seed = {100 * number + i}") for i in range(4)]
+        assert said in stub.run(jobs=seeds)[1]
+
+
+def test_drjit_takes_the_number_of_threads(stub):
+    run = "from envedit.run import main; sys.exit(main())"
+    assert run in COMMAND[2]
+    show = (
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
+        "print(drjit.thread_count(), sys.argv[1:], file=sys.stderr); sys.exit(1)"
+    )
+    stub.command = (*COMMAND[:2], COMMAND[2].replace(run, show), *COMMAND[3:])
+    one = stub.jobs(1)[0]
+    error = run_job(one, stub.out, stub.command, threads=5).error
+    folder = one.folder(stub.out)
+    assert error == f"exit code 1: 5 ['{folder}/job.toml', '--out', '{folder}', '--resume']"
+
+
+# ---- jobs --------------------------------------------------------------------------------------------------
+
+
+def test_the_key_is_that_of_content_and_not_of_names_or_places(tmp_path):
+    keys = {}
+    for place in ("here", "there"):
+        folder = tmp_path / place
+        folder.mkdir()
+        (folder / "map.exr").write_bytes(b"a map")
+        write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
+        text = f'[input]\nenvmap = "map.exr"\n[scene]\nfile = "scene.xml"\n[output]\ndir = "{place}"'
+        keys[place] = job(place, text, folder)
+    assert keys["here"].key == keys["there"].key and re.fullmatch("[0-9a-f]{32}", keys["here"].key)
+    loaded = config.loads(keys["here"].toml)
+    assert loaded.input.envmap == str(tmp_path / "here" / "map.exr")
+    (tmp_path / "there" / "map.exr").write_bytes(b"another map")
+    assert job("there", text, tmp_path / "there").key != keys["here"].key
+    assert job("x", {"seed": 1}).key == job("y", "seed = 1").key != job("x", "seed = 2").key
+    assert job("x", "").key == job("x", 'preset = "standard"').key != job("x", 'preset = "draft"').key
+    # A map that is not there is not known by its content, and one of another name is another one.
+    gone = [job("x", f'[input]\nenvmap = "{name}"', tmp_path).key for name in ("p.exr", "q.exr")]
+    assert gone[0] != gone[1]
+
+
+def test_files_that_a_scene_names_count(tmp_path):
+    mesh = '<shape type="ply"><string name="filename" value="ball.ply"/></shape>'
+    write_scene(tmp_path, SENSOR, '<include filename="part.xml"/>', LIGHT, name="scene.xml")
+    write_scene(tmp_path, mesh, name="part.xml")
+    text = '[scene]\nfile = "scene.xml"'
+    keys = [job("x", text, tmp_path).key]
+    for content in ("one", "two"):
+        (tmp_path / "ball.ply").write_text(content)
+        keys.append(job("x", text, tmp_path).key)
+    assert len(set(keys)) == 3
+    shipped = {name: job("x", f'[scene]\nfile = "{name}"').key for name in ("sphere", "matte")}
+    assert shipped["sphere"] != shipped["matte"]
+
+
+def test_files_in_scene_parameters_are_found_from_the_job_s_folder_too(tmp_path):
+    (tmp_path / "mesh.ply").write_text("one")
+    text = '[scene]\nfile = "mesh"\nparameters = { mesh = "mesh.ply", kind = "rough" }'
+    made = job("x", text, tmp_path)
+    parameters = config.loads(made.toml).scene.parameters
+    assert dict(parameters) == {"mesh": str(tmp_path / "mesh.ply"), "kind": "rough"}
+    (tmp_path / "mesh.ply").write_text("two")
+    assert job("x", text, tmp_path).key != made.key
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mesh.ply").write_text("one")
+    assert job("x", text, other).key == made.key
+
+
+def test_jobs_are_read_from_a_file_and_from_a_folder(tmp_path):
+    (tmp_path / "jobs.toml").write_text(
+        "[common]\nseed = 3\n[common.fit]\nepochs = 7\n"
+        '[jobs.a]\n[jobs."b c".fit]\nlr = 0.1\n[jobs.d]\nseed = 4\n'
+    )
+    jobs = read_jobs(tmp_path / "jobs.toml")
+    assert [one.name for one in jobs] == ["a", "b c", "d"]
+    loaded = [config.loads(one.toml) for one in jobs]
+    assert [one.seed for one in loaded] == [3, 3, 4] and {one.fit.epochs for one in loaded} == {7}
+    assert loaded[1].fit.lr == 0.1
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "b.toml").write_text("seed = 2")
+    (folder / "a.toml").write_text("[fit]\nepochs = 7\n[input]\nenvmap = '../x.exr'")
+    jobs = read_jobs(folder)
+    assert [one.name for one in jobs] == ["a", "b"]
+    assert Path(config.loads(jobs[0].toml).input.envmap).resolve() == tmp_path / "x.exr"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no job in it"), ("jobs = 3", "no job in it"), ("[jobs]\na = 1", "a: wanted a table"),
+        ("common = 1\n[jobs.a]", "common: wanted a table"), ("[job.a]", "unknown table or key job"),
+        ("[jobs.a]\nsede = 1", "job a: unknown table or key sede; did you mean seed?"), ("[[", "not TOML"),
+        ("[jobs.a.fit]\nepochs = -1", "epochs"), ('[jobs."a\\n"]', "printable"), ('[jobs.""]', "printable"),
+    ],
+)  # fmt: skip
+def test_a_file_of_jobs_that_is_not_usable_is_an_error_on_one_line(tmp_path, capsys, text, words):
+    (tmp_path / "jobs.toml").write_text(text)
+    assert main([str(tmp_path / "jobs.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert words in said and len(said.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_jobs_that_are_not_there_are_an_error(tmp_path, capsys):
+    for path in (tmp_path, tmp_path / "none.toml"):
+        assert main([str(path), "--out", str(tmp_path / "out")]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    (tmp_path / "map.exr").write_text("")
+    (tmp_path / "map.exr").chmod(0)
+    if not os.access(tmp_path / "map.exr", os.R_OK):  # root reads everything
+        with pytest.raises(InputError, match="map.exr"):
+            job("x", '[input]\nenvmap = "map.exr"', tmp_path)
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--workers", "0"], ["--threads", "-1"], ["--workers", "2", "--scheduler", "x"]]
+)
+def test_usage(wrong, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([str(tmp_path), "--out", str(tmp_path), *wrong])
+    assert stop.value.code == 2 and wrong[-2] in capsys.readouterr().err
+
+
+# ---- locks -------------------------------------------------------------------------------------------------
+
+
+def lock_of(folder, host, processes, age=0.0):
+    path = folder / "lock-0"
+    path.write_text(json.dumps({"host": host, "processes": processes}))
+    then = time.time() - age
+    os.utime(path, (then, then))
+    return path
+
+
+def holder(folder):
+    with locks.Lock(folder) as lock:
+        return lock.holder
+
+
+def test_a_lock_is_held_until_it_is_given_back(tmp_path):
+    with locks.Lock(tmp_path) as first:
+        assert not first.holder
+        assert holder(tmp_path) == f"process {os.getpid()} on {socket.gethostname()}"
+        assert len(list(tmp_path.iterdir())) == 1
+    assert holder(tmp_path) == "" and list(tmp_path.iterdir()) == []
+
+
+def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
+    gone = subprocess.Popen(["true"])
+    started = locks._started(gone.pid)
+    gone.wait()
+    path = lock_of(tmp_path, locks._host(), [[gone.pid, started]])
+    assert holder(tmp_path) == "" and not path.exists()
+    # The process id is in use again, by somebody who started at another time.
+    if locks._started(os.getpid()):
+        lock_of(tmp_path, locks._host(), [[os.getpid(), 1]])
+        assert holder(tmp_path) == ""
+    # One of its processes lives: the driver died, its job did not.
+    mine = [os.getpid(), locks._started(os.getpid())]
+    path = lock_of(tmp_path, locks._host(), [[gone.pid, started], mine], age=1e6)
+    assert str(os.getpid()) in holder(tmp_path) and path.exists()
+
+
+def test_a_zombie_holds_nothing(tmp_path):
+    gone = subprocess.Popen(["true"])
+    started = locks._started(gone.pid)
+    until(lambda: os.waitid(os.P_PID, gone.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG))
+    lock_of(tmp_path, locks._host(), [[gone.pid, started or 1]])
+    assert (holder(tmp_path) == "") or sys.platform != "linux"
+    gone.wait()
+
+
+def test_the_lock_of_another_machine_lives_by_its_age(tmp_path):
+    path = lock_of(tmp_path, "elsewhere pid:[1]", [[1, 2]], age=locks.LOST - 20)
+    assert holder(tmp_path) == "process 1 on elsewhere" and path.exists()
+    lock_of(tmp_path, "elsewhere pid:[1]", [[1, 2]], age=locks.LOST + 20)
+    assert holder(tmp_path) == "" and not path.exists()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"host": 1}', '{"host": "x", "processes": 3}'])
+def test_a_lock_that_cannot_be_read_is_respected_for_a_while(tmp_path, content):
+    path = tmp_path / "lock-x"
+    path.write_text(content)
+    assert holder(tmp_path) != ""
+    os.utime(path, (1, 1))
+    assert holder(tmp_path) == "" and not path.exists()
+
+
+def test_a_sign_of_life_makes_a_lock_young_again(tmp_path, monkeypatch):
+    with locks.Lock(tmp_path) as lock:
+        (path,) = tmp_path.iterdir()
+        os.utime(path, (1, 1))
+        assert lock.beat() and path.stat().st_mtime == 1  # not yet due
+        monkeypatch.setattr(locks, "BEAT", 0.0)
+        assert lock.beat() and path.stat().st_mtime > time.time() - 100
+        path.unlink()
+        assert not lock.beat()
+
+
+def test_of_many_who_ask_at_once_at_most_one_gets_the_lock(tmp_path):
+    for _ in range(20):
+        gate, got = threading.Barrier(4), []
+
+        def ask(gate=gate, got=got):
+            gate.wait(20)
+            with locks.Lock(tmp_path) as lock:
+                got.append(lock.holder)
+                gate.wait(20)
+
+        threads = [threading.Thread(target=ask) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert got.count("") <= 1 and len(got) == 4
+        assert list(tmp_path.iterdir()) == []
+
+
+# ---- progress ----------------------------------------------------------------------------------------------
+
+
+def test_lines_tell_how_far_it_has_come_and_when_it_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.sweep.board.time.time", lambda: 1e9)
+    made = [job(f"j{i}", f"seed = {i}") for i in range(6)]
+    said = io.StringIO()
+    board = Board(6, 2, False, said)
+    board.begin("6 jobs")
+    clock = time.strftime("%H:%M", time.localtime(1e9 + 2.5 * 40))
+    board.tell(Outcome(made[0], "done", 40.0), tmp_path)
+    board.tell(Outcome(made[1], "failed", 400.0, "exit code 3: no"), tmp_path)
+    for one in made[2:5]:
+        board.tell(Outcome(one, "skipped"), tmp_path)
+    board.tell(Outcome(made[5], "done", 8.0), tmp_path)
+    lines = said.getvalue().splitlines()
+    assert lines[0] == "6 jobs"
+    assert lines[1] == f"[1/6] j0: done, 40 s; about 100 s left, until {clock}".replace("100 s", "2 min")
+    assert lines[2].startswith(f"[2/6] j1: failed, 400 s: exit code 3: no ({tmp_path}")
+    assert "; 1 failed, about 7 min left" in lines[2]  # 4 jobs, 2 at a time, 220 s each
+    assert lines[5].startswith("[5/6] j4: skipped; 1 failed, about 4 min left")  # one is left: one at a time
+    assert lines[6] == "[6/6] j5: done, 8 s; 1 failed"
+
+
+def test_without_known_slots_the_end_is_estimated_from_the_rate(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("experiments.sweep.board.time.monotonic", lambda: now[0])
+    said = io.StringIO()
+    board = Board(10, None, False, said)
+    now[0] = 50.0
+    for i in range(5):
+        board.tell(Outcome(job(f"j{i}", f"seed = {i}"), "done", 40.0), tmp_path)
+    assert "about 50 s left" in said.getvalue().splitlines()[-1]
+
+
+def test_that_the_scheduler_is_gone_is_said_once(tmp_path):
+    said = io.StringIO()
+    board = Board(3, None, False, said)
+    for i in range(3):
+        board.tell(Outcome(job(f"j{i}", f"seed = {i}"), "lost", error="the scheduler went away"), tmp_path)
+    assert said.getvalue() == "the scheduler went away: run again to complete the table\n"
+
+
+def test_a_terminal_gets_a_bar_and_quiet_nothing(tmp_path):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    said = Terminal()
+    board = Board(2, 1, False, said)
+    board.begin("2 jobs")
+    board.tell(Outcome(job("a", ""), "done", 40.0), tmp_path)
+    board.tell(Outcome(job("b", ""), "failed", 1.0, "why"), tmp_path)
+    board.refresh()
+    board.close()
+    assert "2/2 |" in said.getvalue() and "about 40 s left" in said.getvalue()
+    assert "b: failed, 1 s: why" in said.getvalue() and "a: done" not in said.getvalue()
+    quiet = Terminal()
+    board = Board(1, 1, True, quiet)
+    board.begin("1 job")
+    board.tell(Outcome(job("a", ""), "failed", 1.0), tmp_path)
+    board.close()
+    assert quiet.getvalue() == ""
+
+
+def test_the_table_has_a_line_for_each_job():
+    outcomes = [Outcome(job("long name", ""), "done", 3.25), Outcome(job("x", "seed=1"), "lost", 0, "why")]
+    lines = table(outcomes).splitlines()
+    assert lines[0] == f"long name  done          3.2 s  {outcomes[0].job.key}"
+    assert lines[1].startswith("x          lost   ") and lines[1].endswith("  why")
+    assert lines[2] == "2 jobs: 1 done, 1 lost"
+    assert table([]) == "0 jobs: "
+
+
+# ---- the real run ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_real_run_is_made(tmp_path):
+    tiny = {
+        "input": {"width": 16}, "scene": {"width": 16}, "target": {"spp": 8}, "optimizer": {"iterations": 2},
+        "renderer": {"spp": 16, "max_depth": 2, "cache": False},
+        "output": {"spp": 8, "report": False, "full": False},
+    }  # fmt: skip
+    one = job("tiny", tiny)
+    said = io.StringIO()
+    (outcome,) = sweep([one], tmp_path, threads=1, stream=said)
+    assert outcome.state == "done", (one.folder(tmp_path) / "log.txt").read_text()
+    left = files(one.folder(tmp_path))
+    assert {"metrics.json", "edited.exr", "config.toml", "job.toml", "done.json", "log.txt"} <= set(left)
+    assert not [name for name in left if name.startswith(("earlier", "lock", "checkpoint"))]
+    # done.json is lost: the run itself knows that it is complete.
+    (one.folder(tmp_path) / "done.json").unlink()
+    before = (one.folder(tmp_path) / "metrics.json").stat().st_mtime_ns
+    assert sweep([one], tmp_path, threads=1, stream=said)[0].state == "done"
+    assert (one.folder(tmp_path) / "metrics.json").stat().st_mtime_ns == before
+
+
+# ---- on a Dask cluster -------------------------------------------------------------------------------------
+
+dask = pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None,
+    reason="dask.distributed is missing: pip install .[cluster]",
+)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is not None, reason="dask.distributed is there")
+def test_without_dask_the_option_says_what_to_install(stub, capsys):
+    ask = [str(stub.written(1)), "--out", str(stub.out), "--scheduler", "tcp://127.0.0.1:1"]
+    assert main(ask, stub.command) == 2
+    assert "pip install 'envedit[cluster]'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def cluster(stub):
+    """A scheduler and a way to start workers, real processes; ended with the test."""
+    started = []
+
+    def start(*arguments):
+        log = open(stub.folder / f"dask-{len(started)}.log", "wb")  # noqa: SIM115
+        command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
+        started.append(subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log))
+        log.close()
+        return started[-1]
+
+    place = stub.folder / "scheduler.json"
+    local = ("--host", "127.0.0.1", "--no-dashboard")
+    scheduler = start("scheduler", *local, "--port", "0", "--scheduler-file", str(place))
+    until(place.exists)
+    address = until(lambda: place.read_text() and json.loads(place.read_text())["address"])
+    space = ("--local-directory", str(stub.folder), "--nthreads", "1", "--no-nanny")
+    yield address, scheduler, lambda: start("worker", address, *local, *space)
+    for one in started:
+        one.kill()
+        one.wait()
+
+
+@dask
+@linux
+def test_jobs_run_on_a_cluster_and_the_death_of_a_worker_costs_what_it_was_at(stub, cluster):
+    address, _, worker = cluster
+    stub.block("hold", 0, 1)
+    workers = {one.pid: one for one in (worker(), worker())}
+    driver = stub.driver(5, "--scheduler", address)
+    until(lambda: {seed for seed, _ in stub.noted("begin")} == {0, 1}, 60)
+    victim = stub.noted("begin")[0][1]
+    parent = int(Path(f"/proc/{victim}/stat").read_text().rpartition(")")[2].split()[1])
+    workers[parent].kill()
+    until(lambda: dead(victim))
+    until(lambda: len(stub.noted("begin")) >= 3 or stub.free(), 60)
+    stub.free()
+    said, _ = driver.communicate(timeout=60)
+    assert driver.returncode == 0, said
+    assert stub.counts("end", 5) == [1] * 5
+    assert sorted(stub.counts("begin", 5)) == [1, 1, 1, 1, 2]
+    assert stub.run(5)[0] == ["skipped"] * 5
+
+
+@dask
+def test_the_death_of_the_scheduler_costs_what_was_in_flight(stub, cluster):
+    address, scheduler, worker = cluster
+    stub.block("hold", 1)
+    worker()
+    driver = stub.driver(4, "--scheduler", address)
+    until(lambda: 1 in dict(stub.noted("begin")), 60)
+    before = stub.counts("end", 4)
+    scheduler.kill()
+    said, _ = driver.communicate(timeout=60)
+    assert driver.returncode == 1 and said.count("the scheduler went away: run again") == 1, said
+    assert "Traceback" not in said
+    stub.free()
+    assert set(stub.run(4)[0]) <= {"done", "skipped"}
+    assert stub.counts("end", 4) == [1] * 4
+    assert all(begun == 1 for begun, ended in zip(stub.counts("begin", 4), before, strict=True) if ended)
+    assert max(stub.counts("begin", 4)) <= 2
+
+
+@dask
+def test_the_death_of_the_driver_costs_a_cluster_nothing_that_runs(stub, cluster):
+    address, _, worker = cluster
+    worker()
+    stub.block("hold", 1)
+    driver = stub.driver(4, "--scheduler", address)
+    until(lambda: 1 in dict(stub.noted("begin")), 60)
+    driver.kill()
+    driver.communicate()
+    again = stub.driver(4, "--scheduler", address)
+    time.sleep(0.5)
+    stub.free()
+    said, _ = again.communicate(timeout=60)
+    assert again.returncode == 0, said
+    assert stub.counts("begin", 4) == stub.counts("end", 4) == [1] * 4
+
+
+@dask
+def test_a_cluster_reports_failures_and_an_address_where_nobody_is(stub, cluster):
+    address, _, worker = cluster
+    worker()
+    stub.block("fail", 1)
+    driver = stub.driver(2, "--scheduler", address)
+    said, _ = driver.communicate(timeout=60)
+    assert driver.returncode == 1 and "job 1: failed, 0 s: exit code 5: the last line" in said, said
+    driver = stub.driver(3, "--scheduler", "tcp://127.0.0.1:1")
+    said, _ = driver.communicate(timeout=60)
+    assert driver.returncode == 2 and "no scheduler there" in said, said
+    driver = stub.driver(3, "--scheduler", "nonsense://x:1")
+    said, _ = driver.communicate(timeout=60)
+    assert driver.returncode == 2 and "wanted HOST:PORT" in said, said

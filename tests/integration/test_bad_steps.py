@@ -1,0 +1,372 @@
+"""Values that are not finite, put in at every stage of an edit: what is skipped, counted, stopped, kept."""
+
+import dataclasses
+import json
+import math
+import types
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit import config, pipeline, representations, results
+from envedit.core.errors import NumericalError
+from envedit.losses import losses, optimizer
+from envedit.report import manifest
+from envedit.scene import scene
+from envedit.solve import adam_loop, edit_job
+from envedit.transport.light_transport import LightTransport
+from tests.oracles.matrix_renderer import arrays, case, same
+from tests.oracles.runs import call, changed, measured, names, pixels, settings_of, sunny, world
+from tests.oracles.tiers import slow_but
+
+pytestmark = pytest.mark.usefixtures("isolated", "own_cache")
+
+TERMS = ("ssim", "luminance", "l1", "tv", "image_l1", "image_l2")
+BAD_VALUES = [math.nan, math.inf]
+
+
+class Hole(dr.CustomOp):
+    """A tensor as it is, whose gradient has one bad element."""
+
+    def eval(self, x, value):
+        self.value = value
+        return mi.TensorXf(x)
+
+    def backward(self):
+        slope = self.grad_out()
+        here = dr.arange(mi.UInt32, len(slope.array)) == 40
+        self.set_grad_in("x", mi.TensorXf(dr.select(here, self.value, slope.array), slope.shape))
+
+
+class Spoiler:
+    """Spoil what a function returns at some of its calls, which are counted."""
+
+    def __init__(self, function, calls, value, how="value"):
+        self.function, self.calls, self.value, self.how, self.count = function, calls, value, how, 0
+
+    def __call__(self, *arguments, **keys):
+        out = self.function(*arguments, **keys)
+        bad, self.count = self.count in self.calls, self.count + 1
+        if not bad:
+            return out
+        if self.how == "slope":
+            return dr.custom(Hole, out, self.value)
+        if not dr.is_tensor_v(out):
+            return out + self.value
+        here = dr.arange(mi.UInt32, len(out.array)) == 40
+        return mi.TensorXf(dr.select(here, self.value, out.array), out.shape)
+
+
+class FakeDists:
+    """Stands for DISTS: the squared difference of display values."""
+
+    def against(self, reference):
+        return lambda shown: dr.mean(dr.square(shown.array - reference.array))
+
+
+def spoiled(stage, calls, value, monkeypatch):
+    """Return what ``optimise`` takes, with one stage spoiled at some steps."""
+    weights = config.Loss(**dict.fromkeys(TERMS, 0.1), dists=0.1)
+    arguments, _ = case(np.random.default_rng(1), weights=weights, iterations=40)
+    representation, params, renderer, objective, original, *rest = arguments
+    picture = objective._target.numpy()
+    objective = adam_loop.Objective(weights, picture, None, original[:3], 40, FakeDists())
+    assert objective.ramps.keys() == {*TERMS, "dists"}
+    where, how = stage.removeprefix("slope of "), "slope" if stage.startswith("slope") else "value"
+    if where == "map":
+        representation.decode = Spoiler(representation.decode, calls, value, how)
+    elif where == "picture":
+        renderer.render = Spoiler(renderer.render, calls, value, how)
+    elif where == "ssim":
+        objective._ssim = Spoiler(objective._ssim, calls, value)
+    elif where == "dists":
+        objective._dists = Spoiler(objective._dists, calls, value)
+    else:
+        monkeypatch.setitem(losses.LOSSES, where, Spoiler(losses.LOSSES[where], calls, value))
+    return representation, params, renderer, objective, original, *rest
+
+
+STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
+
+
+# ---- the loop --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", slow_but(BAD_VALUES, math.nan))
+@pytest.mark.parametrize("stage", STAGES)
+def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):
+    arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
+    seen.append(arrays(arguments[1]))
+    params, state = adam_loop.optimise(
+        *arguments, after_step=lambda _, adam: seen.append(arrays(adam.params))
+    )
+    assert (state.step, state.bad_steps, state.bad_in_a_row) == (40, 3, 0)
+    assert same(seen[6], seen[4]) and same(seen[7], seen[4]) and same(seen[13], seen[11])
+    rates = [row["lr"] for row in state.history]
+    assert rates[6] == rates[5] / 2 and rates[7] == rates[5] / 4 and rates[13] < 0.51 * rates[12]
+    assert rates[39] == rates[0]  # won back
+    assert all(np.isfinite(values).all() for values in arrays(params).values())
+    assert state.history[-1]["loss"] < state.history[0]["loss"]
+    slope = stage.startswith("slope")
+    for row in state.history:
+        assert math.isfinite(row["loss"]) == (slope or row["iteration"] not in (5, 6, 12))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stage, monkeypatch):
+    arguments = spoiled(stage, range(5, 1000), math.nan, monkeypatch)
+    adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[-1].beta2)), adam_loop.State()
+    with pytest.raises(NumericalError, match="iteration 24: 20 steps in a row") as info:
+        adam_loop.optimise(*arguments, adam=adam, state=state)
+    assert info.value.exit_code == 5 and state.bad_steps == 20 and len(state.history) == 24
+    monkeypatch.undo()
+    good = spoiled("map", (), 0, monkeypatch)
+    expected, _ = adam_loop.optimise(*good[:-1], config.Optimizer(iterations=4, lr=0.02, schedule="constant"))
+    assert same(arrays(adam.params), arrays(expected))
+
+
+@pytest.mark.parametrize("value", BAD_VALUES)
+@pytest.mark.parametrize("part", ["_m", "_v"])
+def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):
+    """One bad element, as a faulty memory makes it. An infinite v alone would give steps of zero for ever."""
+    arguments, _ = case(np.random.default_rng(0), iterations=60)
+    adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), adam_loop.State()
+
+    def spoil(state, adam):
+        if state.step == 5:
+            moments = getattr(adam, part)
+            bad = moments["log_radiance"].numpy()
+            bad[1, 2, 0] = value
+            moments["log_radiance"] = dr.opaque(mi.TensorXf(bad))
+
+    with pytest.raises(NumericalError, match="iteration 24"):
+        adam_loop.optimise(*arguments, adam=adam, state=state, after_step=spoil)
+    assert state.bad_steps == 20
+    assert all(np.isfinite(values).all() for values in arrays(adam.params).values())
+
+
+def test_a_step_to_parameters_that_are_not_finite_is_refused():
+    adam = optimizer.Adam({"p": mi.TensorXf([1.0, 3e38])}, lr=1.0)
+    good = {"p": mi.TensorXf([1.0, 1.0])}
+    before = adam.state_dict()
+    assert not adam.step({"p": mi.TensorXf([1.0, -1.0])}, lr=3e38)  # 3e38 + 3e38 is infinite
+    assert all(np.array_equal(before[key], value) for key, value in adam.state_dict().items())
+    assert adam.step(good) and np.isfinite(np.array(adam.params["p"])).all()
+
+
+def test_a_step_that_is_taken_back_leaves_the_moments():
+    adam = optimizer.Adam({"p": mi.TensorXf([1.0, 2.0])}, lr=0.1)
+    slope = {"p": mi.TensorXf([1.0, -1.0])}
+    adam.take_back()
+    assert np.array_equal(np.array(adam.params["p"]), [1, 2])
+    adam.step(slope)
+    first = adam.state_dict()
+    adam.step(slope)
+    moved = adam.state_dict()
+    for _ in range(2):
+        adam.take_back()
+        state = adam.state_dict()
+        assert np.array_equal(state["params/p"], first["params/p"])
+        assert all(np.array_equal(state[key], moved[key]) for key in ("m/p", "v/p", "step"))
+
+
+class Steep:
+    """Radiance is exp(x), with nothing that holds x: a long step ends in infinity."""
+
+    lr = 0.01
+
+    def encode(self, image, seed=0):
+        return {"log": dr.opaque(mi.TensorXf(np.log(image)))}
+
+    def decode(self, params):
+        return dr.exp(params["log"])
+
+
+def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
+    """Without going back the parameters would stay where the radiance is infinite, whatever the rate."""
+    arguments, _ = case(np.random.default_rng(0), iterations=80)
+    _, _, renderer, objective, original, first, _ = arguments
+    steep = Steep()
+    settings = config.Optimizer(iterations=80, lr=2000.0, schedule="cosine")
+    adam, state = optimizer.Adam(steep.encode(original[:3]), 2000.0, (0.9, settings.beta2)), adam_loop.State()
+    params, state = adam_loop.optimise(
+        steep, adam.params, renderer, objective, original, first, settings, adam=adam, state=state
+    )
+    assert 4 <= state.bad_steps < 40 and state.step == 80
+    assert np.isfinite(steep.decode(params).numpy()).all()
+
+
+# ---- an edit in progress ---------------------------------------------------------------------------------
+
+
+def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
+    """Neither is one that stops, nor the first by default if it is they."""
+    lost = object()
+    ends = {0: 1.0, 1: math.nan, 2: 0.5, 3: lost}
+    monkeypatch.setattr(adam_loop, "Objective", lambda *_: None)
+
+    def ended(self, params, *_):
+        if ends[params] is lost:
+            raise NumericalError("it stopped")
+        return None, adam_loop.State(history=[{"loss": ends[params]}])
+
+    monkeypatch.setattr(edit_job.Job, "_loop", ended)
+    wanted = types.SimpleNamespace(aim=None, weight=None)
+    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, edit_job.Watch())
+    for order, best in (((0, 1, 2, 3), 2), ((1, 0, 2), 2), ((3, 1, 0), 0), ((1, 3), 1), ((0, 1, 3), 0)):
+        params, notes = work.best([(i, [f"start {i}"]) for i in order], None)
+        assert params == best and f"start {order.index(best) + 1} of {len(order)}" in notes[-1]
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """Record the parameters that ``Pixels`` decodes; those listed in ``recorded.bad`` decode to NaN."""
+    decode, seen = representations.Pixels.decode, types.SimpleNamespace(all=[], bad=set())
+
+    def noted(self, params):
+        values = np.array(dr.detach(params["radiance"]))
+        seen.all.append(values)
+        crop = decode(self, params)
+        return crop * math.nan if values.tobytes() in seen.bad else crop
+
+    monkeypatch.setattr(representations.Pixels, "decode", noted)
+    return seen
+
+
+PIXELS = {"representation": {"kind": "pixels"}, "optimizer": {"iterations": 6}}
+
+
+def test_a_last_step_that_leads_to_no_map_is_taken_back(tmp_path, rng, recorded):
+    settings = settings_of(tmp_path, sunny(rng), **PIXELS)
+    whole = pipeline.run(settings)
+    assert whole.metrics["non_finite_steps"] == 0
+    steps = recorded.all[:6]
+    recorded.bad.add(recorded.all[6].tobytes())
+    found = pipeline.run(settings)
+    assert found.metrics["non_finite_steps"] == 1 and found.metrics["iterations"] == 6
+    assert np.array_equal(found.envmap[:4], np.maximum(steps[-1], 0))
+    assert np.array_equal(found.envmap[4:], whole.envmap[4:])
+
+
+def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypatch):
+    original, decode = sunny(rng), representations.Pixels.decode
+    monkeypatch.setattr(
+        representations.Pixels, "decode", lambda self, params: decode(self, params) * math.nan
+    )
+    settings = settings_of(tmp_path, original, **PIXELS)
+    for iterations, message in (
+        (40, "20 steps in a row"),
+        (6, "not finite at row 0, column 0"),
+        (0, "row 0"),
+    ):
+        few = dataclasses.replace(settings, optimizer=config.Optimizer(iterations=iterations))
+        with pytest.raises(pipeline.Stopped, match=message) as stop:
+            pipeline.run(few)
+        assert stop.value.exit_code == 5 and stop.value.envmap.tobytes() == original.tobytes()
+
+
+@pytest.mark.slow
+def test_the_path_tracer_hides_no_bad_slope(tmp_path, rng, monkeypatch):
+    """It adds gradients with atomics, which drop NaN on LLVM: the parameters' gradients are all finite."""
+    weigh = adam_loop.Objective.__call__
+
+    def with_hole(self, rendering, crop, step):
+        return weigh(self, dr.custom(Hole, rendering, math.nan) if step == 2 else rendering, crop, step)
+
+    monkeypatch.setattr(adam_loop.Objective, "__call__", with_hole)
+    tables = PIXELS | {"renderer": {"kind": "path", "spp": 4, "max_depth": 3}}
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), **tables))
+    assert found.metrics["non_finite_steps"] == 1 and np.isfinite(found.envmap).all()
+
+
+# ---- the command line ------------------------------------------------------------------------------------
+
+
+def spoil_renderer(monkeypatch, steps):
+    render = LightTransport.render
+
+    def spoiled(self, envmap, step):
+        return render(self, envmap, step) * dr.opaque(mi.Float, math.nan if step in steps else 1)
+
+    monkeypatch.setattr(LightTransport, "render", spoiled)
+
+
+@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
+def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
+    spoil_renderer(monkeypatch, {1, 4})
+    path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
+    assert call(path, "--quiet", *changed(optimizer__iterations=6)) == 0
+    assert measured(out)["non_finite_steps"] == 2 and measured(out)["iterations"] == 6
+    lines = (out / "history.csv").read_text().splitlines()
+    empty = [i for i, line in enumerate(lines[1:]) if line.split(",")[1] == ""]
+    assert empty == [1, 4] and (out / "report.html").stat().st_size > 0
+    assert np.isfinite(pixels(out / "edited.exr")).all()
+
+
+def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch, capsys, recorded):
+    spoil_renderer(monkeypatch, range(5, 1000))
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet", *changed(optimizer__iterations=60)) == 5
+    said = capsys.readouterr().err
+    assert "20 steps in a row" in said and "last good map is kept" in said and len(said.splitlines()) <= 2
+    last_good = np.maximum(recorded.all[4], 0)  # decoded for step 4, the last with a finite loss
+    assert not np.array_equal(recorded.all[4], recorded.all[3])
+    assert np.array_equal(pixels(out / "edited.exr")[:4], last_good)
+    assert names(out) == {"edited.exr"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["judged rendering", "metrics", "transport's error"])
+def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+
+    def fails(*arguments, **keys):
+        raise NumericalError(f"{stage}: not finite at row 1, column 2")
+
+    sampled = scene.Scene.sampled
+
+    def judged_fails(self, envmap, spp, seed):
+        return fails() if seed == pipeline.JUDGE_SEED + 1 else sampled(self, envmap, spp, seed)
+
+    if stage == "judged rendering":
+        monkeypatch.setattr(scene.Scene, "sampled", judged_fails)
+    elif stage == "metrics":
+        monkeypatch.setattr(pipeline.metrics, "compare", fails)
+    else:
+        monkeypatch.setattr(LightTransport, "coarse_error", fails)
+    assert call(path, "--quiet") == 5
+    said = capsys.readouterr().err
+    assert "row 1, column 2" in said and len(said.splitlines()) <= 2
+    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
+    assert names(out) == {"edited.exr", "checkpoint.npz"}
+
+
+def test_a_metric_that_is_not_finite_is_null_and_told(tmp_path, rng, monkeypatch, capsys):
+    compare = pipeline.metrics.compare
+    monkeypatch.setattr(pipeline.metrics, "compare", lambda *a: compare(*a) | {"ssim": math.nan})
+    path = world(tmp_path, rng, representation={"kind": "pixels"})
+    assert call(path, "--quiet") == 0
+    assert measured(tmp_path / "c_out")["render"]["ssim"] is None
+    assert "metrics.json: render.ssim was not finite and is null" in capsys.readouterr().err
+
+
+def test_a_full_map_that_is_not_finite_does_not_cost_the_result(tmp_path, rng, monkeypatch, capsys):
+    def fails(*arguments):
+        raise NumericalError("the carried map is not finite at row 3, column 4")
+
+    monkeypatch.setattr(results, "at_full_resolution", fails)
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    said = capsys.readouterr().err
+    assert "edited_full.exr is not written" in said and "row 3, column 4" in said
+    assert "metrics.json" in names(out) and "edited_full.exr" not in names(out)
+    assert json.loads((out / "metrics.json").read_text())["iterations"] == 4
+
+
+def test_no_file_of_results_takes_what_is_not_finite():
+    lost = []
+    assert manifest.plain({"a": [1.0, math.nan], "b": math.inf}, "", lost) == {"a": [1.0, None], "b": None}
+    assert lost == ["a[1]", "b"]

@@ -1,0 +1,327 @@
+"""What a user can get wrong: each mistake has its exit code and one or two lines that say what to do."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envedit.cli import doctor, run
+from envedit.images import images
+from tests.oracles import ROOT
+from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
+from tests.oracles.runs import FILES, SKY, call, changed, names, pixels, small_world, world
+from tests.oracles.tiers import slow_but
+
+ENSURE = doctor.ensure
+
+
+@pytest.fixture(autouse=True)
+def isolated(tmp_path_factory):
+    with small_world(tmp_path_factory.mktemp("cache")):
+        yield
+
+
+@pytest.fixture
+def path(tmp_path, rng):
+    """Return a configuration that would run."""
+    return world(tmp_path, rng)
+
+
+def fails(code, capsys, path, *arguments):
+    """Run the command line, which fails with ``code``; return its message.
+
+    Nothing else is printed, and no result is left that could be taken for one.
+    """
+    assert call(path, "--quiet", *arguments) == code
+    out, err = capsys.readouterr()
+    assert out == "" and "Traceback" not in err
+    lines = err.splitlines()
+    assert 1 <= len(lines) <= 2 and lines[0].startswith("envedit: ") and len(err) < 600, err
+    folder = Path(path).parent / "c_out"
+    assert not folder.is_dir() or not names(folder) & {"edited.exr", "metrics.json", "checkpoint.npz"}
+    return err
+
+
+def test_the_configuration_of_these_tests_runs(path, tmp_path):
+    assert call(path, "--quiet") == 0 and names(tmp_path / "c_out") >= FILES
+
+
+# ---- configuration and usage: 2 --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[fit]\nepoch = 3", ["[fit]", "epoch", "did you mean epochs"]),
+        ("[inptu]\nwidth = 16", ["inptu", "did you mean input"]),
+        ("sede = 1", ["sede", "did you mean seed"]),
+        ("[input]\nmax_depth = 3", ["max_depth", "did you mean renderer.max_depth"]),
+        ('[fit]\nepochs = "many"', ["fit.epochs", "'many'", "integer"]),
+        ("[fit]\nepochs = 2.5", ["fit.epochs", "2.5", "integer"]),
+        ("[output]\nreport = 1", ["output.report", "true or false"]),
+        ("[optimizer]\nlr = nan", ["optimizer.lr", "nan", "finite"]),
+        ("[optimizer]\nlr = -1", ["optimizer.lr", "-1", "above 0"]),
+        ("[input]\nwidth = 1", ["input.width", "came 1", "even"]),
+        ("[input]\nwidth = 17", ["input.width", "came 17", "even"]),
+        ("[input]\nwidth = 4", ["width", "4", "even"]),
+        ("[input]\nwidth = 16\nrows = [3, 8]", ["input.rows", "[3, 8]"]),
+        ("input = 3", ["input", "[input]"]),
+        ('preset = "drafty"', ["preset", "drafty", "did you mean draft"]),
+        ('variant = "scalar_rgb"', ["variant", "scalar_rgb"]),
+        ('[representation]\nkind = "layer"', ["representation.kind", "'layer'", "did you mean layers"]),
+        ('[target]\nkind = "strokes"', ["target.strokes", "came none", "at least one"]),
+        ('[target]\nkind = "image"', ["target.file"]),
+        ('[target]\nfile = "a.exr"\nrotate_degrees = 3', ["target.file", "rotate_degrees"]),
+        ("[fit\nepochs = 3", ["not TOML", "line 1"]),
+        ("[fit]\nepochs = 3\nepochs = 4", ["not TOML", "line 3"]),
+    ],
+)
+def test_a_configuration_that_cannot_be_understood(text, says, tmp_path, capsys):
+    file = tmp_path / "c.toml"
+    file.write_text(text)
+    said = fails(2, capsys, file)
+    assert all(words in said for words in says), said
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("fit.epoch=3", ["--set", "did you mean epochs"]),
+        ("fit.epochs=few", ["--set", "fit.epochs", "few"]),
+        ("fit.epochs", ["--set", "table.key=value"]),
+        ("=3", ["--set", "table.key=value"]),
+        ("input.width=1", ["--set", "input.width"]),
+    ],
+)
+def test_an_override_that_cannot_be_understood(override, says, path, capsys):
+    said = fails(2, capsys, path, "--set", override)
+    assert all(words in said for words in says), said
+
+
+def test_a_configuration_that_is_not_there(tmp_path, capsys):
+    assert "none.toml: no such configuration file" in fails(2, capsys, tmp_path / "none.toml")
+    assert "a folder" in fails(2, capsys, tmp_path)
+
+
+def test_an_image_in_place_of_the_configuration(path, capsys, tmp_path):
+    assert "map.exr" in fails(2, capsys, tmp_path / "map.exr")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "CONFIG.toml"),
+        (["c.toml", "--nonsense"], "--nonsense"),
+        (["c.toml", "--preset", "best"], "best"),
+        (["c.toml", "--out"], "--out"),
+        (["c.toml", "d.toml"], "d.toml"),
+    ],
+)
+def test_a_bad_command_line(arguments, says, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run.main(arguments)
+    out, err = capsys.readouterr()
+    assert stop.value.code == 2 and out == ""
+    assert "usage:" in err and says in err.splitlines()[-1] and "Traceback" not in err
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a", ".exr", "a.exr.tif"])
+def test_an_export_of_another_kind(name, path, capsys, tmp_path):
+    said = fails(2, capsys, path, "--export-initial", tmp_path / name)
+    assert "--export-initial" in said and ".exr or .png" in said
+    assert not (tmp_path / name).exists()
+
+
+def test_an_export_does_not_resume(path, capsys, tmp_path):
+    with pytest.raises(SystemExit) as stop:
+        call(path, "--resume", "--export-initial", tmp_path / "a.png")
+    assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
+
+
+def test_a_parameter_that_the_scene_does_not_have(path, capsys):
+    said = fails(2, capsys, path, *changed(scene__file="sphere", scene__parameters={"roughnes": 0.5}))
+    assert "scene.parameters" in said and "did you mean roughness?" in said
+
+
+# ---- files: 3 --------------------------------------------------------------------------------------------
+
+
+def test_a_map_that_is_not_there(path, capsys):
+    said = fails(3, capsys, path, *changed(input__envmap="none.exr"))
+    assert str(path.parent / "none.exr") in said  # relative to the configuration
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.99])
+def test_a_truncated_map(share, path, capsys, tmp_path, rng):
+    images.write_exr(tmp_path / "map.exr", sky(rng, 64, 128))
+    data = (tmp_path / "map.exr").read_bytes()
+    (tmp_path / "map.exr").write_bytes(data[: int(share * len(data))])
+    assert "map.exr" in fails(3, capsys, path)
+
+
+@pytest.mark.parametrize("data", [b"hello, world\n" * 40, b"\0" * 4096])
+def test_a_map_that_is_no_image(data, path, capsys, tmp_path):
+    (tmp_path / "map.exr").write_bytes(data)
+    assert "map.exr" in fails(3, capsys, path)
+
+
+def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
+    images.write_png(tmp_path / "map.png", sky(rng) / 3)
+    assert call(path, "--quiet", *changed(input__envmap="map.png")) == 0
+    out, err = capsys.readouterr()
+    assert out == "" and len(err.splitlines()) == 1
+    assert err.startswith("envedit: warning: ") and "not HDR" in err
+    assert "not HDR" in (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("height, width", [(8, 15), (16, 16), (1, 2), (1, 1)])
+def test_a_map_that_is_not_two_to_one_or_too_small(height, width, path, capsys, tmp_path, rng):
+    images.write_exr(tmp_path / "map.exr", sky(rng, height, width))
+    said = fails(3, capsys, path)
+    assert "map.exr" in said and f"{width} x {height}" in said
+
+
+@pytest.mark.parametrize("value", slow_but([np.nan, np.inf, -np.inf], np.nan))
+def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
+    picture = sky(rng) + 0.1
+    picture[3, 7, 1] = picture[6, 2, 0] = value
+    exr(tmp_path / "map.exr", **{c: picture[..., i].copy() for i, c in enumerate("RGB")})
+    said = fails(3, capsys, path)
+    assert "map.exr" in said and "row 3, column 7" in said and "2 texels" in said and "repair" in said
+    # What the message asks for works.
+    assert call(path, "--quiet", *changed(input__repair=True)) == 0
+    assert "row 3, column 7" in capsys.readouterr().err
+    edited, good = pixels(tmp_path / "c_out" / "edited.exr"), np.ones((8, 16), bool)
+    assert np.isfinite(edited).all()
+    good[6, 2] = False
+    assert edited[4:][good[4:]].tobytes() == picture[4:][good[4:]].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("parts", "says"),
+    [
+        ([SENSOR, BALL], ["no environment emitter"]),
+        ([SENSOR, BALL, LIGHT, SKY], ["2 environment emitters", "constant", "envmap"]),
+        ([BALL, LIGHT], ["no sensor"]),
+        ([SENSOR, BALL, LIGHT, '<shape type="spere"/>'], ["spere"]),
+        ([SENSOR, BALL, LIGHT, "<shape"], []),
+        ([SENSOR, BALL, LIGHT, '<shape type="ply"><string name="filename" value="none.ply"/></shape>'],
+         ["none.ply"]),
+    ],
+)  # fmt: skip
+def test_a_scene_that_cannot_be_used(parts, says, path, capsys, tmp_path):
+    write_scene(tmp_path, *parts, name="scene.xml")
+    said = fails(3, capsys, path)
+    assert "scene.xml" in said and all(words in said for words in says), said
+
+
+def test_a_scene_that_sees_no_light(path, capsys, tmp_path):
+    inside = '<shape type="sphere"><float name="radius" value="50"/></shape>'
+    write_scene(tmp_path, SENSOR, inside, LIGHT, name="scene.xml")
+    said = fails(3, capsys, path)
+    assert "scene.xml" in said and "no pixel receives light" in said
+
+
+@pytest.mark.parametrize(
+    "name, says", [("spere", "did you mean sphere?"), ("none.xml", "no such file"), (".", "a folder")]
+)
+def test_a_scene_that_is_not_there(name, says, path, capsys):
+    assert says in fails(3, capsys, path, *changed(scene__file=name))
+
+
+def test_a_transport_that_does_not_fit_the_memory(path, capsys):
+    said = fails(3, capsys, path, *changed(renderer__memory_gb=1e-6))
+    assert "memory_gb" in said
+
+
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [
+        ({"file": "none.exr"}, ["none.exr"]),
+        ({"kind": "image", "file": "none.exr"}, ["none.exr"]),
+        ({"kind": "image", "file": "map.exr"}, ["map.exr", "16x8", "24x18"]),
+        ({"kind": "image", "file": "nan.exr"}, ["nan.exr", "row 2, column 5"]),
+        ({"kind": "image", "file": "good.exr", "mask": "map.exr"}, ["map.exr", "16x8"]),
+        ({"kind": "image", "file": "good.exr", "mask": "black.png"}, ["black.png"]),
+        ({"kind": "image", "file": "good.exr", "mask": "none.png"}, ["none.png"]),
+    ],
+)
+def test_a_target_that_cannot_be_used(target, says, path, capsys, tmp_path):
+    good = np.full((18, 24, 3), 0.5, np.float32)
+    images.write_exr(tmp_path / "good.exr", good)
+    images.write_png(tmp_path / "black.png", 0 * good)
+    good[2, 5] = np.nan
+    exr(tmp_path / "nan.exr", **{c: good[..., i].copy() for i, c in enumerate("RGB")})
+    said = fails(3, capsys, path, *changed(**{f"target__{key}": value for key, value in target.items()}))
+    assert all(words in said for words in says), said
+
+
+def test_a_file_in_place_of_the_output_folder(path, capsys, tmp_path):
+    (tmp_path / "c_out").write_text("mine")
+    said = fails(3, capsys, path)
+    assert str(tmp_path / "c_out") in said and "--out" in said
+    assert (tmp_path / "c_out").read_text() == "mine"
+
+
+def test_an_output_folder_that_cannot_be_made(path, capsys, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for folder in (tmp_path / "file" / "results", Path(os.devnull) / "results", Path("/proc/results")):
+        if folder.parent.exists():
+            said = fails(3, capsys, path, "--out", str(folder))
+            assert str(folder) in said and "--out" in said
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="permissions do not bind root")
+def test_an_output_folder_that_is_read_only(path, capsys, tmp_path):
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o555)
+    said = fails(3, capsys, path, "--out", str(folder))
+    assert str(folder) in said and "--out" in said
+
+
+def test_an_export_overwrites_nothing(path, capsys, tmp_path):
+    map_before = (tmp_path / "map.exr").read_bytes()
+    said = fails(3, capsys, path, "--export-initial", tmp_path / "map.exr")
+    assert str(tmp_path / "map.exr") in said and "not overwritten" in said
+    assert (tmp_path / "map.exr").read_bytes() == map_before
+    (tmp_path / "link.png").symlink_to(tmp_path / "nowhere.png")
+    assert "link.png" in fails(3, capsys, path, "--export-initial", tmp_path / "link.png")
+    assert "folder" in fails(3, capsys, path, "--export-initial", tmp_path / "none" / "a.png")
+    assert not (tmp_path / "nowhere.png").exists()
+
+
+def test_a_damaged_checkpoint(path, capsys, tmp_path):
+    (tmp_path / "c_out").mkdir()
+    (tmp_path / "c_out" / "checkpoint.npz").write_bytes(b"PK\3\4" + b"\0" * 100)
+    assert call(path, "--quiet", "--resume") == 3
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) <= 2 and "checkpoint.npz" in said and "Traceback" not in said
+
+
+# ---- the machine: 4 --------------------------------------------------------------------------------------
+
+
+def test_a_machine_without_llvm(path, tmp_path):
+    environment = os.environ | {
+        "DRJIT_LIBLLVM_PATH": "/nonexistent",
+        "XDG_CACHE_HOME": str(tmp_path / "fresh"),
+    }
+    command = [sys.executable, "-m", "envedit.run", str(path)]
+    found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    lines = found.stderr.splitlines()
+    assert found.returncode == 4 and found.stdout == "" and "Traceback" not in found.stderr
+    assert len(lines) <= 2 and lines[0].startswith("envedit: ")
+    assert "DRJIT_LIBLLVM_PATH=/nonexistent" in lines[0] and "libllvm19" in found.stderr
+    assert not names(tmp_path / "c_out")
+
+
+@pytest.mark.slow
+def test_a_machine_without_a_gpu(path, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "ensure", ENSURE)
+    if doctor.check("cuda_ad_rgb").ok:
+        pytest.skip("this machine has a GPU")
+    said = fails(4, capsys, path, *changed(variant="cuda_ad_rgb"))
+    assert "cuda_ad_rgb" in said and "llvm_ad_rgb" in said

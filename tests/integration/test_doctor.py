@@ -1,0 +1,157 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from envedit.cli import doctor
+from envedit.core.errors import MachineError
+from tests.oracles import ROOT
+
+LIBRARIES = Path("/usr/lib/x86_64-linux-gnu")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "envedit"
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return doctor.check()
+
+
+def test_this_machine_is_well(healthy):
+    assert healthy.ok and healthy.lines == ()
+    assert healthy.versions["radiance"] == pytest.approx(0.5, abs=1e-3)
+    assert int(healthy.versions["llvm"].split(".")[0]) >= 17 and healthy.versions["gflops"] > 0
+
+
+def test_a_library_that_is_not_there(monkeypatch):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nonexistent/libLLVM.so")
+    found = doctor.check()
+    assert not found.ok and len(found.lines) == 2
+    assert "DRJIT_LIBLLVM_PATH=/nonexistent/libLLVM.so" in found.lines[0]
+    assert "libllvm19" in found.lines[1]
+
+
+@pytest.mark.parametrize(
+    "version, says", [(14, "LLVM 14 .* is too old"), (15, r"LLVM 15\.\S+ \(.*\) stops the process")]
+)
+def test_a_library_that_cannot_run_it(version, says, monkeypatch, cache):
+    library = LIBRARIES / f"libLLVM-{version}.so.1"
+    if not library.exists():
+        pytest.skip(f"LLVM {version} is not installed")
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(library))
+    with pytest.raises(MachineError, match=says) as caught:
+        doctor.ensure()
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 2 and "libllvm19" in lines[1] and max(map(len, lines)) < 200
+    assert not cache.exists()  # a failure is never remembered
+
+
+def test_cuda_without_a_gpu(healthy):
+    found = doctor.check("cuda_ad_rgb")
+    if found.ok:
+        pytest.skip("this machine has a GPU")
+    assert "NVIDIA" in found.lines[0] and "llvm_ad_rgb" in found.lines[1]
+
+
+def test_a_variant_envedit_does_not_know():
+    assert "does not run on variant 'scalar_rgb'" in doctor.check("scalar_rgb").lines[0]
+
+
+def test_the_command_prints_versions_and_returns_the_exit_code(monkeypatch):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nonexistent/libLLVM.so")
+    done = subprocess.run([sys.executable, "-m", "envedit.doctor"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 4 and "mitsuba" in done.stdout and "numpy" in done.stdout
+    assert len(done.stderr.splitlines()) == 2 and "Traceback" not in done.stderr
+
+
+def test_main_reports_a_healthy_machine(monkeypatch, capsys, healthy):
+    monkeypatch.setattr(doctor, "check", lambda variant: healthy)
+    assert doctor.main([]) == 0
+    assert "llvm_ad_rgb: ready" in capsys.readouterr().out
+
+
+# ---- the memory of a success -------------------------------------------------------------------------------
+
+
+def counting(monkeypatch, diagnosis):
+    calls = []
+    monkeypatch.setattr(doctor, "check", lambda variant: calls.append(variant) or diagnosis)
+    return calls
+
+
+def test_a_success_is_remembered_until_something_changes(monkeypatch, cache, tmp_path):
+    library = tmp_path / "libLLVM.so"
+    library.write_text("one")
+    calls = counting(monkeypatch, doctor.Diagnosis(True, (), {"llvm_path": str(library)}))
+    doctor.ensure()
+    doctor.ensure()
+    assert len(calls) == 1
+    library.write_text("another")  # the library is replaced
+    doctor.ensure()
+    assert len(calls) == 2
+    doctor.ensure("cuda_ad_rgb")  # another variant
+    assert len(calls) == 3
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/elsewhere")
+    doctor.ensure()
+    assert len(calls) == 4
+    monkeypatch.setattr(doctor, "_version", lambda package: "99.0")
+    doctor.ensure()
+    assert len(calls) == 5
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"ok": true}', '{"ok": true, "library": ["/gone", 1, 2]}', "\x00\xff"]
+)
+def test_a_damaged_memory_means_a_new_probe(monkeypatch, cache, tmp_path, content):
+    library = tmp_path / "libLLVM.so"
+    library.write_text("one")
+    calls = counting(monkeypatch, doctor.Diagnosis(True, (), {"llvm_path": str(library)}))
+    cache.mkdir()
+    doctor._memory("llvm_ad_rgb").write_bytes(content.encode("latin-1"))
+    doctor.ensure()
+    assert len(calls) == 1 and json.loads(doctor._memory("llvm_ad_rgb").read_text())["ok"] is True
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(monkeypatch, cache, tmp_path):
+    cache.write_text("a file where the folder should be")
+    calls = counting(monkeypatch, doctor.Diagnosis(True, (), {"llvm_path": __file__}))
+    doctor.ensure()
+    doctor.ensure()
+    assert len(calls) == 2
+
+
+# ---- wording of what cannot be provoked here ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "code, said, says",
+    [
+        (-6, "LLVM ERROR: Cannot select: f32 = fminimum", "at the first rendering (SIGABRT: LLVM ERROR"),
+        (-11, "", "SIGSEGV"),
+        (None, "", "did not end in"),
+        (1, "ImportError: ... because the LLVM shared library", "no LLVM library was found"),
+        (1, "Traceback\nValueError: odd", "ValueError: odd"),
+        (1, "", "it said nothing"),
+        (-99, "", "exit code -99"),
+    ],
+)
+def test_every_end_of_the_child_has_two_lines(monkeypatch, code, said, says):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    cause, remedy = doctor._explain("llvm_ad_rgb", code, said, {})
+    assert says in cause and remedy and "\n" not in cause + remedy
+
+
+def test_a_wrong_picture_is_not_ready(monkeypatch):
+    class Child:
+        returncode = 0
+        stdout = b'{"radiance": 0.25}\n{"done": true}\n'
+
+    monkeypatch.setattr(doctor.subprocess, "run", lambda *a, **k: Child)
+    found = doctor.check()
+    assert not found.ok and "computed 0.25, not 0.5" in found.lines[0]

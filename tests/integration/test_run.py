@@ -1,0 +1,669 @@
+"""The command line on small runs: what it leaves, what it says, and how it stops and continues."""
+
+import contextlib
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from envedit import config, pipeline
+from envedit.cli import run
+from envedit.images import images
+from envedit.scene import scene
+from envedit.solve import adam_loop, checkpoint
+from envedit.transport.light_transport import LightTransport
+from tests.oracles import ROOT
+from tests.oracles.builders import read_png, sky
+from tests.oracles.runs import (
+    FILES,
+    INFLUENCE,
+    call,
+    changed,
+    content,
+    measured,
+    names,
+    no_constant,
+    numbers,
+    pixels,
+    rows_of,
+    small_world,
+    world,
+)
+from tests.oracles.tiers import slow_but
+
+pytestmark = pytest.mark.usefixtures("isolated")
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """Return (configuration, output folder, stdout, stderr) of one finished run."""
+    folder = tmp_path_factory.mktemp("done")
+    path = world(folder, np.random.default_rng(0), representation={"kind": "siren", "hidden": 16, "depth": 1})
+    out, err = io.StringIO(), io.StringIO()
+    with small_world(folder / "cache"), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        assert call(path) == 0
+    return path, folder / "c_out", out.getvalue(), err.getvalue()
+
+
+# ---- what a run leaves -----------------------------------------------------------------------------------
+
+
+def test_exactly_the_promised_files_beside_the_configuration(done):
+    path, folder, out, _ = done
+    assert names(folder) == FILES | INFLUENCE
+    assert all(line in out.splitlines() for line in measured(folder)["choices"])
+    assert str(folder) in out and re.search(r"rendering [\d.]+ -> [\d.]+ dB, map [\d.]+ -> [\d.]+ dB", out)
+
+
+def test_images_are_float32_of_the_right_size_and_finite(done):
+    _, folder, _, _ = done
+    for path in folder.glob("*.exr"):
+        expected = (18, 24) if path.name.startswith("render") else (8, 16)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            planes = {name: channel.pixels.copy() for name, channel in file.channels().items()}
+        beside = {f"{layer}.{c}" for layer in ("initial", "difference") for c in "RGB"} | {"influence.Y"}
+        assert set(planes) == set("RGB") | (beside if path.name == "edited_layers.exr" else set())
+        for name, plane in planes.items():
+            assert plane.dtype == np.float32 and plane.shape == expected
+            assert np.isfinite(plane).all() and (name.startswith("difference") or (plane >= 0).all())
+
+
+def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
+    found = measured(done[1])
+    image_keys = {"psnr", "ssim", "mse", "lpips"}
+    assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
+    assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached", "seconds"}
+    timing = {
+        "import",
+        "target",
+        "fit",
+        "transport",
+        "reach",
+        "start",
+        "edit",
+        "judge",
+        "full",
+        "report",
+        "total",
+    }
+    assert set(found["timing"]) == {f"{part}_s" for part in timing} | {"per_iteration_ms"}
+    assert found["timing"]["start_s"] == 0 < found["timing"]["fit_s"]
+    assert {"iterations", "non_finite_steps", "tonemap", "active_rows", "choices"} <= set(found)
+    traced = found["transport"]
+    assert set(traced) == {
+        "cached", "entries", "memory_bytes", "columns", "path_depth", "depth_error", "samples",
+        "predicted_error", "frozen",
+    }  # fmt: skip
+    assert traced["cached"] is False and traced["path_depth"] == 3 and traced["samples"] == 32
+    assert 0 <= traced["depth_error"] < 0.1 and 0 < traced["predicted_error"] < 1 and traced["frozen"] == 0
+    # At least the packed entries, 16 bytes each, in both directions.
+    assert traced["memory_bytes"] >= 32 * traced["entries"] > 0
+    assert found["iterations"] == 4 and found["non_finite_steps"] == 0
+    assert found["tonemap"] == "clip(E, 0, 1)^(1/2.2)" and found["active_rows"] == [0, 3]
+    assert found["fit"]["epochs"] == 4 and found["fit"]["cached"] is False
+    assert all(math.isfinite(number) for number in numbers(found))
+    parts = [value for key, value in found["timing"].items() if key not in ("total_s", "per_iteration_ms")]
+    assert min(parts) >= 0 and found["timing"]["total_s"] >= 0.99 * max(parts)
+
+
+def test_metrics_are_those_of_the_written_pictures(done):
+    """Against the definition, from the files: mean squared error of clip(E, 0, 1)^(1/2.2)."""
+    _, folder, _, _ = done
+    found = measured(folder)
+
+    def error(a, b):
+        shown = [np.clip(np.float64(x), 0, 1) ** (1 / 2.2) for x in (a, b)]
+        return np.mean((shown[0] - shown[1]) ** 2)
+
+    target = pixels(folder / "render_target.exr")
+    for name, key in (("render_edited.exr", "render"), ("render_initial.exr", "initial")):
+        mse = error(pixels(folder / name), target)
+        assert found[key]["mse"] == pytest.approx(mse, rel=1e-4)
+        assert found[key]["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-3)
+
+
+def test_the_map_is_measured_on_its_active_rows_against_the_one_that_was_turned(tmp_path, rng):
+    """90 degrees are a quarter of the columns, so that turning is exact whatever its sense."""
+    path = world(tmp_path, rng, target={"rotate_degrees": 90.0})
+    assert call(path, "--quiet") == 0
+    found, start = measured(tmp_path / "c_out"), pixels(tmp_path / "map.exr")
+    edited = pixels(tmp_path / "c_out" / "edited.exr")
+    errors = []
+    for true in (np.roll(start, 4, axis=1), np.roll(start, -4, axis=1)):
+        shown = [np.clip(np.float64(x[:4]), 0, 1) ** (1 / 2.2) for x in (edited, true)]
+        errors.append(np.mean((shown[0] - shown[1]) ** 2))
+    assert any(found["envmap"]["mse"] == pytest.approx(error, rel=1e-3) for error in errors)
+
+
+def test_history_has_a_row_for_every_iteration(done):
+    rows = rows_of(done[1])
+    assert [int(row["iteration"]) for row in rows] == [0, 1, 2, 3]
+    for row in rows:
+        assert all(math.isfinite(float(value)) for value in row.values())
+        terms = row.keys() - {"iteration", "loss", "lr", "step_ms"}
+        assert "ssim" in terms
+        assert float(row["loss"]) == pytest.approx(sum(float(row[term]) for term in terms), rel=1e-5)
+
+
+def test_the_resolved_configuration_loads_back_to_the_same_one(done):
+    path, folder, _, _ = done
+    assert config.load(folder / "config.toml") == config.load(path)
+
+
+def test_the_manifest_names_inputs_versions_and_seed(done):
+    path, folder, _, _ = done
+    found = json.loads((folder / "manifest.json").read_text(), parse_constant=no_constant)
+    for role, name in (("envmap", "map.exr"), ("scene", "scene.xml")):
+        given = found["inputs"][role]
+        assert given["path"] == str(path.parent / name)
+        assert given["sha256"] == hashlib.sha256((path.parent / name).read_bytes()).hexdigest()
+    assert {"envedit", "python", "mitsuba", "drjit", "numpy", "OpenEXR"} <= found["versions"].keys()
+    assert None not in found["versions"].values() and "commit" in found
+    assert found["seeds"] == {"seed": 0} and found["variant"] == "llvm_ad_rgb" and found["llvm"]["version"]
+
+
+def test_rows_that_are_not_active_come_back_bit_for_bit(done):
+    path, folder, _, _ = done
+    before, after = pixels(path.parent / "map.exr"), pixels(folder / "edited.exr")
+    assert after[4:].tobytes() == before[4:].tobytes()
+    assert (after[:4] != before[:4]).any()
+
+
+@pytest.mark.parametrize(
+    "rows, active", slow_but([("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])], "all")
+)
+def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
+    path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows})
+    assert call(path, "--quiet") == 0
+    before, after = pixels(tmp_path / "map.exr"), pixels(tmp_path / "c_out" / "edited.exr")
+    first, last = measured(tmp_path / "c_out")["active_rows"]
+    assert [first, last] == active
+    assert after[:first].tobytes() == before[:first].tobytes()
+    assert after[last + 1 :].tobytes() == before[last + 1 :].tobytes()
+    assert (after[first : last + 1] != before[first : last + 1]).any()
+
+
+def test_preview_and_report_are_whole(done):
+    _, folder, _, _ = done
+    picture = read_png(folder / "preview.png")
+    assert picture.ndim == 3 and picture.std() > 0
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.rstrip().endswith("</html>") and page.count("data:image/png;base64,") >= 7
+    assert "What this view determines" in page
+    assert page.count("<figure>") == page.count("</figure>") and "<svg" in page
+    assert f"{measured(folder)['render']['psnr']:.4g}"[:4] in page
+    assert not re.search(r'(src|href)\s*=\s*"https?:', page)  # opens offline
+
+
+def test_without_a_report_neither_page_nor_preview_is_written(tmp_path, rng):
+    path = world(tmp_path, rng, output={"report": False})
+    assert call(path, "--quiet") == 0
+    assert names(tmp_path / "c_out") == FILES - {"preview.png", "report.html"} | INFLUENCE
+
+
+# ---- what is computed ------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path, rng, monkeypatch):
+    """The transport is made wrong by a factor; the picture that is judged does not know it.
+
+    Mitsuba reads edited.exr by itself; pictures of 1024 and 4096 samples a pixel agree within their noise.
+    """
+    apply = LightTransport.apply
+    monkeypatch.setattr(LightTransport, "apply", lambda self, envmap: 3 * apply(self, envmap))
+    path = world(tmp_path, rng, output={"spp": 1024}, optimizer={"iterations": 12, "lr": 0.05})
+    assert call(path, "--quiet") == 0
+    out = tmp_path / "c_out"
+    final = pixels(out / "render_edited.exr")
+    own = mi.load_file(str(tmp_path / "scene.xml"), map=str(out / "edited.exr"))
+    direct = np.array(mi.render(own, integrator=mi.load_dict({"type": "path"}), spp=4096, seed=1))
+    # 16 x 12 pixels in the file, 24 x 18 in the run: both have 8 x 6 blocks.
+    a = final.reshape(6, 3, 8, 3, 3).mean((1, 3))
+    b = direct.reshape(6, 2, 8, 2, 3).mean((1, 3))
+    assert np.sqrt(np.mean((a - b) ** 2)) < 0.03 * b.mean()
+    assert final.mean() == pytest.approx(direct.mean(), rel=0.02)
+    assert pixels(out / "edited.exr")[:4].mean() < 0.9 * pixels(tmp_path / "map.exr")[:4].mean()
+
+
+def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share_no_noise(tmp_path, rng):
+    path = world(
+        tmp_path, rng, representation={"kind": "pixels"}, optimizer={"iterations": 0}, output={"spp": 256}
+    )
+    assert call(path, "--quiet") == 0
+    out = tmp_path / "c_out"
+    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
+    a, b = pixels(out / "render_initial.exr"), pixels(out / "render_edited.exr")
+    assert (a != b).any() and a.mean() == pytest.approx(b.mean(), rel=0.05)
+    found = measured(out)
+    assert found["iterations"] == 0 and found["timing"]["per_iteration_ms"] is None and rows_of(out) == []
+
+
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
+@pytest.mark.parametrize("renderer", slow_but(["transport", "path"], "transport"))
+def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path, rng):
+    path = world(tmp_path, rng)
+    settings = changed(representation__kind=kind, renderer__kind=renderer, optimizer__iterations=2)
+    assert call(path, "--quiet", *settings) == 0
+    found = measured(tmp_path / "c_out")
+    assert found["iterations"] == 2 and found["non_finite_steps"] == 0
+    assert (found["fit"] is None) == (kind != "siren")
+    assert names(tmp_path / "c_out") & INFLUENCE == (INFLUENCE if renderer == "transport" else set())
+    assert (found["transport"] is None) == (renderer == "path") and found["choices"]
+
+
+@pytest.mark.slow
+def test_a_painted_target_has_no_known_map(tmp_path, rng):
+    path = world(tmp_path, rng, target={"kind": "image", "file": "painted.exr", "mask": "mask.png"})
+    images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
+    images.write_png(tmp_path / "mask.png", np.ones((18, 24, 3)))
+    assert call(path, "--quiet") == 0
+    out = tmp_path / "c_out"
+    found = measured(out)
+    assert found["envmap"] is None and found["render"]["psnr"] > 0
+    assert (pixels(out / "render_target.exr") == 0.5).all()
+    inputs = json.loads((out / "manifest.json").read_text())["inputs"]
+    assert set(inputs) == {"envmap", "scene", "target", "mask"}
+
+
+@pytest.mark.slow
+def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
+    path = world(tmp_path, rng, input={"envmap": "sunsky", "width": 16}, scene={"file": "matte"})
+    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
+    inputs = json.loads((tmp_path / "c_out" / "manifest.json").read_text())["inputs"]
+    shipped = next(p for p in (ROOT / "scenes", ROOT / "envedit" / "scenes") if p.is_dir()) / "matte.xml"
+    assert inputs["scene"]["sha256"] == hashlib.sha256(shipped.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("value", slow_but([0.0, 1e-30], 0.0))
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
+def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
+    path = world(tmp_path, rng, representation={"kind": kind})
+    images.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
+    assert call(path, "--quiet") == 0
+    assert ("black" in capsys.readouterr().err) == (value == 0)
+    assert np.isfinite(pixels(tmp_path / "c_out" / "edited.exr")).all()
+
+
+@pytest.mark.parametrize("value", slow_but([65504.0, 1e6, 1e30], 1e30))
+def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
+    path = world(tmp_path, rng)
+    bright = sky(rng)
+    bright[2, 5] = value
+    images.write_exr(tmp_path / "map.exr", bright)
+    assert call(path, "--quiet") == 0
+    assert all(math.isfinite(number) for number in numbers(measured(tmp_path / "c_out")))
+
+
+def test_layers_without_iterations_are_where_the_search_put_them(tmp_path, rng):
+    """A sun in an even sky, turned by a quarter: most of the way is made before the first step."""
+    path = world(tmp_path, rng, target={"rotate_degrees": 90.0, "spp": 64}, optimizer={"iterations": 0})
+    images.write_exr(tmp_path / "map.exr", one_sun(1, 3))
+    assert call(path, "--quiet", *changed(renderer__spp=256)) == 0
+    found = measured(tmp_path / "c_out")
+    assert found["render"]["mse"] < 0.2 * found["initial"]["mse"]
+    assert found["sun_offset_texels"] <= 1 and found["iterations"] == 0
+    assert found["timing"]["start_s"] > 0 and found["fit"] is None
+    told = [line for line in found["choices"] if line.startswith("light 1 of 1")]
+    assert len(told) == 1 and "degrees from where it was" in told[0]
+    assert told[0] in (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8").replace("&#x27;", "'")
+
+
+def one_sun(row, column):
+    picture = np.full((8, 16, 3), 0.3, np.float32)
+    picture[row, column] = 60
+    return picture
+
+
+@pytest.mark.slow
+def test_the_initial_rendering_has_few_samples(tmp_path, rng, monkeypatch):
+    seen, render = [], scene.Scene.render
+
+    def noted(self, envmap, spp, *rest, **keys):
+        seen.append(spp)
+        return render(self, envmap, spp, *rest, **keys)
+
+    monkeypatch.setattr(scene.Scene, "render", noted)
+    monkeypatch.setattr(pipeline, "INITIAL_SPP", 8)
+    for spp, few in ((16, 8), (8, 8), (1, 1)):
+        seen.clear()
+        path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp})
+        assert call(path, "--quiet", *changed(representation__kind="pixels")) == 0
+        assert seen == [16, few, spp]  # target, before, after
+
+
+# ---- what is said and set --------------------------------------------------------------------------------
+
+
+def test_quiet_prints_nothing(tmp_path, rng, capsys):
+    assert call(world(tmp_path, rng), "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_progress_goes_to_stderr_and_results_to_stdout(done):
+    _, folder, out, err = done
+    stages = ["loading", "rendering the target", "fitting (siren)", "tracing light transport", "editing",
+              "rendering the result", "writing"]  # fmt: skip
+    assert [line for line in err.splitlines() if line in stages] == stages
+    assert "lights" not in err
+    assert not set(out.splitlines()) & set(stages) and out.splitlines()[-1] == f"results in {folder}"
+
+
+def test_layers_are_separated_and_searched_for_not_fitted(tmp_path, rng, capsys):
+    assert call(world(tmp_path, rng)) == 0
+    err = capsys.readouterr().err
+    stages = ["loading", "rendering the target", "separating lights", "tracing light transport",
+              "searching for lights", "editing", "rendering the result", "writing"]  # fmt: skip
+    assert [line for line in err.splitlines() if line in stages] == stages and "fitting" not in err
+
+
+def test_presets_and_overrides_take_effect(tmp_path, rng, capsys):
+    path = world(tmp_path, rng)
+    out = tmp_path / "o"
+    assert call(path, "--preset", "draft", *changed(optimizer__iterations=3, seed=5), "--out", out) == 0
+    found = config.load(out / "config.toml")
+    standard = config.load(path)
+    assert found.preset == "draft" and found.seed == 5 and found.optimizer.iterations == 3
+    # The preset beats the defaults, the file beats the preset.
+    assert found == config.load(path, "draft", ["optimizer.iterations=3", "seed=5", f"output.dir={out}"])
+    assert standard.preset == "standard" and standard.seed == 0
+    assert found.target.spp == standard.target.spp == 16
+    assert measured(out)["iterations"] == len(rows_of(out)) == 3
+    assert json.loads((out / "manifest.json").read_text())["seeds"] == {"seed": 5}
+
+
+@pytest.mark.parametrize("name", slow_but(["with space", "é ü", "😀", 'a"b', "back\\slash"], "😀"))
+def test_out_may_have_any_name(name, tmp_path, rng):
+    path = world(tmp_path / "in", rng)
+    assert call(path, "--quiet", "--out", tmp_path / name, *changed(optimizer__iterations=0)) == 0
+    assert names(tmp_path) == {"in", name} and names(tmp_path / name) >= FILES
+
+
+def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
+    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    kept = []
+    for seed in range(3):
+        assert call(path, "--quiet", *changed(optimizer__iterations=1, seed=seed)) == 0
+        kept.append({name: data for name, data in content(out).items() if not name.startswith("earlier-")})
+    (out / "earlier-note").write_text("mine")
+    assert names(out) == FILES | INFLUENCE | {"earlier-1", "earlier-2", "earlier-note"}
+    assert content(out / "earlier-1") == kept[0] and content(out / "earlier-2") == kept[1]
+    # What is not ours stays where it is.
+    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
+    assert (out / "earlier-note").read_text() == "mine" and content(out / "earlier-3") == kept[2]
+
+
+def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    first = pixels(out / "edited.exr")
+    assert call(out / "config.toml", "--quiet") == 0
+    assert pixels(out / "edited.exr").tobytes() == first.tobytes()
+    assert names(out / "earlier-1") == FILES | INFLUENCE
+
+
+@pytest.mark.slow
+def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path, rng, monkeypatch):
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "run", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert call(out / "config.toml", "--quiet") == 130
+    assert "metrics.json" not in names(out) and call(out / "config.toml", "--quiet") == 0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+def test_an_input_is_known_by_any_name(tmp_path, rng, capsys):
+    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    (tmp_path / "link").symlink_to(out)
+    for name in (tmp_path / "link" / "edited.exr", tmp_path / "nowhere" / ".." / "c_out" / "edited.exr"):
+        assert call(path, "--quiet", *changed(input__envmap=str(name))) == 3
+        assert "--out" in capsys.readouterr().err and (out / "edited.exr").exists()
+
+
+def test_an_input_is_not_moved_away_with_earlier_results(tmp_path, rng, capsys):
+    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    before = content(out)
+    capsys.readouterr()
+    assert call(path, "--quiet", *changed(input__envmap=str(out / "edited.exr"))) == 3
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "edited.exr" in said and "--out" in said
+    assert content(out) == before
+
+
+# ---- stopping and continuing -----------------------------------------------------------------------------
+
+
+def test_a_finished_run_has_nothing_to_resume(done, capsys):
+    path, folder, _, _ = done
+    before = content(folder)
+    assert call(path, "--resume") == 0
+    assert "complete" in capsys.readouterr().out
+    assert call(path, "--resume", *changed(optimizer__iterations=9)) == 3
+    assert "another configuration" in capsys.readouterr().err
+    assert content(folder) == before
+
+
+def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, capsys):
+    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
+    before = content(out)
+    named = Path(config.load(path).input.envmap)
+    images.write_exr(named, 2 * images.read(named)[0])
+    assert call(path, "--resume", *changed(optimizer__iterations=1)) == 3
+    said = capsys.readouterr().err
+    assert said.startswith(f"envedit: {named}: has changed since") and len(said.splitlines()) == 1
+    named.unlink()
+    assert call(path, "--resume", *changed(optimizer__iterations=1)) == 0
+    assert content(out) == before
+
+
+def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(tmp_path, rng):
+    path = world(tmp_path, rng)
+    written = path.read_bytes()
+    path = path.rename(tmp_path / "config.toml")
+    assert call(path, "--resume", "--quiet", "--out", tmp_path, *changed(optimizer__iterations=1)) == 0
+    assert path.read_bytes() != written and (tmp_path / "earlier-1" / "config.toml").read_bytes() == written
+
+
+def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch):
+    def press(self, crop, original, start):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(adam_loop._PlaceRows, "eval", press)
+    assert call(world(tmp_path, rng), "--quiet") == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_resume_in_an_empty_folder_is_a_run(tmp_path, rng):
+    assert call(world(tmp_path, rng), "--resume", "--quiet", *changed(optimizer__iterations=1)) == 0
+    assert names(tmp_path / "c_out") >= FILES
+
+
+@pytest.mark.slow
+def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
+    path, out = world(tmp_path, rng, optimizer={"iterations": 4, "checkpoint_s": 0.0}), tmp_path / "c_out"
+    save = checkpoint.save
+
+    def save_and_interrupt(*arguments):
+        save(*arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save", save_and_interrupt)
+        assert call(path, "--quiet") == 130
+    said = capsys.readouterr().err
+    assert "--resume" in said and len(said.splitlines()) == 1
+    before = content(out)
+    assert call(path, "--quiet", "--resume", *changed(optimizer__iterations=9)) == 3
+    said = capsys.readouterr().err
+    assert "checkpoint.npz" in said and "another configuration" in said and len(said.splitlines()) <= 2
+    assert content(out) == before
+    # Without --resume the checkpoint is an earlier run's and is kept like its results.
+    assert call(path, "--quiet") == 0
+    assert names(out / "earlier-1") == {"checkpoint.npz"} and "checkpoint.npz" not in names(out)
+
+
+@pytest.mark.slow
+def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, rng, capsys, monkeypatch):
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+    from envedit.cli.progress import Progress
+
+    def stage(self, text):
+        if text == "rendering the result":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "stage", stage)
+        assert call(path, "--quiet") == 130
+    assert "--resume" in capsys.readouterr().err and "checkpoint.npz" in names(out)
+    monkeypatch.setattr(LightTransport, "render", lambda self, envmap, step: 1 / 0)
+    assert call(path, "--quiet", "--resume") == 0
+    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
+
+
+def test_an_interrupt_while_results_are_written_names_the_checkpoint(tmp_path, rng, capsys, monkeypatch):
+    path = world(tmp_path, rng, representation={"kind": "pixels"})
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "_write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert call(path, "--quiet") == 130
+    assert "--resume" in capsys.readouterr().err
+    assert call(path, "--quiet", "--resume") == 0 and "metrics.json" in names(tmp_path / "c_out")
+
+
+class NotANumber:
+    """A renderer whose picture is NaN."""
+
+    choices, transport = (), None
+
+    def render(self, envmap, step):
+        return mi.TensorXf(dr.sum(envmap.array) + dr.opaque(mi.Float, math.nan, 18 * 24 * 3), (18, 24, 3))
+
+    def state(self):
+        return {}
+
+
+def test_an_edit_that_cannot_go_on_leaves_the_last_good_map(tmp_path, rng, capsys, monkeypatch):
+    monkeypatch.setattr(pipeline.renderers, "make", lambda *_: NotANumber())
+    path = world(tmp_path, rng, representation={"kind": "pixels"})
+    assert call(path, "--quiet", *changed(optimizer__iterations=50)) == 5
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) <= 2 and "20 steps in a row" in said and "lr" in said
+    out = tmp_path / "c_out"
+    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
+    assert not names(out) & {"metrics.json", "render_edited.exr"}
+
+
+def started(path, cache, *arguments):
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    command = [sys.executable, "-m", "envedit.run", str(path), *arguments]
+    return subprocess.Popen(command, cwd=ROOT, env=environment, text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+
+
+def stop_at_checkpoint(process, file, number):
+    """Send a signal as soon as a new checkpoint is there; return exit code, stdout and stderr."""
+    before = file.stat().st_mtime_ns if file.exists() else 0
+    try:
+        while process.poll() is None and (not file.exists() or file.stat().st_mtime_ns == before):
+            time.sleep(0.01)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    return process.returncode, out, err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng):
+    """Ctrl-C, then SIGKILL, each in a process of its own; the third process, this one, ends it."""
+    optimizer = {"iterations": 400, "checkpoint_s": 0.0}
+    path = world(tmp_path, rng, representation={"kind": "pixels"}, optimizer=optimizer)
+    out = tmp_path / "c_out"
+    code, said, errors = stop_at_checkpoint(started(path, tmp_path), out / "checkpoint.npz", signal.SIGINT)
+    assert code == 130, errors
+    assert "Traceback" not in errors and "--resume" in errors.splitlines()[-1]
+    assert names(out) == {"checkpoint.npz", "edited.exr"}
+    so_far = pixels(out / "edited.exr")
+    assert so_far[4:].tobytes() == pixels(tmp_path / "map.exr")[4:].tobytes()
+
+    process = started(path, tmp_path, "--resume", "--quiet")
+    code, _, _ = stop_at_checkpoint(process, out / "checkpoint.npz", signal.SIGKILL)
+    assert code == -signal.SIGKILL and "checkpoint.npz" in names(out)
+    with np.load(out / "checkpoint.npz") as stored:
+        step = json.loads(stored["meta"].tobytes())["state"]["step"]
+    assert 0 < step < 400
+
+    assert call(path, "--quiet", "--resume") == 0
+    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+    edited = pixels(out / "edited.exr")
+    assert edited.tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes() != so_far.tobytes()
+    assert names(out) == FILES | INFLUENCE and len(rows_of(out)) == 400
+
+
+# ---- other commands --------------------------------------------------------------------------------------
+
+
+def test_help_needs_no_renderer(tmp_path):
+    """The text comes at once: neither the import nor --help loads Mitsuba, Dr.Jit or NumPy."""
+    program = (
+        "import sys, envedit.run\n"
+        "try: envedit.run.main(['--help'])\n"
+        "except SystemExit as stop: assert stop.code == 0\n"
+        "loaded = {'mitsuba', 'drjit', 'numpy', 'OpenEXR'} & set(sys.modules)\n"
+        "assert not loaded, loaded"
+    )
+    found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    for option in ("CONFIG.toml", "--out", "--preset", "--set", "--resume", "--quiet"):
+        assert option in found.stdout
+
+
+@pytest.mark.slow
+def test_doctor_finds_this_machine_well():
+    found = subprocess.run([sys.executable, "-m", "envedit.doctor"], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    assert "llvm_ad_rgb: ready" in found.stdout and found.stderr == ""
+
+
+# ---- the picture to paint on -----------------------------------------------------------------------------
+
+
+def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsys):
+    path = world(tmp_path, rng, target={"kind": "image", "file": "later.png"})
+    before = content(tmp_path)
+    for name in ("a.exr", "b.png", "c.exr"):
+        assert call(path, "--quiet", "--export-initial", tmp_path / name) == 0
+    assert capsys.readouterr().out == ""
+    after = content(tmp_path)
+    assert after.keys() - before.keys() == {"a.exr", "b.png", "c.exr"}
+    assert all(after[key] == before[key] for key in before)
+    assert after["a.exr"] == after["c.exr"]  # the same picture again
+    assert pixels(tmp_path / "a.exr").shape == (18, 24, 3)
+    expected = np.rint(np.clip(pixels(tmp_path / "a.exr").astype(np.float64), 0, 1) ** (1 / 2.2) * 65535)
+    assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
+
+
+def test_the_export_says_what_to_do_next(tmp_path, rng, capsys):
+    path = world(tmp_path, rng)
+    assert call(path, "--export-initial", tmp_path / "b.png") == 0
+    out, _ = capsys.readouterr()
+    assert len(out.splitlines()) == 1 and "24x18" in out and "'gamma'" in out
+    assert f'[target] kind = "image", file = "{tmp_path / "b.png"}"' in out

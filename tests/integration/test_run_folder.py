@@ -1,0 +1,142 @@
+"""What a run writes beside the metrics: the map at its file's size, layers, and what no light can do."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from envedit import config, results
+from envedit.cli import doctor, run
+from envedit.core import latlong
+from envedit.images import images
+from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
+
+WIDTH = 64
+STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
+
+
+@pytest.fixture(autouse=True)
+def small_world(tmp_path_factory, monkeypatch):
+    level = mi.log_level()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+    monkeypatch.setattr(doctor, "ensure", lambda variant: None)
+    yield
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(level)
+
+
+def source(rng):
+    """Return a map of 64 x 32 with a sun."""
+    picture = (0.5 + 0.05 * rng.random((WIDTH // 2, WIDTH, 3))).astype(np.float32)
+    picture[6, 20:22] = 400
+    return picture
+
+
+def carried_out(folder, picture, *arguments, **tables):
+    """Run on the map with 16 working texels; returns the results' folder."""
+    images.write_exr(folder / "map.exr", picture)
+    write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
+    given = {
+        "input": {"envmap": "map.exr", "width": 16},
+        "scene": {"file": "scene.xml", "width": 24},
+        "target": {"spp": 16},
+        "fit": {"epochs": 4},
+        "optimizer": {"iterations": 4},
+        "renderer": {"spp": 32, "max_depth": 3},
+        "output": {"spp": 16},
+    }
+    for table, keys in tables.items():
+        given[table] = given.get(table, {}) | keys
+    lines = []
+    for table, keys in given.items():
+        lines += [f"[{table}]", *(f"{key} = {config.quote(value)}" for key, value in keys.items())]
+    (folder / "c.toml").write_text("\n".join(lines))
+    assert run.main([str(folder / "c.toml"), "--quiet", *arguments]) == 0
+    return folder / "c_out"
+
+
+@pytest.mark.parametrize("kind", slow_but(["layers", "log-pixels"], "log-pixels"))
+def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
+    picture = source(rng)
+    out = carried_out(tmp_path, picture, representation={"kind": kind}, input={"width": 32})
+    full, edited = (images.read(out / name)[0] for name in ("edited_full.exr", "edited.exr"))
+    assert full.shape == picture.shape and edited.shape == (16, 32, 3)
+    assert full[WIDTH // 4 :].tobytes() == picture[WIDTH // 4 :].tobytes()  # below the horizon
+    assert not np.array_equal(full, picture)
+    omega = [latlong.lookup_solid_angles(*m.shape[:2])[:, None, None] for m in (full, edited)]
+    flux = [(m * o).sum((0, 1)) for m, o in zip((full, edited), omega, strict=True)]
+    np.testing.assert_allclose(*flux, rtol=0.02)
+
+
+def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_path, rng):
+    (tmp_path / "a").mkdir()
+    out = carried_out(tmp_path / "a", latlong.resize(source(rng), 8, 16))
+    assert not (out / "edited_full.exr").exists() and (out / "edited_layers.exr").exists()
+    (tmp_path / "b").mkdir()
+    out = carried_out(tmp_path / "b", source(rng), "--set", "output.full=false")
+    assert not (out / "edited_full.exr").exists()
+
+
+def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monkeypatch, capsys):
+    def out_of_memory(*arguments):
+        raise MemoryError
+
+    monkeypatch.setattr(results, "at_full_resolution", out_of_memory)
+    out = carried_out(tmp_path, source(rng))
+    assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
+    assert "not enough memory" in capsys.readouterr().err
+
+
+def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
+    full = results.at_full_resolution
+
+    def gone(*arguments):
+        (tmp_path / "map.exr").unlink()
+        return full(*arguments)
+
+    monkeypatch.setattr(results, "at_full_resolution", gone)
+    out = carried_out(tmp_path, source(rng))
+    assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
+    said = capsys.readouterr().err
+    assert "edited_full.exr is not written" in said and "map.exr" in said
+
+
+def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
+    out = carried_out(tmp_path, source(rng))
+    channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()
+    planes = {name: channel.pixels for name, channel in channels.items()}
+    edited, influence = images.read(out / "edited.exr")[0], images.read(out / "influence.exr")[0]
+    for i, c in enumerate("RGB"):
+        np.testing.assert_array_equal(planes[c], edited[..., i])
+        np.testing.assert_allclose(planes[f"difference.{c}"], planes[c] - planes[f"initial.{c}"], atol=1e-5)
+    np.testing.assert_array_equal(planes["influence.Y"], influence[..., 0])
+
+
+@pytest.mark.slow
+def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, capsys):
+    target = {"kind": "strokes", "strokes": [STROKE]}
+    out = carried_out(tmp_path, source(rng), target=target)
+    found = json.loads((out / "metrics.json").read_text())
+    painted = found["painted"]
+    assert set(painted) == {"towards", "elsewhere", "reachable"} and 0 <= painted["reachable"] <= 1
+    assert found["envmap"] is None and found["timing"]["reach_s"] > 0
+    assert any("within reach" in line for line in found["choices"])
+    assert images.read(out / "unreachable.png")[0].shape == (18, 24, 3)
+    assert "What was painted" in (out / "report.html").read_text()
+    wanted, initial = (images.read(out / f"render_{name}.exr")[0] for name in ("target", "initial"))
+    np.testing.assert_allclose(wanted[8:10, 10:14], 0.5 * initial[8:10, 10:14], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_less_than_half_within_reach_is_a_warning(tmp_path, rng, capsys):
+    """A chequered patch in the middle of a matte ball: no light does that."""
+    strokes = [
+        {"type": kind, "rectangle": [x, y, x + 1, y + 1], "units": "pixels", "amount": 1.0}
+        for x in range(10, 14) for y in range(7, 11) for kind in ("light" if (x + y) % 2 else "shadow",)
+    ]  # fmt: skip
+    out = carried_out(tmp_path, source(rng), target={"kind": "strokes", "strokes": strokes})
+    assert json.loads((out / "metrics.json").read_text())["painted"]["reachable"] < 0.5
+    assert "within reach of any map" in capsys.readouterr().err

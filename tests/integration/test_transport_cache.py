@@ -1,0 +1,189 @@
+"""A recording on disk: the same bits as traced, for the same scene, grid and samples and no other."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.scene import scene
+from envedit.transport import light_transport, recording
+from envedit.transport.light_transport import LightTransport
+from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
+
+LAMP = """<shape type="sphere"><point name="center" x="0" y="3" z="0"/><float name="radius" value="0.3"/>
+    <emitter type="area"><rgb name="radiance" value="6, 3, 12"/></emitter></shape>"""
+GROUND = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="9"/>
+    <translate y="-1"/></transform></shape>"""
+TURNED = """<emitter type="envmap"><string name="filename" value="none.exr"/>
+    <transform name="to_world"><rotate y="1" angle="30"/></transform></emitter>"""
+
+
+@pytest.fixture
+def lit(tmp_path):
+    return scene.load(write_scene(tmp_path, SENSOR, BALL, GROUND, LAMP, LIGHT))
+
+
+def build(folder, lit, height=8, width=16, **options):
+    return LightTransport.build(lit, height, width, folder=folder / "cache", **{"spp": 16, **options})
+
+
+def pictures(t, rng):
+    """Return what a transport makes of a map and of a picture, as bytes."""
+    image = mi.TensorXf(rng.random((t.grid.height, t.grid.width, 3)).astype(np.float32))
+    picture = mi.TensorXf(rng.random((*t.shape, 3)).astype(np.float32))
+    return t.apply(image).numpy().tobytes(), t.adjoint(picture).numpy().tobytes()
+
+
+def nothing_is_traced(monkeypatch):
+    def refuse(*arguments, **keys):
+        raise AssertionError("something was traced")
+
+    monkeypatch.setattr(recording, "contributions", refuse)
+    monkeypatch.setattr(scene.Scene, "render", refuse)
+
+
+@pytest.mark.parametrize("lamp", slow_but([True, False], True))
+def test_a_second_build_traces_nothing_and_gives_the_same_bits(lamp, tmp_path, rng, monkeypatch):
+    """Under a lamp the light that is not the map's is kept as well."""
+    s = scene.load(write_scene(tmp_path, SENSOR, BALL, *([LAMP] if lamp else []), LIGHT))
+    first = build(tmp_path, s)
+    with monkeypatch.context() as patch:
+        nothing_is_traced(patch)
+        second = build(tmp_path, s)
+    assert not first.cached and second.cached
+    state = rng.bit_generator.state
+    made = pictures(first, rng)
+    rng.bit_generator.state = state
+    assert pictures(second, rng) == made
+    assert second.influence.tobytes() == first.influence.tobytes() and second.influence.flags.writeable
+    assert second.choices == first.choices and len(first.choices) == 2
+    differing = {"cached"}
+    told, told_again = first.summary(), second.summary()
+    assert {k for k in told if told[k] != told_again[k]} == differing
+    assert (np.abs(first.apply(dr.zeros(mi.TensorXf, (8, 16, 3))).numpy()).max() > 0) == lamp
+
+
+@pytest.mark.slow
+def test_exact_columns_beside_a_recording_from_disk_are_the_same(lit, tmp_path, rng):
+    sun = np.full((8, 16, 3), 0.1, np.float32)
+    sun[2, 5] = 500
+    made = []
+    for t in (build(tmp_path, lit), build(tmp_path, lit)):
+        t.resolve(sun)
+        assert len(t.columns)
+        made.append((t.columns.tolist(), t.apply(mi.TensorXf(sun)).numpy().tobytes()))
+    assert made[0] == made[1]
+
+
+@pytest.mark.slow
+def test_what_was_lost_is_told_from_disk_as_well(lit, tmp_path, monkeypatch):
+    real = recording.contributions
+
+    def spoiled(*arguments):
+        for bounce, pixel, texel, value in real(*arguments):
+            first = dr.arange(mi.UInt32, len(pixel)) == 0
+            yield bounce, pixel, texel, dr.select(first, float("nan"), value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recording, "contributions", spoiled)
+        first = build(tmp_path, lit)
+    second = build(tmp_path, lit)
+    assert second.cached and second.choices == first.choices and "not finite" in second.choices[-1]
+
+
+CHANGES = {
+    "seed": {"seed": 1},
+    "samples": {"spp": 8},
+    "depth": {"max_depth": 2},
+    "grid": {"height": 9, "width": 16},
+}
+
+
+@pytest.mark.parametrize("name", slow_but(CHANGES, "seed"))
+def test_another_recording_is_not_taken_for_this_one(name, lit, tmp_path):
+    build(tmp_path, lit)
+    other = build(tmp_path, lit, **CHANGES[name])
+    assert not other.cached
+    assert build(tmp_path, lit).cached and build(tmp_path, lit, **CHANGES[name]).cached
+
+
+@pytest.mark.slow
+def test_another_scene_is_not_taken_for_this_one(tmp_path):
+    """Colour, camera, film, turn of the emitter, a parameter of the scene: each makes its own recording."""
+    ball = BALL.replace("0.2, 0.4, 0.6", "$red, 0.4, 0.6")
+    parts = {
+        "first": (SENSOR, ball, LIGHT),
+        "camera": (SENSOR.replace("0,1,6", "0,2,6"), ball, LIGHT),
+        "film": (SENSOR.replace('"16"', '"20"'), ball, LIGHT),
+        "emitter": (SENSOR, ball, TURNED),
+        "object": (SENSOR, ball, BALL.replace("sphere", "cube"), LIGHT),
+    }
+    red = '<default name="red" value="0.2"/>'
+    made = [scene.load(write_scene(tmp_path, red, *some, name=f"{n}.xml")) for n, some in parts.items()]
+    made.append(scene.load(tmp_path / "first.xml", 20, 20))
+    made.append(scene.load(tmp_path / "first.xml", parameters={"red": 0.3}))
+    assert [build(tmp_path, s).cached for s in made] == [False] * len(made)
+    # The same scene by another name and in another folder is the same.
+    (tmp_path / "there").mkdir()
+    assert build(tmp_path, scene.load(write_scene(tmp_path / "there", red, *parts["first"]))).cached
+
+
+@pytest.mark.slow
+def test_a_mesh_is_known_by_its_content(tmp_path):
+    def load():
+        return scene.load(write_scene(tmp_path, SENSOR, '<shape type="obj"><string name="filename" value='
+                                      '"a.obj"/></shape>', LIGHT))  # fmt: skip
+
+    square = "v -1 0 0\nv 1 0 0\nv 1 {top} 0\nv -1 {top} 0\nf 1 2 3\nf 1 3 4\n"
+    (tmp_path / "a.obj").write_text(square.format(top=1))
+    assert not build(tmp_path, load()).cached and build(tmp_path, load()).cached
+    (tmp_path / "a.obj").write_text(square.format(top=2))
+    assert not build(tmp_path, load()).cached
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lamp", [True, False])
+def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp_path):
+    """But under a lamp, whose light is cut only where a depth is asked for."""
+    lit = scene.load(write_scene(tmp_path, SENSOR, BALL, GROUND, *([LAMP] if lamp else []), LIGHT))
+    depth = build(tmp_path, lit).bounces + 1
+    asked = build(tmp_path, lit, max_depth=depth)
+    assert asked.cached == (not lamp) and len(asked.choices) == 1
+    assert 0 < asked.depth_error <= recording.DEPTH_TOLERANCE < build(tmp_path, lit, max_depth=2).depth_error
+
+
+def test_a_later_version_records_anew(lit, tmp_path, monkeypatch):
+    build(tmp_path, lit)
+    monkeypatch.setattr(light_transport, "_RECORDING", light_transport._RECORDING + 1)
+    assert not build(tmp_path, lit).cached
+
+
+def test_damaged_files_are_traced_again(lit, tmp_path, rng):
+    first = build(tmp_path, lit)
+    state = rng.bit_generator.state
+    made = pictures(first, rng)
+    for path in (tmp_path / "cache").iterdir():
+        path.write_bytes(path.read_bytes()[:-100])
+    again = build(tmp_path, lit)
+    rng.bit_generator.state = state
+    assert not again.cached and pictures(again, rng) == made
+    assert build(tmp_path, lit).cached
+
+
+@pytest.mark.slow
+def test_recordings_of_a_refresh_are_not_kept(lit, tmp_path, rng):
+    image = mi.TensorXf(np.ones((8, 16, 3), np.float32))
+    first = build(tmp_path, lit, refresh=1)
+    kept = sorted(path.name for path in (tmp_path / "cache").iterdir())
+    second = build(tmp_path, lit, refresh=1)
+    made = [t.render(image, 1).numpy().tobytes() for t in (first, second)]
+    assert made[0] == made[1] != build(tmp_path, lit).render(image, 0).numpy().tobytes()
+    assert sorted(path.name for path in (tmp_path / "cache").iterdir()) == kept
+
+
+def test_without_a_folder_nothing_is_kept(lit, tmp_path):
+    before = set(tmp_path.rglob("*"))
+    for _ in range(2):
+        assert not LightTransport.build(lit, 8, 16, spp=4).cached
+    assert set(tmp_path.rglob("*")) == before

@@ -1,0 +1,169 @@
+"""Every map of the matrix through every stage, odd targets and scenes; the page in docs/ says the same."""
+
+import numpy as np
+import pytest
+
+from envedit import pipeline
+from envedit.core import latlong, radiance
+from envedit.core.errors import InputError, NumericalError
+from envedit.images import images
+from envedit.representations import LogPixels, Pixels
+from envedit.representations.layers.layers import Layers
+from envedit.scene import scene
+from envedit.targets import painted_image, target
+from tests.oracles import ROOT, extremes
+from tests.oracles.extremes_stages import transport, write_plain
+from tests.oracles.runs import settings_of
+from tests.oracles.tiers import slow_but
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.mark.parametrize(("name", "stage"), slow_but(extremes.CELLS, "1e30", "NaN", "sun at the seam"))
+def test_cell(name, stage, tmp_path):
+    outcome = extremes.observe(extremes.STAGES[stage], extremes.MAPS[name], tmp_path)
+    extremes.agree(extremes.expected(name, stage), *outcome)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", extremes.TARGETS)
+def test_target(name, tmp_path):
+    act, outcome = extremes.TARGETS[name]
+    extremes.agree(outcome, *extremes.observe(act, tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", extremes.SCENES)
+def test_scene(name, tmp_path):
+    act, outcome = extremes.SCENES[name]
+    extremes.agree(outcome, *extremes.observe(act, tmp_path))
+
+
+def test_every_declared_exception_is_a_cell():
+    assert set(extremes.EXCEPTIONS) <= set(extremes.CELLS)
+
+
+def test_the_page_is_current():
+    """``python -m tests.oracles.extremes > docs/extremes.md`` writes it anew."""
+    page = ROOT / "docs" / "extremes.md"
+    assert page.read_text(encoding="utf-8") == extremes.document()
+
+
+# ---- refusals ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("value", "says"), [
+    (np.nan, "sky: 2 texels are not finite, the first at row 11, column 3: repair the map"),
+    (-np.inf, "sky: 2 texels are not finite, the first at row 11, column 3: repair the map"),
+    (-1e-30, "sky: 2 texels are negative, the first at row 11, column 3: set them to 0"),
+    (2e30, r"sky: 2 texels are brighter than 1.27e\+30, the first at row 11, column 3: scale the map down"),
+])  # fmt: skip
+def test_what_is_no_radiance_is_refused_by_row_and_column(value, says):
+    m = np.ones((4, 8, 3), np.float32)
+    m[1, 3, 2] = m[2, 0, 0] = value
+    with pytest.raises(InputError, match=f"^{says}$"):
+        radiance.require_radiance(m, "sky", 10, radiance.BRIGHTEST)
+    radiance.require_radiance(np.full((4, 8, 3), 1.2e30, np.float32), "sky", 10, radiance.BRIGHTEST)
+    radiance.require_radiance(np.full((4, 8, 3), 3e38, np.float32), "sky")
+    radiance.require_radiance(-np.zeros((4, 8, 3), np.float32), "sky")
+
+
+def test_rows_of_a_refusal_are_those_of_the_map():
+    m = extremes.texel(np.nan)
+    with pytest.raises(InputError, match="row 12, column 9"):
+        Layers(rows=(7, 32)).encode(m)
+    for made in (Pixels(), LogPixels()):
+        with pytest.raises(InputError, match="row 5, column 9"):
+            made.encode(m)
+
+
+def test_pixels_hold_what_logarithms_cannot():
+    m = extremes.texel(3e38)
+    np.testing.assert_array_equal(Pixels().decode(Pixels().encode(m)).numpy(), m)
+    with pytest.raises(InputError, match="log-pixels: 1 texels are brighter"):
+        LogPixels().encode(m)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("value", "error", "says"), [
+    (1e10, None, ""),
+    (1e30, NumericalError, "not finite"),
+    (3e38, InputError, "layers: 1 texels are brighter than 1.27e[+]30, the first at row 2, column 5"),
+])  # fmt: skip
+def test_whole_runs_end_finite_or_with_a_reason(value, error, says, tmp_path):
+    m = extremes.sky(8, 16)
+    m[2, 5] = value
+    settings = settings_of(tmp_path, m, target={"rotate_degrees": 90.0}, input={"rows": "all"})
+    if error:
+        with pytest.raises(error, match=says):
+            pipeline.run(settings)
+        return
+    result = pipeline.run(settings)
+    assert np.isfinite(result.envmap).all() and result.metrics["non_finite_steps"] == 0
+
+
+@pytest.mark.parametrize(("value", "stored"), [(65504, 65504), (65505, 65504), (1.5e5, np.inf)])
+def test_half_floats_cut_a_sun_and_it_is_told(value, stored, tmp_path):
+    with np.errstate(over="ignore"):
+        path = write_plain(tmp_path / "half.exr", extremes.texel(value).astype(np.float16))
+    if np.isinf(stored):
+        with pytest.raises(InputError, match="1 texels are NaN or infinite, the first at row 5, column 9"):
+            images.load_envmap(path)
+        return
+    found, info = images.load_envmap(path)
+    assert found[5, 9].tolist() == [stored] * 3
+    assert len(info["warnings"]) == 1 and "1 texels sit at 65504, the largest half" in info["warnings"][0]
+
+
+def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
+    m = extremes.sky(8, 16)
+    settings = settings_of(tmp_path, m)
+    lit = scene.load(settings.scene.file, settings.scene.width)
+    picture = painted_image.initial(lit, m, settings)
+    picture[3, 4] = 3e38
+    made = target.make(settings, lit, m, picture)
+    assert any("target: 1 pixels are brighter than 1.27e+30" in line for line in made.warnings)
+    assert (made.picture[3, 4] == np.float32(2.0**100)).all()
+    picture[3, 4] = 1e30
+    made = target.make(settings, lit, m, picture)
+    np.testing.assert_array_equal(made.picture, picture)
+    assert not made.warnings
+
+
+def test_another_map_beyond_all_light_is_refused_as_a_target(tmp_path):
+    images.write_exr(tmp_path / "other.exr", extremes.texel(3e38))
+    settings = settings_of(tmp_path, extremes.sky(8, 16), target={"file": "other.exr"}, input={"width": 16})
+    with pytest.raises(InputError, match=r"other.exr: \d+ texels are brighter than 1.27e[+]30"):
+        pipeline.run(settings)
+
+
+# ---- what the matrix found ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [1e6, 1e30, 2.0**100])
+def test_a_light_of_any_radiance_comes_back(value):
+    m = extremes.texel(value)
+    made = Layers()
+    got = made.decode(made.encode(m)).numpy()
+    assert len(made.separation.lights) == 1
+    np.testing.assert_allclose(got[5, 9], value, rtol=1e-6)
+    assert np.abs(got - m)[m < 1].max() <= 0.02
+
+
+def test_a_light_near_the_end_of_single_precision_is_not_put_out():
+    """What the sum of a polar texel would be overflows, and nothing else may."""
+    one = extremes.CHECKS["flux of a light that is shared out"]
+    assert one.measure() <= one.bound
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -5.0])
+def test_no_error_is_told_of_a_map_that_is_no_radiance(value):
+    with pytest.raises(InputError, match="light transport: 1 texels are .* row 5, column 9"):
+        transport(16, 32).coarse_error(extremes.texel(value))
+
+
+@pytest.mark.parametrize("size", [(1, 2), (2, 4), (3, 1)])
+def test_a_grid_that_mitsuba_does_not_take_is_refused(size):
+    with pytest.raises(InputError, match=f"map of {size[1]} x {size[0]} texels is too small"):
+        latlong.check_envmap_size(*size)
+    latlong.check_envmap_size(3, 2)

@@ -1,0 +1,673 @@
+"""Light transport against Mitsuba's path tracer, against integrals, and against itself."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong, shipped
+from envedit.core.errors import InputError
+from envedit.images.images import load_envmap
+from envedit.scene import scene
+from envedit.transport import block_transport
+from envedit.transport.light_transport import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE
+from tests.oracles.kernels import compiled
+from tests.oracles.scenes import (
+    DEPTH,
+    HEIGHT,
+    LAMP,
+    METAL,
+    SCENES,
+    SEEDS,
+    WALL,
+    WHITE,
+    WIDTH,
+    ball,
+    black,
+    build,
+    dot,
+    load,
+    noise,
+    one_hot,
+    picture,
+    references,
+    refined,
+    stage,
+    sun,
+)
+from tests.oracles.statistics import LEVEL, disagreement
+from tests.oracles.tiers import slow_but
+
+# ---- scenes ------------------------------------------------------------------------------------------------
+
+
+SUNS = {
+    "the horizon": (HEIGHT // 2 - 1, 9),
+    "the seam, first column": (4, 0),
+    "the seam, last column": (5, WIDTH - 1),
+    "the pole": (0, 5),
+}
+SUNS_BELOW = {"below the horizon": (HEIGHT // 2, 22), "the lower pole": (HEIGHT - 1, 5)}
+MAPS = {
+    "sunny sky": "puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr",
+    "city": "hdri/venice_sunset_1k.hdr",
+}
+
+
+# ---- Mitsuba's pictures ------------------------------------------------------------------------------------
+
+
+def test_every_shipped_scene_is_compared():
+    assert {value[0] for value in SCENES.values() if isinstance(value, tuple)} == set(shipped.scenes())
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def recorded(request):
+    """Return a scene's name, the scene, and independent transports of it."""
+    s = load(request.param)
+    return request.param, s, [build(s, seed=seed) for seed in range(SEEDS)]
+
+
+@pytest.mark.slow
+def test_pictures_are_those_of_mitsuba(recorded):
+    name, s, transports = recorded
+    wrong, unseen, some = {}, {}, noise(2, *transports[0].shape)
+
+    def compare(what, image, theirs, sees=1.03):
+        ours = np.stack([picture(t, image) for t in transports])
+        if text := disagreement(ours, theirs):
+            wrong[what] = text
+        if not disagreement(sees * ours, theirs):  # negative control
+            unseen[what] = sees
+
+    # The coarse tier alone.
+    grey = np.full((HEIGHT, WIDTH, 3), 0.7, np.float32)
+    compare("grey", grey, references(s, grey), sees=1.02)
+    under_noise = references(s, noise())
+    compare("noise", noise(), under_noise)
+    if name == "mirror":  # negative control: only a mirror sees single texels of a noisy sky
+        moved = np.stack([picture(t, np.roll(noise(), 1, axis=1)) for t in transports])
+        assert disagreement(moved, under_noise) != ""
+    assert_transpose(transports[0], noise(), some)
+
+    # Both tiers.
+    suns = SUNS | (SUNS_BELOW if name == "in the air" else {})
+    for what, (row, column) in suns.items():
+        image = sun(row, column)
+        assert all(t.resolve(image) >= 1 for t in transports)
+        assert row * WIDTH + column in transports[0].columns
+        # The plane sees a sun at the horizon at grazing incidence: both renderings are noisier.
+        theirs = references(s, refined(image), spp=128)
+        compare(f"sun at {what}", image, theirs, sees=1.1 if what == "the horizon" else 1.03)
+        assert_transpose(transports[0], image, some)
+        if name == "matte" and what == "the seam, first column":  # negative control: one texel further
+            moved = np.roll(image, 1, axis=1)
+            assert all(t.resolve(moved) >= 1 for t in transports)
+            assert disagreement(np.stack([picture(t, moved) for t in transports]), theirs) != ""
+    # The columns that are there now do not spoil other maps.
+    compare("noise through both tiers", noise(), under_noise)
+    assert_transpose(transports[0], noise(), some)
+    assert not wrong, wrong
+    assert not unseen, f"a bias would not have been seen: {unseen}"
+
+
+# Films and frames have no say in what a real map has beyond noise and a sun.
+SURFACES = [name for name in SCENES if name not in ("turned and cropped", "in the air", "mitchell filter")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recorded", SURFACES, indirect=True)
+def test_pictures_under_a_real_map_are_those_of_mitsuba(recorded, data):
+    name, s, transports = recorded
+    for file in ("sunny sky", "city") if name == "pair" else ("sunny sky",):
+        image, _ = load_envmap(data / MAPS[file], WIDTH)
+        assert all(1 <= t.resolve(image, limit=8) <= 8 for t in transports)  # both tiers take part
+        ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image, spp=128)
+        assert disagreement(ours, theirs) == "", file
+        assert disagreement(1.03 * ours, theirs) != "", file  # negative control
+
+
+@pytest.mark.slow
+def test_comparison_sees_one_percent():
+    s = load("matte")
+    ours = np.stack([picture(build(s, seed=seed), noise()) for seed in range(SEEDS)])
+    assert disagreement(1.01 * ours, references(s, noise())) != ""
+
+
+ALL_EXACT = ["sphere", "sphere, alpha 0.02", "mirror", "glass", "red wall and a lamp"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALL_EXACT)
+def test_exact_columns_of_the_whole_map_give_the_picture(name):
+    s, image = load(name), noise(1, 4, 8)
+    transports = [build(s, 4, 8, seed=seed) for seed in range(SEEDS)]
+    for t in transports:
+        t.resolve(image, tolerance=0)
+        # What cannot matter needs no column, and the last one alone has no variance.
+        assert len(t.columns) >= np.count_nonzero(t.influence) - 1
+    ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image)
+    assert disagreement(ours, theirs) == ""
+    assert disagreement(1.01 * ours, theirs) != ""  # negative control
+
+
+@pytest.mark.parametrize("depth", slow_but([1, 2, 3], 2))
+def test_depth_means_what_it_means_to_mitsuba(depth):
+    film = {"width": 24, "height": 24}
+    # Low and level, so that the sky is in view; the light of the lamp is cut at the same depth.
+    s = scene.load(stage(ball(WHITE), WALL, LAMP, film=film, origin=(0, 1.2, 7)))
+    transports = [build(s, max_depth=depth, seed=seed) for seed in range(SEEDS)]
+    # Low contrast: at 64 samples a pixel that sees the fringe of one bright texel is far from normal.
+    for image in (1 + noise(), black()):
+        ours = np.stack([picture(t, image) for t in transports])
+        assert disagreement(ours, references(s, image, depth=depth)) == ""
+
+
+@pytest.mark.slow
+def test_sky_seen_directly_converges_with_every_seed():
+    # Were jitter within the pixel and choice among four texels correlated, more samples would not help.
+    s = scene.load(stage(film={"width": 12, "height": 12}, origin=(0, 1.2, 7), up=(0, 1, 0)))
+    image = noise()
+    exact = np.mean(references(s, image, spp=4096, depth=1), axis=0)
+
+    def error(seed, spp):
+        return np.sqrt(np.mean((picture(build(s, max_depth=1, seed=seed, spp=spp), image) - exact) ** 2))
+
+    for seed in range(3):
+        # 16 times the samples: a quarter of the error; 2.5 leaves room for chance in 144 pixels.
+        assert error(seed, 1024) < error(seed, 64) / 2.5
+
+
+# ---- integrals ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row, column", [(0, 3), (1, 0), (4, WIDTH - 1), (7, 20), (8, 11)])
+def test_plane_under_one_texel_receives_its_irradiance(row, column):
+    # I = albedo / pi * integral of cos(theta) times the texel's tent over the upper hemisphere.
+    image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    image[row, column] = (1e5, 2e5, 3e5)
+    v = (np.arange(1500) + 0.5) / 3000  # midpoints; the error is of the order of the step squared
+    phi = 2 * np.pi * (np.arange(640) + 0.5) / 640
+    theta = np.pi * v[:, None]
+    ring = np.sin(theta)
+    d = np.stack([ring * np.sin(phi), np.cos(theta) + 0 * phi, -ring * np.cos(phi)], axis=-1)
+    measure = np.cos(theta) * np.sin(theta) * (np.pi / 3000) * (2 * np.pi / 640)
+    expected = 0.5 / np.pi * (latlong.lookup(image, d) * measure[..., None]).sum(axis=(0, 1))
+
+    s = scene.load(stage(origin=(0, 5, 0), up=(0, 0, -1)))
+    ours = []
+    for seed in range(SEEDS):
+        t = build(s, max_depth=2, seed=seed)
+        assert t.resolve(image) == 1
+        ours.append(picture(t, image))
+    ours = np.stack(ours)
+    assert disagreement(ours, np.broadcast_to(expected, ours.shape), sizes=(4, 0)) == ""
+    # Negative control; at grazing incidence half the tent is below the plane, and the noise is larger.
+    wrong = 1.1 if row == 8 else 1.01
+    assert disagreement(wrong * ours, np.broadcast_to(expected, ours.shape), sizes=(0,)) != ""
+
+
+@pytest.mark.slow
+def test_automatic_depth_is_that_of_the_scene():
+    plane = scene.load(stage(film={"width": 8, "height": 8}, origin=(0, 5, 0), up=(0, 0, -1)))
+    t = build(plane, max_depth="auto", spp=16)
+    assert t.bounces == 1  # an open plane does not light itself
+    assert any("path depth 2" in text for text in t.choices)
+    assert build(load("red wall and a lamp"), max_depth="auto", spp=16).bounces >= 3
+    assert build(plane, max_depth=5, spp=16).bounces == 4
+
+
+def test_texels_below_the_ground_have_no_influence(lit):
+    # The plane ends 1.2 degrees below the horizon; the tent of row 9 begins 6 degrees below it.
+    assert (lit.influence[9:] == 0).all() and (lit.influence[1:7] > 0).all()
+    gradient = lit.adjoint(mi.TensorXf(np.ones((*lit.shape, 3), np.float32))).numpy()
+    assert (gradient[9:] == 0).all()
+
+
+@pytest.mark.slow
+def test_influence_is_what_a_texel_adds_to_the_picture():
+    t = build(load("matte"), 6, 12)
+    ones = mi.TensorXf(np.ones((*t.shape, 3), np.float32))
+    # Sums of some thousand positive numbers in float32.
+    np.testing.assert_allclose(t.influence, t.adjoint(ones).numpy().mean(axis=2), rtol=1e-4)
+
+
+# ---- a linear operation and its adjoint --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lamp_scene():
+    return scene.load(stage(ball(METAL), WALL, LAMP, film={"width": 23, "height": 17}))
+
+
+@pytest.fixture(scope="module")
+def lit(lamp_scene):
+    """Transport without columns, for a scene with a lamp, on an odd number of pixels."""
+    return build(lamp_scene, spp=32)
+
+
+@pytest.fixture(scope="module")
+def resolved(lamp_scene):
+    """The same with exact columns."""
+    t = build(lamp_scene, spp=32)
+    assert t.resolve(sun(4, 0)) >= 1 and t.resolve(sun(7, 9)) >= 1
+    assert t.resolve(noise(), limit=20) >= 1
+    return t
+
+
+@pytest.fixture(params=["coarse", "with columns"])
+def transport(request):
+    return request.getfixturevalue("lit" if request.param == "coarse" else "resolved")
+
+
+def assert_transpose(transport, x, y):
+    """Compare <T x, y> and <x, T' y>.
+
+    All terms must be positive: float32 sums of some hundred terms have errors of some 1e-6.
+    """
+    lit = (picture(transport, x) - picture(transport, black()).astype(np.float64)) * y
+    pulled = transport.adjoint(mi.TensorXf(y)).numpy()
+    assert lit.sum() > 0
+    assert abs(lit.sum() - dot(x, pulled)) <= 1e-5 * lit.sum()
+
+
+def test_adjoint_is_the_transpose(transport, rng):
+    for _ in range(3):
+        x = rng.random((HEIGHT, WIDTH, 3), dtype=np.float32)
+        y = rng.random((*transport.shape, 3), dtype=np.float32)
+        assert_transpose(transport, x, y)
+        # Each channel on its own; a mixture of channels would not be seen in the sum.
+        only = np.zeros_like(y)
+        only[..., 1] = y[..., 1]
+        pulled = transport.adjoint(mi.TensorXf(only)).numpy()
+        assert (pulled[..., [0, 2]] == 0).all()
+        assert_transpose(transport, x, only)
+
+
+def test_reverse_mode_gives_the_adjoint(transport, rng):
+    y = mi.TensorXf(rng.standard_normal((*transport.shape, 3)).astype(np.float32))
+    x = mi.TensorXf(rng.random((HEIGHT, WIDTH, 3), dtype=np.float32))
+    dr.enable_grad(x)
+    dr.backward(dr.sum(transport.apply(x) * y, axis=None))
+    np.testing.assert_array_equal(dr.grad(x).numpy(), transport.adjoint(y).numpy())
+
+
+def test_forward_mode_gives_the_product_without_the_lamp(transport, rng):
+    x, v = (rng.random((HEIGHT, WIDTH, 3), dtype=np.float32) for _ in range(2))
+    variable = mi.TensorXf(x)
+    dr.enable_grad(variable)
+    dr.set_grad(variable, mi.TensorXf(v))
+    image = transport.apply(variable)
+    tangent = dr.forward_to(image).numpy()
+    difference = picture(transport, v) - picture(transport, black())
+    # The difference cancels digits where the lamp is bright.
+    np.testing.assert_allclose(tangent, difference, rtol=1e-5, atol=1e-5 * picture(transport, v).max())
+    # A lamp that crept in would add its own light.
+    assert picture(transport, black()).max() > 100 * np.abs(tangent - difference).max()
+
+
+def test_finite_differences_of_a_nonlinear_loss(transport, rng):
+    x, v = (rng.random((HEIGHT, WIDTH, 3), dtype=np.float32) + 0.1 for _ in range(2))
+    variable = mi.TensorXf(x)
+    dr.enable_grad(variable)
+    dr.backward(dr.sum(dr.log(transport.apply(variable)), axis=None))
+    slope = dot(dr.grad(variable).numpy(), v)
+
+    def loss(step):
+        return np.log(picture(transport, (x + step * v).astype(np.float32)).astype(np.float64)).sum()
+
+    # Central difference: error ~ step^2 = 1e-4 of the slope, and 1e-6 / step = 1e-4 from rounding.
+    assert slope == pytest.approx((loss(1e-2) - loss(-1e-2)) / 2e-2, rel=1e-3)
+
+
+def test_rendering_is_linear(transport, rng):
+    a, b = (rng.random((HEIGHT, WIDTH, 3), dtype=np.float32) for _ in range(2))
+    offset = picture(transport, black())
+    together = picture(transport, 2 * a + 3 * b) - offset
+    apart = 2 * (picture(transport, a) - offset) + 3 * (picture(transport, b) - offset)
+    # Rounding of float32 sums, at the size of what was subtracted.
+    np.testing.assert_allclose(together, apart, rtol=1e-5, atol=1e-5 * picture(transport, a).max())
+
+
+def test_linear_is_the_rendering_without_other_lamps(transport, rng):
+    x = rng.random((HEIGHT, WIDTH, 3), dtype=np.float32)
+    alone, lamp = transport.linear(mi.TensorXf(x)).numpy(), picture(transport, black())
+    # The difference cancels digits where the lamp is bright.
+    np.testing.assert_allclose(alone, picture(transport, x) - lamp, rtol=1e-5, atol=1e-6 * lamp.max())
+    assert lamp.max() > 0.1 * alone.max() > 0  # a lamp that crept in would be seen
+    assert (transport.linear(mi.TensorXf(black())).numpy() == 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e-30, 65504.0, 1e6, 1e30])
+def test_scale_of_the_map_is_the_scale_of_the_picture(scale):
+    t = build(load("matte"), 6, 12, spp=16)
+    image = noise(2, 6, 12)
+    scaled = (image * np.float32(scale)).astype(np.float32)
+    t.resolve(scaled)
+    # The same sums in the same order; a power of two apart they would have the same bits.
+    np.testing.assert_allclose(picture(t, scaled) / scale, picture(t, image), rtol=2e-5)
+
+
+def test_black_map_needs_no_columns_and_shows_the_lamp(lamp_scene, lit):
+    assert lit.resolve(black()) == 0
+    lamp = picture(lit, black())
+    assert lamp.max() > 0.1 and np.isfinite(lamp).all()
+    t = build(load("matte"), 6, 12, spp=16)
+    np.testing.assert_array_equal(picture(t, np.zeros((6, 12, 3), np.float32)), 0)
+
+
+def test_non_finite_texel_is_not_hidden():
+    t = build(load("matte"), 6, 12, spp=16)
+    image = np.ones((6, 12, 3), np.float32)
+    for value in (np.nan, np.inf):
+        image[1, 4] = value
+        assert not np.isfinite(picture(t, image)).all()
+
+
+# ---- columns -----------------------------------------------------------------------------------------------
+
+
+def test_texels_that_deserve_it_get_columns(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    assert t.resolve(np.ones((HEIGHT, WIDTH, 3), np.float32)) == 0  # a grey sky has no error
+    image = sun(4, 0)
+    image[12, 3] = 1e6  # below the ground: bright, but of no consequence
+    assert t.resolve(image) == 1
+    np.testing.assert_array_equal(t.columns, [4 * WIDTH])
+    assert t.resolve(image) == 0  # exact for good
+    many = t.bright_texels(noise(), tolerance=0.001)
+    radiance = noise().reshape(-1, 3).max(axis=1)[many]
+    assert len(many) > len(t.bright_texels(noise(), tolerance=0.01))
+    assert (np.diff(radiance) <= 0).all()  # brightest first
+
+
+def test_limit_bounds_the_new_columns(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    image = noise()
+    image[4, :3] = 1e4  # lights and mere bright texels are traced differently, and bounded together
+    assert t.resolve(image, tolerance=0, limit=2) == 2
+    assert len(t.columns) == 2
+
+
+@pytest.mark.slow
+def test_capacity_is_never_exceeded(lamp_scene):
+    pixels = lamp_scene.width * lamp_scene.height
+    coarse = pixels * 32 * 1.5 * 32 / 1e9
+    t = build(lamp_scene, spp=32, memory_gb=coarse + 5.5 * 16 * pixels / 1e9)
+    assert t.capacity == 5
+    t.resolve(noise(), tolerance=0)
+    assert len(t.columns) == 5 and len(set(t.columns)) == 5
+    # Texels that are bright now take the places of those that were.
+    stay = np.intersect1d(t.columns, t.bright_texels(noise(1), 0)[:5])
+    assert t.resolve(noise(1), tolerance=0) == 5 - len(stay) > 0
+    assert set(t.columns) == set(t.bright_texels(noise(1), 0)[:5])
+    fresh = build(lamp_scene, spp=32, memory_gb=coarse + 5.5 * 16 * pixels / 1e9)
+    fresh.resolve(noise(1), tolerance=0)
+    np.testing.assert_allclose(picture(t, noise()), picture(fresh, noise()), rtol=1e-5)
+    none = build(lamp_scene, spp=32, memory_gb=coarse * 1.0001)
+    assert none.capacity == 0 and none.resolve(sun(4, 0)) == 0
+    gradient = none.adjoint(mi.TensorXf(np.ones((*none.shape, 3), np.float32))).numpy()
+    assert np.isfinite(picture(none, sun(4, 0))).all() and np.isfinite(gradient).all()
+
+
+def test_same_seed_gives_the_same_bytes(lamp_scene):
+    def run(seed):
+        t = build(lamp_scene, spp=32, seed=seed)
+        before = picture(t, noise())
+        t.resolve(sun(7, 9))
+        t.resolve(noise(), limit=5)
+        after = picture(t, sun(7, 9))
+        return before, after, t.adjoint(mi.TensorXf(before)).numpy(), t.influence
+
+    first, again, other = run(3), run(3), run(4)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(first, other, strict=True):
+        assert (a != b).any()
+
+
+@pytest.mark.slow
+def test_every_seed_of_a_configuration_works(lamp_scene):
+    for seed in (2**31 - 1, 2**32 - 1):
+        t = build(lamp_scene, spp=4, seed=seed)
+        t.resolve(sun(7, 9))
+        assert np.isfinite(picture(t, noise())).all()
+
+
+@pytest.mark.slow
+def test_state_brings_back_the_same_bytes(lamp_scene):
+    t = build(lamp_scene, spp=32, refresh=4)
+    image = mi.TensorXf(sun(7, 9))
+    for step in (0, 5):  # the second in the next epoch: everything was traced afresh
+        drawn = t.render(image, step).numpy()
+    t.resolve(noise(), limit=5)
+    after = picture(t, noise())
+    copy = build(lamp_scene, spp=32, refresh=4)
+    copy.restore({key: np.array(value) for key, value in t.state().items()})
+    np.testing.assert_array_equal(picture(copy, noise()), after)
+    np.testing.assert_array_equal(copy.columns, t.columns)
+    np.testing.assert_array_equal(copy.render(image, 5).numpy(), t.render(image, 5).numpy())
+    assert (drawn != build(lamp_scene, spp=32).render(image, 5).numpy()).any()
+
+
+@pytest.mark.slow
+def test_refreshed_transport_is_another_estimate_of_the_same(lamp_scene):
+    t = build(lamp_scene, spp=32, refresh=1)
+    # Seeds far apart and many: a refreshed run visits hundreds of epochs.
+    ours = np.stack([t.render(mi.TensorXf(sun(7, 9)), step).numpy() for step in range(0, 80, 10)])
+    assert t.epoch == 70
+    theirs = references(lamp_scene, sun(7, 9))
+    assert disagreement(ours, theirs) == ""
+    assert (ours[0] != ours[1]).any()
+
+
+def test_probes_are_the_columns_that_render(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    texels = np.array([4 * WIDTH, 7 * WIDTH + 9, 3 * WIDTH + 31, 2])
+    before = t.linear(mi.TensorXf(one_hot(texels[1]))).numpy()
+    columns = t.probe(texels)
+    assert columns.shape == (4, 17 * 23, 3) and set(t.columns) == set(texels)
+    assert (t._exact.paths_of[texels] == t.paths[0]).all()
+    for texel, column in zip(texels, columns, strict=True):
+        drawn = t.linear(mi.TensorXf(one_hot(texel))).numpy()
+        np.testing.assert_array_equal(column.reshape(drawn.shape), drawn)
+        assert drawn.max() > 0
+    assert (before != t.linear(mi.TensorXf(one_hot(texels[1]))).numpy()).any()  # it was coarse
+    # What is there is not traced again, and comes in the order in which it is asked for.
+    again = t.probe(texels[::-1])
+    np.testing.assert_array_equal(again[::-1], columns)
+
+
+def test_probing_a_texel_that_has_a_better_column_keeps_it(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    assert t.resolve(sun(7, 9)) == 1
+    texels = np.array([7 * WIDTH + 9, 7 * WIDTH + 10])
+    better = t.linear(mi.TensorXf(one_hot(texels[0]))).numpy()
+    columns = t.probe(texels)
+    np.testing.assert_array_equal(columns[0].reshape(better.shape), better)
+    assert t._exact.paths_of[texels].tolist() == [COLUMN_PATHS[-1], COLUMN_PATHS[0]]
+
+
+@pytest.mark.slow
+def test_probes_are_mitsubas_pictures_of_one_texel(lamp_scene):
+    image, depth = 100 * one_hot(4 * WIDTH + 12), {"max_depth": DEPTH}
+    lamp = np.stack([lamp_scene.render(black(), spp=2048, seed=k, **depth) for k in range(2)]).mean(axis=0)
+    lit = np.stack([lamp_scene.render(refined(image), spp=2048, seed=9 + k, **depth) for k in range(2)])
+    theirs = (lit.mean(axis=0) - lamp).mean(axis=(0, 1))
+    ours = 100 * build(lamp_scene, spp=4).probe(np.array([4 * WIDTH + 12]))[0].mean(axis=0)
+    np.testing.assert_allclose(ours, theirs, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_few_paths_for_maps_of_few_parameters(lamp_scene, tmp_path):
+    plain = build(lamp_scene, spp=32, folder=tmp_path)
+    few = build(lamp_scene, spp=32, folder=tmp_path, few=True)
+    assert few.cached  # the recording is the same
+    assert (few.paths, few.tolerance) == (FEW_PATHS, FEW_TOLERANCE) != (plain.paths, plain.tolerance)
+    for t in (plain, few):
+        assert t.resolve(sun(7, 9)) == 1
+        assert t._exact.paths_of[t.columns].tolist() == [t.paths[-1]]
+    assert few.paths[-1] < plain.paths[-1]
+    counts = [len(t.bright_texels(noise() ** 4)) for t in (plain, few)]
+    assert counts[0] > counts[1]
+
+
+@pytest.mark.slow
+def test_a_state_replaces_the_columns_that_are_there(lamp_scene):
+    t, other = build(lamp_scene, spp=32), build(lamp_scene, spp=32)
+    t.resolve(sun(7, 9))
+    other.resolve(sun(4, 0))
+    other.probe(np.arange(5 * WIDTH, 5 * WIDTH + 6))
+    other.restore({key: np.array(value) for key, value in t.state().items()})
+    np.testing.assert_array_equal(other.columns, t.columns)
+    for image in (noise(), sun(4, 0)):
+        np.testing.assert_array_equal(picture(other, image), picture(t, image))
+    assert other.resolve(sun(4, 0)) == 1  # it is known that its column is gone
+
+
+# ---- at a glance -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """Coarse transport with tiles of 2 x 2 pixels and of 3 x 3 texels, cut off at both far borders."""
+    s = scene.load(stage(ball(METAL), WALL, LAMP, film={"width": 39, "height": 33}))
+    return build(s, 80, 160, spp=16)
+
+
+def tile(index, size, height, width):
+    """Return rows and columns of one tile of an image."""
+    row, column = divmod(index, -(-width // size))
+    return np.s_[row * size : (row + 1) * size, column * size : (column + 1) * size]
+
+
+def blocks_of(image, size):
+    """Average tiles, one by one."""
+    count = -(-image.shape[0] // size) * -(-image.shape[1] // size)
+    tiles = [image[tile(i, size, *image.shape[:2])] for i in range(count)]
+    return np.array([t.reshape(-1, 3).mean(axis=0) for t in tiles], np.float64)
+
+
+@pytest.mark.slow
+def test_overview_is_the_picture_of_cells_averaged_over_blocks(wide, rng):
+    found = wide.overview()
+    assert found.matrix.shape == (3, 20 * 17, 27 * 54) and len(found.omega) == 27 * 54
+    # Some that matter, and those at the borders: the zenith, the last column.
+    often = np.argsort(-found.matrix.sum(axis=(0, 1)))[:200]
+    for cell in [0, 53, 5 * 54 + 53, 26 * 54 + 53, *rng.choice(often, 8)]:
+        image = np.zeros((80, 160, 3), np.float32)
+        image[tile(int(cell), 3, 80, 160)] = 1
+        drawn = blocks_of(wide.linear(mi.TensorXf(image)).numpy(), 2)
+        np.testing.assert_allclose(found.matrix[:, :, cell].T, drawn, rtol=1e-4, atol=1e-4 * drawn.max())
+        assert drawn.max() > 0 or cell not in often
+    # All cells at once, of any values.
+    values = rng.random((27 * 54, 3))
+    image = values.reshape(27, 54, 3).repeat(3, axis=0).repeat(3, axis=1)[:80, :160].astype(np.float32)
+    drawn = blocks_of(wide.linear(mi.TensorXf(image)).numpy(), 2)
+    told = np.stack([found.matrix[c] @ values[:, c] for c in range(3)], axis=1)
+    np.testing.assert_allclose(told, drawn, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_overview_does_not_depend_on_columns(wide):
+    before = wide.overview()
+    fresh = build(wide.scene, 80, 160, spp=16)
+    fresh.probe(np.array([20 * 160 + 40]))
+    assert fresh.overview().matrix.tobytes() == before.matrix.tobytes()
+    assert wide.overview() is before  # summed up once
+
+
+@pytest.mark.slow
+def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
+    first = build(lamp_scene, spp=32, folder=tmp_path).overview()
+    with monkeypatch.context() as patch:
+        patch.setattr(block_transport, "make", lambda *_: 1 / 0)
+        again = build(lamp_scene, spp=32, folder=tmp_path).overview()
+        with pytest.raises(ZeroDivisionError):  # of another recording it is not
+            build(lamp_scene, spp=32, seed=1, folder=tmp_path).overview()
+    assert vars(first).keys() == vars(again).keys()
+    for name, value in vars(first).items():
+        loaded = getattr(again, name)
+        assert loaded.dtype == value.dtype and loaded.shape == value.shape
+        assert loaded.tobytes() == value.tobytes(), name
+        assert loaded.flags.writeable
+
+
+# ---- compiled once -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_after_the_first_steps(lamp_scene):
+    t = build(lamp_scene, spp=32)
+    x, y = mi.TensorXf(noise()), mi.TensorXf(np.ones((*t.shape, 3), np.float32))
+
+    def step():
+        image = mi.TensorXf(x)
+        dr.enable_grad(image)
+        loss = dr.sum(t.apply(image) * y, axis=None)
+        dr.backward(loss)
+        dr.eval(dr.grad(image), t.adjoint(y))
+
+    for texel in ((4, 0), (7, 9), (2, 2)):
+        t.resolve(sun(*texel))
+        step()
+    assert compiled(step)[0] >= 2 and compiled(step)[1] == 0
+    # More columns: neither they nor the products that use them need another kernel.
+    assert compiled(lambda: t.resolve(sun(3, 20)))[1] == 0
+    assert compiled(step)[1] == 0
+
+
+@pytest.mark.slow
+def test_another_seed_needs_no_other_kernel(lamp_scene):
+    # Else every refresh, and every run of a series, would pay seconds of compilation.
+    build(lamp_scene, spp=32, seed=11).resolve(sun(7, 9))
+    count, fresh = compiled(lambda: build(lamp_scene, spp=32, seed=12).resolve(sun(3, 20)))
+    # Where no path of a batch is kept, what it left unevaluated may join a later kernel: one in a hundred.
+    assert count > 50 and fresh <= 0.05 * count
+
+
+# ---- refusals ----------------------------------------------------------------------------------------------
+
+
+def test_wrong_shapes_are_refused(lit):
+    for shape in ((HEIGHT, WIDTH + 2, 3), (WIDTH, HEIGHT, 3), (HEIGHT, WIDTH, 4), (HEIGHT * WIDTH, 3)):
+        with pytest.raises(ValueError, match=r"map must have shape \(16, 32, 3\), got \("):
+            lit.apply(dr.ones(mi.TensorXf, shape))
+    with pytest.raises(ValueError, match=r"picture must have shape \(17, 23, 3\), got \(23, 17, 3\)"):
+        lit.adjoint(dr.ones(mi.TensorXf, (23, 17, 3)))
+
+
+@pytest.mark.slow
+def test_too_little_memory_is_told_with_what_to_do(lamp_scene):
+    text = r"needs .* GB for 23x17 pixels at 4096 samples.*0.01.*memory_gb.*spp"
+    with pytest.raises(InputError, match=text):
+        build(lamp_scene, spp=4096, memory_gb=0.01)
+    # Left to itself it takes fewer samples.
+    t = build(lamp_scene, spp="auto", memory_gb=0.002)
+    assert t.spp < 256 and t.memory_bytes < 0.003e9
+
+
+@pytest.mark.parametrize("depth", ["auto", DEPTH])
+def test_closed_room_is_refused(depth):
+    room = {"type": "sphere", "radius": 50.0, "flip_normals": True, "bsdf": WHITE}
+    with pytest.raises(InputError, match="no pixel receives light from the environment"):
+        build(scene.load(stage(room)), max_depth=depth)
+
+
+@pytest.mark.parametrize("depth", [1, 0, -1])
+def test_depth_at_which_the_sky_lights_nothing_is_refused(depth):
+    # The camera of the matte scene sees ground and ball only: a black picture would be the silent result.
+    with pytest.raises(ValueError, match=r"depth|light"):
+        build(load("matte"), max_depth=depth)
+
+
+@pytest.mark.parametrize("spp", [0, -4])
+def test_no_samples_are_refused(lamp_scene, spp):
+    with pytest.raises(ValueError, match="spp"):
+        build(lamp_scene, spp=spp)
+
+
+def test_level_of_the_comparisons_is_strict():
+    assert LEVEL <= 1e-4  # 200 comparisons: one false alarm in fifty changes of samples

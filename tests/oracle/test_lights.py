@@ -1,0 +1,609 @@
+"""Lights on the sphere against plain numpy in float64; derivatives also by the fundamental theorem."""
+
+import dataclasses
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from envedit.core import latlong
+from envedit.representations.layers import lights
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights, rotation_vector
+from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
+from tests.oracles.plain import single
+from tests.oracles.tiers import slow_but
+
+H, W = 25, 48
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def turned(v, d):
+    """Rotate rows of directions (n, 3) by a rotation vector, with a matrix."""
+    angle = np.linalg.norm(v)
+    if angle == 0:
+        return np.asarray(d, np.float64)
+    x, y, z = np.asarray(v, np.float64) / angle
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return d @ (np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k).T
+
+
+def random_turn(rng):
+    """Anywhere on the sphere: up to a whole turn about any axis."""
+    axis = rng.normal(size=3)
+    return axis / np.linalg.norm(axis) * rng.uniform(0, 2 * np.pi)
+
+
+def unit(rng, *shape):
+    d = rng.normal(size=(*shape, 3))
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def patch(rng, top, left, rows=3, columns=4, *, shape=(H, W), peak=100.0, glow=None):
+    """Make a light of a patch of texels of a map, columns periodic."""
+    height, width = shape
+    r, c = np.meshgrid(top + np.arange(rows), (left + np.arange(columns)) % width, indexing="ij")
+    r, c = r.ravel(), c.ravel()
+    radiance = peak * rng.uniform(0.2, 1.0, (len(r), 3))
+    flux = radiance.sum(axis=1) * latlong.lookup_solid_angles(*shape)[r]
+    centre = (latlong.directions(*shape)[r, c] * flux[:, None]).sum(axis=0)
+    return Light(centre / np.linalg.norm(centre), r * width + c, radiance, glow, 0.5)
+
+
+def image_of(light, shape=(H, W)):
+    image = np.zeros((shape[0] * shape[1], 3))
+    image[light.texels] = light.radiance
+    return image.reshape(*shape, 3)
+
+
+def place(made, turn=0.0, flux=0.0, size=0.0):
+    """Parameters (turn, log flux, log size) of the own lights; spare ones stay dark."""
+    own = made.count - SPARE
+    dark = np.full((SPARE, 3), DARK)
+    turn = np.concatenate([np.broadcast_to(turn, (own, 3)), np.zeros((SPARE, 3))])
+    flux = np.concatenate([np.broadcast_to(flux, (own, 3)), dark])
+    size = np.concatenate([np.broadcast_to(size, (own, 1)), np.zeros((SPARE, 1))])
+    return single(turn), single(flux), single(size)
+
+
+def core(made, *at, shape=(H, W), rows=None, **where):
+    return made.core(*(at or place(made, **where)), shape, rows or (0, shape[0])).numpy()
+
+
+def flux_of(image):
+    omega = latlong.lookup_solid_angles(*image.shape[:2])
+    return (np.float64(image) * omega[:, None, None]).sum(axis=(0, 1))
+
+
+def plain_core(light, turn, flux=0.0, size=0.0, shape=(H, W), of=(H, W)):
+    """The core of one light of a map ``of`` some size, in float64 and without snapping."""
+    (height, width), (old_height, old_width) = shape, of
+    row, column = np.divmod(light.texels, old_width)
+    points = latlong.directions(*of)[row, column]
+    power = light.radiance * latlong.lookup_solid_angles(*of)[row][:, None] * np.exp(flux)
+    along = (points @ light.direction)[:, None] * light.direction
+    points = along + (points - along) * np.exp(size)
+    points = turned(turn, points / np.linalg.norm(points, axis=1, keepdims=True))
+    y, x = latlong.texel_position(points, height, width)
+    sine = np.sin(np.pi * row / (old_height - 1)) * np.exp(size) * width / old_width
+    half = np.clip(sine / np.maximum(np.hypot(points[:, 0], points[:, 2]), 1e-9), 1, 2 * width)
+
+    def tents(k, at, half):
+        share = np.maximum(1 - np.abs(k - at[:, None]) / half, 0)
+        return share / share.sum(axis=1, keepdims=True)
+
+    down = tents(np.arange(height), y, max(1.0, (height - 1) / (old_height - 1)))
+    across = tents(np.arange(-3 * width, 4 * width), x, half[:, None]).reshape(-1, 7, width).sum(axis=1)
+    lit = np.einsum("nr,nc,nk->rck", down, across, power)
+    return lit / latlong.lookup_solid_angles(*shape)[:, None, None]
+
+
+def weights(shape=(H, W)):
+    """Smooth on the sphere, another for every channel."""
+    d = latlong.directions(*shape)
+    return np.stack([np.sin(2 * d[..., k] + 0.7 * k) + d[..., (k + 1) % 3] ** 2 for k in range(3)], axis=-1)
+
+
+def derivatives(loss, *at):
+    """Gradients of a loss of (turn, log flux, log size), and its value."""
+    at = [type(p)(p) for p in at]
+    dr.enable_grad(at)
+    value = loss(*at)
+    dr.backward(value)
+    return [dr.grad(p).numpy().astype(np.float64) for p in at], np.float64(value.numpy())
+
+
+def weighted(image, weight):
+    return dr.sum((image * single(weight)).array)
+
+
+# ---- rotations -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [0, 1e-9, 1e-4, 0.3, math.pi / 2, math.pi, 5.0, 2 * math.pi])
+def test_rotate_is_the_rotation_matrix(angle, rng):
+    v, d = unit(rng, 50) * angle, unit(rng, 50)
+    got = lights.rotate(mi.Vector3f(v.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32))).numpy().T
+    expected = np.concatenate([turned(a, b[None]) for a, b in zip(v, d, strict=True)])
+    np.testing.assert_allclose(got, expected, atol=3e-6)
+    if angle == 0:
+        np.testing.assert_array_equal(got, d.astype(np.float32))
+
+
+def test_rotate_is_right_handed():
+    got = lights.rotate(mi.Vector3f(0, math.pi / 2, 0), mi.Vector3f(0, 0, 1)).numpy().ravel()
+    np.testing.assert_allclose(got, [1, 0, 0], atol=1e-6)
+    got = lights.rotate(mi.Vector3f(0, math.pi, 0), mi.Vector3f(0.6, 0.8, 0)).numpy().ravel()
+    np.testing.assert_allclose(got, [-0.6, 0.8, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0, 1e-8, 1e-3, 0.7, math.pi])
+def test_gradient_of_rotate(angle, rng):
+    """At zero it is the cross product; elsewhere that of the matrix, by central differences."""
+    d, weight = unit(rng), rng.normal(size=3)
+    start = unit(rng) * angle
+    v = mi.Vector3f(start)
+    dr.enable_grad(v)
+    dr.backward(dr.dot(lights.rotate(v, mi.Vector3f(d)), mi.Vector3f(weight)))
+    h, got = 1e-6, dr.grad(v).numpy().ravel()
+    steps = [(turned(start + h * e, d[None]) - turned(start - h * e, d[None])) @ weight for e in np.eye(3)]
+    np.testing.assert_allclose(got, np.ravel(steps) / (2 * h), atol=1e-5)
+    if angle == 0:
+        np.testing.assert_allclose(got, np.cross(d, weight), atol=1e-6)
+
+
+angles = st.tuples(st.floats(-math.pi, math.pi), st.floats(-math.pi / 2, math.pi / 2))
+
+
+def direction(azimuth, elevation):
+    c = math.cos(elevation)
+    return np.array([c * math.sin(azimuth), math.sin(elevation), -c * math.cos(azimuth)])
+
+
+@settings(deadline=None, max_examples=300)
+@given(angles, angles)
+@example((0.0, 0.0), (math.pi, 0.0))
+@example((0.4, 0.3), (0.4 - math.pi, -0.3))
+@example((0.0, math.pi / 2), (0.0, -math.pi / 2))
+@example((0.0, math.pi / 2), (2.0, 0.1))
+@example((2.0, 0.1), (0.0, -math.pi / 2))
+@example((0.0, 0.5), (0.0, 0.5 + 1e-7))
+def test_rotation_vector_takes_one_direction_to_the_other(start, end):
+    start, end = direction(*start), direction(*end)
+    v = rotation_vector(start, end)
+    assert np.linalg.norm(v) < math.pi + 1e-9
+    np.testing.assert_allclose(turned(v, start[None])[0], end, atol=3e-6)
+    # Upright stays upright: level stays level.
+    for d in (start, end):
+        if np.hypot(d[0], d[2]) < 1e-3:
+            return
+    east = [np.array([-d[2], 0, d[0]]) / np.hypot(d[0], d[2]) for d in (start, end)]
+    np.testing.assert_allclose(turned(v, east[0][None])[0], east[1], atol=3e-6)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3))
+@example(0.0, 0.2, 3.0)
+def test_turn_at_one_elevation_is_about_the_vertical(azimuth, elevation, by):
+    v = rotation_vector(direction(azimuth, elevation), direction(azimuth + by, elevation))
+    np.testing.assert_allclose(v, [0, -by, 0], atol=1e-7)
+
+
+@pytest.mark.parametrize("d", [(0, 1, 0), (0, -1, 0), (1, 0, 0), (0.6, 0, -0.8), (-0.48, 0.6, 0.64)])
+def test_rotation_vector_between_equal_directions_is_zero(d):
+    np.testing.assert_array_equal(rotation_vector(d, d), 0)
+    np.testing.assert_allclose(rotation_vector(d, 3 * np.array(d)), 0, atol=1e-12)
+
+
+def test_rotation_vector_of_antipodes_is_a_half_turn(rng):
+    for d in [*unit(rng, 20), UP, -UP, np.eye(3)[0]]:
+        v = rotation_vector(d, -d)
+        assert abs(np.linalg.norm(v) - math.pi) < 1e-9
+        np.testing.assert_allclose(turned(v, d[None])[0], -d, atol=1e-6)
+
+
+# ---- values ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("top", "left"), [(1, 5), (5, 10), (12, 46), (21, 0)])
+def test_unmoved_light_gives_the_core_back(top, left, rng):
+    light = patch(rng, top, left)
+    got, expected = core(Lights([light], (0, H), W)), image_of(light)
+    assert np.abs(got - expected).max() < 1e-6 * expected.max()
+
+
+@pytest.mark.parametrize("columns", [1, -1, 7, 24, 47])
+@pytest.mark.parametrize("top", [2, 11])
+def test_turn_by_whole_texels_is_a_roll(top, columns, rng):
+    light = patch(rng, top, 44)
+    got = core(Lights([light], (0, H), W), turn=(0, columns * 2 * np.pi / W, 0))
+    expected = np.roll(image_of(light), -columns, axis=1)
+    assert np.abs(got - expected).max() < 1e-6 * expected.max()
+    assert np.abs(got - image_of(light)).max() > 0.1 * expected.max()  # negative control
+
+
+@pytest.mark.parametrize("top", [2, 11])
+@pytest.mark.parametrize("degrees", [0.9, -3.1, 77.7, 181.3])
+def test_turn_by_fractions_is_that_of_the_map(top, degrees, rng):
+    light = patch(rng, top, 45)
+    got = core(Lights([light], (0, H), W), turn=(0, np.radians(degrees), 0))
+    expected = latlong.rotate(image_of(light), degrees)
+    assert np.abs(got - expected).max() < 1e-4 * expected.max()
+
+
+@pytest.mark.parametrize("shape", [(H, W), (49, 96), (13, 24), (30, 50), (7, 9)])
+def test_core_is_the_plain_one(shape, rng):
+    light = patch(rng, 6, 46)
+    made = Lights([light], (0, H), W)
+    for _ in range(10):
+        turn, flux, size = random_turn(rng), rng.normal(size=3), rng.uniform(-1, 1)
+        expected = plain_core(light, turn, flux, size, shape)
+        got = core(made, turn=turn, flux=flux, size=size, shape=shape)
+        # What snaps to a texel's centre is at most 2e-4 of a texel off, in rows and in columns.
+        assert np.abs(got - expected).max() < 5e-4 * expected.max()
+    assert np.abs(got - plain_core(light, turn, flux, size + 0.3, shape)).max() > 0.01 * expected.max()
+
+
+def centred_at(light, elevation, azimuth):
+    return rotation_vector(light.direction, direction(azimuth, elevation))
+
+
+GOALS = [(math.pi / 2, 0.0), (-math.pi / 2, 0.0), (1.5, 2.0), (-1.5, -2.0), (0.0, math.pi), (1.2, -math.pi),
+         (0.01, 0.1), (0.9, 0.0)]  # fmt: skip
+
+
+@pytest.mark.parametrize("top", [1, 3, 11, 20])
+def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
+    """Low to high and back, across the seam, over a pole, at a pole."""
+    light = patch(rng, top, 46)
+    made, expected = Lights([light], (0, H), W), flux_of(image_of(light))
+    np.testing.assert_allclose(made.flux[0], expected, rtol=1e-6)
+    turns = [centred_at(light, *goal) for goal in GOALS] + [random_turn(rng) for _ in range(30)]
+    for turn in turns:
+        got = core(made, turn=turn)
+        assert np.isfinite(got).all() and (got >= 0).all()
+        np.testing.assert_allclose(flux_of(got), expected, rtol=1e-5)
+
+
+def test_moved_light_is_where_it_was_sent(rng):
+    light = patch(rng, 6, 46)
+    made, d = Lights([light], (0, H), W), latlong.directions(H, W)
+    omega = latlong.lookup_solid_angles(H, W)[:, None, None]
+    for goal in unit(rng, 20):
+        got = core(made, turn=rotation_vector(light.direction, goal))
+        mean = (got.sum(axis=2, keepdims=True) * omega * d).sum(axis=(0, 1))
+        assert mean / np.linalg.norm(mean) @ goal > math.cos(math.radians(2))
+
+
+def test_every_channel_has_its_own_flux(rng):
+    light = patch(rng, 6, 10)
+    light.radiance[:, 1] *= 0.01
+    light.radiance[:, 2] = 0
+    made, expected = Lights([light], (0, H), W), flux_of(image_of(light))
+    got = flux_of(core(made, turn=random_turn(rng), flux=(-1.0, 0.5, 3.0)))
+    np.testing.assert_allclose(got, expected * np.exp([-1.0, 0.5, 3.0]), rtol=1e-5)
+    assert got[2] == 0
+
+
+@pytest.mark.parametrize("size", [-3.0, -0.7, 0.4, 1.2])
+def test_size_keeps_the_flux(size, rng):
+    light = patch(rng, 10, 10)
+    made, expected = Lights([light], (0, H), W), flux_of(image_of(light))
+    got = core(made, size=size)
+    np.testing.assert_allclose(flux_of(got), expected, rtol=1e-5)
+    lit, before = np.count_nonzero(got), np.count_nonzero(image_of(light))
+    assert lit > before if size > 0 else lit <= before
+
+
+def test_rows_that_are_not_wanted_lose_their_flux_and_nothing_else(rng):
+    light = patch(rng, 4, 10, rows=6)
+    made = Lights([light], (0, H), W)
+    for turn in (np.zeros(3), random_turn(rng), centred_at(light, 0.2, 3.1)):
+        whole = core(made, turn=turn)
+        for first, last in [(0, 7), (6, 9), (3, H), (20, 25)]:
+            part = core(made, turn=turn, shape=(last - first, W), rows=(first, H))
+            np.testing.assert_allclose(part, whole[first:last], rtol=1e-6, atol=1e-8)
+
+
+def test_light_of_rows_of_a_map_is_that_of_the_map(rng):
+    light = patch(rng, 8, 10)
+    part = Light(light.direction, light.texels - 5 * W, light.radiance, None, 0.5)
+    turn = random_turn(rng)
+    whole, of_rows = (core(Lights([x], (f, H), W), turn=turn) for x, f in ((light, 0), (part, 5)))
+    np.testing.assert_array_equal(whole, of_rows)
+
+
+def test_lights_add_up(rng):
+    both = [patch(rng, 4, 10), patch(rng, 15, 40, peak=1.0)]
+    turn, flux, size = rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), rng.normal(size=(2, 1)) * 0.3
+    got = core(Lights(both, (0, H), W), turn=turn, flux=flux, size=size)
+    alone = [
+        core(Lights([x], (0, H), W), turn=turn[i], flux=flux[i], size=size[i]) for i, x in enumerate(both)
+    ]
+    np.testing.assert_allclose(got, sum(alone), rtol=1e-5, atol=1e-6)
+    assert all(a.any() for a in alone)
+
+
+def test_dark_light_gives_nothing_beside_a_bright_one(rng):
+    both = [patch(rng, 4, 10), patch(rng, 15, 40)]
+    made = Lights(both, (0, H), W)
+    got = core(made, flux=[[0.0] * 3, [DARK] * 3])
+    assert got[:10].any() and not got[12:].any()
+    assert core(made, flux=[[0.0] * 3, [-10.0] * 3])[12:].any()  # negative control
+
+
+def test_a_spare_light_can_have_a_colour_that_no_light_has(rng):
+    light = patch(rng, 4, 10)
+    made = Lights([dataclasses.replace(light, radiance=light.radiance * [1, 0, 0])], (0, H), W)
+    assert (made.flux[0] > 0).tolist() == [True, False, False]
+    turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
+    flux[1] = np.log(made.flux[1, 0] / made.flux[1])
+    got = flux_of(core(made, single(turn), single(flux), single(size), shape=(64, 128)))
+    np.testing.assert_allclose(got, made.flux[0, 0], rtol=1e-4)
+
+
+def test_spare_lights_are_lobes_with_the_mean_flux(rng):
+    both = [patch(rng, 4, 10), patch(rng, 15, 40)]
+    for own in (both, both[:1], []):
+        made = Lights(own, (0, H), W)
+        fluxes = [flux_of(image_of(light)) for light in own] or [np.ones(3)]
+        turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
+        assert made.count == len(own) + SPARE
+        for i in range(SPARE):
+            flux[:], turn[:] = DARK, 0
+            flux[len(own) + i] = 0
+            for _ in range(5):
+                goal = unit(rng)
+                turn[len(own) + i] = rotation_vector(UP, goal)
+                got = core(made, single(turn), single(flux), single(size), shape=(64, 128))
+                np.testing.assert_allclose(flux_of(got), np.mean(fluxes, axis=0), rtol=1e-5)
+                d, omega = latlong.directions(64, 128), latlong.lookup_solid_angles(64, 128)[:, None]
+                share = got[..., 0] * omega / (got[..., 0] * omega).sum()
+                assert share[np.degrees(np.arccos(np.clip(d @ goal, -1, 1))) < 4 * LOBE_DEGREES].sum() > 0.9
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------
+
+
+def loss_of(image, kind):
+    return weighted(image, weights()) if kind == "linear" else dr.sum(dr.square(image.array)) * 1e-3
+
+
+def plain_loss(image, kind):
+    return (image * weights()).sum() if kind == "linear" else (image**2).sum() * 1e-3
+
+
+@pytest.mark.parametrize("kind", ["linear", "squares"])
+@pytest.mark.parametrize("top", [3, 11])
+def test_gradient_is_the_finite_difference(kind, top, rng):
+    """Of the plain core, at random places on the whole sphere, but for those at a line through centres."""
+    light, h, seen = patch(rng, top, 46), 1e-7, 0
+    made = Lights([light], (0, H), W)
+    for _ in range(12):
+        at = np.concatenate([random_turn(rng), rng.normal(size=3) * 0.5, rng.uniform(-0.5, 0.5, 1)])
+
+        def loss(x):
+            return plain_loss(plain_core(light, x[:3], x[3:6], x[6]), kind)
+
+        here = loss(at)
+        ahead, behind = (
+            np.array([sign * (loss(at + sign * h * e) - here) / h for e in np.eye(7)]) for sign in (1, -1)
+        )
+        scale = np.abs(ahead).max()
+        if np.abs(ahead - behind).max() > 1e-4 * scale:
+            continue
+        seen += 1
+        grads, value = derivatives(
+            lambda *p: loss_of(made.core(*p, (H, W), (0, H)), kind),
+            *place(made, turn=at[:3], flux=at[3:6], size=at[6]),
+        )
+        np.testing.assert_allclose(value, here, rtol=1e-3)
+        got = np.concatenate([g[0] for g in grads])
+        np.testing.assert_allclose(got, (ahead + behind) / 2, atol=2e-3 * scale)
+        assert all(np.abs(g[1:]).max() < 1e-9 * scale for g in grads)  # spare lights are dark
+    assert seen >= 8
+
+
+def path(start, end, count):
+    """Turns along a straight line between two rotation vectors, at the middles of equal steps."""
+    return start + (end - start) * ((np.arange(count) + 0.5) / count)[:, None]
+
+
+def over(light, name):
+    """Ends of paths for a light: (start, end)."""
+    east = np.cross(light.direction, UP)
+    east /= np.linalg.norm(east)
+    polar = math.acos(light.direction[1])  # angle to the zenith
+    return {
+        "texel borders": (np.zeros(3), np.array([0.6, 0.8, -0.1])),
+        "seam": (np.array([0, -0.4, 0.01]), np.array([0, 0.5, 0.02])),
+        "over the pole": (east * (polar - 0.8), east * (polar + 0.3)),
+        "past the pole": (east * (polar - 0.8) + [0.03, 0, 0.02], east * (polar + 0.3) + [0.03, 0, 0.02]),
+        "over the nadir": (-east * (math.pi - polar - 0.2), -east * (math.pi - polar + 0.7)),
+        "half a turn": (np.array([0, 2.5, 0.1]), np.array([0.3, 3.9, 0.1])),
+    }[name]
+
+
+PATHS = ["texel borders", "seam", "over the pole", "past the pole", "over the nadir", "half a turn"]
+
+
+@pytest.mark.parametrize("name", slow_but(PATHS, "seam"))
+@pytest.mark.parametrize("top", slow_but([3, 11], 11))
+@pytest.mark.parametrize("by", slow_but(["radiance", "flux"], "radiance"))
+def test_gradient_along_a_path_adds_up_to_the_change(name, top, by, rng):
+    """Many copies of a light, one at every step of the path: a linear loss is the sum of theirs."""
+    light, count = patch(rng, top, 46), 3000
+    start, end = over(light, name)
+    weight = weights() * (latlong.lookup_solid_angles(H, W)[:, None, None] if by == "flux" else 1)
+    at = place(made := Lights([light] * count, (0, H), W), turn=path(start, end, count))
+    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weight), *at)
+    slopes = turn[:count] @ (end - start)
+    alone = Lights([light], (0, H), W)
+    low, high = ((core(alone, turn=v) * weight).sum() for v in (start, end))
+    np.testing.assert_allclose(slopes.mean(), high - low, atol=1e-3 * np.abs(slopes).mean())
+    assert abs(high - low) > 0.05 * np.abs(slopes).mean()
+
+
+@pytest.mark.parametrize("which", ["flux", "size"])
+def test_gradient_by_flux_and_size_adds_up_to_the_change(which, rng):
+    light, count = patch(rng, 5, 46), 600
+    made, alone = Lights([light] * count, (0, H), W), Lights([light], (0, H), W)
+    turn, low, high = np.array([0.2, 0.7, 0.1]), -1.0, 1.0
+    middle = low + (high - low) * ((np.arange(count) + 0.5) / count)[:, None]
+    at = place(made, turn=turn, **{which: middle})
+    grads, _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weights()), *at)
+    slopes = grads[1 if which == "flux" else 2][:count].sum(axis=1) * (high - low)
+    ends = [(core(alone, turn=turn, **{which: x}) * weights()).sum() for x in (low, high)]
+    np.testing.assert_allclose(slopes.mean(), ends[1] - ends[0], atol=2e-3 * np.abs(slopes).mean())
+
+
+def test_gradients_of_lights_do_not_mix(rng):
+    both = [patch(rng, 4, 10), patch(rng, 15, 40, peak=10.0)]
+    made = Lights(both, (0, H), W)
+    where = {"turn": np.array([[0.11, 0.03, 0.07], [-0.05, 0.13, 0.02]]), "size": np.array([[0.1], [0.2]])}
+    upper = weights() * (np.arange(H) < 12)[:, None, None]
+    grads, _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), upper), *place(made, **where))
+    alone = Lights(both[:1], (0, H), W)
+    expected, _ = derivatives(
+        lambda *p: weighted(alone.core(*p, (H, W), (0, H)), upper),
+        *place(alone, **{name: value[0] for name, value in where.items()}),
+    )
+    for got, one in zip(grads, expected, strict=True):
+        assert one[0].all()
+        np.testing.assert_allclose(got[0], one[0], rtol=1e-5)
+        assert not got[1].any()
+
+
+def test_gradient_of_an_unmoved_light_has_the_direction_of_the_change(rng):
+    """Where all its texels lie on lines through centres, and every fit begins."""
+    light = patch(rng, 11, 20)
+    made = Lights([light], (0, H), W)
+    weight = weights() * latlong.lookup_solid_angles(H, W)[:, None, None]
+    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weight), *place(made))
+    ends = [[(plain_core(light, v) * weight).sum() for v in 0.02 * sign * np.eye(3)] for sign in (1, -1)]
+    slope = (np.array(ends[0]) - ends[1]) / 0.04
+    assert turn[0] @ slope > 0.98 * np.linalg.norm(turn[0]) * np.linalg.norm(slope)
+    assert np.linalg.norm(turn[0]) > 0.8 * np.linalg.norm(slope)
+
+
+@pytest.mark.parametrize("goal", [UP, -UP])
+def test_gradient_at_a_pole_is_finite(goal, rng):
+    light = patch(rng, 8, 20, rows=1, columns=1)
+    made = Lights([light], (0, H), W)
+    at = place(made, turn=rotation_vector(light.direction, goal))
+    grads, value = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weights()), *at)
+    assert np.isfinite(value) and all(np.isfinite(g).all() for g in grads)
+
+
+# ---- glow ------------------------------------------------------------------------------------------------
+
+TABLE = np.stack(
+    [a * (np.exp(-GLOW_DEGREES / b) - np.exp(-80 / b)) for a, b in [(3, 15), (2, 20), (1, 40)]], 1
+)
+TABLE[80:] = 0  # falls there without a step
+
+
+def device(d):
+    return mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32))
+
+
+def plain_glow(own, turns, fluxes, d):
+    factor = np.ones((len(d), 3))
+    for light, turn, flux in zip(own, turns, fluxes, strict=True):
+        if light.glow is not None:
+            factor *= 1 + glow_at(light.glow, d @ turned(turn, light.direction[None])[0]) * np.exp(flux)
+    return factor
+
+
+def test_glow_is_the_product_over_the_lights(rng):
+    own = [patch(rng, 4, 10, glow=TABLE), patch(rng, 9, 20), patch(rng, 15, 40, glow=0.5 * TABLE[:, ::-1])]
+    made, d = Lights(own, (0, H), W), latlong.directions(H, W).reshape(-1, 3)
+    assert made.glowing and not Lights(own[1:2], (0, H), W).glowing
+    for _ in range(5):
+        turn, flux = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+        turns, fluxes, _ = place(made, turn=turn, flux=flux)
+        got = made.glow(turns, fluxes, device(d)).numpy().T
+        np.testing.assert_allclose(got, plain_glow(own, turn, flux, d), rtol=2e-3)
+    far = plain_glow(own, turn, flux, d) == 1
+    assert far.any()
+    np.testing.assert_array_equal(got[far], 1)
+
+
+def test_gradient_of_the_glow_is_the_finite_difference(rng):
+    own = [patch(rng, 4, 10, glow=TABLE), patch(rng, 15, 40, glow=0.5 * TABLE)]
+    made, d, h = Lights(own, (0, H), W), unit(rng, 200), 1e-6
+    weight = rng.normal(size=(200, 3))
+    for _ in range(4):
+        at = rng.normal(size=12) * 0.7
+
+        def loss(x):
+            return (plain_glow(own, x[:6].reshape(2, 3), x[6:].reshape(2, 3), d) * weight).sum()
+
+        expected = np.array([(loss(at + h * e) - loss(at - h * e)) / (2 * h) for e in np.eye(12)])
+        turn, flux, _ = place(made, turn=at[:6].reshape(2, 3), flux=at[6:].reshape(2, 3))
+
+        def ours(turn, flux):
+            value = made.glow(turn, flux, device(d))
+            w = mi.Color3f(np.ascontiguousarray(weight.T, np.float32))
+            return dr.sum(value.x * w.x + value.y * w.y + value.z * w.z)
+
+        grads, value = derivatives(ours, turn, flux)
+        np.testing.assert_allclose(value, loss(at), rtol=1e-4)
+        got = np.concatenate([g[:2].ravel() for g in grads])
+        np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_gradient_of_the_glow_along_a_path_adds_up_to_the_change(rng):
+    light, count = patch(rng, 4, 46, glow=TABLE), 250
+    made, d = Lights([light], (0, H), W), device(latlong.directions(H, W))
+    start, end = over(light, "over the pole")
+    weight = mi.Color3f(np.ascontiguousarray(weights().reshape(-1, 3).T, np.float32))
+
+    def ours(turn, flux):
+        value = made.glow(turn, flux, d) * weight
+        return dr.sum(value.x + value.y + value.z)
+
+    slopes = []
+    for v in path(start, end, count):
+        (turn, _), _ = derivatives(ours, *place(made, turn=v)[:2])
+        slopes.append(turn[0] @ (end - start))
+    low, high = (ours(*place(made, turn=v)[:2])[0] for v in (start, end))
+    np.testing.assert_allclose(np.mean(slopes), high - low, atol=5e-3 * np.abs(slopes).mean())
+
+
+# ---- determinism, extremes -------------------------------------------------------------------------------
+
+
+def test_core_has_the_same_bits_every_time(rng):
+    light = patch(rng, 2, 20, rows=20, columns=24)
+    made = Lights([light], (0, H), W)
+    turn = random_turn(rng)
+    first = core(made, turn=turn)
+    for _ in range(5):
+        np.testing.assert_array_equal(core(made, turn=turn), first)
+    # In another order as well.
+    order = rng.permutation(len(light.texels))
+    other = Light(light.direction, light.texels[order], light.radiance[order], None, 0.5)
+    np.testing.assert_array_equal(core(Lights([other], (0, H), W), turn=turn), first)
+
+
+@pytest.mark.parametrize("name", ["turn", "flux", "size"])
+@pytest.mark.parametrize("value", [np.nan])
+def test_what_is_not_finite_is_not_dropped(name, value, rng):
+    made = Lights([patch(rng, 4, 10), patch(rng, 15, 40)], (0, H), W)
+    where = {"turn": np.zeros((2, 3)), "flux": np.zeros((2, 3)), "size": np.zeros((2, 1))}
+    assert np.isfinite(core(made, **where)).all()
+    where[name][1, 0] = value
+    assert np.isnan(core(made, **where)).any()
+
+
+@pytest.mark.parametrize("peak", [1e-30, 1e-20, 1e-6, 65504.0, 1e6, 1e12])
+def test_core_of_any_exposure(peak, rng):
+    light = patch(rng, 6, 46, peak=peak)
+    made, expected = Lights([light], (0, H), W), image_of(light)
+    np.testing.assert_allclose(core(made), expected, atol=1e-6 * peak)
+    for _ in range(5):
+        np.testing.assert_allclose(flux_of(core(made, turn=random_turn(rng))), flux_of(expected), rtol=1e-5)

@@ -1,0 +1,350 @@
+"""Loading and rendering scenes: against Mitsuba itself, closed forms, and files broken on purpose."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong, shipped
+from envedit.core.errors import ConfigError, InputError, NumericalError
+from envedit.images import images
+from envedit.scene import scene
+from tests.oracles import ROOT
+from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
+from tests.oracles.tiers import slow_but
+
+SCENES = ROOT / "scenes"
+
+
+# ---- rendering ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(sampler, tmp_path, rng):
+    image = sky(rng)
+    turn = '<transform name="to_world"><rotate x="0.48" y="0.8" z="0.36" angle="70"/></transform>'
+    missing = f'<emitter type="envmap"><string name="filename" value="not-there.exr"/>{turn}</emitter>'
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, missing), sampler=sampler)
+    ours = loaded.render(image, spp=16, seed=3, max_depth=4)
+
+    mi.Bitmap(image).write(str(tmp_path / "sky.exr"))
+    sampled = SENSOR.replace("</sensor>", f'<sampler type="{sampler}"/></sensor>')
+    there = f'<emitter type="envmap"><string name="filename" value="sky.exr"/>{turn}</emitter>'
+    theirs = mi.load_file(str(write_scene(tmp_path, sampled, BALL, there, name="theirs.xml")))
+    seed = int(np.random.SeedSequence([3, 0]).generate_state(1)[0])
+    integrator = mi.load_dict({"type": "path", "max_depth": 4})
+    expected = np.array(mi.render(theirs, integrator=integrator, spp=16, seed=seed))
+    assert ours.shape == (12, 16, 3) and ours.dtype == np.float32
+    np.testing.assert_allclose(ours, expected, rtol=2e-5, atol=1e-6)
+    # The camera sees the sky through the rotation that to_world states.
+    corner = np.array(loaded.mi.sensors()[0].sample_ray(0, 0.5, [0.01, 0.01], [0.5, 0.5])[0].d).ravel()
+    seen = latlong.lookup(image, loaded.to_world.T @ corner)
+    np.testing.assert_allclose(ours[0, 0], seen, rtol=0.2)
+
+
+def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    picture = loaded.render(np.ones((8, 16, 3)), spp=256)
+    np.testing.assert_allclose(picture[0, 0], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(picture[5:7, 7:9].mean(axis=(0, 1)), [0.2, 0.4, 0.6], rtol=0.02)
+
+
+@pytest.mark.slow
+def test_resolution_may_change_between_renderings(tmp_path, rng):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    small, large = sky(rng), sky(rng, 32, 64)
+    first = loaded.render(small, spp=8)
+    other = loaded.render(large, spp=8)
+    assert np.array_equal(loaded.render(small, spp=8), first)
+    fresh = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(large, spp=8)
+    assert np.array_equal(other, fresh) and not np.array_equal(other, first)
+
+
+def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
+    lamp = '<emitter type="point"><point name="position" x="2" y="3" z="4"/></emitter>'
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT, lamp))
+    dark = loaded.render(np.zeros((8, 16, 3)), spp=64)
+    lit = loaded.render(np.ones((8, 16, 3)), spp=256)
+    assert dark[0, 0].max() == 0 and dark.max() > 0.005
+    middle = (slice(5, 7), slice(7, 9))
+    albedo = lit[middle].mean((0, 1)) - dark[middle].mean((0, 1))
+    np.testing.assert_allclose(albedo, [0.2, 0.4, 0.6], rtol=0.05)
+
+
+@pytest.mark.slow
+def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, monkeypatch):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    image = sky(rng)
+    whole = loaded.render(image, spp=10)
+    calls = []
+    render = mi.render
+
+    def record(*args, **kwargs):
+        calls.append((kwargs["spp"], kwargs["seed"], result := np.array(render(*args, **kwargs))))
+        return result
+
+    monkeypatch.setattr(scene, "_PASS_SAMPLES", 4 * 16 * 12)
+    monkeypatch.setattr(mi, "render", record)
+    split = loaded.render(image, spp=10)
+    assert [c[0] for c in calls] == [4, 4, 2] and len({c[1] for c in calls}) == 3
+    np.testing.assert_allclose(split, sum(n / 10 * p for n, _, p in calls), rtol=1e-6)
+    assert np.array_equal(loaded.render(image, spp=10), split) and not np.array_equal(split, whole)
+    assert not np.array_equal(loaded.render(image, spp=10, seed=1), split)
+
+
+@pytest.mark.slow
+def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
+    """A lone bright texel over a rough ball is noisier than an even sky."""
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    even = np.ones((8, 16, 3), np.float32)
+    sunny = 0.05 * even
+    sunny[2, 3] = 300
+    quiet, few, noise = loaded.sampled(even, "auto", 4)
+    _, many, louder = loaded.sampled(sunny, "auto", 4)
+    assert few == 256 <= many <= 768
+    truth = loaded.render(even, spp=4096, seed=99)
+    error = np.mean((np.clip(quiet, 0, 1) ** (1 / 2.2) - np.clip(truth, 0, 1) ** (1 / 2.2)) ** 2)
+    assert error < 2 * 10 ** (-scene.QUIET_DECIBELS / 10)
+    assert noise.shape == quiet.shape[:2] and error / 4 < np.mean(noise**2) < 4 * error
+    assert louder.mean() > noise.mean()
+    assert np.array_equal(loaded.sampled(even, "auto", 4)[0], quiet)
+    picture, taken, unknown = loaded.sampled(even, 16, 4)
+    assert taken == 16 and unknown is None and np.array_equal(picture, loaded.render(even, spp=16, seed=4))
+
+
+def test_noise_that_does_not_fall_ends_at_the_most_samples(tmp_path, monkeypatch):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    monkeypatch.setattr(scene, "QUIET_DECIBELS", 200.0)
+    assert loaded.sampled(np.ones((8, 16, 3)), "auto")[1] == 768
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e6])
+def test_extreme_maps_render_in_proportion(tmp_path, value):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    one = loaded.render(np.ones((8, 16, 3)), spp=8)
+    many = loaded.render(np.full((8, 16, 3), value), spp=8)
+    np.testing.assert_allclose(many, one * np.float32(value), rtol=1e-4)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e-3, 1e300])
+def test_a_bad_texel_is_named_and_not_rendered(tmp_path, value):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    image = np.ones((8, 16, 3))
+    image[3, 5, 1] = value
+    with pytest.raises(NumericalError, match=r"1 texels .* row 3, column 5: \S+ in G"):
+        loaded.render(image)
+
+
+def test_a_non_finite_rendering_is_refused(tmp_path, monkeypatch):
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    picture = np.ones((12, 16, 3))
+    picture[2, 7, 0] = np.nan
+    monkeypatch.setattr(mi, "render", lambda *a, **k: picture)
+    with pytest.raises(NumericalError, match="1 pixels are not finite, the first at row 2, column 7"):
+        loaded.render(np.ones((8, 16, 3)))
+
+
+@pytest.mark.parametrize("given", [{"spp": 0}, {"spp": 1.5}, {"seed": -1}, {"max_depth": -2}, {"spp": True}])
+def test_unusable_rendering_settings_are_refused(tmp_path, given):
+    with pytest.raises(ConfigError, match=next(iter(given))):
+        scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(np.ones((8, 16, 3)), **given)
+
+
+@pytest.mark.parametrize("image", [np.ones((8, 16)), np.ones((8, 16, 4)), np.ones((2, 4, 3)), "sky.exr"])
+def test_a_map_of_the_wrong_shape_is_refused(tmp_path, image):
+    with pytest.raises(InputError):
+        scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).set_envmap(image)
+
+
+def test_a_dict_scene_is_the_same_as_its_xml(tmp_path, rng):
+    to_world = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "filter": {"type": "box"}}
+    given = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 40, "to_world": to_world, "film": film},
+        "ball": {
+            "type": "sphere",
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}},
+        },
+        "light": {"type": "envmap", "filename": "not-there.exr"},
+    }
+    image = sky(rng)
+    from_xml = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(image, spp=8)
+    from_dict = scene.load(given)
+    assert from_dict.path is None
+    np.testing.assert_allclose(from_dict.render(image, spp=8), from_xml, rtol=1e-4, atol=1e-6)
+    given["light"] = mi.load_dict({"type": "constant"})
+    with pytest.raises(InputError):
+        scene.load(given)
+
+
+# ---- what is wrong with a file -----------------------------------------------------------------------------
+
+TEXTURED = """<shape type="sphere"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+    <string name="filename" value="wood.png"/></texture></bsdf></shape>"""
+MESH = '<shape type="ply"><string name="filename" value="a.ply"/></shape>'
+SCALED = '<emitter type="envmap"><transform name="to_world"><scale x="-1"/></transform></emitter>'
+
+
+@pytest.mark.parametrize(
+    "parts, says",
+    [
+        ((SENSOR, BALL), "no environment emitter"),
+        ((SENSOR, BALL, '<emitter type="point"/>'), "no environment emitter"),
+        ((SENSOR, BALL, LIGHT, '<emitter type="envmap"/>'), r"2 environment emitters \(constant, envmap\)"),
+        ((SENSOR, BALL, SCALED), "to_world of the environment emitter .*rotation"),
+        ((SENSOR, TEXTURED, LIGHT), r"line \d+.*texture names a missing file: wood.png"),
+        ((SENSOR, MESH, LIGHT), "shape names a missing file: a.ply"),
+        ((SENSOR, '<shape type="sphere"><ref id="gold"/></shape>', LIGHT), 'unresolved reference to "gold"'),
+        ((SENSOR, '<shape type="spere"/>', LIGHT), 'Plugin "spere" not found'),
+        ((SENSOR, BALL.replace("<bsdf", '<float name="raduis" value="2"/><bsdf'), LIGHT), "raduis"),
+        ((SENSOR, BALL, LIGHT, "<shape"), r"Error parsing start element tag \(line \d+"),
+        ((BALL, LIGHT), "no sensor"),
+        ((SENSOR.replace("hdrfilm", "specfilm"), BALL, LIGHT), "hdrfilm"),
+    ],
+)
+def test_a_broken_scene_is_told_in_short(tmp_path, parts, says):
+    path = write_scene(tmp_path, *parts)
+    with pytest.raises(InputError, match=says) as caught:
+        scene.load(path)
+    text = str(caught.value)
+    assert "test.xml" in text and len(text.splitlines()) <= 2 and not re.search(r"\.cpp:", text), text
+
+
+def test_a_damaged_mesh_is_an_input_error(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat nonsense\n\x00")
+    with pytest.raises(InputError, match="a.ply"):
+        scene.load(write_scene(tmp_path, SENSOR, MESH, LIGHT))
+
+
+@pytest.mark.parametrize(
+    "name, says",
+    [
+        ("spere", "did you mean sphere?"),
+        ("nowhere/sphere.xml", "no such file"),
+        ("", "folder"),
+        ("zzz", "one of matte, mesh, mirror"),
+    ],
+)
+def test_a_missing_scene_is_told_with_the_nearest_name(name, says):
+    with pytest.raises(InputError, match=re.escape(says)):
+        scene.load(name)
+
+
+# ---- parameters --------------------------------------------------------------------------------------------
+
+
+def test_parameters_fill_the_names_and_reach_the_material():
+    loaded = scene.load("sphere", width=8, parameters={"roughness": 0.45})
+    np.testing.assert_allclose(np.array(loaded.params["object.bsdf.alpha.value"]), 0.45, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name, parameters, says",
+    [
+        ("sphere", {"rougness": 1}, r"no parameter rougness; did you mean roughness\? \(known: roughness\)"),
+        ("mirror", {"roughness": 1}, r"known: none"),
+        ("mesh", {}, "mesh.xml needs mesh, which has no default"),
+        ("sphere", {"roughness": float("nan")}, "roughness is nan"),
+        ("sphere", {"roughness": -0.1}, "roughness alpha is -0.1"),
+        ("sphere", {"roughness": [1]}, "roughness is a list"),
+        ("mesh", {"mesh": "statue.ply", "up": "w"}, "up axis is 'w'"),
+    ],
+)
+def test_unusable_parameters_are_config_errors(name, parameters, says):
+    with pytest.raises(ConfigError, match=says):
+        scene.load(name, parameters=parameters)
+
+
+def test_text_where_a_number_belongs_is_told():
+    with pytest.raises(InputError, match='could not parse floating point value "smooth"'):
+        scene.load("sphere", parameters={"roughness": "smooth"})
+
+
+def test_names_are_found_in_included_files(tmp_path):
+    sized = BALL.replace("<bsdf", '<float name="radius" value="$size"/><bsdf')
+    write_scene(tmp_path, '<default name="size" value="1"/>', sized, name="ball.xml")
+    path = write_scene(tmp_path, SENSOR, '<include filename="ball.xml"/>', LIGHT)
+    box = scene.load(path, parameters={"size": 0.5}).mi.bbox()
+    np.testing.assert_allclose(np.array(box.max).ravel(), 0.5, rtol=1e-6)
+
+
+# ---- shipped scenes and the statue -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", slow_but(shipped.scenes(), "mesh"))
+def test_shipped_scenes_render(name, rng):
+    parameters = {"mesh": "statue.ply"} if name == "mesh" else None
+    loaded = scene.load(name, parameters=parameters)
+    assert (loaded.width, loaded.height) == (256, 256)
+    picture = scene.load(f"{name}.xml", width=16, parameters=parameters).render(np.ones((8, 16, 3)), spp=64)
+    # In the open the plane shows its albedo; nothing reflects more than it receives, and nothing is black.
+    np.testing.assert_allclose(picture[0].mean(), 0.5, rtol=0.03)
+    assert picture.min() > 0.1 and picture.max() < 1.2
+    box = {s.id(): s.bbox() for s in loaded.mi.shapes()}.get("object")
+    if name != "pair":  # two smaller objects
+        low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
+        np.testing.assert_allclose([low[1], high[1]], [0, 2], atol=1e-5)
+    # The plane below hides the lower half of the sky.
+    below = np.zeros((8, 16, 3))
+    below[5:] = 1
+    assert scene.load(name, width=16, parameters=parameters).render(below, spp=16).max() < 1e-2
+
+
+@pytest.fixture(scope="module")
+def statue():
+    spec = importlib.util.spec_from_file_location("make_statue", SCENES / "make_statue.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_statue_is_closed_oriented_and_not_convex(statue):
+    vertices, faces = statue.build()
+    assert 20_000 <= len(faces) <= 60_000 and np.isfinite(vertices).all()
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    there = edges[:, 0] << 32 | edges[:, 1]
+    back = edges[:, 1] << 32 | edges[:, 0]
+    # Each directed edge once and its reverse once: every edge lies in two triangles, wound alike.
+    assert len(np.unique(there)) == len(there) and np.array_equal(np.sort(there), np.sort(back))
+    a, b, c = (vertices[faces[:, i]].astype(float) for i in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert areas.min() > 1e-9 and volume > 0.5  # positive: wound counter-clockwise seen from outside
+    assert volume < 0.7 * np.prod(vertices.max(0) - vertices.min(0))
+    np.testing.assert_allclose([vertices[:, 1].min(), vertices[:, 1].max()], [0, 2], atol=1e-6)
+
+
+def test_the_committed_statue_is_the_scripts(statue, tmp_path):
+    committed = (SCENES / "statue.ply").read_bytes()
+    statue.write_ply(tmp_path / "statue.ply", *statue.build())
+    made = (tmp_path / "statue.ply").read_bytes()
+    assert len(made) == len(committed) < 1_200_000
+    body = made.index(b"end_header\n") + len(b"end_header\n")
+    assert made[:body] == committed[:body]
+    count = len(statue.build()[0]) * 24
+    # Positions to the last digits: another machine's sine may differ there.
+    ours, theirs = (np.frombuffer(t[body : body + count], "<f4") for t in (made, committed))
+    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+    assert made[body + count :] == committed[body + count :]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away here")
+def test_a_texture_is_read_on_one_core(tmp_path):
+    """Mitsuba's reader of EXR files waits for a second thread."""
+    images.write_exr(tmp_path / "wood.exr", np.full((4, 4, 3), 0.5, np.float32))
+    wood = '<texture type="bitmap" name="reflectance"><string name="filename" value="wood.exr"/></texture>'
+    ball = f'<shape type="sphere"><bsdf type="diffuse">{wood}</bsdf></shape>'
+    path = write_scene(tmp_path, SENSOR, ball, LIGHT)
+    code = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        f"from envedit.scene import scene; print(scene.load({str(path)!r}).width)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.strip().isdecimal(), done.stderr

@@ -1,0 +1,269 @@
+"""The matrix of extremes as data: maps, stages, and what happens where they meet.
+
+``python -m tests.oracles.extremes > docs/extremes.md`` writes the table; it runs every cell first, and
+refuses to write one that is not so.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from envedit.core.errors import EnveditError, InputError, NumericalError
+from tests.oracles.extremes_precision import CHECKS
+from tests.oracles.extremes_stages import DONE, STAGES, Outcome, refused, seen, sky
+from tests.oracles.extremes_targets import SCENES, TARGETS
+
+# ---- maps ------------------------------------------------------------------------------------------------
+
+
+def texel(value, place=(5, 9)):
+    """Return the sky of the matrix with one texel of another value."""
+    m = sky()
+    m[place] = value
+    return m
+
+
+def ramp():
+    """Return a map from 1e-6 to 1e6, evenly in its logarithm."""
+    return np.geomspace(1e-6, 1e6, 16 * 32 * 3).astype(np.float32).reshape(32, 16, 3).swapaxes(0, 1).copy()
+
+
+def sunny(height, width):
+    """Return the sky at another size with a sun of 1e4."""
+    m = sky(height, width)
+    m[height // 2, width // 2] = 1e4
+    return m
+
+
+MAPS = {
+    "0": texel(0),
+    "1e-30": texel(1e-30),
+    "1e-6": texel(1e-6),
+    "65504": texel(65504),
+    "65505": texel(65505),
+    "1.5e5": texel(1.5e5),
+    "1e6": texel(1e6),
+    "1e10": texel(1e10),
+    "1e30": texel(1e30),
+    "3e38": texel(3e38),
+    "NaN": texel(np.nan),
+    "+Inf": texel(np.inf),
+    "-Inf": texel(-np.inf),
+    "-5": texel(-5),
+    "all zero": np.zeros((16, 32, 3), np.float32),
+    "constant": np.full((16, 32, 3), 0.5, np.float32),
+    "all negative": np.full((16, 32, 3), -5, np.float32),
+    "sun in the pole": texel(1e4, (0, 7)),
+    "sun at the seam": texel(1e4, (5, 0)),
+    "sun at the horizon": texel(1e4, (7, 20)),
+    "range of 1e12": ramp(),
+    "width 2": sunny(1, 2),
+    "width 3": sunny(2, 3),
+    "width 5": sunny(3, 5),
+    "width 4096": sunny(16, 4096),
+}
+"""A texel of that value in a smooth sky of 16 x 32 unless said otherwise; 4096 is 16 rows of such a map."""
+
+# ---- what happens ----------------------------------------------------------------------------------------
+
+
+AT = "the first at row 5, column 9"
+NOT_FINITE, NEGATIVE = ("NaN", "+Inf", "-Inf"), ("-5", "all negative")
+
+
+def _declare():
+    """List the cells that end otherwise than in a finite and correct result."""
+    cells = {}
+    for name in NOT_FINITE:
+        cells[name, "read"] = refused(
+            InputError,
+            f"1 texels are NaN or infinite, {AT}; repair the map",
+            "`[input] repair = true` takes the mean of its neighbours instead.",
+        )
+        cells[name, "normalise"] = seen(
+            "range", "The range is not finite; every representation refuses the map before."
+        )
+        wrong = refused(InputError, f"1 texels are not finite, {AT}: repair the map")
+        cells[name, "fit"] = cells[name, "edit loop"] = wrong
+        cells[name, "transport"] = seen(
+            "picture, adjoint",
+            "Pixels that the texel lights are not finite; the loop does not take such a step.",
+        )
+        cells[name, "losses"] = seen(
+            "change, hdr, image_l1, image_l2, l1, log_mse, log_ssim, luminance, ssim, tv",
+            "Every loss: the loop does not take such a step.",
+        )
+        cells[name, "Adam"] = seen(
+            "step", "The step is refused as a whole: no parameter and no moment changes."
+        )
+        cells[name, "write"] = refused(NumericalError, f"not written: 1 texels are not finite, {AT}")
+        cells[name, "metrics"] = refused(
+            InputError, f"1 texel(s) are not finite, {AT}; repair the image first"
+        )
+    for name, count, first in (("-5", 1, AT), ("all negative", 512, "the first at row 0, column 0")):
+        cells[name, "normalise"] = cells["NaN", "normalise"]
+        wrong = refused(InputError, f"{count} texels are negative, {first}: set them to 0")
+        cells[name, "fit"] = cells[name, "edit loop"] = wrong
+        cells[name, "losses"] = seen(
+            "change, log_mse, log_ssim", "Losses of a logarithm; all others are right."
+        )
+    for name in ("1e30", "3e38"):
+        cells[name, "Adam"] = seen(
+            "step",
+            "A gradient above 1.8e19 has no square in single precision: the step is refused as a whole.",
+        )
+    cells["1e30", "edit loop"] = Outcome(
+        "done",
+        "Where a pixel is dark beside such a light, the gradient of the light's place has no square in "
+        "single precision: an edit then stops after 20 steps that are refused, with a `NumericalError`.",
+    )
+    bright = refused(InputError, f"1 texels are brighter than 1.27e+30, {AT}: scale the map down")
+    cells["3e38", "fit"] = cells["3e38", "edit loop"] = bright
+    cells["3e38", "normalise"] = Outcome(
+        "done",
+        "Comes back as e^88, 1.65e38: just above, the exponential of Dr.Jit is infinite. Logarithms, SIREN "
+        "and layers refuse such a map before; pixels hold it.",
+    )
+    cells["3e38", "losses"] = seen(
+        "change, l1, tv", "Sums and quotients beyond single precision; all other losses are right."
+    )
+    small = "an environment map of {} texels is too small for Mitsuba"
+    for name, size in (("width 2", "2 x 1"), ("width 3", "3 x 2")):
+        cells[name, "transport"] = refused(InputError, small.format(size))
+        cells[name, "edit loop"] = refused(InputError, small.format(size))
+    cells["width 2", "read"] = refused(InputError, "2 x 1 texels are too few for a map; use at least 6 x 3")
+    cells["width 3", "read"] = refused(InputError, "a lat-long map is 2:1, this is 3 x 2")
+    cells["width 5", "read"] = refused(InputError, "a lat-long map is 2:1, this is 5 x 3")
+    return cells
+
+
+EXCEPTIONS = _declare()
+CELLS = [(name, stage) for name in MAPS for stage in STAGES]
+
+
+def expected(name, stage):
+    """Return the declared outcome of a cell."""
+    return EXCEPTIONS.get((name, stage), DONE)
+
+
+def observe(act, *given):
+    """Run a cell: its kind and what was said; wrong numbers fail an assertion."""
+    try:
+        bad = act(*given)
+    except EnveditError as error:
+        return "refused", error
+    return ("seen", ", ".join(bad)) if bad else ("done", "")
+
+
+def agree(outcome, kind, said):
+    """Assert that a cell ended as it was declared."""
+    assert kind == outcome.kind, f"{kind}: {said}"
+    if kind == "refused":
+        assert type(said) is outcome.error and outcome.words in str(said), f"{type(said).__name__}: {said}"
+        assert len(str(said).splitlines()) <= 2
+    else:
+        assert said == outcome.words
+
+
+# ---- the document ----------------------------------------------------------------------------------------
+
+HEAD = """# Extremes
+
+What happens where a map, a target or a scene is as odd as it can be. This page is written from the tests
+(`python -m tests.oracles.extremes > docs/extremes.md`), which check every cell: that the result is finite and
+correct, by the definition of its stage; or that it is refused, with these words.
+"""
+
+
+def first_line(act):
+    """Return a docstring's first line as the end of a list item."""
+    return " ".join(act.__doc__.split())
+
+
+def table(rows, columns, outcome):
+    """Lay out outcomes, with numbered notes for those that are no finite and correct result."""
+    notes = []
+
+    def mark(row, column):
+        found = outcome(row, column)
+        if found is None:
+            return ""
+        if found.kind == "done" and not found.says:
+            return "ok"
+        text = found.says
+        if found.kind == "refused":
+            text = f'`{found.error.__name__}`, "{found.words}". {text}'.strip()
+        elif found.kind == "seen":
+            text = f"Not finite, and seen: {found.words}. {text}".strip()
+        if text not in notes:
+            notes.append(text)
+        return f"{'ok' if found.kind == 'done' else found.kind} [{notes.index(text) + 1}]"
+
+    lines = [f"| | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+    lines += [f"| {row} | {' | '.join(mark(row, column) for column in columns)} |" for row in rows]
+    return lines + ["", *(f"{i}. {note}" for i, note in enumerate(notes, 1))]
+
+
+def document():
+    """Return docs/extremes.md."""
+    lines = [
+        HEAD,
+        "## Maps",
+        "",
+        "Rows: a texel of that value in a smooth sky of 32 x 16 texels, or as named. Columns:",
+        "",
+    ]
+    lines += [f"- **{stage}**: {first_line(act)}" for stage, act in STAGES.items()]
+    lines += ["", *table(MAPS, STAGES, expected)]
+    lines += ["", "## Targets and scenes", ""]
+    for what, cases in (("target", TARGETS), ("scene", SCENES)):
+        lines += [f"| {what} | what happens |", "|---|---|"]
+        for name, (_, outcome) in cases.items():
+            text = f'refused, `{outcome.error.__name__}`: "{outcome.words}". ' if outcome.error else ""
+            lines += [f"| {name} | {text}{outcome.says} |"]
+        lines += [""]
+    lines += [
+        "## Single precision against double",
+        "",
+        "Largest error over the range, relative unless said otherwise.",
+        "",
+    ]
+    lines += ["| what | range | bound | why |", "|---|---|---|---|"]
+    lines += [f"| {name} | {c.range} | {c.bound:.0e} | {c.why} |" for name, c in CHECKS.items()]
+    return "\n".join(lines) + "\n"
+
+
+def main():
+    """Run every cell, then write the document to standard output."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    wrong = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for name, stage in CELLS:
+            try:
+                agree(expected(name, stage), *observe(STAGES[stage], MAPS[name], Path(folder)))
+            except Exception as error:  # all that is wrong is told, not the first alone
+                wrong += 1
+                print(f"{name} / {stage}: {type(error).__name__}: {error}", file=sys.stderr)
+        for cases in (TARGETS, SCENES):
+            for name, (act, outcome) in cases.items():
+                try:
+                    agree(outcome, *observe(act, Path(folder)))
+                except Exception as error:
+                    wrong += 1
+                    print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
+    for name, one in CHECKS.items():
+        error = one.measure()
+        if not error <= one.bound:
+            wrong += 1
+        print(f"{name}: {error:.2g} of {one.bound:.0e}", file=sys.stderr)
+    if wrong:
+        sys.exit(f"{wrong} cells end otherwise: nothing written")
+    print(document(), end="")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,376 @@
+"""Single precision against double: every loss, metric and reduction, with the bound of its error and why.
+
+A check measures its largest error over a range of at least ten orders of magnitude.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import color, latlong, radiance
+from envedit.losses import losses, metrics, optimizer, ssim
+from envedit.representations.layers import lights
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
+from tests.oracles.extremes_stages import LUMINANCE, dense, loss_and_gradient, plain, single, sky, transport
+from tests.oracles.plain import plain_ssim
+
+SCALES = [10.0**k for k in range(-5, 6)]
+RANGE = "1e-5 to 1e5"
+
+
+@dataclass(frozen=True)
+class Check:
+    """``measure()`` returns the largest error, which ``bound`` holds, for the reason ``why``."""
+
+    measure: Callable[[], float]
+    bound: float
+    why: str
+    range: str = RANGE
+
+
+def error(got, wanted, beside=None) -> float:
+    """Return the largest error relative to the largest reference value, or to what it stands ``beside``."""
+    got, wanted = np.asarray(got, np.float64), np.asarray(wanted, np.float64)
+    largest = np.abs(wanted).max() if beside is None else beside
+    return float(np.abs(got - wanted).max() / largest) if largest else float(np.abs(got - wanted).max())
+
+
+@functools.cache
+def pair(scale, shape=(16, 32, 3)):
+    """Return two random images up to ``scale``, float32."""
+    rng = np.random.default_rng(7)
+    return tuple((scale * rng.random(shape)).astype(np.float32) for _ in range(2))
+
+
+@functools.cache
+def wild(shape=(16, 32, 3)):
+    """Return two images whose texels are spread evenly over 1e-5 to 1e5 by their logarithms."""
+    rng = np.random.default_rng(8)
+    return tuple((10 ** rng.uniform(-5, 5, shape)).astype(np.float32) for _ in range(2))
+
+
+def sunny(sun=1e6, below=1e-3):
+    """Return a sun over a dim sky, a megapixel."""
+    m = np.full((512, 512, 3), below, np.float32)
+    m[100, 200] = sun
+    return m
+
+
+def _cases(name):
+    if name in ("log_mse", "log_ssim"):  # of what was normalised to [0, 1] only
+        return [pair(scale) for scale in SCALES[:6]]
+    return [*(pair(scale) for scale in SCALES), wild()]
+
+
+def _value(name):
+    def measure():
+        worst = 0.0
+        for x, y in _cases(name):
+            worst = max(worst, error(loss_and_gradient(name, x, y)[0], plain(name, x, y)[0]))
+        return worst
+
+    return measure
+
+
+def _gradient(name):
+    def measure():
+        worst = 0.0
+        for x, y in _cases(name):
+            worst = max(worst, error(loss_and_gradient(name, x, y)[1], plain(name, x, y)[1]))
+        return worst
+
+    return measure
+
+
+# ---- reductions ------------------------------------------------------------------------------------------
+
+
+def _sun_luminance():
+    m = sunny()
+    wanted = (m.astype(np.float64) @ LUMINANCE).sum()
+    lum = losses.luminance(single(m), single(np.zeros_like(m)))[0]
+    return max(error(lum, wanted), error(color.luminance(m).sum(), wanted))
+
+
+def _sky_under_sun():
+    m = sunny()
+    brighter = np.where(m < 1, np.float32(1.001e-3), m)
+    wanted = ((brighter.astype(np.float64) - m) @ LUMINANCE).sum()
+    return error(losses.luminance(single(brighter), single(m))[0], wanted)
+
+
+def _sum_under_sun():
+    return error(losses.l1(single(sunny()))[0], sunny().astype(np.float64).sum())
+
+
+def _resize():
+    worst = 0.0
+    for m in (sunny(1e5, 1e-5)[:256], *wild((64, 128, 3))):
+        small = latlong.resize(m, 32, 64).astype(np.float64)
+        light = [
+            (e.astype(np.float64) * latlong.solid_angles(*e.shape[:2])[:, None, None]).sum()
+            for e in (small, m)
+        ]
+        worst = max(worst, error(*light))
+    return worst
+
+
+def _health():
+    worst = 0.0
+    for m in wild():
+        found, y = radiance.health(m), m.astype(np.float64) @ LUMINANCE
+        for got, wanted in ((found.median, np.median(y)), (found.dynamic_range, y.max() / y.min())):
+            worst = max(worst, error(got, wanted))
+    return worst
+
+
+def _transport(adjoint):
+    def measure():
+        traced, matrix, worst = transport(16, 32), dense(16, 32), 0.0
+        rng = np.random.default_rng(9)
+        for scale in SCALES:
+            m = (scale * 10 ** rng.uniform(-5, 0, (16, 32, 3))).astype(np.float32)
+            picture = traced.apply(single(m)).numpy()
+            got = traced.adjoint(single(picture)).numpy() if adjoint else picture
+            for c in range(3):
+                x = (picture if adjoint else m).reshape(-1, 3)[:, c].astype(np.float64)
+                wanted = (matrix[c].T if adjoint else matrix[c]) @ x
+                worst = max(worst, error(got.reshape(-1, 3)[:, c], wanted))
+        return worst
+
+    return measure
+
+
+def _rows():
+    worst, n = 0.0, 65536
+    rng = np.random.default_rng(10)
+    for scale in SCALES:
+        x = (scale * rng.random((n, 4))).astype(np.float32)
+        x[n // 3] = scale * 1e6
+        worst = max(worst, error(siren._sum_of_rows(mi.TensorXf(x)).numpy(), x.sum(axis=0, dtype=np.float64)))
+    return worst
+
+
+def _flux():
+    worst = 0.0
+    omega = latlong.lookup_solid_angles(16, 32)
+    for scale in [1e-20, *SCALES, 1e20, 1e38]:
+        row, column = mi.Float([3.3, 7.8]), mi.Float([9.2, 31.7])
+        flux = mi.Color3f(scale * 0.02)
+        got = lights.shared_out(
+            row, column, mi.Float([1.0, 1.5]), flux + mi.Color3f(mi.Float(0, 0)), 1.0, (16, 32), (0, 16)
+        )
+        light = (got.numpy().astype(np.float64) * omega[:, None, None]).sum(axis=(0, 1))
+        worst = max(worst, error(light, np.full(3, 2 * np.float64(np.float32(scale * 0.02)))))
+    return worst
+
+
+# ---- structural similarity -------------------------------------------------------------------------------
+
+
+def _constant_ssim():
+    worst, c1 = 0.0, 0.01**2
+    for a in SCALES:
+        for b in (a, 2 * a, 0.0):
+            x, y = (np.full((16, 32, 3), v, np.float32) for v in (a, b))
+            p, q = float(x[0, 0, 0]), float(y[0, 0, 0])
+            got = ssim.ssim_loss(single(x), single(y))[0]
+            wanted = (p - q) ** 2 / (p * p + q * q + c1)
+            if a == b and got:
+                return math.inf  # equal images are equal
+            worst = max(worst, error(got, wanted) if wanted else 0.0)
+    return worst
+
+
+# ---- normalisation and the network -----------------------------------------------------------------------
+
+
+def _round_trip():
+    worst = 0.0
+    for m in (*wild(), np.geomspace(1e-5, 1e10, 512 * 3).astype(np.float32).reshape(16, 32, 3)):
+        normal = fit.Normalisation.of(m)
+        back = normal.decode(single(normal.encode(m))).numpy().astype(np.float64)
+        worst = max(worst, float((np.abs(back - m) / (m.astype(np.float64) + 0.01)).max()))
+    return worst
+
+
+def _ends():
+    worst = 0.0
+    for top in (1e-3, 1.0, 1e5, 1e10, 1e30):
+        m = sky()
+        m[0, 0], m[5, 9] = 0, top
+        normal = fit.Normalisation.of(m)
+        y = siren._sigmoid(mi.TensorXf(np.float32([-1e30, -1e3, 1e3, 1e30])))
+        assert y.numpy().tolist() == [0, 0, 1, 1]
+        low, _, _, high = normal.decode(y).numpy().astype(np.float64)
+        largest = float(m.max())
+        worst = max(worst, abs(low) / 0.01, abs(high - largest) / (largest + 0.01))
+    return worst
+
+
+def _zero_layer():
+    rng, worst = np.random.default_rng(11), 0.0
+    for scale in (0.0, *SCALES):
+        weights = {
+            "0.weight": rng.normal(size=(8, 3)),
+            "0.bias": np.zeros(8),
+            "1.weight": scale * rng.normal(size=(3, 8)),
+            "1.bias": np.zeros(3),
+        }
+        params = {name: single(value) for name, value in weights.items()}
+        perturbation = fit.Perturbation(params, 0.01)
+        perturbation.update(
+            {name: single(rng.normal(size=value.shape)) for name, value in weights.items()}, 1e-4
+        )
+        moved = perturbation.apply(params)["1.weight"].numpy().astype(np.float64)
+        before = params["1.weight"].numpy().astype(np.float64)
+        if scale == 0:
+            worst = max(worst, 0.0 if np.array_equal(moved, before) else math.inf)
+        else:
+            ratio = np.linalg.norm(moved - before) / np.linalg.norm(before)
+            worst = max(worst, abs(ratio / 0.01 - 1))
+    return worst
+
+
+def _adam():
+    rng, worst = np.random.default_rng(12), 0.0
+    for scale in SCALES:
+        p = start = rng.random((16, 32, 3)).astype(np.float32).astype(np.float64)
+        one, m, v = optimizer.Adam({"x": single(start)}, 1e-3), 0.0, 0.0
+        for t in range(1, 31):
+            g = (scale * rng.normal(size=p.shape)).astype(np.float32)
+            one.step({"x": single(g)})
+            g = g.astype(np.float64)
+            m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+            p = p - 1e-3 * m / (1 - 0.9**t) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
+        worst = max(worst, error(one.params["x"].numpy(), p))
+    return worst
+
+
+# ---- metrics ---------------------------------------------------------------------------------------------
+
+
+def _judged(function, reference):
+    def measure():
+        worst = 0.0
+        for a, b in _cases(""):
+            wide = a.astype(np.float64), b.astype(np.float64)
+            worst = max(worst, error(function(a, b), reference(*wide)))
+        return worst
+
+    return measure
+
+
+def _mse(a, b):
+    return math.fsum(((a - b) ** 2).ravel()) / a.size
+
+
+def _log_psnr(a, b):
+    a, b = np.log(a + 0.01), np.log(b + 0.01)
+    return 10 * math.log10((b.max() - b.min()) ** 2 / _mse(a, b))
+
+
+def _ssim(a, b):
+    return plain_ssim(a, b).mean()
+
+
+def _high_pass(a):
+    y = np.log(a @ LUMINANCE + 0.01)
+    taps, out = np.array([1, 4, 6, 4, 1]) / 16, np.zeros_like(y)
+    for i in range(5):
+        for j in range(5):
+            rows = np.clip(np.arange(y.shape[0]) + i - 2, 0, y.shape[0] - 1)
+            out += taps[i] * taps[j] * np.roll(y[rows], 2 - j, axis=1)
+    return math.fsum(((y - out) ** 2).ravel()) / y.size
+
+
+def _same():
+    for a, _ in _cases(""):
+        assert metrics.compare(a, a) == {"psnr": 200.0, "ssim": 1.0, "mse": 0.0, "lpips": None}
+        assert metrics.psnr(a, a) == metrics.log_psnr(a, a) == 200 and metrics.ssim(a, a) == 1
+    return 0.0
+
+
+_ROUNDING = "a rounding (6e-8) a texel; the sum is double"
+_WIDE = "double throughout"
+_VALUES = {
+    "image_l1": (2e-7, _ROUNDING),
+    "image_l2": (3e-7, _ROUNDING),
+    "log_mse": (3e-7, _ROUNDING),
+    "hdr": (2e-7, _ROUNDING),
+    "luminance": (2e-7, "double throughout, then rounded"),
+    "l1": (2e-7, "double throughout, then rounded"),
+    "tv": (3e-7, _ROUNDING),
+    "change": (3e-7, "a logarithm in single precision, and sqrt(d^2 + s^2) - s where d is small"),
+    "ssim": (3e-7, "variances merged from deviations: 1e-6, whatever the level"),
+    "log_ssim": (3e-7, "variances merged from deviations: 1e-6, whatever the level"),
+}
+_GRADIENTS = {
+    "ssim": (3e-6, "1e-6 times level over local contrast"),
+    "log_ssim": (3e-6, "1e-6 times level over local contrast"),
+    "change": (1e-5, "quotients and a root in single precision"),
+    "tv": (3e-7, "sums of signs"),
+}
+
+CHECKS = {f"loss `{name}`": Check(_value(name), *_VALUES[name]) for name in losses.LOSSES}
+CHECKS |= {
+    f"gradient of `{name}`": Check(_gradient(name), *_GRADIENTS.get(name, (3e-7, "a few roundings")))
+    for name in losses.LOSSES
+}
+CHECKS |= {
+    "luminance of a sun of 1e6 over a sky of 1e-3": Check(
+        _sun_luminance, 1e-7, "double, then rounded", "1e9"
+    ),
+    "its change when the sky alone grows by 0.1 %": Check(
+        _sky_under_sun, 1e-6, "the difference is taken in double precision", "1e9"
+    ),
+    "sum of the same map": Check(_sum_under_sun, 1e-7, "double, then rounded", "1e9"),
+    "light kept by resizing": Check(
+        _resize, 1e-6, "sums in double, texels rounded", "1e-5 to 1e5 in one map"
+    ),
+    "median and dynamic range": Check(_health, 1e-12, _WIDE, "1e-5 to 1e5 in one map"),
+    "T E": Check(_transport(False), 3e-6, "sums of some 300 positive terms in single precision", RANGE),
+    "T' y": Check(_transport(True), 3e-6, "sums of some 50 positive terms in single precision", RANGE),
+    "sum over 65536 points in the network's gradient": Check(
+        _rows, 1e-4, "32 stretches in single precision: up to 2048 roundings each; half the sum is one point"
+    ),
+    "flux of a light that is shared out": Check(
+        _flux, 1e-6, "integers of 40 bits, then rounded", "1e-20 to 1e38"
+    ),
+    "SSIM of constant images": Check(
+        _constant_ssim, 3e-6, "1 - SSIM = (a - b)^2 / (a^2 + b^2 + C1); exactly 0 where they are equal"
+    ),
+    "normalisation, there and back": Check(
+        _round_trip, 1e-5, "relative to E + 0.01: the exponent, up to 28, rounds at 1e-6", "1e-5 to 1e10"
+    ),
+    "Eq. 3 where the sigmoid is 0 and 1": Check(
+        _ends, 2e-5, "the ends of the map's range, relative to E + 0.01", "1e-3 to 1e30"
+    ),
+    "norm of a perturbation over gamma times the layer's": Check(
+        _zero_layer, 1e-4, "weight and offset differ by 1 / gamma; a layer of zeros keeps its bits"
+    ),
+    "30 steps of Adam": Check(_adam, 1e-6, "a few roundings a step, of parameters that are near 1"),
+    "metric `mse`": Check(_judged(metrics.mse, _mse), 1e-12, _WIDE),
+    "metric `psnr`": Check(_judged(metrics.psnr, lambda a, b: -10 * math.log10(_mse(a, b))), 1e-12, _WIDE),
+    "metric `ssim`": Check(_judged(metrics.ssim, _ssim), 1e-12, _WIDE),
+    "metric `log_psnr`": Check(_judged(metrics.log_psnr, _log_psnr), 1e-12, _WIDE),
+    "metric `peak_ratio`": Check(
+        _judged(metrics.peak_ratio, lambda a, b: (a @ LUMINANCE).max() / (b @ LUMINANCE).max()), 1e-12, _WIDE
+    ),
+    "metric `mean_luminance_ratio`": Check(
+        _judged(metrics.mean_luminance_ratio, lambda a, b: (a @ LUMINANCE).mean() / (b @ LUMINANCE).mean()),
+        1e-12,
+        _WIDE,
+    ),
+    "metric `high_frequency_energy`": Check(
+        _judged(lambda a, b: metrics.high_frequency_energy(a), lambda a, b: _high_pass(a)), 1e-12, _WIDE
+    ),
+    "every metric of identical images": Check(_same, 0.0, "200 dB, SSIM 1 and error 0 exactly"),
+}
+"""What is computed -> its check. References are plain float64; those of the losses of SSIM are the same code
+in double precision, which the metric's check compares with the formula window by window."""

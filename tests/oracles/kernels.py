@@ -1,0 +1,27 @@
+"""Which kernels some work launches, and which of them are new."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def launched(work):
+    """Do some work and return the hashes of the kernels it launched, compiled for it or found in a cache."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        work()
+        dr.sync_thread()
+        return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+
+def own(array):
+    return dr.opaque(mi.TensorXf(np.asarray(array, np.float32)))
+
+
+def compiled(call):
+    """Count the kernels that were not in memory yet: compiled, or fetched from the disk."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        call()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    return len(kernels), sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)

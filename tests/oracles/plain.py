@@ -1,0 +1,77 @@
+"""Losses and the network in plain NumPy, and the way of their arguments to Dr.Jit and back."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def waves(height=40, width=56):
+    """Two images by formula, so that another program can make the same ones."""
+    r, c = np.mgrid[:height, :width]
+    y = np.stack([0.5 + 0.4 * np.sin(0.3 * r + 0.11 * c * k) * np.cos(0.07 * k * c) for k in (1, 2, 3)], -1)
+    return y + 0.1 * np.cos(1.7 * r + 2.3 * c)[..., None], y
+
+
+def single(a):
+    return mi.TensorXf(np.asarray(a, np.float32))
+
+
+def double(a):
+    return mi.TensorXd(np.asarray(a, np.float64))
+
+
+def gradient(loss, x, *args, **kwargs):
+    """Return value and gradient of a loss."""
+    x = type(x)(x)
+    dr.enable_grad(x)
+    value = loss(x, *args, **kwargs)
+    dr.backward(value)
+    return value[0], np.array(dr.grad(x))
+
+
+def plain_ssim(x, y, data_range=1.0):
+    """Wang et al. 2004, Eq. 13, window by window, the window not factored."""
+
+    def taps(length):
+        radius = (min(11, length) - 1) // 2
+        return np.exp(-0.5 * (np.arange(-radius, radius + 1) / 1.5) ** 2)
+
+    g = np.outer(taps(x.shape[0]), taps(x.shape[1]))
+    g = (g / g.sum())[..., None]
+    (n, m), (c1, c2) = g.shape[:2], ((0.01 * data_range) ** 2, (0.03 * data_range) ** 2)
+    out = np.empty((x.shape[0] - n + 1, x.shape[1] - m + 1, x.shape[2]))
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            a, b = x[i : i + n, j : j + m], y[i : i + n, j : j + m]
+            ma, mb = (g * a).sum((0, 1)), (g * b).sum((0, 1))
+            va, vb = (g * (a - ma) ** 2).sum((0, 1)), (g * (b - mb) ** 2).sum((0, 1))
+            cov = (g * (a - ma) * (b - mb)).sum((0, 1))
+            out[i, j] = (2 * ma * mb + c1) * (2 * cov + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
+    return out
+
+
+def plain_ssim_loss(x, y, w):
+    s = plain_ssim(x, y)
+    r, c = (x.shape[0] - s.shape[0]) // 2, (x.shape[1] - s.shape[1]) // 2
+    w = np.broadcast_to(w, x.shape)[r : r + s.shape[0], c : c + s.shape[1]]
+    return 1 - np.sum(w * s) / np.sum(w)
+
+
+def plain_display(x):
+    toe = 1e-3 ** (1 / 2.2)
+    middle = np.clip(x, 1e-3, 1) ** (1 / 2.2)
+    return np.where(x < 1e-3, x * toe / 1e-3, np.where(x > 1, 1 + np.log(np.maximum(x, 1)) / 2.2, middle))
+
+
+def numpy_layers(params, x, omega):
+    """Sitzmann et al. 2020, layer by layer, in float64: every sine layer and the output."""
+    h, last, activations = np.float64(x), len(params) // 2 - 1, []
+    for i in range(last + 1):
+        z = h @ np.float64(params[f"{i}.weight"]).T + np.float64(params[f"{i}.bias"])
+        h = np.sin(omega * z) if i < last else 1 / (1 + np.exp(-z))
+        activations.append(h)
+    return activations
+
+
+def numpy_forward(params, x, omega):
+    return numpy_layers(params, x, omega)[-1]

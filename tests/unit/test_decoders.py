@@ -1,0 +1,310 @@
+"""Reading images of every kind, against hand-made files and files damaged on purpose."""
+
+import os
+import struct
+import subprocess
+import sys
+import time
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from envedit.core.errors import InputError
+from envedit.images import exr as exr_module
+from envedit.images import images
+from tests.oracles.builders import SCANLINE, exr, planes, stacked
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint32])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_exr_pixel_types(tmp_path, rng, dtype, alpha):
+    p = planes(rng, dtype)
+    extra = {"A": np.zeros((4, 8), dtype)} if alpha else {}
+    found, info = images.read(exr(tmp_path / "a.exr", **extra, **p))
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, stacked(p))
+    assert (info["format"], info["size"], info["hdr"], info["warnings"]) == ("exr", (8, 4), True, [])
+
+
+def test_exr_mixed_types_layers_and_parts(tmp_path, rng):
+    p = planes(rng)
+    mixed = {"R": p["R"].astype(np.float16), "G": p["G"], "B": p["B"].astype(np.uint32)}
+    np.testing.assert_array_equal(images.read(exr(tmp_path / "m.exr", **mixed))[0], stacked(mixed))
+
+    other = {f"aov.{c}": np.zeros((4, 8), np.float32) for c in "RGB"}
+    layers = {f"View.Combined.{c}": p[c] for c in "RGB"} | other | {"Z": p["R"]}
+    found, info = images.read(exr(tmp_path / "l.exr", **layers))
+    np.testing.assert_array_equal(found, stacked(p))
+    assert info["warnings"] == ["2 colour layers: 'View.Combined' was read"]
+
+    part = OpenEXR.Part(dict(SCANLINE), {"Z": p["R"]}, "depth")
+    colour = OpenEXR.Part(dict(SCANLINE), dict(p), "colour")
+    OpenEXR.File([part, colour]).write(str(tmp_path / "p.exr"))
+    np.testing.assert_array_equal(images.read(tmp_path / "p.exr")[0], stacked(p))
+
+
+def test_exr_of_many_channels_is_refused_before_it_is_decoded(tmp_path, rng, monkeypatch):
+    """The library decodes all of them, whichever are asked for."""
+    path = exr(
+        tmp_path / "many.exr", **planes(rng), **{f"aov{i}": np.zeros((4, 8), np.float32) for i in range(9)}
+    )
+    monkeypatch.setattr(exr_module, "_MOST_VALUES", 12 * 32)
+    assert images.read(path)[0].shape == (4, 8, 3)
+    monkeypatch.setattr(exr_module, "_MOST_VALUES", 12 * 32 - 1)
+    with pytest.raises(InputError, match="its 12 channels hold more than 383 values; save only colour"):
+        images.read(path)
+
+
+def test_exr_luminance_is_grey(tmp_path, rng):
+    y = rng.random((4, 8)).astype(np.float32)
+    found, info = images.read(exr(tmp_path / "y.exr", Y=y))
+    np.testing.assert_array_equal(found, np.repeat(y[..., None], 3, 2))
+    assert "luminance" in info["warnings"][0]
+
+
+def test_exr_window_and_primaries(tmp_path, rng):
+    p = planes(rng)
+    box = {"dataWindow": ((2, 1), (9, 4)), "displayWindow": ((0, 0), (7, 3))}
+    header = {"chromaticities": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)}  # ACES AP0
+    path = exr(tmp_path / "w.exr", box, **p)
+    found, info = images.read(path)
+    expected = np.zeros((4, 8, 3), np.float32)
+    expected[1:, 2:] = stacked(p)[:3, :6]
+    np.testing.assert_array_equal(found, expected)
+    assert "cropped" in info["warnings"][0]
+    _, info = images.read(exr(tmp_path / "aces.exr", header, **p))
+    assert "not Rec.709" in info["warnings"][0]
+
+
+def test_exr_without_colour(tmp_path, rng):
+    with pytest.raises(InputError, match=r"z.exr: no R, G, B channels \(found: Z\)"):
+        images.read(exr(tmp_path / "z.exr", Z=rng.random((4, 8)).astype(np.float32)))
+
+
+def rgbe_file(path, body, size="-Y 4 +X 8", header="FORMAT=32-bit_rle_rgbe\n"):
+    path.write_bytes(f"#?RADIANCE\n{header}\n{size}\n".encode() + body)
+    return path
+
+
+def run_length(rows):
+    body = b""
+    for row in rows:
+        body += bytes([2, 2, 0, len(row)])
+        for c in range(4):
+            same = (row[:, c] == row[0, c]).all()
+            body += bytes([128 + len(row), row[0, c]]) if same else bytes([len(row)]) + row[:, c].tobytes()
+    return body
+
+
+def test_radiance_encodings(tmp_path, rng):
+    q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8)
+    q[0, 0] = 0
+    q[1] = q[1, 0]
+    q[2, :, 3] = 148
+    expected = np.where(q[..., 3:] > 0, q[..., :3] * 2.0 ** (q[..., 3:] - 136.0), 0).astype(np.float32)
+    old = q[0].tobytes() + q[1, 0].tobytes() + bytes([1, 1, 1, 7]) + q[2:].tobytes()
+    for name, body in (("flat", q.tobytes()), ("new", run_length(q)), ("old", old)):
+        found, info = images.read(rgbe_file(tmp_path / f"{name}.hdr", body))
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+        assert info["format"] == "hdr" and info["hdr"] and not info["warnings"]
+    # A run longer than 255: the second marker counts in units of 256.
+    long = q[0, 1].tobytes() + bytes([1, 1, 1, 255 - 1, 1, 1, 1, 1]) + bytes([1, 1, 1, 1])
+    found, _ = images.read(rgbe_file(tmp_path / "long.hdr", long[:12], size="-Y 1 +X 511"))
+    np.testing.assert_array_equal(found, np.broadcast_to(expected[0, 1], (1, 511, 3)))
+
+
+def test_radiance_header(tmp_path, rng):
+    q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8).tobytes()
+    with pytest.raises(InputError, match=r"x.hdr: holds XYZ colours"):
+        images.read(rgbe_file(tmp_path / "x.hdr", q, header="FORMAT=32-bit_rle_xyze\n"))
+    with pytest.raises(InputError, match=r"x.hdr: rows are stored as '\+Y 4 \+X 8'"):
+        images.read(rgbe_file(tmp_path / "x.hdr", q, size="+Y 4 +X 8"))
+    _, info = images.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=2.5\n"))
+    assert "EXPOSURE=2.5" in info["warnings"][0]
+    assert not images.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=1.000\n"))[1]["warnings"]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_png_is_decoded_and_flagged(tmp_path, rng, dtype, channels):
+    top = np.iinfo(dtype).max
+    q = rng.integers(0, top + 1, (4, 8, channels)).astype(dtype)
+    q[0, 0], q[0, 1] = 0, top
+    mi.Bitmap(q).write(str(tmp_path / "a.png"))
+    found, info = images.read(tmp_path / "a.png")
+    s = np.repeat(q, 3, 2) / top if channels == 1 else q[..., :3] / top
+    expected = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert found.dtype == np.float32 and found.shape == (4, 8, 3)
+    assert info["hdr"] is False and "not HDR" in info["warnings"][0]
+
+
+def test_jpeg(tmp_path):
+    mi.Bitmap(np.full((16, 32, 3), 188, np.uint8)).write(str(tmp_path / "a.jpg"))
+    found, info = images.read(tmp_path / "a.jpg")
+    np.testing.assert_allclose(found, 0.503, atol=0.01)  # sRGB 188 is half the light
+    assert info["format"] == "jpeg" and info["size"] == (32, 16)
+
+
+def damaged_files(folder, rng):
+    """Yield (name, words of the message) for files that must be refused."""
+    p = planes(rng, size=(64, 128))
+    raw = exr(folder / "whole.exr", **p).read_bytes()
+    at = raw.index(b"dataWindow\0box2i\0") + 17 + 4
+    hdr = rgbe_file(folder / "whole.hdr", run_length(rng.integers(128, 256, (4, 8, 4)).astype(np.uint8)))
+    hdr = hdr.read_bytes()
+    for kind in ("png", "jpg"):
+        mi.Bitmap(rng.integers(0, 256, (64, 128, 3)).astype(np.uint8)).write(str(folder / f"whole.{kind}"))
+    png, jpg = ((folder / f"whole.{k}").read_bytes() for k in ("png", "jpg"))
+    sof = jpg.index(b"\xff\xc0") + 5
+
+    def window(x, y):
+        return raw[:at] + struct.pack("<4i", 0, 0, x, y) + raw[at + 16 :]
+
+    files = {
+        "empty.exr": (b"", "is empty"),
+        "text.exr": (b"<html>not found</html>", "not an image"),
+        "text.hdr": (b"P6 8 4", "not an image"),
+        "half.exr": (raw[: len(raw) // 2], "damaged or truncated"),
+        "head.exr": (raw[:60], "damaged or truncated"),
+        "magic.exr": (raw[:4], "damaged or truncated"),
+        "noise.exr": (raw[:700] + rng.bytes(len(raw) - 700), "damaged or truncated"),
+        "wide.exr": (window(199_999, 99_999), "declares 200000 x 100000 texels"),
+        "many.exr": (window(32_000, 31_000), "declares 32001 x 31001 texels"),
+        "widest.exr": (window(2**31 - 2, 2**31 - 2), "exr: "),
+        "negative.exr": (window(-5, -5), "exr: "),
+        "half.hdr": (hdr[: len(hdr) - 9], "damaged or truncated"),
+        "head.hdr": (hdr[:30], "damaged or truncated"),
+        "long.hdr": (hdr.replace(b"\x02\x02\x00\x08\x08", b"\x02\x02\x00\x08\xff"), "is too long"),
+        "flat.hdr": (hdr[: hdr.index(b"+X 8") + 5] + bytes(range(3, 40)), "damaged or truncated"),
+        "wide.hdr": (hdr.replace(b"-Y 4 +X 8", b"-Y 100000 +X 200000"), "declares 200000 x 100000 texels"),
+        "none.hdr": (hdr.replace(b"-Y 4 +X 8", b"-Y 0 +X 0"), "declares 0 x 0 texels"),
+        "half.png": (png[: len(png) // 2], "damaged or truncated"),
+        "magic.png": (png[:8], "png: "),
+        "wide.png": (png[:16] + struct.pack(">2I", 2**31 - 1, 2**31 - 1) + png[24:], "declares 2147483647 x"),
+        "half.jpg": (jpg[: len(jpg) // 2], "damaged or truncated"),
+        "magic.jpg": (jpg[:3], "damaged or truncated"),
+        "wide.jpg": (jpg[:sof] + b"\xff\xff\xff\xff" + jpg[sof + 4 :], "declares 65535 x 65535 texels"),
+    }
+    for name, (content, words) in files.items():
+        (folder / name).write_bytes(content)
+        yield name, words
+    (folder / "folder.exr").mkdir()
+    os.mkfifo(folder / "pipe.exr")
+    yield from (
+        ("folder.exr", "is a folder"),
+        ("pipe.exr", "not a regular file"),
+        ("gone.exr", "no such file"),
+    )
+
+
+def test_damaged_files_are_refused_quietly(tmp_path, rng, capfd):
+    for name, words in damaged_files(tmp_path, rng):
+        with pytest.raises(InputError) as e:
+            images.read(tmp_path / name)
+        message = str(e.value)
+        assert message.startswith(str(tmp_path / name)) and words in message, message
+        assert "\n" not in message
+    assert capfd.readouterr() == ("", "")  # no library has spoken over us
+
+
+def test_reading_survives_random_damage(tmp_path, rng):
+    """Flip bytes: each file either reads or is refused, in a process that must end well."""
+    exr(tmp_path / "a.exr", **planes(rng, np.float16, (8, 16)))
+    rgbe_file(tmp_path / "a.hdr", run_length(rng.integers(128, 256, (4, 8, 4)).astype(np.uint8)))
+    script = """
+import sys, numpy as np
+from pathlib import Path
+from envedit.images import images
+from envedit.core.errors import InputError
+rng, folder, refused = np.random.default_rng(1), Path(sys.argv[1]), 0
+for name in ("a.exr", "a.hdr"):
+    raw = np.frombuffer((folder / name).read_bytes(), np.uint8)
+    for _ in range(200):
+        bad = raw.copy()
+        bad[rng.integers(4, len(raw), 3)] = rng.integers(0, 256, 3)
+        (folder / ("b" + name)).write_bytes(bad.tobytes())
+        try:
+            images.read(folder / ("b" + name))
+        except InputError:
+            refused += 1
+print(refused)
+"""
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert int(done.stdout) > 20
+
+
+def test_no_file_stays_open(tmp_path, rng):
+    before = set(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else pytest.skip("no /proc")
+    kept = [images.read(exr(tmp_path / "a.exr", **planes(rng)))]
+    assert set(os.listdir("/proc/self/fd")) == before and kept
+
+
+@pytest.mark.parametrize("size", [(9, 2**22 + 8), (2**31 - 1, 8), (2**16, 2**16), (1025, 1024)])
+def test_tiles_larger_than_the_image_are_refused(tmp_path, rng, size):
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize, tiles.ySize = 8, 4
+    path = exr(tmp_path / "t.exr", {"type": OpenEXR.tiledimage, "tiles": tiles}, **planes(rng, size=(16, 32)))
+    assert images.read(path)[0].shape == (16, 32, 3)
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<2I", raw, raw.index(b"tiles\0tiledesc\0") + 19, *size)
+    path.write_bytes(raw)
+    words = "tiles of" if max(size) < 2**31 - 1 else "tiles of|damaged"  # the library refuses some itself
+    with pytest.raises(InputError, match=words):
+        images.read(path)
+
+
+def test_jpeg_2000_that_ends_early_is_damaged_and_quiet(tmp_path, capfd):
+    smooth = np.float32(np.add.outer(np.arange(16), np.arange(32)) / 64)
+    method = getattr(OpenEXR, "HTJ2K256_COMPRESSION", None)
+    if method is None:
+        pytest.skip("this OpenEXR has no JPEG 2000")
+    path = exr(tmp_path / "j.exr", {"compression": method}, **{c: smooth.copy() for c in "RGB"})
+    np.testing.assert_array_equal(images.read(path)[0][..., 0], smooth)
+    raw = path.read_bytes()
+    read = 0
+    for at in range(len(raw) - 400, len(raw), 7):  # within the stream: all that follows moves
+        path.write_bytes(raw[:at] + b"\xff\x7f\0" + raw[at:])
+        try:
+            found = images.read(path)[0]
+            read += not np.array_equal(found[..., 0], smooth)
+        except InputError as error:
+            assert "damaged" in str(error)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "line", [b"EXPOSURE=a" + b" " * 60_000 + b"b", b"EXPOSURE=" + b"e" * 60_000, b"a" * 60_000 + b" ="]
+)
+def test_a_long_line_in_a_radiance_header_takes_no_time(tmp_path, line):
+    (tmp_path / "l.hdr").write_bytes(b"#?RADIANCE\n" + line + b"\n\n-Y 4 +X 8\n" + bytes(range(128)))
+    start = time.process_time()
+    _, info = images.read(tmp_path / "l.hdr")
+    assert time.process_time() - start < 2  # with a pattern: 10 to 25 s of processor time
+    assert all(len(w) < 200 and w.isprintable() for w in info["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [("2.5EV", True), ("1-2", True), ("1 1 1", False), ("1.0", False)]
+)
+def test_odd_exposures_are_told_and_not_damage(tmp_path, value, told):
+    text = f"#?RADIANCE\nEXPOSURE = {value} \n\n-Y 4 +X 8\n"
+    (tmp_path / "e.hdr").write_bytes(text.encode() + bytes(range(128)))
+    _, info = images.read(tmp_path / "e.hdr")
+    assert info["metadata"] == {"EXPOSURE": value}
+    assert [f"EXPOSURE={value} in its header" in w for w in info["warnings"]] == [True] * told
+
+
+def test_a_jpeg_whose_table_breaks_off_is_damaged(tmp_path):
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((16, 32, 3), 188, np.uint8)).write(str(tmp_path / "a.jpg"))
+    raw = (tmp_path / "a.jpg").read_bytes()
+    at = raw.index(b"\xff\xdb")
+    for length in (3, 20, 66):  # the table's first byte only, some of it, all but one
+        (tmp_path / "b.jpg").write_bytes(raw[: at + 2] + struct.pack(">H", length) + raw[at + 4 :])
+        with pytest.raises(InputError, match="b.jpg: damaged"):
+            images.read_stored(tmp_path / "b.jpg")

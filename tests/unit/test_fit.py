@@ -1,0 +1,670 @@
+"""The fit: normalisation and objective against formulas, perturbation by its definition, fits on disk."""
+
+import dataclasses
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit import config
+from envedit.core.errors import InputError, NumericalError
+from envedit.losses import metrics, optimizer, ssim
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
+from tests.oracles.kernels import launched
+from tests.oracles.plain import plain_ssim_loss
+
+NETWORK = config.Representation(hidden=12, depth=1, coordinates="sphere")
+QUICK = config.Fit(epochs=4, lr=5e-3, awp_gamma=0.0)
+
+
+def sky(rng, height=16, width=32, peak=50.0):
+    """Smooth sky with a sun a few texels wide."""
+    row, column = np.mgrid[:height, :width]
+    base = 0.4 + 0.3 * np.cos(2 * np.pi * column / width) * np.sin(np.pi * (row + 0.5) / height)
+    sun = peak * np.exp(-((row - height * 0.3) ** 2 + (column - width * 0.6) ** 2) / 4)
+    grain = 0.01 * rng.random((height, width, 3))
+    return ((base + sun)[..., None] * [1.0, 0.9, 0.7] + grain).astype(np.float32)
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def numpy(params):
+    return {name: value.numpy() for name, value in params.items()}
+
+
+def tensors(params):
+    return {name: mi.TensorXf(np.asarray(value, np.float32)) for name, value in params.items()}
+
+
+def picture(fitted, network, shape, rows=None):
+    """What a fitted network makes of its own points."""
+    x = fit.points(network, shape, rows)
+    return fit.evaluate(tensors(fitted.params), fitted.normalisation, x, shape, network.omega).numpy()
+
+
+def facts(fitted):
+    """All of a fit but its weights and whether it was read from disk."""
+    found = dataclasses.asdict(fitted)
+    return {key: found[key] for key in ("normalisation", "log_psnr", "peak_ratio", "epochs")}
+
+
+# ---- normalisation (Eq. 1-3) -----------------------------------------------------------------------------
+
+
+def test_normalisation_is_equation_1(rng):
+    image = sky(rng)
+    logs = np.log(image.astype(np.float64) + 0.01)
+    expected = (logs - logs.min()) / (logs.max() - logs.min())
+    values = fit.Normalisation.of(image).encode(image)
+    np.testing.assert_allclose(values, expected, atol=1e-12)
+    assert values.min() == 0 and abs(values.max() - 1) < 1e-12
+
+
+@pytest.mark.parametrize("peak", [1.0, 65504.0, 1e6, 1e38])
+def test_normalisation_round_trip(peak):
+    image = np.array([0, 1e-30, 1e-4, 0.5, 1, peak / 7, peak] * 3, np.float32).reshape(1, 7, 3)
+    normalisation = fit.Normalisation.of(image)
+    decoded = normalisation.decode(mi.TensorXf(normalisation.encode(image).astype(np.float32))).numpy()
+    assert np.isfinite(decoded).all()
+    # x rounds at 6e-8 in [0, 1], and the exponent by as much of the 93 that its range can be.
+    np.testing.assert_allclose(decoded, image, rtol=2e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, 0.3, 65504.0, 1e38])
+def test_constant_map_lies_in_the_middle_of_a_range_of_one(value):
+    image = np.full((2, 4, 3), value, np.float32)
+    normalisation = fit.Normalisation.of(image)
+    values = normalisation.encode(image)
+    assert normalisation.span == 1
+    np.testing.assert_allclose(values, 0.5)
+    decoded = normalisation.decode(mi.TensorXf(values.astype(np.float32))).numpy()
+    np.testing.assert_allclose(decoded, image, rtol=2e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.001, 3e38])
+@pytest.mark.parametrize("flat", [False, True])
+def test_decoded_radiance_is_always_finite_and_never_negative(value, flat):
+    """A whole rendering is NaN after one infinite texel, and the scene refuses a negative one."""
+    image = np.full((2, 4, 3), value) * (1 if flat else np.arange(24).reshape(2, 4, 3) / 23)
+    normalisation = fit.Normalisation.of(image)
+    decoded = normalisation.decode(mi.TensorXf(np.float32([0, 1e-30, 1e-7, 0.25, 1]))).numpy()
+    assert np.isfinite(decoded).all() and (decoded >= 0).all(), decoded
+
+
+@pytest.mark.parametrize("headroom", [0.0, 0.05, 0.45])
+def test_headroom_is_left_free_at_either_end(headroom, rng):
+    for image in (
+        sky(rng),
+        sky(rng, peak=1e6),
+        np.float32([[[0, 1e-30, 1e6]]]),
+        np.float32([[[1, 1, 1.01]]]),
+    ):
+        normalisation = fit.Normalisation.of(image, headroom)
+        values = normalisation.encode(image)
+        np.testing.assert_allclose([values.min(), values.max()], [headroom, 1 - headroom], atol=1e-9)
+        decoded = normalisation.decode(mi.TensorXf(values.astype(np.float32))).numpy()
+        # A value rounds at 6e-8, and the exponent by as much of the span, at most 185 here.
+        np.testing.assert_allclose(decoded, image, rtol=3e-5, atol=1e-6)
+        logs = np.log(image.astype(np.float64) + 0.01)
+        free = headroom / (1 - 2 * headroom) * np.ptp(logs)
+        ends = np.exp(np.minimum([logs.min() - free, logs.max() + free], 88)) - 0.01
+        decoded = normalisation.decode(mi.TensorXf(np.float32([0, 1]))).numpy()
+        np.testing.assert_allclose(decoded, np.maximum(ends, 0), rtol=1e-4, atol=1e-6)
+
+
+def test_no_headroom_is_equation_1(rng):
+    image = sky(rng)
+    assert fit.Normalisation.of(image, 0.0) == fit.Normalisation.of(image) != fit.Normalisation.of(image, 0.1)
+
+
+@pytest.mark.parametrize("headroom", [0.0, 0.05, 0.45])
+@pytest.mark.parametrize("value", [0.0, 0.3, 1e38])
+def test_a_constant_map_needs_no_headroom(value, headroom):
+    image = np.full((2, 4, 3), value, np.float32)
+    assert fit.Normalisation.of(image, headroom) == fit.Normalisation.of(image)
+
+
+# ---- objective (Eq. 4) -----------------------------------------------------------------------------------
+
+
+def rows(image):
+    """Reorder an image (H, W, 3) as the network's output (H * W, 3)."""
+    return np.ascontiguousarray(np.asarray(image).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("coordinates", ["sphere", "plane"])
+def test_network_output_becomes_an_image_differentiably(coordinates, rng):
+    network = config.Representation(hidden=9, depth=1, coordinates=coordinates)
+    x, normalisation = fit.points(network, (4, 6)), fit.Normalisation(-2.0, 5.0)
+    assert x.shape == (24, 3 if coordinates == "sphere" else 2)
+    leaves = siren.init(0, 9, 1, inputs=x.shape[1])
+    dr.enable_grad(leaves)
+    out = fit.evaluate(leaves, normalisation, x, (4, 6), 30.0)
+    values = siren.forward({name: dr.detach(p) for name, p in leaves.items()}, x, 30.0)[0].numpy()
+    for texel in range(24):
+        expected = np.exp(5.0 * values[texel].astype(np.float64) - 2.0) - fit.EPSILON
+        np.testing.assert_allclose(out.numpy()[divmod(texel, 6)], expected, rtol=1e-5)
+    weight = rng.random((4, 6, 3), dtype=np.float32)
+    dr.backward(dr.sum((out * mi.TensorXf(weight)).array))
+    # The bias of the last layer: d out / d b = span (out + eps) y (1 - y).
+    slope = 5.0 * (rows(out.numpy()) + fit.EPSILON) * values * (1 - values)
+    expected = np.sum(rows(weight) * slope, axis=0, dtype=np.float64)
+    np.testing.assert_allclose(dr.grad(leaves["2.bias"]).numpy(), expected, rtol=1e-4)
+
+
+def plain_objective(y, image, normalisation, settings, only_ssim=False):
+    """Eq. 4 in float64, norms as the losses say they are read."""
+    values, logs = y.reshape(image.shape), normalisation.encode(image)
+    ssim = plain_ssim_loss(values, logs, np.ones(()))
+    if only_ssim:
+        return ssim
+    radiance = np.exp(values * normalisation.span + normalisation.low) - fit.EPSILON
+    squared, absolute = np.mean((values - logs) ** 2), np.mean(np.abs(radiance - image))
+    return settings.log_mse * squared + settings.log_ssim * ssim + settings.hdr * absolute
+
+
+@pytest.mark.parametrize("terms", [(0.85, 0.25, 0.01), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+def test_objective_is_equation_4_and_its_gradient_the_finite_difference(terms, rng):
+    settings = config.Fit(log_mse=terms[0], log_ssim=terms[1], hdr=terms[2])
+    image = sky(rng, 12, 16, peak=5.0)
+    normalisation = fit.Normalisation.of(image)
+    y = np.clip(rows(normalisation.encode(image)) + 0.1 * rng.normal(size=(192, 3)), 0.01, 0.99)
+    y = y.astype(np.float32).astype(np.float64)
+    loss, gradient = fit.Objective(image, normalisation, settings).gradient(mi.TensorXf(y.astype(np.float32)))
+    np.testing.assert_allclose(loss[0], plain_objective(y, image, normalisation, settings), rtol=1e-5)
+    g = np.array(gradient, np.float64)
+    direction, h = g / np.linalg.norm(g), 1e-6
+    ends = [plain_objective(y + s * h * direction, image, normalisation, settings) for s in (1, -1)]
+    np.testing.assert_allclose(np.linalg.norm(g), (ends[0] - ends[1]) / (2 * h), rtol=1e-4)
+    direction = rng.normal(size=y.shape)
+    ends = [plain_objective(y + s * h * direction, image, normalisation, settings) for s in (1, -1)]
+    np.testing.assert_allclose(np.sum(g * direction), (ends[0] - ends[1]) / (2 * h), rtol=1e-3, atol=1e-6)
+
+
+def test_objective_of_the_perturbation_is_the_ssim_alone(rng):
+    image = sky(rng, 12, 16)
+    normalisation = fit.Normalisation.of(image)
+    y = rng.random((192, 3)).astype(np.float32)
+    loss, _ = fit.Objective(image, normalisation, config.Fit()).gradient(mi.TensorXf(y), only_ssim=True)
+    expected = plain_objective(y, image, normalisation, None, only_ssim=True)
+    np.testing.assert_allclose(loss[0], expected, rtol=1e-5)
+
+
+def test_objective_does_not_touch_the_callers_graph(rng):
+    image = sky(rng, 12, 16)
+    objective = fit.Objective(image, fit.Normalisation.of(image), config.Fit())
+    y = mi.TensorXf(rng.random((192, 3)).astype(np.float32))
+    objective.gradient(y)
+    assert not dr.grad_enabled(y)
+
+
+# ---- adversarial weight perturbation (Eq. 5) -------------------------------------------------------------
+
+
+def step_of_perturbation(rng, gamma=0.01, lr=1e-4):
+    image = sky(rng)
+    params, x = siren.init(0, 16, 2, 30.0), siren.coordinates(16, 32)
+    objective = fit.Objective(image, fit.Normalisation.of(image), config.Fit())
+    y, tape = siren.forward(params, x, 30.0)
+    before, slope = objective.gradient(y, only_ssim=True)
+    perturbation = fit.Perturbation(params, gamma)
+    perturbation.update(siren.backward(params, tape, slope), lr)
+    moved = perturbation.apply(params)
+    after, _ = objective.gradient(siren.forward(moved, x, 30.0)[0], only_ssim=True)
+    return params, moved, before[0], after[0]
+
+
+@pytest.mark.parametrize("gamma", [1e-3, 0.01, 0.1])
+def test_perturbation_moves_each_weight_matrix_by_gamma_of_its_norm(gamma, rng):
+    params, moved, _, _ = step_of_perturbation(rng, gamma)
+    assert list(moved) == list(params)
+    for name in params:
+        old, new = (np.array(p[name], np.float64) for p in (params, moved))
+        if name.endswith("bias"):
+            np.testing.assert_array_equal(old, new)
+        else:
+            # The difference of two weights of size w keeps 6e-8 w / (gamma w) of itself.
+            np.testing.assert_allclose(np.linalg.norm(new - old), gamma * np.linalg.norm(old), rtol=1e-3)
+
+
+def test_perturbation_makes_the_ssim_worse(rng):
+    _, _, before, after = step_of_perturbation(rng, gamma=1e-3)
+    assert after > before
+    _, _, _, further = step_of_perturbation(rng, gamma=2e-3)
+    assert further > after
+
+
+def test_perturbation_does_not_depend_on_the_proxys_rate(rng):
+    a, b = (step_of_perturbation(np.random.default_rng(0), lr=lr)[1] for lr in (1e-4, 1e-2))
+    for name in a:
+        np.testing.assert_allclose(a[name].numpy(), b[name].numpy(), rtol=1e-4, atol=1e-6)
+
+
+def test_perturbation_of_a_zero_layer_or_by_a_zero_gradient_changes_nothing(rng):
+    params = siren.init(0, 8, 1)
+    params["1.weight"] = dr.zeros(mi.TensorXf, (8, 8))
+    perturbation = fit.Perturbation(params, 0.01)
+    grads = {name: mi.TensorXf(rng.normal(size=p.shape).astype(np.float32)) for name, p in params.items()}
+    grads["2.weight"] = dr.opaque(mi.TensorXf, 0, (3, 8))
+    perturbation.update(grads, 1e-4)
+    moved = perturbation.apply(params)
+    assert np.any(moved["0.weight"].numpy() != params["0.weight"].numpy())
+    for name in ("1.weight", "2.weight"):
+        np.testing.assert_array_equal(moved[name].numpy(), params[name].numpy())
+
+
+def test_perturbation_is_none_after_a_gradient_that_is_not_finite(rng):
+    params = siren.init(0, 8, 1)
+    perturbation = fit.Perturbation(params, 0.01)
+    good = {name: dr.opaque(mi.TensorXf, 1, p.shape) for name, p in params.items()}
+    bad = good | {"1.weight": dr.opaque(mi.TensorXf, math.nan, (8, 8))}
+    perturbation.update(good, 1e-4)
+    perturbation.update(bad, 1e-4)  # nor does the direction of the update before it stay
+    assert same(numpy(perturbation.apply(params)), numpy(params))
+
+
+# ---- the fit ---------------------------------------------------------------------------------------------
+
+
+def test_small_fit_reaches_a_good_picture(rng):
+    image = sky(rng)
+    settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)
+    network = config.Representation(hidden=32, depth=1, coordinates="sphere")
+    fitted = fit.fit(image, network, settings)
+    # 43.5 to 44.0 dB and 0.99 for four seeds where this was written; an untrained network has 10 dB.
+    assert fitted.log_psnr > 40
+    assert 0.9 < fitted.peak_ratio < 1.1
+    assert fitted.epochs == 150 and not fitted.cached
+    got = picture(fitted, network, (16, 32))
+    assert metrics.log_psnr(got, image) == fitted.log_psnr
+    assert metrics.peak_ratio(got, image) == fitted.peak_ratio
+
+
+@pytest.mark.slow
+def test_robust_fit_loses_less_to_noise_in_its_weights(rng):
+    """What the perturbation is for (paper, Sec. 4): moving the weights moves the picture less."""
+    image, network = sky(rng), config.Representation(hidden=32, depth=1)
+    drops = []
+    for gamma in (0.0, 0.03):
+        fitted = fit.fit(image, network, config.Fit(epochs=120, lr=5e-3, awp_gamma=gamma))
+        noise = np.random.default_rng(1)
+        scores = []
+        for _ in range(8):
+            moved = {}
+            for name, w in fitted.params.items():
+                d = noise.normal(size=w.shape)
+                moved[name] = w + 0.03 * np.linalg.norm(w) / np.linalg.norm(d) * d
+            got = picture(dataclasses.replace(fitted, params=moved), network, (16, 32))
+            scores.append(metrics.log_psnr(got, image))
+        drops.append(fitted.log_psnr - np.mean(scores))
+    # 19.2 to 21.5 and 5.7 to 6.6 dB for four seeds where this was written.
+    assert drops[1] < drops[0] - 8
+
+
+def sunny(height=24, width=48, sun=1e4):
+    """Make a sky of about 1 with a sun of one texel, which holds nine tenths of the light."""
+    row, column = np.mgrid[:height, :width]
+    base = 0.7 + 0.4 * np.cos(2 * np.pi * column / width) * np.sin(np.pi * (row + 0.5) / height)
+    grain = 0.05 * np.random.default_rng(0).random((height, width, 3))
+    image = (base[..., None] * [0.8, 0.9, 1.0] + grain).astype(np.float32)
+    image[height // 2, width // 3] = sun
+    return image
+
+
+@pytest.mark.slow
+def test_the_recipe_keeps_the_light_of_a_sun_of_one_texel():
+    image, network, rows = sunny(), config.Representation(hidden=48, depth=2), (0, 48)
+    ratios = []
+    for light in (1.0, 0.0):
+        fitted = fit.fit(image, network, config.Fit(epochs=200, light=light), rows=rows)
+        got = picture(fitted, network, (24, 48), rows)
+        ratios.append((metrics.peak_ratio(got, image), metrics.mean_luminance_ratio(got, image)))
+    (peak, mean), (peak_before, mean_before) = ratios
+    assert abs(peak - 1) < 0.1 and abs(mean - 1) < 0.03
+    # Gradient descent alone comes last to the sun: 0.66 and 0.68 where this was written, 0.69 and 0.71
+    # with another seed.
+    assert peak_before < 0.85 and mean_before < 0.85
+
+
+@pytest.mark.parametrize("coordinates", ["sphere", "plane"])
+def test_light_changes_the_last_layer_alone(coordinates, rng):
+    image, network = sky(rng), dataclasses.replace(NETWORK, coordinates=coordinates)
+    before, after = (
+        fit.fit(image, network, dataclasses.replace(QUICK, light=light)).params for light in (0.0, 1.0)
+    )
+    assert list(before) == list(after)
+    changed = [name for name in before if not np.array_equal(before[name], after[name])]
+    assert changed == ["2.weight", "2.bias"]
+
+
+@pytest.mark.parametrize(("shape", "value"), [((16, 32), 0.0), ((16, 32), 0.25), ((1, 2), 7.0)])
+def test_flat_maps_can_be_fitted(shape, value):
+    image = np.full((*shape, 3), value, np.float32)
+    fitted = fit.fit(image, NETWORK, dataclasses.replace(QUICK, epochs=60, awp_gamma=0.01))
+    assert all(np.isfinite(w).all() for w in fitted.params.values())
+    got = picture(fitted, NETWORK, shape)
+    np.testing.assert_allclose(got, image, atol=0.05 * (value + fit.EPSILON))
+
+
+@pytest.mark.parametrize("peak", [65504.0, 1e6, 3e38])
+def test_fit_of_extreme_peaks_stays_finite(peak, rng):
+    image = sky(rng)
+    image[3, 5] = peak
+    fitted = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.01))
+    assert all(np.isfinite(w).all() for w in fitted.params.values())
+
+
+def test_no_epochs_leaves_the_initial_weights(rng):
+    initial = numpy(siren.init(3, 12, 1, 30.0, inputs=3))
+    image, settings = sky(rng), dataclasses.replace(QUICK, epochs=0, light=0.0)
+    assert same(fit.fit(image, NETWORK, settings, seed=3).params, initial)
+    solved = fit.fit(image, NETWORK, dataclasses.replace(settings, light=1.0), seed=3).params
+    changed = [name for name in initial if not np.array_equal(initial[name], solved[name])]
+    assert changed == ["2.weight", "2.bias"]
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.01])
+def test_same_seed_same_bytes(gamma, rng):
+    image, settings = sky(rng), dataclasses.replace(QUICK, awp_gamma=gamma)
+    a, b, c = (fit.fit(image, NETWORK, settings, seed) for seed in (1, 1, 2))
+    assert same(a.params, b.params) and not same(a.params, c.params)
+
+
+def test_progress_ends_with_the_last_epoch(rng):
+    seen = []
+    fit.fit(sky(rng), NETWORK, dataclasses.replace(QUICK, epochs=23), progress=lambda *now: seen.append(now))
+    assert [now[0] for now in seen] == [1, 21, 23] and {now[1] for now in seen} == {23}
+    assert all(math.isfinite(now[2]) for now in seen)
+
+
+def test_progress_counts_perturbed_and_polishing_epochs_alike(rng):
+    seen = []
+    settings = dataclasses.replace(QUICK, epochs=43, awp_gamma=0.01, awp_until=0.4)
+    fit.fit(sky(rng), NETWORK, settings, progress=lambda *now: seen.append(now))
+    assert [now[:2] for now in seen] == [(1, 43), (21, 43), (41, 43), (43, 43)]
+
+
+# ---- perturbation for a while, grids, Adam ---------------------------------------------------------------
+
+
+def test_perturbation_that_never_starts_is_none(rng):
+    image = sky(rng)
+    none = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.0))
+    never = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.05, awp_until=0.0))
+    always = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.05, awp_until=1.0))
+    assert same(never.params, none.params) and not same(always.params, none.params)
+
+
+@pytest.mark.parametrize(("until", "every", "updates", "applied"), [
+    (0.7, 2, 4, 7), (1.0, 1, 10, 10), (0.1, 3, 1, 1), (0.75, 3, 3, 8), (0.0, 1, 0, 0),
+])  # fmt: skip
+def test_epochs_are_perturbed_up_to_a_share_of_them(until, every, updates, applied, rng, monkeypatch):
+    calls = []
+    for name in ("update", "apply"):
+        plain = getattr(fit.Perturbation, name)
+
+        def counted(self, *args, name=name, plain=plain):
+            calls.append(name)
+            return plain(self, *args)
+
+        monkeypatch.setattr(fit.Perturbation, name, counted)
+    settings = dataclasses.replace(QUICK, epochs=10, awp_gamma=0.01, awp_until=until, awp_every=every)
+    fit.fit(sky(rng), NETWORK, settings)
+    assert (calls.count("update"), calls.count("apply")) == (updates, applied)
+
+
+GRIDS = [  # height, width, stride, grids
+    (16, 32, 1, 1), (22, 22, 2, 4), (24, 48, 2, 4), (23, 35, 2, 4), (33, 34, 3, 9), (21, 64, 2, 1),
+    (64, 21, 2, 1), (32, 99, 3, 1), (1, 2, 2, 1), (16, 32, 64, 1),
+]  # fmt: skip
+
+
+def grids_of(height, width, stride):
+    """Grids of an image whose first channel numbers its texels; the points, numbered alike, beside."""
+    image = np.ones((height, width, 3), np.float32)
+    image[..., 0] = np.arange(height * width).reshape(height, width)
+    normalisation = fit.Normalisation.of(image)
+    x = fit.points(NETWORK, (height, width), (3, height + 5))
+    grids = fit._grids(image, normalisation, x, config.Fit(stride=stride))
+    return image, normalisation, x.numpy(), grids
+
+
+@pytest.mark.parametrize(("height", "width", "stride", "count"), GRIDS)
+def test_every_texel_belongs_to_one_grid_with_its_point(height, width, stride, count):
+    image, normalisation, x, grids = grids_of(height, width, stride)
+    assert len(grids) == count
+    logs, seen = normalisation.encode(image), []
+    for objective, points in grids:
+        part = objective.radiance.numpy()
+        texels = part[..., 0].astype(int)
+        assert objective.shape == texels.shape and points.shape == (texels.size, 3)
+        # A picture itself: rows and columns a stride apart, and no smaller than the window of the SSIM.
+        step = stride if count > 1 else 1
+        assert (np.diff(texels, axis=1) == step).all() and (np.diff(texels, axis=0) == step * width).all()
+        assert count == 1 or min(texels.shape) >= ssim.WINDOW
+        np.testing.assert_array_equal(part, image.reshape(-1, 3)[texels])
+        np.testing.assert_array_equal(points.numpy(), x[texels.ravel()])
+        expected = logs.reshape(-1, 3)[texels].astype(np.float32)
+        np.testing.assert_array_equal(objective.logs.numpy(), expected)
+        seen += texels.ravel().tolist()
+    assert sorted(seen) == list(range(height * width))
+
+
+def test_grids_take_turns_at_random(rng, monkeypatch):
+    image, used, plain = sky(rng, 23, 31), [], fit.Objective.gradient
+
+    def noted(self, y, only_ssim=False):
+        used.append(float(self.radiance.numpy()[0, 0, 0]))
+        return plain(self, y, only_ssim)
+
+    monkeypatch.setattr(fit.Objective, "gradient", noted)
+    corners = image[:2, :2, 0].ravel().tolist()
+    for seed in (0, 0, 1):
+        fit.fit(image, NETWORK, dataclasses.replace(QUICK, epochs=16), seed)
+    turns = [used[start : start + 4] for start in range(0, 48, 4)]
+    assert len(used) == 48 and all(sorted(turn) == sorted(corners) for turn in turns)
+    assert turns[:4] == turns[4:8] != turns[8:]
+    assert any(turn != turns[0] for turn in turns[:4])
+
+
+def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
+    betas, plain = [], optimizer.Adam.__init__
+
+    def noted(self, params, lr, betas_=(0.9, 0.999), *args):
+        betas.append(betas_)
+        plain(self, params, lr, betas_, *args)
+
+    monkeypatch.setattr(optimizer.Adam, "__init__", noted)
+    image = sky(rng)
+    a, b = (fit.fit(image, NETWORK, dataclasses.replace(QUICK, beta2=beta2)) for beta2 in (0.99, 0.9))
+    assert betas == [(0.9, 0.99), (0.9, 0.9)] and not same(a.params, b.params)
+
+
+# ---- schedules -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.01])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_no_new_kernel_after_every_grid_had_a_turn(stride, gamma, rng):
+    """Odd sizes: the grids differ in size, but no kernel depends on it."""
+    image = sky(rng, 23, 31)
+    few = 3 if stride == 1 else 8
+    settings = dataclasses.replace(QUICK, awp_gamma=gamma, awp_until=1.0, stride=stride)
+    short, long = (dataclasses.replace(settings, epochs=epochs) for epochs in (few, 2 * few + 1))
+    first = launched(lambda: fit.fit(image, NETWORK, short))
+    assert first and launched(lambda: fit.fit(image, NETWORK, long)) <= first
+
+
+@pytest.mark.parametrize(("schedule", "expected"), [
+    ("constant", [1, 1, 1, 1, 1]),
+    ("cosine", [1, 0.853553, 0.5, 0.146447, 0]),
+    ("warm-restarts", [1, 0.5, 1, 0.5, 1]),
+])  # fmt: skip
+def test_learning_rate_follows_the_schedule(schedule, expected):
+    settings = config.Fit(epochs=4, schedule=schedule, restart_period=2)
+    rates = [fit.learning_rate(settings, 2e-3, epoch) / 2e-3 for epoch in range(5)]
+    np.testing.assert_allclose(rates, expected, atol=1e-6)
+
+
+# ---- fits on disk ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("black", [False, True])
+def test_a_fit_is_read_back_as_it_was(tmp_path, black, rng):
+    image = sky(rng) * (not black)
+    made = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
+    found = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
+    assert (made.cached, found.cached) == (False, True)
+    assert same(made.params, found.params) and list(made.params) == list(found.params)
+    assert facts(found) == facts(made)
+
+
+def test_the_cache_can_be_refused(tmp_path, rng):
+    settings = dataclasses.replace(QUICK, cache=False)
+    assert not fit.fit(sky(rng), NETWORK, settings, folder=tmp_path).cached
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed"])
+def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
+    image = sky(rng)
+    made = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
+    (path,) = tmp_path.iterdir()
+    data = bytearray(path.read_bytes())
+    if damage == "changed":
+        weights = data.index(made.params["1.weight"].tobytes())
+        data[weights : weights + 4] = b"\xff" * 4  # a NaN
+    if damage == "truncated":
+        data = data[: len(data) // 2]
+    path.write_bytes({"empty": b"", "text": b"not a fit"}.get(damage, data))
+    again = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
+    assert not again.cached and same(again.params, made.params)
+    assert fit.fit(image, NETWORK, QUICK, folder=tmp_path).cached
+
+
+def test_other_settings_are_another_fit(tmp_path, rng):
+    image = sky(rng)
+    quick = dataclasses.replace(QUICK, epochs=1)
+    fit.fit(image, NETWORK, quick, folder=tmp_path)
+    brighter = image.copy()
+    brighter[0, 0, 0] += 1e-6
+    others = [
+        (brighter, NETWORK, quick, 0),
+        (image.reshape(32, 16, 3), NETWORK, quick, 0),
+        (image, dataclasses.replace(NETWORK, hidden=13), quick, 0),
+        (image, dataclasses.replace(NETWORK, depth=2), quick, 0),
+        (image, dataclasses.replace(NETWORK, omega=29.0), quick, 0),
+        (image, NETWORK, dataclasses.replace(quick, lr=4e-3), 0),
+        (image, NETWORK, dataclasses.replace(quick, schedule="constant"), 0),
+        (image, NETWORK, dataclasses.replace(quick, hdr=0.02), 0),
+        (image, NETWORK, dataclasses.replace(quick, awp_gamma=0.01), 0),
+        (image, NETWORK, dataclasses.replace(quick, awp_until=0.5), 0),
+        (image, NETWORK, dataclasses.replace(quick, beta2=0.98), 0),
+        (image, NETWORK, dataclasses.replace(quick, stride=1), 0),
+        (image, NETWORK, dataclasses.replace(quick, headroom=0.1), 0),
+        (image, NETWORK, dataclasses.replace(quick, light=0.5), 0),
+        (image, dataclasses.replace(NETWORK, coordinates="plane"), quick, 0),
+        (image, NETWORK, quick, 0, (0, 17)),
+        (image, NETWORK, quick, 0, (1, 17)),
+        (image, NETWORK, quick, 1),
+    ]
+    for other in others:
+        assert not fit.fit(*other, folder=tmp_path).cached
+    assert len(list(tmp_path.iterdir())) == 1 + len(others)
+    for rows in (None, (0, 16)):  # a whole map, both
+        assert fit.fit(image, NETWORK, quick, 0, rows, folder=tmp_path).cached
+
+
+def test_the_same_texels_elsewhere_in_a_map_are_another_picture(rng):
+    image = sky(rng)
+    top, equator, whole, told = (
+        fit.fit(image, NETWORK, QUICK, rows=rows) for rows in ((0, 32), (8, 32), None, (0, 16))
+    )
+    assert same(whole.params, told.params) and not same(top.params, equator.params)
+    assert not same(top.params, whole.params)
+    # In the plane a crop is stretched to a whole, wherever it lies.
+    plane = dataclasses.replace(NETWORK, coordinates="plane")
+    top, equator = (fit.fit(image, plane, QUICK, rows=rows) for rows in ((0, 32), (8, 32)))
+    assert same(top.params, equator.params)
+
+
+def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path, rng):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    assert not fit.fit(sky(rng), NETWORK, QUICK, folder=blocked / "fits").cached
+
+
+class Killed(Exception):
+    pass
+
+
+def killed_at(epoch, told=None):
+    """Make a progress function that ends a fit as if it were killed; it is called after every 20 epochs."""
+
+    def progress(done, total, loss):
+        if told is not None:
+            told.append(done)
+        if done >= epoch:
+            raise Killed
+
+    return progress
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gamma", [0.0, 0.01])
+@pytest.mark.parametrize("begun", ["whole", "damaged", "none"])
+def test_a_killed_fit_goes_on_to_the_same_weights(tmp_path, monkeypatch, gamma, begun, rng):
+    settings = config.Fit(epochs=60, lr=5e-3, awp_gamma=gamma, awp_every=3, stride=2, awp_until=0.9)
+    image = sky(rng, 24, 48)
+    undisturbed = fit.fit(image, NETWORK, settings)
+    monkeypatch.setattr(fit, "SAVED_EVERY", math.inf if begun == "none" else 0.0)
+    with pytest.raises(Killed):
+        fit.fit(image, NETWORK, settings, folder=tmp_path, progress=killed_at(41))
+    if begun == "none":
+        assert not list(tmp_path.iterdir())
+    if begun == "damaged":
+        (path,) = tmp_path.iterdir()
+        path.write_bytes(path.read_bytes()[:-100])
+    epochs = []
+    continued = fit.fit(image, NETWORK, settings, folder=tmp_path, progress=killed_at(math.inf, epochs))
+    # The progress of epoch 41 came before its state would have been kept: 39 were, a multiple of 3.
+    assert epochs == ([41, 60] if begun == "whole" else [1, 21, 41, 60])
+    assert not continued.cached and same(continued.params, undisturbed.params)
+    assert facts(continued) == facts(undisturbed)
+    assert len(list(tmp_path.iterdir())) == 1 and fit.fit(image, NETWORK, settings, folder=tmp_path).cached
+
+
+def test_seconds_of_a_killed_fit_count(tmp_path, monkeypatch, rng):
+    ticks = iter(range(0, 10**6, 100))
+    monkeypatch.setattr(fit.time, "perf_counter", lambda: float(next(ticks)))
+    image, settings = sky(rng), dataclasses.replace(QUICK, epochs=40)
+    undisturbed = fit.fit(image, NETWORK, settings, folder=tmp_path / "one")
+    with pytest.raises(Killed):
+        fit.fit(image, NETWORK, settings, folder=tmp_path / "two", progress=killed_at(21))
+    continued = fit.fit(image, NETWORK, settings, folder=tmp_path / "two")
+    assert undisturbed.seconds > 40 * 100 and abs(continued.seconds - undisturbed.seconds) <= 400
+
+
+def test_default_folder_follows_the_desktop_standard(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert fit.default_folder() == tmp_path / "envedit" / "fits"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert fit.default_folder() == tmp_path / ".cache" / "envedit" / "fits"
+
+
+def test_a_fit_that_ends_in_nan_is_refused_as_what_it_is(rng):
+    with pytest.raises(NumericalError, match=r"not finite; lower \[fit\] lr"):
+        fit.fit(sky(rng), NETWORK, config.Fit(epochs=4, lr=1e37, awp_gamma=0.0))
+
+
+def test_an_image_that_is_not_finite_is_refused(rng):
+    image = sky(rng)
+    image[2, 3, 1] = np.nan
+    with pytest.raises(InputError, match="row 2, column 3"):
+        fit.fit(image, NETWORK, QUICK)

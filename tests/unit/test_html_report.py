@@ -1,0 +1,197 @@
+"""The HTML report: parsed, and read for what it says about good, failed and empty runs."""
+
+import ast
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.report import html_report
+from tests.oracles import ROOT
+from tests.oracles.builders import grey
+
+
+class Page(HTMLParser):
+    """Collects text and attributes, and checks that elements close in order."""
+
+    VOID = {"meta", "img"}
+
+    def __init__(self, path):
+        super().__init__()
+        self.open, self.tags, self.links, self.words, self.classes = [], [], [], [], []
+        self.feed(Path(path).read_text(encoding="utf-8"))
+        assert self.open == []
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "data")]
+        self.classes += [value for name, value in attrs if name == "class"]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+
+def write(path, **changes):
+    settings = {
+        "title": "sphere",
+        "config_toml": 'preset = "standard"\n',
+        "metrics": {
+            "render": {"psnr": 38.71, "ssim": 0.98, "mse": 1e-4, "lpips": None},
+            "initial": {"psnr": 19.2, "ssim": 0.7, "mse": 1e-2, "lpips": None},
+            "envmap": None,
+            "fit": {"log_psnr": 45.7, "peak_ratio": 0.88, "epochs": 400, "cached": False},
+            "timing": {"edit_s": 21.4, "total_s": 47.3, "per_iteration_ms": 53.5},
+            "iterations": 2,
+            "non_finite_steps": 0,
+            "tonemap": "gamma",
+            "active_rows": [0, 7],
+        },
+        "manifest": {"variant": "llvm_ad_rgb"},
+        "history": [{"iteration": 0, "loss": 1.0}, {"iteration": 1, "loss": 0.1}],
+        "renders": {"initial": grey(0.1), "target": grey(0.5), "edited": grey(0.4)},
+        "maps": {"initial": grey(1.0), "target": None, "edited": grey(2.0)},
+        "influence": None,
+        "frozen": None,
+        "unreachable": None,
+        "warnings": [],
+        "notes": ["renderer.spp = 64"],
+    }
+    assert not set(changes) - set(settings)
+    html_report.write_report(path, **{**settings, **changes})
+    return Page(path)
+
+
+def test_report_is_one_file_that_says_the_verdict(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    page = write(tmp_path / "report.html")
+    assert "19.2 dB → 38.7 dB PSNR · 47.3 s in total" in page.text
+    assert "map against the true one" not in page.text and "target, environment map: not known" in page.text
+    assert page.tags.count("img") == 5 + 2
+    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert not {"script", "link", "iframe"} & set(page.tags)
+    assert "http" not in (tmp_path / "report.html").read_text()
+    assert "further from the target" not in page.text and "Warnings" not in page.text
+    assert "−0.1 0 +0.1" in page.text, "0.66 - 0.73, rounded up"
+    assert "+1 stops" in page.text
+
+
+def test_report_shows_what_the_view_determines(tmp_path):
+    assert "What this view determines" not in write(tmp_path / "a.html").text
+    influence, frozen = np.ones((8, 16), np.float32), np.zeros((8, 16), bool)
+    page = write(tmp_path / "b.html", influence=influence, frozen=frozen)
+    assert "0.001 10 influence" in page.text
+    assert "keep their original value" not in page.text and page.tags.count("img") == 5 + 2 + 1
+    frozen[3] = True
+    assert "keep their original value" in write(tmp_path / "c.html", influence=influence, frozen=frozen).text
+
+
+def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
+    metrics = {"transport": {"entries": 12345, "cached": True}, "choices": ["path depth 5"]}
+    page = write(tmp_path / "r.html", metrics=metrics, notes=["path depth 5"])
+    assert page.text.count("path depth 5") == 1 and "choices" not in page.text
+    assert "transport entries 12345" in page.text
+
+
+def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
+    psnr = {"initial": {"psnr": 30.0}, "render": {"psnr": 25.0}}
+    painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
+    unreachable = np.full((8, 8, 3), 0.5)
+    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, unreachable=unreachable)
+    assert "81 % of the way to the paint · the rest changed by 0.012 of white" in page.text
+    assert "What was painted" in page.text and "90 % of the request is within reach" in page.text
+    assert "further from" not in page.text  # the whole picture may well be
+    worse = write(tmp_path / "w.html", metrics={"painted": painted | {"towards": -0.2}})
+    assert "further from the paint" in worse.text
+
+
+def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
+    truth = grey(1.0)
+    truth[3, 5] = 1e6
+    metrics = {"initial": {"psnr": 20.0}, "render": {"psnr": 15.0}, "envmap": {"psnr": 12.34}}
+    page = write(tmp_path / "r.html", metrics=metrics, maps={"target": truth, "edited": grey(1.0)})
+    assert "map against the true one: 12.3 dB" in page.text
+    assert "further from the target" in page.text
+    assert "target 16 × 8 1e+06 3, 5" in page.text
+
+
+def test_report_escapes_all_text(tmp_path):
+    nasty = "<script>alert('&')</script> Gemälde/заря \udcff \0"
+    page = write(
+        tmp_path / "r.html",
+        title=nasty,
+        config_toml=nasty,
+        manifest={nasty: nasty},
+        metrics={nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}, "timing": {nasty: 1.0}},
+        history=[{nasty: 1.0}],
+        renders={nasty: grey(0.5), "y" * 3000: grey(0.5)},
+        warnings=[nasty],
+        notes=[nasty],
+    )
+    assert "script" not in page.tags
+    assert page.text.count("<script>alert('&')</script> Gemälde/заря") >= 9
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, None])
+def test_report_of_a_run_that_went_wrong(tmp_path, bad):
+    picture = grey(0.0 if bad is None else bad, 1, 1)
+    page = write(
+        tmp_path / "r.html",
+        metrics={"render": {"psnr": bad}, "timing": {"edit_s": bad}, "initial": None, "iterations": bad},
+        history=[{"iteration": 0, "loss": bad}],
+        renders={"initial": picture, "target": grey(0.0, 1, 1), "edited": picture},
+        maps={"initial": picture, "target": picture, "edited": grey(0.0, 2, 4)},
+    )
+    assert "unknown → unknown PSNR" in page.text
+    assert "No loss to draw" in page.text
+    assert "maps edited and initial differ in size, (2, 4) and (1, 1)" in page.text
+    words = {word.strip(".,:()").lower() for word in page.text.split()}
+    assert not {"nan", "inf"} & words
+    if bad is not None:
+        assert "history[0].loss" in page.text and "rendering edited: 1 pixels are not finite" in page.text
+
+
+def test_report_of_nothing(tmp_path):
+    page = write(tmp_path / "r.html", metrics={}, manifest={}, history=[], renders={}, maps={}, notes=[])
+    assert "No loss to draw" in page.text and "img" not in page.tags
+
+
+def test_map_statistics_weight_the_mean_by_solid_angle():
+    image = grey(0.0, 33, 64)
+    image[:8] = 2.0
+    cells = html_report._map_statistics(image)
+    # Eight of 33 rows aligned to the corners are a cap of angle pi * 7.5 / 32 around the pole.
+    mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
+    assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"]
+    assert cells[4:] == ["0", "0", "0"]
+
+
+def test_map_statistics_of_a_real_map(data):
+    source = next((data / "puresky").glob("kloofendal*.hdr"))
+    image = np.array(mi.Bitmap(str(source)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+    light = image.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
+    row, column = np.unravel_index(light.argmax(), light.shape)
+    cells = html_report._map_statistics(image)
+    assert float(cells[1]) == pytest.approx(light.max(), rel=1e-3) and cells[2] == f"{row}, {column}"
+
+
+def test_only_what_writes_results_imports_the_report():
+    """The rest does without the page; which packages may import which, import-linter says."""
+    package = ROOT / "envedit"
+    for source in package.rglob("*.py"):
+        if source.relative_to(package).as_posix() != "report/run_folder.py":
+            tree = ast.parse(source.read_text(encoding="utf-8"))
+            nodes = [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom))]
+            assert not [node for node in nodes if "html_report" in ast.unparse(node)], source.name

@@ -1,0 +1,156 @@
+"""Loading maps and writing images: another reader, real maps, full disks, values that must not be written."""
+
+import os
+import resource
+import signal
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError, NumericalError
+from envedit.images import exr as exr_module
+from envedit.images import images
+from tests.oracles.builders import exr, planes, stacked
+
+# ---- reading -----------------------------------------------------------------------------------------------
+
+
+def test_real_maps(data):
+    for name in ("puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr", "hdri/venice_sunset_1k.hdr"):
+        found, info = images.read(data / name)
+        assert found.shape == (512, 1024, 3) and not info["warnings"]
+        # Independent decoder: the run lengths of the first scanline, by hand.
+        raw = (data / name).read_bytes()
+        at = raw.index(b"+X 1024\n") + 8 + 4
+        bands = []
+        for _ in range(4):
+            band = []
+            while len(band) < 1024:
+                n = raw[at]
+                band += [raw[at + 1]] * (n - 128) if n > 128 else raw[at + 1 : at + 1 + n]
+                at += 2 if n > 128 else 1 + n
+            bands.append(band)
+        q = np.array(bands, np.float64).T
+        np.testing.assert_array_equal(found[0], (q[:, :3] * 2 ** (q[:, 3:] - 136)).astype(np.float32))
+        small, info = images.load_envmap(data / name, width=128)
+        assert small.shape == (64, 128, 3) and info["size"] == (1024, 512) and info["health"].ok
+        energy = [i.sum(1, dtype=np.float64).T @ latlong.solid_angles(*i.shape[:2]) for i in (found, small)]
+        np.testing.assert_allclose(*energy, rtol=1e-6)
+
+
+def test_load_envmap(tmp_path, rng):
+    p = planes(rng, size=(8, 16))
+    p["G"][3, 4] = -2
+    p["B"][0, 0] = 65504
+    path = exr(tmp_path / "a.exr", **p)
+    found, info = images.load_envmap(path)
+    np.testing.assert_array_equal(found, np.maximum(stacked(p), 0))
+    assert info["clipped"] == 1 and info["repaired"] == 0
+    assert info["warnings"][0] == "1 texels are negative (down to -2), the first at row 3, column 4: set to 0"
+    assert "65504" in info["warnings"][1] and len(info["warnings"]) == 2
+    assert images.load_envmap(path, width=8)[0].shape == (4, 8, 3)
+    assert "enlarged from 16 to 64" in images.load_envmap(path, width=64)[1]["warnings"][-1]
+
+    p["R"][5, 6], p["R"][5, 2] = np.nan, np.inf
+    path = exr(tmp_path / "a.exr", **p)
+    with pytest.raises(
+        InputError, match=r"a.exr: 2 texels are NaN or infinite, the first at row 5, column 2"
+    ):
+        images.load_envmap(path, width=8)
+    found, info = images.load_envmap(path, width=8, repair=True)
+    assert np.isfinite(found).all() and (found >= 0).all() and info["repaired"] == 2
+    assert any("replaced from their neighbours" in w for w in info["warnings"])
+
+
+def test_load_envmap_refusals(tmp_path):
+    def grey(height, width, value=1.0):
+        return exr(tmp_path / "g.exr", **{c: np.full((height, width), value, np.float32) for c in "RGB"})
+
+    for height, width in ((8, 8), (1, 1), (5, 11)):
+        with pytest.raises(InputError, match=rf"g.exr: a lat-long map is 2:1, this is {width} x {height}"):
+            images.load_envmap(grey(height, width))
+    for height, width in ((1, 2), (2, 4)):
+        with pytest.raises(InputError, match=rf"g.exr: {width} x {height} texels are too few"):
+            images.load_envmap(grey(height, width))
+    for width in (0, 1, 5, 7, -8, 10**6):
+        with pytest.raises(ConfigError, match=f"got {width}$"):
+            images.load_envmap(grey(4, 8), width=width)
+    with pytest.raises(InputError, match="g.exr: all 32 texels"):
+        images.load_envmap(grey(4, 8, np.nan), repair=True)
+    found, info = images.load_envmap(grey(4, 8, 0.0), width=16)
+    assert not found.any() and "black" in info["warnings"][0]
+
+
+# ---- writing -----------------------------------------------------------------------------------------------
+
+
+def test_write_exr_round_trip(tmp_path, rng):
+    path = tmp_path / "sky é.exr"
+    values = (10 ** rng.uniform(-30, 30, (6, 12, 3))).astype(np.float32)
+    values[0, 0] = [0, -1.5, 1.5e5]  # more than a half holds
+    images.write_exr(path, values, {"source": "sky.hdr", "width": 12, "seed": 2**40, "gamma": 0.5})
+    found, info = images.read(path)
+    np.testing.assert_array_equal(found, values)
+    header = OpenEXR.File(str(path), header_only=True).header()
+    assert header["envmap"] == OpenEXR.ENVMAP_LATLONG and not info["warnings"]
+    assert header["software"].startswith("envedit ")
+    np.testing.assert_allclose(header["chromaticities"], exr_module.REC709, rtol=1e-6)
+    expected = {"source": "sky.hdr", "width": 12, "seed": str(2**40), "gamma": 0.5}
+    assert {k: info["metadata"][k] for k in expected} == expected
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(path))), values)  # another reader
+    images.write_exr(path, values * 0)
+    assert not images.read(path)[0].any()
+    assert os.listdir(tmp_path) == [path.name]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e39])
+@pytest.mark.parametrize("writer", [images.write_exr, images.write_png])
+def test_non_finite_values_reach_no_file(tmp_path, bad, writer):
+    values = np.zeros((4, 8, 3))
+    values[2, 5, 1] = bad
+    with pytest.raises(
+        NumericalError, match=r"o.x: not written: 1 texels .* row 2, column 5 \(0, (nan|inf), 0\)"
+    ):
+        writer(tmp_path / "o.x", values)
+    assert not os.listdir(tmp_path)
+
+
+def test_unwritable(tmp_path):
+    values = np.zeros((4, 8, 3))
+    for writer in (images.write_exr, images.write_png):
+        with pytest.raises(InputError, match=r"gone/a.exr: cannot be written \(its folder does not exist\)"):
+            writer(tmp_path / "gone" / "a.exr", values)
+        (tmp_path / "taken").mkdir(exist_ok=True)
+        with pytest.raises(InputError, match=r"taken: cannot be written \(Is a directory\)"):
+            writer(tmp_path / "taken", values)
+        with pytest.raises(ValueError, match=r"\(H, W, 3\), got shape \(4, 8, 4\)"):
+            writer(tmp_path / "a", np.zeros((4, 8, 4)))
+    with pytest.raises(ConfigError, match="'dataWindow' cannot be used"):
+        images.write_exr(tmp_path / "a.exr", values, {"dataWindow": "x"})
+    assert os.listdir(tmp_path) == ["taken"]
+
+
+@pytest.mark.parametrize("writer", [images.write_exr, images.write_png])
+def test_a_full_disk_keeps_the_old_file(tmp_path, rng, writer):
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"old")
+    limit, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limit[1]))
+    try:
+        with pytest.raises(InputError, match=r"a.exr: cannot be written \(File too large\)"):
+            writer(path, rng.random((64, 128, 3)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.exr"]
+
+
+def test_write_png(tmp_path):
+    ramp = np.linspace(-0.1, 1.1, 32).reshape(4, 8)
+    images.write_png(tmp_path / "a.png", ramp)
+    found = np.array(mi.Bitmap(str(tmp_path / "a.png")))
+    assert found.shape == (4, 8, 3) and found.dtype == np.uint8
+    np.testing.assert_array_equal(found[..., 1], np.rint(np.clip(ramp, 0, 1) * 255))

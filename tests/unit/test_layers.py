@@ -1,0 +1,494 @@
+"""A map told apart and composed again: nothing changes but what is asked for, at any resolution."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong
+from envedit.core.color import LUMINANCE
+from envedit.representations.layers import gain, layers
+from envedit.representations.layers.layers import VEIL, Layers
+from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from tests.oracles.builders import grey
+from tests.oracles.plain import double, single
+
+SHAPE, SUN = (64, 128), (20, 126)
+SMALL = (24, 48)  # quick to tell apart
+
+
+def sky(shape=SHAPE, sun=SUN, glow=True, peak=5000.0, level=1.0):
+    """A blue sky brighter upwards, with a sun of a few texels across the seam and its aureole."""
+    d = latlong.directions(*shape)
+    image = 0.5 + 0.3 * d[..., 1:2] * np.array([0.6, 0.8, 1.0]) + 0.05 * np.sin(5 * d[..., :1])
+    if sun:
+        angle = np.degrees(np.arccos(np.clip(d @ d[sun], -1, 1)))[..., None]
+        image = image * (1 + 3 * np.exp(-angle / 12)) if glow else image
+        image = image + peak * np.array([1, 0.9, 0.7]) * np.clip(4 - angle, 0, 1)
+    return (image * level).astype(np.float32)
+
+
+def lamp(shape=SHAPE, sun=SUN):
+    """A lamp on a black background, and nothing else."""
+    image = sky(shape, sun, glow=False)
+    return np.where(image > 100, image, 0).astype(np.float32)
+
+
+def encoded(image, rows=None, **kwargs):
+    made = Layers(rows, **kwargs)
+    return made, made.encode(image)
+
+
+@pytest.fixture(scope="module")
+def shared():
+    return encoded(sky())
+
+
+@pytest.fixture
+def sunny(shared):
+    """The layers of :func:`sky`, all texels free, and their parameters."""
+    made, params = shared
+    made.keep(None)
+    return made, dict(params)
+
+
+def core_of(made):
+    return (made.separation.core > 0).any(axis=2)
+
+
+def far_from(inside):
+    """All but a core and the texels next to it."""
+    near = inside.copy()
+    for row in (-1, 0, 1):
+        for column in (-1, 0, 1):
+            near |= np.roll(inside, (row, column), axis=(0, 1))
+    return ~near
+
+
+def moved(params, light=0, **changes):
+    """Set parameters of one light, in radians and logarithms."""
+    params = dict(params)
+    for name, value in changes.items():
+        array = params[name].numpy().copy()
+        array[light] = np.asarray(value) / layers.SCALES[name]
+        params[name] = single(array)
+    return params
+
+
+def sent(made, params, end, light=0):
+    return moved(params, light, turn=rotation_vector(made.lights.centres[light], end))
+
+
+def irradiance(image, rows=None):
+    first, total = rows or (0, image.shape[0])
+    omega = latlong.lookup_solid_angles(total, image.shape[1])[first : first + image.shape[0]]
+    return (np.float64(image) * omega[:, None, None]).sum(axis=(0, 1))
+
+
+def random_gain(params, rng, size=1.0):
+    return params | {
+        name: single(rng.normal(size=value.shape) * size)
+        for name, value in params.items()
+        if name.startswith("gain")
+    }
+
+
+# ---- identity --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("glow", "shape", "level"), [
+    (True, SHAPE, 1.0), (False, SHAPE, 1.0), (True, (33, 66), 1e4), (True, (24, 48), 1e-3),
+    (False, (24, 48), 1e4), (True, (16, 32), 1.0), (False, (17, 30), 1.0),
+])  # fmt: skip
+def test_decoding_gives_the_map_back(glow, shape, level):
+    sun = (shape[0] // 3, shape[1] - 1)
+    image = sky(shape, sun, glow, level=level)
+    made, params = encoded(image)
+    assert len(made.separation.lights) == 1 and core_of(made)[sun]
+    got, inside = made.decode(params).numpy(), core_of(made)
+    np.testing.assert_array_equal(got[far_from(inside)], image[far_from(inside)])
+    assert np.abs(got - image).max() <= 1e-6 * image.max()
+
+
+def test_sky_with_several_lights_comes_back():
+    image = sky()
+    image[45:48, 30:34] += [300, 900, 600]
+    image[10:12, 60:62] += [4000, 100, 4000]
+    made, params = encoded(image)
+    assert len(made.separation.lights) == 3
+    got, outside = made.decode(params).numpy(), ~core_of(made)
+    np.testing.assert_array_equal(got[outside], image[outside])
+    assert np.abs(got - image).max() <= 1e-6 * image.max()
+
+
+def test_map_without_lights_keeps_every_bit(rng):
+    for image in (sky(sun=None), grey(0.7), grey(65504.0), rng.random((9, 18, 3), dtype=np.float32) + 0.5):
+        made, params = encoded(image)
+        assert made.separation.lights == [] and made.lights.count == SPARE
+        assert made.decode(params).numpy().tobytes() == image.tobytes()
+
+
+def test_map_is_its_parts(sunny):
+    made, params = sunny
+    parts = made.separation
+    np.testing.assert_allclose(parts.background * parts.glow + parts.core, sky(), rtol=1e-6)
+    dark = made.decode(moved(params, flux=DARK)).numpy()  # core and glow both gone
+    np.testing.assert_allclose(dark, parts.background, rtol=2e-3, atol=2e-3)
+    assert np.abs(made.decode(params).numpy() - parts.background).max() > 1000
+
+
+def test_parameters_are_a_flat_dict_of_tensors(sunny):
+    made, params = sunny
+    assert set(params) == {"turn", "flux", "size", "gain.0", "gain.1", "gain.2"} == set(made.scales)
+    assert all(isinstance(value, mi.TensorXf) for value in params.values())
+    n = made.lights.count
+    assert [params[name].shape for name in ("turn", "flux", "size")] == [(n, 3), (n, 3), (n, 1)]
+    assert n == 1 + SPARE
+    for name, value in params.items():
+        expected = np.zeros(value.shape)
+        if name == "flux":
+            expected[1:] = DARK
+        np.testing.assert_array_equal(value.numpy(), expected)
+
+
+def test_same_image_has_the_same_parameters_and_bits():
+    (a, p), (b, q) = (encoded(sky(SMALL, (8, 47))) for _ in range(2))
+    assert all(np.array_equal(p[name].numpy(), q[name].numpy()) for name in p)
+    p = random_gain(sent(a, p, [0.6, 0.0, 0.8]), np.random.default_rng(1))
+    np.testing.assert_array_equal(a.decode(p).numpy(), b.decode(p).numpy())
+
+
+# ---- other resolutions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(128, 256), (256, 512), (32, 64), (77, 131), (65, 129)])
+def test_other_resolutions_keep_flux_and_irradiance(shape, sunny):
+    made, params = sunny
+    turned = sent(made, params, [0.3, 0.5, -0.6])
+    for p in (params, turned):
+        real = [p[name] * layers.SCALES[name] for name in ("turn", "flux", "size")]
+        core = made.lights.core(*real, shape, (0, shape[0])).numpy()
+        np.testing.assert_allclose(irradiance(core), irradiance(made.separation.core), rtol=1e-3)
+        got = made.decode(p, shape).numpy()
+        assert got.shape == (*shape, 3) and np.isfinite(got).all() and (got >= 0).all()
+        np.testing.assert_allclose(irradiance(got), irradiance(made.decode(p).numpy()), rtol=0.01)
+        sun = made.decode(moved(p, flux=DARK), shape).numpy()
+        assert irradiance(sun).max() < 0.9 * irradiance(got).max()  # negative control
+
+
+@pytest.mark.parametrize("shape", [(128, 256), (32, 64), (77, 131)])
+def test_gain_and_background_are_those_of_the_working_resolution(shape, rng):
+    made, params = encoded(sky(sun=None))
+    params = random_gain(params, rng, 0.3)
+    got = made.decode(params, shape).numpy()
+    expected = latlong.lookup(made.decode(params).numpy(), latlong.directions(*shape))
+    # Not at the poles: there a grid of rows and columns has as many values as columns.
+    np.testing.assert_allclose(got[1:-1], expected[1:-1], rtol=0.05)
+    np.testing.assert_allclose(irradiance(got), irradiance(made.decode(params).numpy()), rtol=0.01)
+
+
+def test_resolution_that_is_named_is_the_same_as_none(sunny):
+    made, params = sunny
+    np.testing.assert_array_equal(made.decode(params, SHAPE).numpy(), made.decode(params).numpy())
+
+
+# ---- rows ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 40), (10, 40), (12, 64)])
+def test_rows_of_a_map(first, last, sunny):
+    image = sky()[first:last]
+    made, params = encoded(image, (first, SHAPE[0]))
+    assert len(made.separation.lights) == 1
+    got, outside = made.decode(params).numpy(), ~core_of(made)
+    np.testing.assert_array_equal(got[outside], image[outside])
+    assert np.abs(got - image).max() <= 1e-6 * image.max()
+    whole, full = sunny
+    end = latlong.directions(*SHAPE)[30, 60]
+    there, expected = made.decode(sent(made, params, end)), whole.decode(sent(whole, full, end))
+    np.testing.assert_allclose(there.numpy()[30 - first].max(), expected.numpy()[30].max(), rtol=0.05)
+    # Out of the rows: the core is gone, and all stays finite.
+    if first:
+        gone = made.decode(sent(made, params, [0, 1, 0])).numpy()
+        assert np.isfinite(gone).all() and gone.max() < 0.01 * image.max()
+
+
+@pytest.mark.parametrize("finer", [2, 0.5, 4])
+def test_rows_at_another_resolution(finer):
+    first, last = 8, 48
+    made, params = encoded(sky()[first:last], (first, SHAPE[0]))
+    shape, rows = (round((last - first) * finer), round(SHAPE[1] * finer)), (first * finer, SHAPE[0] * finer)
+    rows = tuple(round(r) for r in rows)
+    got = made.decode(params, shape).numpy()
+    assert got.shape == (*shape, 3) and np.isfinite(got).all()
+    np.testing.assert_allclose(
+        irradiance(got, rows), irradiance(sky()[first:last], (first, SHAPE[0])), rtol=0.03
+    )
+
+
+@pytest.mark.parametrize("shape", [(80, 256), (20, 64), (160, 512)])
+def test_background_of_rows_is_where_it_was(shape):
+    image, first, last = sky(sun=None), 8, 48
+    made, params = encoded(image[first:last], (first, SHAPE[0]))
+    finer = shape[1] / SHAPE[1]
+    d = latlong.directions(round(SHAPE[0] * finer), shape[1])[round(first * finer) :][: shape[0]]
+    expected = latlong.lookup(image, d)
+    got = made.decode(params, shape).numpy()
+    inner = slice(2, -4)  # beyond the first and the last row given there is nothing to interpolate
+    np.testing.assert_allclose(got[inner], expected[inner], rtol=1e-4)
+    assert np.abs(got[inner] / np.roll(expected, 2, axis=0)[inner] - 1).max() > 1e-3  # negative control
+
+
+# ---- gain ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", range(gain.LEVELS))
+@pytest.mark.parametrize("value", [-3.0, -0.2, 0.1, 2.5])
+def test_even_gain_is_a_factor(level, value):
+    made, params = encoded(grey(0.7))
+    name = f"gain.{level}"
+    params |= {name: dr.full(mi.TensorXf, value / made.scales[name], params[name].shape)}
+    np.testing.assert_allclose(made.decode(params).numpy(), 0.7 * np.exp(value), rtol=1e-5)
+
+
+def test_log_gain_is_that_of_the_map(rng):
+    made, params = encoded(grey(1.0, 24, 48))
+    params = random_gain(params, rng, 0.3)
+    log = made.log_gain(params)
+    got = made.decode(params).numpy()
+    down = (log < 0).all(axis=2)
+    assert log.shape == got.shape and log.dtype == np.float32 and down.mean() > 0.02
+    np.testing.assert_allclose(np.log(got)[down], log[down], rtol=1e-4, atol=1e-6)
+
+
+def test_gain_is_limited():
+    made, params = encoded(grey(1.0))
+    for sign in (1, -1):
+        p = params | {"gain.0": dr.full(mi.TensorXf, sign * 1e30, params["gain.0"].shape)}
+        np.testing.assert_allclose(made.decode(p).numpy(), np.exp(sign * gain.MOST), rtol=1e-4)
+
+
+def test_gain_of_a_channel_leaves_the_others(rng):
+    image = sky(SMALL, None)
+    made, params = encoded(image)
+    nodes = np.zeros(params["gain.1"].shape, np.float32)
+    nodes[..., 1] = rng.normal(size=nodes.shape[:2]) * 0.5
+    got = made.decode(params | {"gain.1": single(nodes)}).numpy()
+    np.testing.assert_array_equal(got[..., [0, 2]], image[..., [0, 2]])
+    assert (got[..., 1] != image[..., 1]).mean() > 0.9
+
+
+@pytest.mark.parametrize("factor", [1.5, 4.0, 0.5])
+def test_black_channel_is_brightened_by_the_veil(factor):
+    image = grey(1.0) * np.float32([0, 0.6, 0.2])
+    made, params = encoded(image)
+    even = dr.full(mi.TensorXf, np.log(factor) / made.scales["gain.0"], params["gain.0"].shape)
+    got = made.decode(params | {"gain.0": even}).numpy()
+    if factor < 1:
+        np.testing.assert_allclose(got, image * factor, rtol=1e-5, atol=1e-9)
+    else:
+        part = image * (1 - VEIL) + (image @ LUMINANCE)[..., None] * VEIL
+        np.testing.assert_allclose(got, image + (factor - 1) * part, rtol=1e-4)
+        assert got[..., 0].min() > 0
+
+
+def test_gain_is_smooth_and_has_no_seam(rng):
+    made, params = encoded(grey(1.0, 24, 48))
+    log = np.log(made.decode(random_gain(params, rng)).numpy())
+    steps = np.abs(np.roll(log, -1, axis=1) - log)
+    assert steps[:, -1].max() <= steps[:, :-1].max() * 1.01
+    assert steps[:, -1].max() > 0
+
+
+@pytest.mark.parametrize("cycles", [1, 4, 12, 40])
+def test_finest_grid_has_two_nodes_a_cycle(cycles):
+    made, params = encoded(grey(1.0), cycles=cycles)
+    sizes = [params[f"gain.{i}"].shape for i in range(gain.LEVELS)]
+    assert sizes[-1][1] == 2 * cycles
+    assert all(a[1] <= b[1] for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+    for level in range(gain.LEVELS):
+        total = sum(w for _, w in made.gain.hats(level, SHAPE))
+        np.testing.assert_allclose(total, 1)
+        assert all(
+            i.max() < np.prod(sizes[level][:2]) and w.min() >= 0 for i, w in made.gain.hats(level, SHAPE)
+        )
+
+
+# ---- texels that are kept --------------------------------------------------------------------------------
+
+
+def test_kept_texels_keep_their_bits_under_any_gain(rng, sunny):
+    free = rng.random(SHAPE) < 0.4
+    made, params = sunny
+    before = made.decode(params).numpy()
+    changed = random_gain(params, rng)
+    made.keep(free)
+    got = made.decode(changed).numpy()
+    np.testing.assert_array_equal(got[~free], before[~free])
+    made.keep(None)
+    np.testing.assert_array_equal(got[free], made.decode(changed).numpy()[free])
+    assert (got[free] != before[free]).mean() > 0.9
+    assert (made.decode(changed).numpy()[~free] != before[~free]).mean() > 0.9  # negative control
+
+
+def test_light_moves_into_kept_texels(sunny):
+    made, params = sunny
+    there = sent(made, params, latlong.directions(*SHAPE)[40, 60])
+    made.keep(np.zeros(SHAPE, bool))
+    assert made.decode(there).numpy()[40, 60].max() > 1000
+
+
+# ---- moving lights ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end", [(40, 60), (25, 0), (10, 120), (50, 3)])
+def test_moving_a_light_without_a_glow_leaves_the_background(end):
+    image = 0.5 + lamp()
+    made, params = encoded(image)
+    assert not made.lights.glowing
+    p = sent(made, params, latlong.directions(*SHAPE)[end])
+    real = [p[name] * layers.SCALES[name] for name in ("turn", "flux", "size")]
+    core, got = made.lights.core(*real, SHAPE, (0, SHAPE[0])).numpy(), made.decode(p).numpy()
+    away = (core == 0).all(axis=2) & ~core_of(made)
+    assert away.mean() > 0.9 and core[end].max() > 100
+    np.testing.assert_array_equal(got[away], image[away])
+    # What the light has left is the sky around it.
+    left = core_of(made) & (core == 0).all(axis=2)
+    np.testing.assert_allclose(got[left], 0.5, rtol=0.01)
+    np.testing.assert_allclose(irradiance(got), irradiance(image), rtol=1e-4)
+
+
+def test_moving_a_light_with_a_glow_leaves_what_is_far_from_it(sunny):
+    image = sky()
+    made, params = sunny
+    (light,) = made.separation.lights
+    assert light.glow is not None
+    reach = np.flatnonzero((light.glow > 0).any(axis=1)).max() + 1.5
+    d = latlong.directions(*SHAPE)
+    end = d[26, 110]
+    got = made.decode(sent(made, params, end)).numpy()
+    near = np.maximum(d @ light.direction, d @ end) > np.cos(np.radians(reach))
+    assert (~near).mean() > 0.1
+    np.testing.assert_array_equal(got[~near], image[~near])
+    changed = np.abs(got / image - 1).max(axis=2) > 0.01
+    assert changed.sum() > 2 * core_of(made).sum() and not changed[~near].any()
+    # The sky is brightest around the light's new place, and darker than it was around the old.
+    old = np.unravel_index(np.argmax(d @ light.direction - 10 * core_of(made)), SHAPE)
+    assert got[old].max() < image[old].max()
+    assert got[26, 104].max() > 1.2 * image[26, 104].max()
+
+
+def test_moving_there_and_back_is_nothing(sunny):
+    made, params = sunny
+    end = latlong.directions(*SHAPE)[40, 60]
+    v = rotation_vector(made.lights.centres[0], end)
+    full = 2 * np.pi * v / np.linalg.norm(v)
+    got = made.decode(moved(params, turn=full)).numpy()
+    np.testing.assert_allclose(got, made.decode(params).numpy(), rtol=1e-3, atol=1e-3 * sky().max())
+
+
+def test_spare_light_adds_its_flux(sunny):
+    made, params = sunny
+    before = made.decode(params).numpy()
+    got = made.decode(moved(params, light=1, flux=np.log([0.5, 1, 2]), turn=[0.7, 0.2, 0.9])).numpy()
+    added = irradiance(np.float64(got) - before)
+    np.testing.assert_allclose(added, made.lights.flux[1] * [0.5, 1, 2], rtol=1e-4)
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------
+
+
+def gradients(made, params, weight, shape=None):
+    params = {name: mi.TensorXf(value) for name, value in params.items()}
+    dr.enable_grad(params)
+    decoded = made.decode(params, shape)
+    dr.backward(dr.sum((decoded * single(weight)).array))
+    return {name: dr.grad(value).numpy() for name, value in params.items()}
+
+
+@pytest.mark.parametrize("start", ["unmoved", "moved", "zenith", "nadir"])
+def test_gradient_is_finite(start, rng, sunny):
+    made, params = sunny
+    if start != "unmoved":
+        end = {"zenith": [0, 1, 0], "nadir": [0, -1, 0], "moved": [0.5, 0.4, 0.7]}[start]
+        params = random_gain(moved(sent(made, params, end), light=1, flux=-1.0), rng, 0.5)
+    grads = gradients(made, params, rng.normal(size=(*SHAPE, 3)))
+    assert set(grads) == set(params)
+    for name, grad in grads.items():
+        assert np.isfinite(grad).all() and grad.any(), name
+        assert grad.shape == params[name].shape
+    assert grads["turn"][0].any() and grads["size"][0].any() and grads["flux"][0].all()
+
+
+def test_gradient_by_gain_and_flux_is_the_finite_difference(rng, sunny):
+    """With nodes of either sign, so that both branches of the veil are seen."""
+    made, params = sunny
+    weight = rng.random((*SHAPE, 3)) / sky()
+    params = random_gain(moved(sent(made, params, [0.5, 0.4, 0.7]), light=1, flux=-4.0), rng, 0.3)
+    grads = gradients(made, params, weight)
+
+    def loss(p):
+        return dr.sum((double(made.decode(p).numpy()) * double(weight)).array)[0]
+
+    for name in ("gain.0", "gain.1", "gain.2", "flux"):
+        along = rng.normal(size=params[name].shape)
+        if name == "flux":
+            along[-1] = 0
+        up, down = (loss(params | {name: params[name] + single(h * along)}) for h in (3e-3, -3e-3))
+        slope = (grads[name].astype(np.float64) * along).sum()
+        np.testing.assert_allclose(
+            slope, (up - down) / 6e-3, rtol=0.01, atol=1e-3 * np.abs(grads[name]).max()
+        )
+
+
+def test_kept_texels_pull_at_no_gain(rng, sunny):
+    made, params = sunny
+    weight, free = rng.normal(size=(*SHAPE, 3)), np.zeros(SHAPE, bool)
+    made.keep(free)
+    grads = gradients(made, params, weight)
+    assert not any(grads[name].any() for name in grads if name.startswith("gain"))
+    assert grads["turn"].any()
+    free[30, 30] = True
+    made.keep(free)
+    assert gradients(made, params, weight)["gain.2"].any()
+
+
+# ---- stress ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(3, 6), (4, 6), (5, 6), (6, 6)])
+def test_smallest_maps(shape, rng):
+    image = rng.random((*shape, 3), dtype=np.float32)
+    image[min(2, shape[0] - 2), 2] += 1000
+    made, params = encoded(image)
+    np.testing.assert_allclose(made.decode(params).numpy(), image, atol=1e-6 * image.max())
+    for p in (random_gain(params, rng), moved(params, flux=1.0, turn=[1.0, 0.5, 2.0], size=0.5)):
+        for other in (None, (9, 14), (3, 6)):
+            assert np.isfinite(made.decode(p, other).numpy()).all()
+
+
+@pytest.mark.parametrize("value", [1e-28, 1e-12, 65504.0, 1e6])
+def test_any_exposure_is_finite(value, rng):
+    for image in (sky(SMALL, (8, 47), level=value), grey(value)):
+        made, params = encoded(image)
+        far = random_gain(sent(made, params, [0.5, 0.4, 0.7]), rng, 3)
+        for p in (params, far):
+            got = made.decode(p).numpy()
+            assert np.isfinite(got).all() and (got >= 0).all()
+        assert all(np.isfinite(g).all() for g in gradients(made, far, np.ones(image.shape)).values())
+
+
+def test_extremes_side_by_side(rng):
+    image = rng.choice(np.float32([0, 1e-30, 1e-4, 0.5, 65504, 1e6]), (*SMALL, 3))
+    image[::7] = 0
+    made, params = encoded(image)
+    got = made.decode(params).numpy()
+    assert np.abs(got - image).max() <= 1e-6 * image.max()
+    assert np.isfinite(made.decode(random_gain(params, rng, 3)).numpy()).all()
+
+
+def test_black_map_stays_black():
+    made, params = encoded(grey(0.0))
+    got = made.decode(params).numpy()
+    assert np.isfinite(got).all() and np.abs(got).max() < 1e-9
+    assert made.separation.lights == []

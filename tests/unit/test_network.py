@@ -1,0 +1,328 @@
+"""The network against plain numpy in double precision, Dr.Jit's own AD, and finite differences."""
+
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong
+from envedit.representations.siren import network as siren
+from tests.oracles.kernels import launched, own
+from tests.oracles.plain import numpy_forward, numpy_layers
+from tests.oracles.tiers import slow_but
+
+OMEGA = 30.0
+
+
+POINTS = [1, 7, 1023, 4997, 16385]  # alone, fewer than a block, no multiple of any block, several blocks
+
+
+def plain_forward(params, x, omega):
+    """The same in Dr.Jit, operation by operation, for its automatic differentiation."""
+    h, last = x, len(params) // 2 - 1
+    for i in range(last + 1):
+        z = dr.matmul(h, params[f"{i}.weight"], Bt=True) + params[f"{i}.bias"]
+        h = dr.sin(omega * z) if i < last else 1 / (1 + dr.exp(-z))
+    return h
+
+
+def arrays(params):
+    return {name: np.array(value, np.float64) for name, value in params.items()}
+
+
+def points(rng, count):
+    return own(rng.uniform(-1, 1, (count, 2)))
+
+
+def gradient(network, params, x, seed_grad, omega=OMEGA):
+    """Gradient of sum(seed_grad * y) through the AD graph."""
+    leaves = {name: mi.TensorXf(value) for name, value in params.items()}
+    dr.enable_grad(leaves)
+    dr.backward(dr.sum((network(leaves, x, omega) * seed_grad).array))
+    return {name: np.array(dr.grad(leaf), np.float64) for name, leaf in leaves.items()}
+
+
+def ours(params, x, seed_grad):
+    """The same gradient by the hand-written pass."""
+    return gradient(siren.evaluate, params, x, seed_grad)
+
+
+def differ(a, b, tolerance=1e-4):
+    """List the tensors that differ by more than so much of their length.
+
+    Each by itself, so that a large layer cannot hide a small one.
+    """
+    assert list(a) == list(b) and all(a[name].shape == b[name].shape for name in a)
+    assert all(np.linalg.norm(b[name]) > 0 for name in b)
+    return [name for name in b if not np.linalg.norm(a[name] - b[name]) < tolerance * np.linalg.norm(b[name])]
+
+
+# ---- forward ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("hidden", "depth"), [(1, 0), (7, 0), (33, 2), (16, 6)])
+@pytest.mark.parametrize("count", POINTS)
+def test_forward_is_the_published_network(hidden, depth, count, rng):
+    params, x = siren.init(3, hidden, depth), points(rng, count)
+    y, _ = siren.forward(params, x, OMEGA)
+    assert y.shape == (count, 3) and siren.layers(params) == depth + 2
+    expected = numpy_forward(arrays(params), x.numpy(), OMEGA)
+    # One rounding of a phase, 6e-8, is multiplied by omega |W| in every layer.
+    np.testing.assert_allclose(y.numpy(), expected, atol=2e-5)
+    np.testing.assert_array_equal(siren.evaluate(params, x, OMEGA).numpy(), y.numpy())
+
+
+def test_extreme_outputs_saturate_without_overflow():
+    params = siren.init(0, 4, 0)
+    params["1.weight"] = dr.zeros(mi.TensorXf, (3, 4))
+    params["1.bias"] = own([-1e6, 0, 1e6])
+    y, tape = siren.forward(params, siren.coordinates(2, 4), OMEGA)
+    np.testing.assert_array_equal(y.numpy(), np.repeat([[0.0, 0.5, 1.0]], 8, axis=0))
+    grads = siren.backward(params, tape, own(np.ones((8, 3))))
+    assert all(np.isfinite(g.numpy()).all() for g in grads.values())
+
+
+# ---- gradient --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth", range(8))
+@pytest.mark.parametrize("hidden", [1, 7, 33])
+def test_gradient_is_that_of_automatic_differentiation(depth, hidden, rng):
+    """1 to 8 sine layers."""
+    params, x, weight = siren.init(depth, hidden, depth), points(rng, 24), rng.normal(size=(24, 3))
+    expected = gradient(plain_forward, params, x, own(weight))
+    assert differ(ours(params, x, own(weight)), expected) == []
+    weight[5] *= 2  # negative control: one point counted twice is seen in every tensor
+    assert differ(ours(params, x, own(weight)), expected) == list(params)
+
+
+@pytest.mark.parametrize("depth", [0, 3])
+def test_network_of_directions_has_three_inputs(depth, rng):
+    params, x, weight = siren.init(0, 9, depth, inputs=3), siren.directions(6, 9), rng.normal(size=(54, 3))
+    y, _ = siren.forward(params, x, OMEGA)
+    np.testing.assert_allclose(y.numpy(), numpy_forward(arrays(params), x.numpy(), OMEGA), atol=2e-5)
+    assert differ(ours(params, x, own(weight)), gradient(plain_forward, params, x, own(weight))) == []
+
+
+@pytest.mark.parametrize("count", slow_but(POINTS, 1, 7, 1023))
+@pytest.mark.parametrize(("hidden", "depth"), [(7, 7), (129, 1)])
+def test_gradient_counts_every_point_once(count, hidden, depth, rng):
+    params, x = siren.init(count, hidden, depth), points(rng, count)
+    weight = rng.normal(size=(count, 3))
+    expected = gradient(plain_forward, params, x, own(weight))
+    assert differ(ours(params, x, own(weight)), expected) == []
+    # Only the last point, and all but the last: what a remainder could be dropped or counted twice by.
+    last = np.zeros_like(weight)
+    last[-1] = weight[-1]
+    alone = gradient(plain_forward, params, own(x.numpy()[-1:]), own(weight[-1:]))
+    assert differ(ours(params, x, own(last)), alone) == []
+    if count > 1:  # negative control
+        assert differ(ours(params, x, own(weight - last)), expected) == list(params)
+
+
+@pytest.mark.parametrize("count", [1, 4997])
+def test_gradient_of_the_two_halves_is_that_of_the_graph(count, rng):
+    params, x, weight = siren.init(0, 9, 2), points(rng, count), own(rng.normal(size=(count, 3)))
+    _, tape = siren.forward(params, x, OMEGA)
+    halves = {name: g.numpy() for name, g in siren.backward(params, tape, weight).items()}
+    for name, expected in ours(params, x, weight).items():
+        np.testing.assert_array_equal(halves[name], expected, err_msg=name)
+
+
+@pytest.mark.parametrize(("hidden", "depth"), [(7, 0), (33, 3)])
+def test_gradient_is_the_finite_difference_in_double_precision(hidden, depth, rng):
+    params, x = siren.init(1, hidden, depth), siren.coordinates(4, 6)
+    weight = rng.normal(size=(24, 3))
+    mine, start, h = ours(params, x, own(weight)), arrays(params), 1e-5
+    for name in params:
+        direction = mine[name] / np.linalg.norm(mine[name])  # where the slope is largest: its length
+
+        def loss(step, name=name, direction=direction):
+            moved = start | {name: start[name] + step * direction}
+            return np.sum(weight * numpy_forward(moved, x.numpy(), OMEGA))
+
+        slope = (8 * (loss(h) - loss(-h)) - (loss(2 * h) - loss(-2 * h))) / (12 * h)
+        np.testing.assert_allclose(np.linalg.norm(mine[name]), slope, rtol=1e-4, err_msg=name)
+
+
+def test_gradient_of_a_loss_that_ignores_the_output_is_zero():
+    grads = ours(siren.init(0, 8, 1), siren.coordinates(2, 4), own(np.zeros((8, 3))))
+    assert not any(g.any() for g in grads.values())
+
+
+def test_gradients_come_in_the_order_of_the_parameters():
+    # dr.CustomOp.set_grad_in takes a dict by position: in another order it is dropped without a word.
+    params, x = siren.init(0, 8, 2), siren.coordinates(2, 4)
+    for order in (list(params), sorted(params, reverse=True)):
+        shuffled = {name: params[name] for name in order}
+        _, tape = siren.forward(shuffled, x, OMEGA)
+        assert list(siren.backward(shuffled, tape, dr.ones(mi.TensorXf, (8, 3)))) == order
+        through_the_graph = ours(shuffled, x, dr.ones(mi.TensorXf, (8, 3)))
+        assert all(g.any() for g in through_the_graph.values())
+
+
+def test_gradient_flows_on_in_a_larger_graph(rng):
+    params, x = siren.init(5, 9, 1), siren.coordinates(3, 4)
+    gain = mi.Float(2.0)
+    leaves = {name: mi.TensorXf(value) for name, value in params.items()}
+    dr.enable_grad(leaves, gain)
+    scaled = leaves | {"1.bias": leaves["1.bias"] * gain}
+    dr.backward(dr.sum(dr.square(siren.evaluate(scaled, x, OMEGA).array)))
+    got = np.sum(np.array(dr.grad(leaves["1.bias"]), np.float64) * np.array(params["1.bias"])) / 2
+    assert got != 0
+    np.testing.assert_allclose(dr.grad(gain)[0], got, rtol=1e-4)
+
+
+# ---- initial weights, coordinates ------------------------------------------------------------------------
+
+
+def test_initial_weights_are_uniform_within_the_published_bounds():
+    hidden, omega = 64, 25.0
+    params = arrays(siren.init(11, hidden, 3, omega, inputs=4, outputs=5))
+    assert [params[f"{i}.weight"].shape for i in range(5)] == [(64, 4), *[(64, 64)] * 3, (5, 64)]
+    assert [params[f"{i}.bias"].shape for i in range(5)] == [(64,)] * 4 + [(5,)]
+    for i in range(5):
+        fan_in = 4 if i == 0 else hidden
+        bounds = {"weight": 1 / 4 if i == 0 else np.sqrt(6 / hidden) / omega, "bias": fan_in**-0.5}
+        for kind, bound in bounds.items():
+            values = params[f"{i}.{kind}"] / bound
+            assert np.abs(values).max() <= 1 + 1e-6
+            if values.size >= 64:
+                assert np.abs(values).max() > 0.9
+            if values.size < 1000:
+                continue
+            # Variance of U(-1, 1) is 1/3, its own standard error sqrt(4/45 / n): 4.5 sigma is 1 in 150 000.
+            assert abs(np.var(values) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / values.size)
+            assert abs(values.mean()) < 4.5 * np.sqrt(1 / 3 / values.size)
+
+
+def test_sine_layers_start_with_unit_slopes():
+    """Sec. 3.2 of Sitzmann et al.: activations keep the arcsine law's variance of 1/2 through the depth."""
+    activations = numpy_layers(arrays(siren.init(2, 128, 5)), siren.coordinates(16, 32).numpy(), OMEGA)
+    assert len(activations) == 7
+    for h in activations[1:-1]:
+        assert 0.4 < np.var(h) < 0.6
+
+
+def test_seed_decides_the_weights():
+    a, b, c = (arrays(siren.init(seed, 8, 1)) for seed in (4, 4, 5))
+    assert all(np.array_equal(a[name], b[name]) for name in a)
+    assert not any(np.array_equal(a[name], c[name]) for name in a)
+
+
+def test_weight_names_leave_biases_out():
+    assert siren.weight_names(siren.init(0, 8, 1)) == ["0.weight", "1.weight", "2.weight"]
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (2, 4), (5, 9)])
+def test_coordinates_are_texel_centres(height, width):
+    x = siren.coordinates(height, width).numpy()
+    assert x.shape == (height * width, 2)
+    for texel in range(height * width):
+        row, column = divmod(texel, width)
+        expected = [(row + 0.5) / height * 2 - 1, (column + 0.5) / width * 2 - 1]
+        np.testing.assert_allclose(x[texel], expected, atol=1e-7)
+
+
+def test_coordinates_at_half_the_resolution_average_the_finer_ones():
+    fine, coarse = siren.coordinates(8, 16).numpy(), siren.coordinates(4, 8).numpy()
+    mean = fine.reshape(4, 2, 8, 2, 2).mean(axis=(1, 3)).reshape(-1, 2)
+    np.testing.assert_allclose(mean, coarse, atol=1e-7)
+
+
+@pytest.mark.parametrize(("height", "width", "rows"), [
+    (1, 1, ()), (4, 8, ()), (5, 9, (0, 5)), (2, 6, (0, 9)), (3, 8, (4, 7)), (1, 5, (2, 3)),
+])  # fmt: skip
+def test_directions_point_through_the_texels_of_their_rows(height, width, rows):
+    x = siren.directions(height, width, *rows)
+    assert isinstance(x, mi.TensorXf) and x.shape == (height * width, 3)
+    first, total = rows or (0, height)
+    unit = np.float64(x.numpy()).reshape(height, width, 3) / siren.SPHERE_SCALE
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1, atol=1e-6)
+    np.testing.assert_allclose(unit, latlong.directions(total, width)[first : first + height], atol=1e-6)
+    row, column = latlong.texel_position(unit, total, width)
+    if total > 1:  # the one row of a map is its equator
+        np.testing.assert_allclose(row, np.broadcast_to(np.arange(first, first + height)[:, None], row.shape),
+                                   atol=1e-5)  # fmt: skip
+    inner = (row > 0.5) & (row < total - 1.5)  # at a pole every column is the same point
+    expected = np.broadcast_to(np.arange(width), column.shape)
+    np.testing.assert_allclose(column[inner], expected[inner], atol=1e-5)
+
+
+def test_directions_have_no_seam_and_one_zenith():
+    x = siren.directions(9, 16).numpy().reshape(9, 16, 3)
+    steps = np.linalg.norm(np.roll(x, -1, axis=1) - x, axis=2)
+    assert steps[1:-1].min() > 0.1
+    for row in steps:  # the last one is that from the last column to the first
+        np.testing.assert_allclose(row, row[0], atol=1e-6)
+    np.testing.assert_array_equal(x[0], np.broadcast_to([0, siren.SPHERE_SCALE, 0], (16, 3)))
+    # Control: row and column as numbers end at the seam.
+    plane = siren.coordinates(9, 16).numpy().reshape(9, 16, 2)
+    steps = np.linalg.norm(np.roll(plane, -1, axis=1) - plane, axis=2)
+    assert (steps[:, -1] > 10 * steps[:, 0]).all()
+
+
+# ---- cost ------------------------------------------------------------------------------------------------
+
+
+class Training:
+    """Steps of gradient descent on the sum of squares; by the two halves or through the AD graph."""
+
+    def __init__(self, count, through_the_graph):
+        self.x = points(np.random.default_rng(0), count)
+        self.params = siren.init(0, 13, 2)
+        self.grad = self.graph if through_the_graph else self.halves
+
+    def halves(self):
+        y, tape = siren.forward(self.params, self.x, OMEGA)
+        return siren.backward(self.params, tape, dr.opaque(2 * y))
+
+    def graph(self):
+        leaves = {name: mi.TensorXf(value) for name, value in self.params.items()}
+        dr.enable_grad(leaves)
+        dr.backward(dr.sum(dr.square(siren.evaluate(leaves, self.x, OMEGA).array)))
+        return {name: dr.grad(leaf) for name, leaf in leaves.items()}
+
+    def steps(self, count):
+        rate = dr.opaque(mi.Float, 1e-6)
+        for _ in range(count):
+            grads = self.grad()
+            self.params = {name: dr.opaque(self.params[name] - rate * g) for name, g in grads.items()}
+        dr.sync_thread()
+
+
+@pytest.mark.parametrize("through_the_graph", [False, True])
+@pytest.mark.parametrize("count", [1, 55, 4997])
+def test_no_new_kernel_after_the_third_step(count, through_the_graph):
+    training = Training(count, through_the_graph)
+    first = launched(lambda: training.steps(3))
+    assert first and launched(lambda: training.steps(4)) <= first
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("through_the_graph", [False, True])
+def test_memory_does_not_grow(through_the_graph):
+    training = Training(4997, through_the_graph)
+
+    def used():
+        """Bytes that arrays hold now; the peak starts again from there."""
+        gc.collect()
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        return dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+
+    training.steps(5)
+    before, peaks = used(), []
+    for _ in range(60):
+        training.steps(1)
+        peaks.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM))
+    activation = 4997 * 13 * 4  # bytes of one layer
+    assert peaks[0] > before + activation
+    assert peaks[-1] < peaks[29] + activation
+    # A gradient alone that stayed would be seen.
+    assert used() == before
+    kept = training.grad()  # negative control
+    assert used() > before and kept

@@ -1,0 +1,235 @@
+"""The last layer that is solved for: against formulas, a search of all of them, and at its limits."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.representations.siren import fit, output_layer
+from envedit.representations.siren import network as siren
+from tests.oracles.kernels import own
+from tests.oracles.plain import numpy_forward
+
+OMEGA = 30.0
+
+
+def arrays(params):
+    return {name: np.float64(value.numpy()) for name, value in params.items()}
+
+
+def weights(light, share):
+    """Weight of each point and channel: 1 + share E / mean(E); 1 where there is no light at all."""
+    light = np.asarray(light, np.float64)
+    mean = light.mean(axis=0)
+    return 1 + share * np.divide(light, mean, out=np.zeros_like(light), where=mean > 0)
+
+
+def error(params, x, wanted, light, share):
+    """Weighted squared error by the network in float64."""
+    y = numpy_forward(arrays(params), x.numpy(), OMEGA)
+    return np.sum(weights(light, share) * (y - wanted) ** 2)
+
+
+def slope(params, x, wanted, light, share, h=1e-6):
+    """Gradient of the error in the last layer's weights and biases, by central differences."""
+    start, last = arrays(params), siren.layers(params) - 1
+    out = []
+    for name in (f"{last}.weight", f"{last}.bias"):
+        for at in np.ndindex(start[name].shape):
+            ends = []
+            for step in (h, -h):
+                moved = start[name].copy()
+                moved[at] += step
+                y = numpy_forward(start | {name: moved}, x.numpy(), OMEGA)
+                ends.append(np.sum(weights(light, share) * (y - wanted) ** 2))
+            out.append((ends[0] - ends[1]) / (2 * h))
+    return np.array(out)
+
+
+def problem(rng, points=200, hidden=8, depth=1, inputs=3):
+    """Return a network, points, values within (0, 1), and their light: a few points hold most of it."""
+    params, x = siren.init(4, hidden, depth, OMEGA, inputs), own(rng.uniform(-1, 1, (points, inputs)))
+    wanted = rng.uniform(0.05, 0.95, (points, 3))
+    light = np.exp(8 * wanted).astype(np.float32)
+    return params, x, wanted, light
+
+
+def again(params, times, x, wanted, light, share):
+    for _ in range(times):
+        params = output_layer.last_layer(params, x, OMEGA, wanted, light, share)
+    return params
+
+
+# ---- what is solved --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 30.0])
+def test_the_solution_is_where_the_weighted_error_is_level(share, rng):
+    params, x, wanted, light = problem(rng)
+    given = x, wanted, light, share
+    solved = again(params, 8, *given)
+    assert error(solved, *given) < 0.95 * error(params, *given)
+    assert np.linalg.norm(slope(solved, *given)) < 1e-4 * np.linalg.norm(slope(params, *given))
+    # Control: it is not level for another weight of the light.
+    other = x, wanted, light, share + 5
+    assert np.linalg.norm(slope(solved, *other)) > 1e-3 * np.linalg.norm(slope(params, *other))
+
+
+@pytest.mark.parametrize("share", [0.0, 2.0])
+def test_one_feature_by_searching_all_lines(share, rng):
+    """Two unknowns a channel: no pair of a fine net of them does better."""
+    params, x, wanted, light = problem(rng, points=40, hidden=1, depth=0, inputs=2)
+    solved = again(params, 6, x, wanted, light, share)
+    state = arrays(params)
+    feature = np.sin(OMEGA * (x.numpy().astype(np.float64) @ state["0.weight"].T + state["0.bias"]))
+    weight, bias = np.meshgrid(np.linspace(-4, 4, 401), np.linspace(-4, 4, 401), indexing="ij")
+    w, got = weights(light, share), arrays(solved)
+    for channel in range(3):
+        total = np.zeros_like(weight)
+        for point in range(40):
+            y = 1 / (1 + np.exp(-(weight * feature[point, 0] + bias)))
+            total += w[point, channel] * (y - wanted[point, channel]) ** 2
+        y = 1 / (1 + np.exp(-(got["1.weight"][channel, 0] * feature[:, 0] + got["1.bias"][channel])))
+        mine = np.sum(w[:, channel] * (y - wanted[:, channel]) ** 2)
+        best = np.unravel_index(np.argmin(total), total.shape)
+        assert mine <= total[best] * (1 + 1e-6)
+        # A net of 0.02: the best pair of it is near, unless the valley is flat along a line.
+        np.testing.assert_allclose(mine, total[best], rtol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 7.5])
+def test_points_that_cannot_be_told_apart_get_their_weighted_mean(share):
+    """All features alike: the output is one number, sum(w y) / sum(w), channel by channel."""
+    params = siren.init(0, 4, 0)
+    params["0.weight"] = dr.zeros(mi.TensorXf, (4, 2))
+    wanted = np.array([[0.3, 0.4, 0.5], [0.5, 0.5, 0.6], [0.7, 0.3, 0.5]])
+    light = np.float32([[1, 0, 5], [2, 0, 1], [30, 0, 0]])
+    solved = again(params, 4, siren.coordinates(1, 3), wanted, light, share)
+    w = 1 + share * light / [11, 1, 2]  # over the mean; the second channel has no light at all
+    expected = np.sum(w * wanted, axis=0) / np.sum(w, axis=0)
+    got = siren.forward(solved, siren.coordinates(1, 3), OMEGA)[0].numpy()
+    np.testing.assert_allclose(got, np.broadcast_to(expected, (3, 3)), atol=1e-5)
+
+
+def test_a_last_layer_that_explains_everything_is_found(rng):
+    params, x, _, light = problem(rng, points=300, hidden=6)
+    truth = params | {"2.weight": own(0.3 * rng.normal(size=(3, 6))), "2.bias": own([0.4, -0.3, 0.1])}
+    wanted = numpy_forward(arrays(truth), x.numpy(), OMEGA)
+    solved = output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0)
+    given = x, wanted, light, 1.0
+    # Two steps of Newton: what is left is squared twice, but for the damping.
+    assert error(solved, *given) < 1e-3 * error(params, *given)
+    solved = again(solved, 4, *given)
+    for name in ("2.weight", "2.bias"):
+        np.testing.assert_allclose(solved[name].numpy(), truth[name].numpy(), atol=1e-4)
+
+
+# ---- what is left alone ----------------------------------------------------------------------------------
+
+
+def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):
+    params, x, wanted, light = problem(rng)
+    for order in (list(params), sorted(params, reverse=True)):
+        given = {name: params[name] for name in order}
+        before = {name: value.numpy().copy() for name, value in given.items()}
+        solved = output_layer.last_layer(given, x, OMEGA, wanted, light, 1.0)
+        assert list(solved) == order and solved is not given
+        assert all(isinstance(p, mi.TensorXf) and p.shape == params[name].shape for name, p in solved.items())
+        changed = {name for name in order if not np.array_equal(solved[name].numpy(), before[name])}
+        assert changed == {"2.weight", "2.bias"}
+        for name in order:  # nor is what was given changed
+            np.testing.assert_array_equal(given[name].numpy(), before[name])
+
+
+def unchanged(params, solved):
+    return list(params) == list(solved) and all(
+        params[name].numpy().tobytes() == solved[name].numpy().tobytes() for name in params
+    )
+
+
+def test_a_perfect_layer_stays_as_it_is(rng):
+    params, x, _, light = problem(rng)
+    params |= {"2.weight": dr.zeros(mi.TensorXf, (3, 8)), "2.bias": dr.zeros(mi.TensorXf, 3)}
+    wanted = np.full((200, 3), 0.5)
+    assert unchanged(params, output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0))
+    # Control: a little beside it, and it moves.
+    assert not unchanged(params, output_layer.last_layer(params, x, OMEGA, wanted + 0.01, light, 1.0))
+
+
+def test_steps_that_lead_too_far_are_not_taken():
+    """From the flat end of the sigmoid Newton's step overshoots to the other end, which is worse."""
+    params = siren.init(0, 4, 0)
+    params |= {"1.weight": dr.zeros(mi.TensorXf, (3, 4)), "1.bias": own([5, 5, 5])}
+    x, light = siren.coordinates(4, 8), np.ones((32, 3), np.float32)
+    assert unchanged(params, output_layer.last_layer(params, x, OMEGA, np.full((32, 3), 0.55), light, 1.0))
+
+
+@pytest.mark.parametrize("where", ["wanted", "2.bias", "2.weight", "0.weight"])
+def test_what_is_not_finite_changes_no_channel_that_it_meets(where, rng):
+    params, x, wanted, light = problem(rng)
+    if where == "wanted":
+        wanted[17, 1] = np.nan
+    else:
+        value = params[where].numpy().copy()
+        value[0] = np.nan
+        params[where] = own(value)
+    solved = output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0)
+    met = {"wanted": [1], "0.weight": [0, 1, 2]}.get(where, [0])
+    assert len(met) == 3 or not unchanged(params, solved)
+    for name in ("2.weight", "2.bias"):
+        np.testing.assert_array_equal(solved[name].numpy()[met], params[name].numpy()[met])
+        if len(met) < 3:
+            assert np.isfinite(np.delete(solved[name].numpy(), met, axis=0)).all()
+
+
+# ---- limits ----------------------------------------------------------------------------------------------
+
+
+def extremes(rng):
+    sun = np.full((60, 3), 1e-30, np.float32)
+    sun[13] = 1e6
+    huge = np.exp(rng.normal(size=(60, 3))).astype(np.float32)
+    huge[5, 1] = 3e38
+    return {
+        "one point": np.float32([[0.2, 3.0, 1e-3]]),
+        "two alike": np.full((2, 3), 0.4, np.float32),
+        "fewer points than features": np.exp(rng.normal(size=(5, 3))).astype(np.float32),
+        "black": np.zeros((60, 3), np.float32),
+        "one channel black": np.exp(rng.normal(size=(60, 3))).astype(np.float32) * np.float32([1, 0, 1]),
+        "constant": np.full((60, 3), 7.0, np.float32),
+        "sun over next to nothing": sun,
+        "subnormal": np.full((60, 3), 1e-45, np.float32),
+        "as bright as float32 goes": huge,
+    }
+
+
+@pytest.mark.parametrize("name", extremes(np.random.default_rng(0)))
+@pytest.mark.parametrize("share", [0.01, 1.0])
+@pytest.mark.parametrize("headroom", [0.0, 0.05])
+def test_never_worse_and_always_finite(name, share, headroom, rng):
+    image = extremes(rng)[name]
+    wanted = fit.Normalisation.of(image, headroom).encode(image)
+    for seed in range(4):
+        params = siren.init(seed, 8, 1, OMEGA, 3)
+        x = own(rng.uniform(-1, 1, (len(image), 3)))
+        before = error(params, x, wanted, image, share)
+        for _ in range(3):
+            params = output_layer.last_layer(params, x, OMEGA, wanted, image, share)
+            assert all(np.isfinite(p.numpy()).all() for p in params.values())
+            after = error(params, x, wanted, image, share)
+            # The solution is rounded to float32 last: 1e-7 of a value, 1e-14 of its square, times the weight.
+            assert after <= before + 1e-12 * weights(image, share).sum()
+            before = after
+
+
+def test_a_sun_is_worth_its_light(rng):
+    """One point of 500 holds nearly all light: it is hit far better when light counts."""
+    params, x, _, _ = problem(rng, points=500, hidden=8)
+    image = np.exp(0.3 * rng.normal(size=(500, 3))).astype(np.float32)
+    image[77] = 1e5
+    wanted = fit.Normalisation.of(image, 0.05).encode(image)
+    off = []
+    for share in (0.0, 1.0, 100.0):
+        solved = again(params, 4, x, wanted, image, share)
+        off.append(np.abs(siren.forward(solved, x, OMEGA)[0].numpy()[77] - wanted[77]).max())
+    assert off[0] > 3 * off[1] > 9 * off[2]

@@ -1,0 +1,645 @@
+"""Painted pictures: what was painted is found in every format, and what tells nothing is said."""
+
+import struct
+import types
+import zlib
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from envedit import config
+from envedit.core.color import TONEMAPS, tonemap
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import images
+from envedit.targets import painted_image
+from tests.oracles.builders import exr
+
+SIZE = (60, 83)  # no multiple of a JPEG's blocks
+RECTANGLE = (slice(13, 37), slice(21, 50))
+
+
+@pytest.fixture
+def initial(rng):
+    """Return a rendering: a noisy slope, an edge, black pixels and some far above white."""
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]] / 60
+    picture = 0.02 + 0.4 * np.stack([rows, columns * 0.5, 1 - rows], -1)
+    picture[30:, 60:] *= 0.1
+    picture *= 1 + 0.02 * rng.standard_normal((*SIZE, 1))
+    picture[50:56, 5:15] = [20, 15, 10]
+    picture[2:5, 70:] = 0
+    return picture.astype(np.float32)
+
+
+def brushed(picture):
+    """Paint a rectangle; returns the picture and where it was painted."""
+    new, where = picture.copy(), np.zeros(picture.shape[:2], bool)
+    new[RECTANGLE] = picture[RECTANGLE] * [0.3, 0.35, 0.5] + [0.002, 0.002, 0.004]
+    where[RECTANGLE] = True
+    return new, where
+
+
+def codes(picture, name="gamma", top=255):
+    return np.rint(tonemap(picture, name) * top).astype({255: np.uint8, 65535: np.uint16}[top])
+
+
+def png(path, pixels):
+    mi.Bitmap(np.ascontiguousarray(pixels)).write(str(path))
+    return path
+
+
+def jpeg(path, pixels, quality=95):
+    mi.Bitmap(np.ascontiguousarray(pixels)).write(str(path), mi.Bitmap.FileFormat.JPEG, quality)
+    return path
+
+
+def floats(path, picture, dtype=np.float32, **more):
+    return exr(path, **{c: picture[..., i].astype(dtype) for i, c in enumerate("RGB")}, **more)
+
+
+def chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def with_chunk(path, kind, data):
+    """Put a chunk before the pixels of a PNG."""
+    raw = path.read_bytes()
+    at = raw.index(b"IDAT") - 4
+    path.write_bytes(raw[:at] + chunk(kind, data) + raw[at:])
+    return path
+
+
+def with_segment(path, marker, data):
+    raw = path.read_bytes()
+    path.write_bytes(raw[:2] + bytes([255, marker]) + struct.pack(">H", len(data) + 2) + data + raw[2:])
+    return path
+
+
+def turned(orientation):
+    """Return EXIF data that says so."""
+    entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
+    return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
+
+
+def told(result):
+    return " | ".join(result.warnings)
+
+
+def refused(words, *arguments, **kwargs):
+    """Return the message, of one line, with which a picture is refused."""
+    with pytest.raises(InputError) as found:
+        painted_image.read(*arguments, **kwargs)
+    message = str(found.value)
+    assert found.value.exit_code == 3 and "\n" not in message and len(message) < 400
+    assert all(part in message for part in words), message
+    return message
+
+
+# ---- what was painted --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["exr", "half", "hdr", "png16", "png8", "widened"])
+@pytest.mark.parametrize("name", TONEMAPS)
+def test_exactly_the_rectangle_is_painted(kind, name, initial, tmp_path):
+    wanted, where = brushed(initial)
+    file, step = tmp_path / "p", 0
+    if kind in ("exr", "half"):
+        floats(file, wanted, np.float16 if kind == "half" else np.float32)
+    elif kind == "hdr":
+        mi.Bitmap(wanted).write(str(file), mi.Bitmap.FileFormat.RGBE)
+    else:
+        top = 65535 if kind == "png16" else 255
+        pixels, step = codes(wanted, name, top), 1 / top
+        png(file.with_suffix(".png"), pixels.astype(np.uint16) * 257 if kind == "widened" else pixels)
+        file = file.with_suffix(".png")
+    found = painted_image.read(file, SIZE, name, initial)
+    np.testing.assert_array_equal(found.coverage, where[..., None].astype(np.float32))
+    assert found.coverage.dtype == found.picture.dtype == np.float32
+    assert found.picture[~where].tobytes() == initial[~where].tobytes()
+    if step:  # right to half a step of display values, with float32 rounding
+        error = tonemap(found.picture[where], name) - tonemap(wanted[where], name)
+        assert np.abs(error).max() <= 0.5 * step + 1e-6
+        assert not found.excluded[where].any()
+    else:
+        room = {"exr": 0, "half": 6e-4, "hdr": 1 / 128}[kind] * wanted[where].max(axis=1, keepdims=True)
+        assert (np.abs(found.picture[where] - wanted[where]) <= room).all()
+        assert not found.excluded.any()
+    assert "%" not in told(found)
+
+
+@pytest.mark.parametrize("quality", [80, 90, 95, 100])
+def test_paint_is_found_in_a_jpeg(quality, initial, tmp_path):
+    wanted, where = brushed(initial)
+    found = painted_image.read(jpeg(tmp_path / "p.jpg", codes(wanted), quality), SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
+    assert found.picture[~where].tobytes() == initial[~where].tobytes()
+    error = np.abs(tonemap(found.picture[where]) - tonemap(wanted[where]))
+    assert error.mean() < 0.02 and "roughly" in told(found)
+
+
+@pytest.mark.parametrize("quality", [75, 90, 100])
+def test_paint_is_found_where_colours_are_subsampled(quality, initial, tmp_path):
+    pillow = pytest.importorskip("PIL.Image")
+    wanted, where = brushed(initial)
+    pillow.fromarray(codes(wanted)).save(tmp_path / "p.jpg", quality=quality, subsampling=2)
+    found = painted_image.read(tmp_path / "p.jpg", SIZE, "gamma", initial).coverage[..., 0] > 0
+    assert (found != where)[np.s_[15:35, 23:48]].sum() == 0  # two pixels inside
+    assert (found & ~where).sum() + (where & ~found).sum() <= 12
+
+
+@pytest.mark.parametrize("quality", [75, 90])
+def test_ringing_beside_strong_paint_is_no_paint(quality, initial, tmp_path):
+    wanted, where = codes(initial.clip(0.2, 0.3)), np.zeros(SIZE, bool)
+    for part in (np.s_[13:21, 21:50], np.s_[27:43, 30:44]):
+        wanted[part], where[part] = 230, True
+    found = painted_image.read(
+        jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial.clip(0.2, 0.3)
+    )
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
+
+
+@pytest.mark.parametrize("quality", [85, 95])
+def test_strong_colours_bleed_by_one_pixel_at_most(quality, initial, tmp_path):
+    wanted, where = codes(initial.clip(0, 0.5)), np.zeros(SIZE, bool)
+    for part in (np.s_[13:21, 21:50], np.s_[27:43, 30:44]):
+        wanted[part], where[part] = [250, 120, 10], True
+    found = painted_image.read(jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial.clip(0, 0.5))
+    around = where.copy()
+    for step in (1, -1):
+        around |= np.roll(where, step, 0) | np.roll(where, step, 1)
+    for step in (1, -1):
+        around |= np.roll(around, step, 1) & np.roll(around, step, 0)
+    assert (
+        not (found.coverage[..., 0] > 0)[~around].any() and (found.coverage[..., 0] > 0)[where].mean() > 0.98
+    )
+
+
+@pytest.mark.parametrize("quality", [50, 75, 90, 98])
+def test_the_quality_of_a_jpeg_is_known(quality, initial, tmp_path):
+    _, info = images.read_stored(jpeg(tmp_path / "p.jpg", codes(initial), quality))
+    assert abs(info["quality"] - quality) <= 1
+
+
+@pytest.mark.parametrize("quality", [75, 95])
+def test_a_colourful_rendering_without_paint_is_refused(quality, tmp_path):
+    pillow = pytest.importorskip("PIL.Image")
+    initial = np.full((*SIZE, 3), 0.2, np.float32)
+    initial[:, (np.arange(83) // 3) % 2 == 0] = [0.6, 0.1, 0.3]  # stripes that subsampled colours mix
+    pillow.fromarray(codes(initial)).save(tmp_path / "p.jpg", quality=quality, subsampling=2)
+    refused(["nothing of it is painted"], tmp_path / "p.jpg", SIZE, "gamma", initial)
+
+
+@pytest.mark.parametrize("kind", ["exr", "half", "png16", "png8", "jpg75", "jpg95"])
+def test_a_picture_without_paint_is_refused(kind, initial, tmp_path):
+    file = tmp_path / f"p.{kind[:3]}"
+    if kind[:3] == "jpg":
+        jpeg(file, codes(initial), int(kind[3:]))
+    elif kind[:3] == "png":
+        png(file, codes(initial, "gamma", 65535 if kind == "png16" else 255))
+    else:
+        floats(file, initial, np.float16 if kind == "half" else np.float32)
+    refused([file.name, "nothing of it is painted", "mask"], file, SIZE, "gamma", initial)
+
+
+@pytest.mark.parametrize(("top", "hidden", "shown"), [(255, 1, 2), (65535, 31, 33)])
+def test_rounding_is_no_paint(top, hidden, shown, initial, tmp_path):
+    initial = initial.clip(0.05, 0.7)
+    pixels = codes(initial, "gamma", top)
+    pixels[3, 4] += shown
+    pixels[9, 9, 1] -= shown
+    pixels[20:] += np.asarray(hidden).astype(pixels.dtype)
+    cut = (tonemap(initial) * top).astype(pixels.dtype)
+    pixels[40:] = cut[40:]  # an editor that does not round
+    found = painted_image.read(png(tmp_path / "p.png", pixels), SIZE, "gamma", initial).coverage
+    assert set(zip(*np.nonzero(found[..., 0]), strict=True)) == {(3, 4), (9, 9)}
+
+
+def test_16_bits_are_kept(initial, tmp_path):
+    wanted = initial.clip(0, 0.9)
+    wanted[RECTANGLE] = np.linspace(0.2, 0.2005, 29)[:, None]  # within a step of 8 bits
+    found = painted_image.read(png(tmp_path / "p.png", codes(wanted, "gamma", 65535)), SIZE, "gamma", initial)
+    np.testing.assert_allclose(found.picture[RECTANGLE], wanted[RECTANGLE], rtol=4e-5)
+    assert len(np.unique(found.picture[RECTANGLE])) > 15
+
+
+def test_without_the_rendering_all_is_painted(initial, tmp_path):
+    found = painted_image.read(png(tmp_path / "p.png", codes(initial)), SIZE, "gamma")
+    assert (found.coverage == 1).all() and found.coverage.shape == (*SIZE, 1)
+    np.testing.assert_array_equal(found.excluded, (codes(initial) == 255).any(axis=2))
+
+
+def test_faint_radiance_is_painted_too(tmp_path):
+    initial = np.full((8, 8, 3), 1e-4, np.float32)
+    wanted = initial.copy()
+    wanted[2, 3] *= 1.01
+    wanted[5, 5] = 0
+    found = painted_image.read(floats(tmp_path / "p.exr", wanted), (8, 8), "gamma", initial)
+    assert set(zip(*np.nonzero(found.coverage[..., 0]), strict=True)) == {(2, 3), (5, 5)}
+
+
+def test_a_sun_that_a_half_cannot_hold_is_no_paint(tmp_path):
+    initial = np.full((8, 8, 3), 0.5, np.float32)
+    initial[1, 1] = 1e6
+    wanted = np.minimum(initial, 65504)
+    wanted[4, 4] = 2
+    found = painted_image.read(floats(tmp_path / "p.exr", wanted, np.float16), (8, 8), "gamma", initial)
+    assert found.coverage.sum() == 1 and found.picture[1, 1, 0] == 1e6 and found.picture[4, 4, 0] == 2
+
+
+def test_one_pixel(tmp_path):
+    initial = np.full((1, 1, 3), 0.25, np.float32)
+    found = painted_image.read(
+        png(tmp_path / "p.png", np.full((1, 1, 3), 20, np.uint8)), (1, 1), "gamma", initial
+    )
+    assert found.coverage.item() == 1
+    assert "100 %" in told(found) and "another rendering" in told(found)
+
+
+# ---- tonemaps ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (b"tEXt", b"log"),
+        (b"zTXt", b"\0" + zlib.compress(b"log")),
+        (b"iTXt", b"\0\0de\0\0log"),
+        (b"iTXt", b"\1\0\0\0" + zlib.compress(b"log")),
+    ],
+)
+def test_the_tonemap_that_the_file_names_is_used(kind, text, initial, tmp_path):
+    wanted, where = brushed(initial)
+    file = png(tmp_path / "p.png", codes(wanted, "log", 65535))
+    with_chunk(file, b"tEXt", "Author\0Jürgen".encode("latin-1"))  # as many an editor writes
+    with_chunk(file, kind, b"envedit.tonemap\0" + text)
+    found = painted_image.read(file, SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
+    np.testing.assert_allclose(found.picture, wanted, rtol=2e-3)
+    assert "'log'" in told(found) and "instead of 'gamma'" in told(found)
+
+
+@pytest.mark.parametrize("said", [b"filmic", b"", b"\xff\0\xff"])
+def test_a_tonemap_that_is_unknown_is_told(said, initial, tmp_path):
+    file = png(tmp_path / "p.png", codes(brushed(initial)[0]))
+    found = painted_image.read(with_chunk(file, b"tEXt", b"envedit.tonemap\0" + said), SIZE, "gamma", initial)
+    assert found.coverage.sum() == brushed(initial)[1].sum()
+    assert ("which is unknown" in told(found)) is (said != b"")
+    for damage in (b"\1\0\0\0x", b"\1", b""):
+        with_chunk(file, b"iTXt", b"envedit.x\0" + damage)
+        with_chunk(file, b"zTXt", b"envedit.y\0" + damage)
+    assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
+
+
+def test_another_tonemap_is_noticed(initial, tmp_path):
+    file = png(tmp_path / "p.png", codes(brushed(initial)[0], "srgb"))
+    found = painted_image.read(file, SIZE, "linear", initial)
+    assert 'set [target] tonemap = "srgb"' in told(found)
+
+
+def test_another_rendering_is_noticed(initial, rng, tmp_path):
+    other = initial * (1 + 0.3 * rng.standard_normal((*SIZE, 1))).astype(np.float32).clip(0.1)
+    file = floats(tmp_path / "p.exr", other, header={"envedit.seed": 7, "envedit.tonemap": "linear"})
+    found = painted_image.read(file, SIZE, "gamma", initial)
+    assert "another rendering (it was made with" in told(found) and "seed 7" in told(found)
+    assert found.coverage.mean() > 0.9
+    warm = floats(tmp_path / "w.exr", initial * np.float32([1.1, 1, 0.9]))  # all of it, on purpose: allowed
+    assert "unless all of it was painted" in told(painted_image.read(warm, SIZE, "gamma", initial))
+
+
+# ---- clipped -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["gamma", "srgb", "linear"])
+@pytest.mark.parametrize("top", [255, 65535])
+def test_clipped_pixels_are_excluded(top, name, initial, tmp_path):
+    pixels = codes(brushed(initial)[0], name, top)
+    pixels[20, 30] = top
+    pixels[21, 30, 0] = top  # one channel is enough
+    pixels[22, 30] = 0  # black is no limit
+    found = painted_image.read(png(tmp_path / "p.png", pixels), SIZE, name, initial)
+    expected = (initial >= 1).any(axis=2)
+    expected[20:22, 30] = True
+    np.testing.assert_array_equal(found.excluded, expected)
+    assert (found.coverage[20:23, 30] == 1).all() and not found.picture[22, 30].any()
+    assert "2 painted pixels are clipped" in told(found)
+    # Where it was clipped before, and nothing was painted, the rendering is known.
+    assert found.picture[52, 8, 0] == 20 and found.coverage[52, 8] == 0
+
+
+def test_only_white_paint_is_refused(initial, tmp_path):
+    pixels = codes(initial)
+    pixels[20:30, 30:40] = 255
+    file = png(tmp_path / "p.png", pixels)
+    refused(["p.png", "clipped", "at least so bright", "log"], file, SIZE, "gamma", initial)
+
+
+def test_white_of_a_jpeg_is_not_quite_white(initial, tmp_path):
+    pixels = codes(initial)
+    pixels[16:32, 16:32], pixels[32:48, 16:32] = 254, 100
+    found = painted_image.read(jpeg(tmp_path / "p.jpg", pixels, 100), SIZE, "gamma", initial)
+    assert found.excluded[16:32, 16:32].mean() > 0.9 and not found.excluded[32:48, 16:32].any()
+
+
+def test_a_float_picture_is_not_clipped(initial, tmp_path):
+    wanted = initial.copy()
+    wanted[20, 30] = 1
+    assert not painted_image.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial).excluded.any()
+
+
+# ---- alpha -------------------------------------------------------------------------------------------------
+
+
+def layer(initial):
+    """Return display values (h, w, 4) of a layer with one stroke, half transparent in its first column."""
+    pixels = np.zeros((*SIZE, 4))
+    pixels[RECTANGLE] = [0.2, 0.3, 0.4, 1]
+    pixels[RECTANGLE[0], RECTANGLE[1].start, 3] = 0.6
+    return pixels
+
+
+@pytest.mark.parametrize("top", [255, 65535])
+def test_a_layer_is_laid_over_the_rendering(top, initial, tmp_path):
+    pixels = layer(initial)
+    file = png(tmp_path / "p.png", np.rint(pixels * top).astype(np.uint16 if top > 255 else np.uint8))
+    found = painted_image.read(file, SIZE, "gamma", initial)
+    np.testing.assert_allclose(found.coverage[..., 0], pixels[..., 3], atol=1e-6)
+    assert found.picture[pixels[..., 3] == 0].tobytes() == initial[pixels[..., 3] == 0].tobytes()
+    edge = (RECTANGLE[0], RECTANGLE[1].start)
+    mixed = 0.6 * np.array([0.2, 0.3, 0.4]) + 0.4 * tonemap(initial[edge])
+    np.testing.assert_allclose(tonemap(found.picture[edge]), mixed, atol=1 / top)
+    empty = SIZE[0] * SIZE[1] - 24 * 29
+    assert f"{empty} pixels are transparent" in told(found) and "24 half transparent" in told(found)
+    assert "laid over the initial rendering" in told(found)
+
+
+def test_alpha_of_an_exr_is_premultiplied(initial, tmp_path):
+    alpha = layer(initial)[..., 3].astype(np.float32)
+    paint = np.float32([0.5, 2, 0.25]) * alpha[..., None]
+    paint[0, 0] = 9  # colour without alpha
+    found = painted_image.read(floats(tmp_path / "p.exr", paint, A=alpha), SIZE, "gamma", initial)
+    np.testing.assert_allclose(found.picture[0, 0], initial[0, 0])
+    expected = paint + (1 - alpha[..., None]) * initial
+    expected[0, 0] = initial[0, 0]
+    np.testing.assert_allclose(found.picture, expected, rtol=1e-6)
+    np.testing.assert_array_equal(found.coverage[..., 0], alpha)
+    alone = painted_image.read(tmp_path / "p.exr", SIZE, "gamma")
+    np.testing.assert_allclose(alone.picture[alpha > 0], np.float32([[0.5, 2, 0.25]] * (24 * 29)), rtol=1e-6)
+    np.testing.assert_array_equal(alone.excluded, alpha == 0)
+    assert not alone.picture[0, 0].any() and "taken as it is" in told(alone)
+
+
+def test_a_cropped_exr_is_not_black_paint(initial, tmp_path):
+    part = brushed(initial)[0][10:40, 15:60]
+    box = {"dataWindow": ((15, 10), (59, 39)), "displayWindow": ((0, 0), (82, 59))}
+    found = painted_image.read(floats(tmp_path / "p.exr", part, header=box), SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
+
+
+def test_an_empty_layer_is_refused(initial, tmp_path):
+    file = png(tmp_path / "p.png", np.zeros((*SIZE, 4), np.uint8))
+    refused(["p.png", "nothing of it is painted"], file, SIZE, "gamma", initial)
+    refused(["p.png", "nothing of it is painted"], file, SIZE, "gamma")
+
+
+# ---- grey, palettes, marks ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["png", "png alpha", "jpg", "exr"])
+def test_grey(kind, initial, tmp_path):
+    grey = np.repeat(initial[..., 1:2], 3, axis=2).clip(0.05, 0.8)
+    wanted = grey.copy()
+    wanted[RECTANGLE] *= 0.3
+    one = codes(wanted)[..., :1]
+    if kind == "exr":
+        file = exr(tmp_path / "p.exr", Y=wanted[..., 0].copy())
+    elif kind == "jpg":
+        file = jpeg(tmp_path / "p.jpg", one)
+    else:
+        opaque = np.full_like(one, 255)
+        file = png(tmp_path / "p.png", np.concatenate([one, opaque], 2) if "alpha" in kind else one)
+    found = painted_image.read(file, SIZE, "gamma", grey)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
+    assert "read as grey" in told(found) and "transparent" not in told(found)
+    refused(["is grey", "RGB"], file, SIZE, "gamma", initial)
+    assert painted_image.read(file, SIZE, "gamma").coverage.all()
+
+
+def test_palette_with_transparency(tmp_path):
+    head = struct.pack(">IIBBBBB", 3, 2, 8, 3, 0, 0, 0)
+    colours = bytes([10, 20, 30, 200, 100, 50])
+    rows = b"\0" + bytes([0, 1, 0]) + b"\0" + bytes([1, 1, 0])
+    parts = [(b"IHDR", head), (b"PLTE", colours), (b"tRNS", b"\xff\0"), (b"IDAT", zlib.compress(rows))]
+    data = b"".join(chunk(*part) for part in parts)
+    (tmp_path / "p.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data + chunk(b"IEND", b""))
+    initial = np.full((2, 3, 3), 0.5, np.float32)
+    found = painted_image.read(tmp_path / "p.png", (2, 3), "linear", initial)
+    np.testing.assert_array_equal(found.coverage[..., 0], [[1, 0, 1], [0, 0, 1]])
+    np.testing.assert_allclose(found.picture[0, 0] * 255, [10, 20, 30], rtol=1e-6)
+
+
+def test_interlaced(tmp_path):
+    """Adam7 of 2 x 2 pixels: passes 1, 6 and 7 hold one, one and two of them."""
+    head = struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 1)
+    a, b, c, d = (np.array([n, 1000 + n, 60000 + n], ">u2").tobytes() for n in (1, 2, 3, 4))
+    rows = b"\0" + a + b"\0" + b + b"\0" + c + d
+    data = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    (tmp_path / "p.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data)
+    found = painted_image.read(tmp_path / "p.png", (2, 2), "linear").picture * 65535
+    np.testing.assert_allclose(found[..., 0], [[1, 2], [3, 4]], rtol=1e-6)
+    np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
+
+
+def test_turned_pictures_are_refused(initial, tmp_path):
+    wanted = codes(brushed(initial)[0])
+    file = with_chunk(png(tmp_path / "p.png", wanted), b"eXIf", turned(6))
+    refused(["p.png", "EXIF orientation 6", "upright"], file, SIZE, "gamma", initial)
+    file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE1, b"Exif\0\0" + turned(3))
+    refused(["p.jpg", "EXIF orientation 3"], file, SIZE, "gamma", initial)
+    file = with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + turned(1))
+    assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
+    for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff"):
+        with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + damage)
+        assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
+
+
+@pytest.mark.parametrize(
+    ("profile", "odd"),
+    [(b"desc sRGB IEC61966-2.1", False), ("sRGB".encode("utf-16-be"), False), (b"Display P3", True)],
+)
+def test_a_colour_profile_is_told(profile, odd, initial, tmp_path):
+    wanted = codes(brushed(initial)[0])
+    file = with_chunk(png(tmp_path / "p.png", wanted), b"iCCP", b"ICC\0\0" + zlib.compress(profile))
+    assert ("colour profile" in told(painted_image.read(file, SIZE, "gamma", initial))) is odd
+    segment = b"ICC_PROFILE\0\1\1" + profile
+    file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE2, segment)
+    assert ("colour profile" in told(painted_image.read(file, SIZE, "gamma", initial))) is odd
+
+
+def test_cmyk_is_refused(initial, tmp_path):
+    frame = bytes([8]) + struct.pack(">HH", *SIZE) + bytes([4]) + bytes(12)
+    data = b"\xff\xd8\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame
+    (tmp_path / "p.jpg").write_bytes(data + b"\xff\xda\0\2")
+    refused(["p.jpg", "4 channels", "CMYK", "RGB"], tmp_path / "p.jpg", SIZE, "gamma", initial)
+
+
+# ---- refused -----------------------------------------------------------------------------------------------
+
+
+def test_another_size(initial, tmp_path):
+    file = png(tmp_path / "p.png", codes(np.repeat(np.repeat(initial, 2, 0), 2, 1)))
+    refused(["p.png: is 166x120 pixels, the rendering is 83x60", "[scene] width"], file, SIZE, "gamma")
+    file = png(tmp_path / "p.png", codes(initial)[:40])
+    refused(["is 83x40 pixels", "83x60", "aspect", "--export-initial"], file, SIZE, "gamma", initial)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite(value, initial, tmp_path):
+    wanted = initial.copy()
+    wanted[7, 11, 2] = value
+    refused(["row 7, column 11", "not finite"], floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial)
+    alpha = np.ones(SIZE, np.float32)
+    alpha[8, 3] = value
+    file = floats(tmp_path / "p.exr", initial, A=alpha)
+    refused(["row 8, column 3"], file, SIZE, "gamma", initial)
+
+
+def test_negative_values_are_set_to_zero(initial, tmp_path):
+    wanted = initial.copy()
+    wanted[7, 11] = [-0.5, 1, 1]
+    found = painted_image.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.picture[7, 11], [0, 1, 1])
+    assert "1 pixels are negative, the first at row 7, column 11" in told(found)
+
+
+# ---- masks -------------------------------------------------------------------------------------------------
+
+
+def test_a_mask_overrides_what_is_seen(initial, tmp_path):
+    wanted, where = brushed(initial)
+    mask = np.zeros((*SIZE, 3), np.uint8)
+    mask[10:20, 15:30], mask[20:25, 15:30] = 255, 128
+    file = png(tmp_path / "p.png", codes(wanted))
+    found = painted_image.read(file, SIZE, "gamma", initial, png(tmp_path / "m.png", mask))
+    np.testing.assert_allclose(found.coverage, mask[..., :1] / 255, atol=1e-6)
+    kept = ~where | (mask[..., 0] == 0)  # what no stroke touched, and what the mask leaves out
+    assert found.picture[kept].tobytes() == initial[kept].tobytes()
+    assert np.abs(found.picture - initial)[~kept].min(axis=0).max() > 0
+    same = painted_image.read(
+        png(tmp_path / "s.png", codes(initial)), SIZE, "gamma", initial, tmp_path / "m.png"
+    )
+    assert same.coverage.any()  # nothing differs, and that is meant
+
+
+@pytest.mark.parametrize("top", [255, 65535])
+def test_greys_of_a_mask_are_weights(top, tmp_path):
+    values = np.linspace(0, top, 24).reshape(4, 6, 1)
+    pixels = np.rint(values).astype(np.uint16 if top > 255 else np.uint8)
+    weight = painted_image.read_mask(png(tmp_path / "m.png", pixels), (4, 6))
+    np.testing.assert_allclose(weight, pixels / top, rtol=1e-6)
+    assert weight.shape == (4, 6, 1) and weight.dtype == np.float32
+    strokes = np.full((4, 6, 4), 255, np.uint8)
+    strokes[..., 3] = np.arange(24).reshape(4, 6)
+    weight = painted_image.read_mask(png(tmp_path / "m.png", strokes), (4, 6))
+    np.testing.assert_allclose(weight[..., 0] * 255, strokes[..., 3], rtol=1e-6)
+
+
+def test_black_of_a_jpeg_mask_is_black(tmp_path):
+    mask = np.full((*SIZE, 3), 3, np.uint8)
+    mask[16:32, 16:48] = 252
+    weight = painted_image.read_mask(jpeg(tmp_path / "m.jpg", mask, 100), SIZE)
+    np.testing.assert_array_equal(weight[..., 0], mask[..., 0] > 100)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        (np.zeros((4, 6, 3)), "black everywhere"),
+        (np.ones((4, 5, 3)), "is 5x4 pixels, the target is 6x4"),
+        (np.full((4, 6, 3), np.nan), "row 0, column 0"),
+        (np.full((4, 6, 3), -1.0), "black everywhere"),
+    ],
+)
+def test_masks_that_cannot_be_used(values, says, tmp_path):
+    with pytest.raises(InputError, match=rf"m\.exr.*{says}"):
+        painted_image.read_mask(floats(tmp_path / "m.exr", values), (4, 6))
+
+
+# ---- the rendering to paint on -----------------------------------------------------------------------------
+
+
+def settings(**target):
+    return config.Config(target=config.Target(**target), seed=3)
+
+
+@pytest.mark.parametrize("ending", [".exr", ".png", ".PNG"])
+@pytest.mark.parametrize("name", TONEMAPS)
+def test_exported_and_painted_on(ending, name, initial, tmp_path):
+    file = tmp_path / f"paint{ending}"
+    told_now = painted_image.export(file, initial, settings(tonemap=name))
+    pixels, info = images.read_stored(file)
+    stored = info["metadata"]
+    assert {k: str(stored[f"envedit.{k}"]) for k in ("scene", "envmap", "seed")} == {
+        "scene": "sphere", "envmap": "sunsky", "seed": "3"
+    }  # fmt: skip
+    assert stored["envedit.tonemap"] == ("linear" if ending == ".exr" else name)
+    refused(["nothing of it is painted"], file, SIZE, name, initial)
+    if ending == ".exr":
+        np.testing.assert_array_equal(pixels, initial)
+        assert "envmap" not in OpenEXR.File(str(file), header_only=True).header()
+        assert not told_now
+        pixels[RECTANGLE] *= 0.5
+        floats(file, pixels)
+    else:
+        np.testing.assert_array_equal(pixels, codes(initial, name, 65535))
+        assert ("clipped" in "".join(told_now)) is (name != "log")
+        pixels[RECTANGLE] //= 2
+        png(file, pixels)
+    found = painted_image.read(file, SIZE, name, initial)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
+
+
+def test_texts_of_a_png_are_as_another_program_reads_them(tmp_path, rng):
+    picture = rng.random((5, 7, 3))
+    images.write_png(
+        tmp_path / "a.png", picture, 16, {"envedit.tonemap": "gamma", "envedit.envmap": "fjälls 空.hdr"}
+    )
+    raw, at, texts = (tmp_path / "a.png").read_bytes(), 8, {}
+    while at < len(raw):
+        (length,), kind = struct.unpack(">I", raw[at : at + 4]), raw[at + 4 : at + 8]
+        body = raw[at + 8 : at + 8 + length]
+        assert struct.unpack(">I", raw[at + 8 + length : at + 12 + length])[0] == zlib.crc32(kind + body)
+        if kind == b"tEXt":
+            key, _, text = body.partition(b"\0")
+            texts[key.decode()] = text.decode("latin-1")
+        at += 12 + length
+    assert texts["envedit.tonemap"] == "gamma" and texts["envedit.envmap"] == "fjälls ?.hdr"
+    pixels, info = images.read_stored(tmp_path / "a.png")
+    assert info["metadata"]["envedit.tonemap"] == "gamma"
+    np.testing.assert_array_equal(pixels, np.rint(picture.astype(np.float32) * np.float32(65535)))
+
+
+def test_what_is_not_exported(initial, tmp_path):
+    (tmp_path / "there.png").write_bytes(b"mine")
+    for file, error, says in (
+        ("a.jpg", ConfigError, "ends in .exr or .png"),
+        ("a", ConfigError, "ends in .exr or .png"),
+        ("there.png", InputError, "there.png: exists and is not overwritten"),
+        ("gone/a.exr", InputError, "folder does not exist"),
+    ):
+        with pytest.raises(error, match=says):
+            painted_image.export(tmp_path / file, initial, settings())
+    assert (tmp_path / "there.png").read_bytes() == b"mine" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_run_renders_the_exported_picture_again():
+    """The seed is stated, and not that of a rendering that is judged."""
+    seen = []
+
+    def sampled(envmap, spp, seed):
+        seen.append((spp, seed))
+        return envmap, spp, None
+
+    lit = types.SimpleNamespace(sampled=sampled)
+    assert painted_image.initial(lit, "map", settings(spp=32)) == "map"
+    assert seen == [(32, 3 + painted_image.SEED)]

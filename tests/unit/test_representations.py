@@ -1,0 +1,262 @@
+"""Every representation gives back what it was given, stays finite and lets gradients through."""
+
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit import config, representations
+from envedit.core import latlong
+from envedit.representations.siren import fit
+from envedit.representations.siren import network as siren
+from tests.oracles.plain import double, numpy_forward
+
+EXTREMES = np.array([0, 1e-30, 1e-4, 0.01, 0.5, 65504, 1e6, 123456.789, 1.0] * 2, np.float32).reshape(2, 3, 3)
+QUICK = config.Fit(polish="always", epochs=5, awp_gamma=0.0)
+
+
+def sky(rng, shape=(8, 16)):
+    return (rng.random((*shape, 3)) ** 4 * 20).astype(np.float32)
+
+
+def make(kind, folder=None, rows=None, **network):
+    network = config.Representation(**{"kind": kind, "hidden": 10, "depth": 1} | network)
+    return representations.make(config.Config(representation=network, fit=QUICK), folder, rows=rows)
+
+
+KINDS = ("pixels", "log-pixels", "siren")
+
+
+def test_pixels_give_back_every_bit():
+    image = EXTREMES.copy()
+    image[0, 0, 0] = 3e38
+    decoded = make("pixels").decode(make("pixels").encode(image)).numpy()
+    assert decoded.tobytes() == image.tobytes()
+
+
+def test_log_pixels_give_back_the_map():
+    log_pixels = make("log-pixels")
+    decoded = log_pixels.decode(log_pixels.encode(EXTREMES)).numpy()
+    # A logarithm of 14 rounds at 5e-7; next to black what is left is the rounding of 0.01.
+    np.testing.assert_allclose(decoded, EXTREMES, rtol=1e-5, atol=1e-8)
+    assert (decoded >= 0).all()
+
+
+def test_siren_gives_back_what_was_fitted(rng):
+    image, representation = sky(rng), make("siren")
+    params = representation.encode(image, seed=4)
+    fitted = fit.fit(image, representation.network, QUICK, seed=4)
+    assert representation.fitted.log_psnr == fitted.log_psnr
+    assert all(np.array_equal(params[name].numpy(), fitted.params[name]) for name in fitted.params)
+    decoded = representation.decode(params)
+    x = fit.points(representation.network, (8, 16))
+    expected = fit.evaluate(params, fitted.normalisation, x, (8, 16), representation.network.omega)
+    np.testing.assert_array_equal(decoded.numpy(), expected.numpy())
+
+
+def plane_points(height, width, rows):
+    y, x = (2 * np.arange(height) + 1) / height - 1, (2 * np.arange(width) + 1) / width - 1
+    return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def sphere_points(height, width, rows):
+    first, total = rows
+    return siren.SPHERE_SCALE * latlong.directions(total, width)[first : first + height].reshape(-1, 3)
+
+
+POINTS = {"plane": plane_points, "sphere": sphere_points}
+
+
+@pytest.mark.parametrize("coordinates", POINTS)
+@pytest.mark.parametrize(("rows", "shape", "found"), [
+    (None, (8, 16), (0, 8)), (None, (16, 32), (0, 16)), (None, (5, 7), (0, 5)), (None, (1, 1), (0, 1)),
+    ((0, 16), (8, 16), (0, 16)), ((0, 16), (4, 8), (0, 8)), ((6, 16), (16, 20), (12, 32)),
+    ((8, 16), (24, 16), (24, 48)), ((2, 12), (4, 8), (1, 6)),
+])  # fmt: skip
+def test_siren_is_one_function_at_any_resolution(coordinates, rows, shape, found, rng):
+    """The network in float64 at the texel centres, and Eq. 2-3."""
+    representation = make("siren", rows=rows, coordinates=coordinates)
+    params = representation.encode(sky(rng))
+    x = POINTS[coordinates](*shape, found)
+    values = numpy_forward({name: value.numpy() for name, value in params.items()}, x, 30.0)
+    normalisation = representation.fitted.normalisation
+    expected = np.exp(values.reshape(*shape, 3) * normalisation.span + normalisation.low) - 0.01
+    np.testing.assert_allclose(representation.decode(params, shape).numpy(), expected, rtol=1e-3, atol=1e-5)
+    again = representation.decode(params, shape).numpy()
+    assert again.tobytes() == representation.decode(params, shape).numpy().tobytes()
+    assert representation.decode(params).shape == (8, 16, 3)
+
+
+def halved(image):
+    height, width = image.shape[:2]
+    return image.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coordinates", POINTS)
+@pytest.mark.parametrize("first", [None, 0, 6, 16])
+def test_siren_at_another_resolution_is_the_same_picture_resized(coordinates, first):
+    """Also where the rows are not a map's first ones: a step of a row would be seen in this sky."""
+    height, rows = (32, None) if first is None else (16, (first, 32))
+    d = latlong.directions(32, 64)[(first or 0) :][:height]
+    image = np.exp(d @ [[0.5, 0.3, 0.1], [1.2, 1.0, 0.8], [0.2, 0.4, 0.6]]).astype(np.float32)
+    representation = make("siren", rows=rows, coordinates=coordinates, omega=3.0, hidden=24)
+    representation.settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)
+    params = representation.encode(image)
+    picture = representation.decode(params).numpy()
+    assert np.abs(picture / image - 1).mean() < 0.1
+    # A map's first and last rows are its poles at any height, so that a finer pair of rows lies up to a
+    # quarter of a row beside the coarser one. Numbers of the plane have no such rule.
+    near = 0.002 if coordinates == "plane" else 0.03
+    for down, across in ((2, 2), (1, 2), (2, 1)):
+        finer = representation.decode(params, (down * height, across * 64)).numpy()
+        back = finer.reshape(height, down, 64, across, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(back, picture, rtol=near if down > 1 else 0.002)
+    halved = picture.reshape(height // 2, 2, 32, 2, 3).mean(axis=(1, 3))
+    coarser = representation.decode(params, (height // 2, 32)).numpy()
+    np.testing.assert_allclose(coarser, halved, rtol=0.01 if coordinates == "plane" else 0.06)
+    # Control: a row's difference is several times what is allowed above.
+    assert np.abs(picture[1:] / picture[:-1] - 1).max() > 0.12
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_decoded_map_is_an_image_of_finite_radiance(kind):
+    representation = make(kind)
+    image = np.repeat(EXTREMES, 4, axis=0).repeat(4, axis=1)
+    decoded = representation.decode(representation.encode(image))
+    assert isinstance(decoded, mi.TensorXf) and decoded.shape == image.shape
+    assert np.isfinite(decoded.numpy()).all() and (decoded.numpy() >= 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shift", [-1e3, -5.0, 5.0, 1e3])
+def test_decoded_map_stays_finite_wherever_the_parameters_go(kind, shift, rng):
+    representation = make(kind)
+    params = representation.encode(sky(rng))
+    last = list(params)[-1]
+    moved = params | {last: mi.TensorXf(params[last].numpy() + np.float32(shift))}
+    decoded = representation.decode(moved).numpy()
+    assert np.isfinite(decoded).all() and (decoded >= 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("value", [0.0, 1e-30, 1e6])
+def test_flat_maps_are_no_special_case(kind, value):
+    representation = make(kind)
+    decoded = representation.decode(representation.encode(np.full((4, 8, 3), value, np.float32))).numpy()
+    assert np.isfinite(decoded).all() and (decoded >= 0).all()
+
+
+@pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
+def test_gradient_is_the_finite_difference(kind, rng):
+    representation, image = make(kind), sky(rng) + np.float32(0.1)
+    ((name, start),) = representation.encode(image).items()
+    weight = rng.normal(size=image.shape)
+    leaf = double(start.numpy())
+    dr.enable_grad(leaf)
+    dr.backward(dr.sum((representation.decode({name: leaf}) * double(weight)).array))
+
+    def loss(step):
+        return np.sum(weight * representation.decode({name: double(start.numpy() + step * weight)}).numpy())
+
+    slope = (loss(1e-5) - loss(-1e-5)) / 2e-5
+    np.testing.assert_allclose(np.sum(np.array(dr.grad(leaf)) * weight), slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradient_reaches_every_parameter(kind, rng):
+    representation = make(kind)
+    params = representation.encode(sky(rng) + np.float32(0.1))
+    leaves = {name: mi.TensorXf(value) for name, value in params.items()}
+    dr.enable_grad(leaves)
+    dr.backward(dr.sum(representation.decode(leaves).array))
+    for leaf in leaves.values():
+        gradient = np.array(dr.grad(leaf))
+        assert np.isfinite(gradient).all() and np.count_nonzero(gradient) > 0.9 * gradient.size
+
+
+@pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
+@pytest.mark.parametrize("below", [0.0, 0.5])
+def test_black_texels_can_be_lit(kind, below):
+    """A slope of 0 at black, or below it where a step may have led, would keep a texel dark for good."""
+    representation = make(kind)
+    ((name, start),) = representation.encode(np.zeros((2, 3, 3), np.float32)).items()
+    leaf = dr.opaque(start - below)
+    dr.enable_grad(leaf)
+    decoded = representation.decode({name: leaf})
+    assert (decoded.numpy() >= 0).all()
+    dr.backward(dr.sum(decoded.array))
+    assert (np.array(dr.grad(leaf)) > 0).all()
+
+
+def test_siren_gradient_is_the_finite_difference(rng):
+    representation = make("siren")
+    params, weight = representation.encode(sky(rng)), rng.normal(size=(8, 16, 3))
+    leaves = {name: mi.TensorXf(value) for name, value in params.items()}
+    dr.enable_grad(leaves)
+    dr.backward(dr.sum((representation.decode(leaves) * mi.TensorXf(weight.astype(np.float32))).array))
+    gradient = {name: np.array(dr.grad(leaf), np.float64) for name, leaf in leaves.items()}
+    x, normalisation = siren.coordinates(8, 16).numpy(), representation.fitted.normalisation
+
+    def loss(step):
+        moved = {name: params[name].numpy() + step * gradient[name] for name in params}
+        values = numpy_forward(moved, x, 30.0).reshape(8, 16, 3)
+        return np.sum(weight * np.exp(values * normalisation.span + normalisation.low))
+
+    h = 1e-7
+    slope = (loss(h) - loss(-h)) / (2 * h)
+    np.testing.assert_allclose(sum(np.sum(g * g) for g in gradient.values()), slope, rtol=1e-3)
+
+
+def test_pixels_below_zero_are_black_and_log_pixels_are_never_below():
+    params = {"radiance": mi.TensorXf(np.full((1, 2, 3), -0.5, np.float32))}
+    assert not representations.Pixels().decode(params).numpy().any()
+    params = {"log_radiance": mi.TensorXf(np.full((1, 2, 3), -100, np.float32))}
+    assert not representations.LogPixels().decode(params).numpy().any()
+
+
+def test_configuration_names_the_representation():
+    found = [make(kind) for kind in KINDS]
+    assert [type(r) for r in found] == [
+        representations.Pixels,
+        representations.LogPixels,
+        representations.Siren,
+    ]
+    assert all(r.lr > 0 for r in found)
+
+
+def test_siren_keeps_its_fits_in_the_folder(tmp_path, rng):
+    image = sky(rng)
+    a, b = make("siren", tmp_path), make("siren", tmp_path)
+    first, second = a.encode(image), b.encode(image)
+    assert not a.fitted.cached and b.fitted.cached
+    assert dataclasses.asdict(a.fitted.normalisation) == dataclasses.asdict(b.fitted.normalisation)
+    np.testing.assert_array_equal(a.decode(first).numpy(), b.decode(second).numpy())
+
+
+def test_siren_keeps_a_fit_for_each_place_in_a_map(tmp_path, rng):
+    image, cached = sky(rng), []
+    for rows in (None, (0, 8), (0, 16), (8, 16), (8, 16)):
+        representation = make("siren", tmp_path, rows)
+        representation.encode(image)
+        cached.append(representation.fitted.cached)
+    assert cached == [False, True, False, False, True]
+
+
+def test_siren_of_another_image_forgets_the_points_of_the_first(rng):
+    used, images = make("siren", rows=(0, 16)), [sky(rng, (8, 16)), sky(rng, (4, 16))]
+    for image in images:
+        fresh = make("siren", rows=(0, 16))
+        decoded = used.decode(used.encode(image), (8, 16)).numpy()
+        np.testing.assert_array_equal(decoded, fresh.decode(fresh.encode(image), (8, 16)).numpy())
+        assert used.decode(used.encode(image)).shape == image.shape
+
+
+def test_a_fit_that_is_edited_is_not_polished_unless_asked_for():
+    settings = config.Config(representation=config.Representation(kind="siren", hidden=8, depth=1))
+    recipe = representations.make(settings).settings
+    assert (recipe.awp_until, recipe.light) == (1.0, 0.0) and recipe == fit.unpolished(settings.fit)
+    asked = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, polish="always"))
+    assert representations.make(asked).settings == asked.fit

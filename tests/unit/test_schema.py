@@ -1,0 +1,298 @@
+"""The configuration: defaults, overrides, refusals by name, and the way to TOML and back."""
+
+import dataclasses
+import math
+import string
+import tomllib
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from envedit import config as cfg
+from envedit.config import schema
+from envedit.core.color import TONEMAPS
+from envedit.core.errors import ConfigError
+from tests.oracles.builders import refused
+
+quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+
+KINDS = ("layers", "siren", "pixels", "log-pixels")
+
+# ---- defaults ----------------------------------------------------------------------------------------------
+
+
+def test_an_empty_file_gives_the_defaults():
+    config = cfg.loads("")
+    assert config.preset == "standard" and config.seed == 0 and config.variant == "llvm_ad_rgb"
+    assert config == dataclasses.replace(cfg.Config(), output=config.output)
+    assert config.input == cfg.Input(envmap="sunsky", width=256, rows="upper")
+    assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
+    assert config.representation.kind == "layers" and config.representation.cycles == "auto"
+    assert config.loss.ssim == 0.1 and config.optimizer.iterations == 100
+    assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
+
+
+def test_every_key_says_what_it_means():
+    for f in dataclasses.fields(cfg.Fit):
+        assert f.metadata["doc"] and f"{f.name} : " in cfg.Fit.__doc__
+    assert "turbidity : float" in cfg.Input.__doc__ and "variant : str" in cfg.Config.__doc__
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_representation_is_accepted_and_comes_back(kind):
+    config = cfg.loads(f'[representation]\nkind = "{kind}"')
+    assert config.representation.kind == kind
+    assert cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="other.toml") == config
+
+
+@pytest.mark.parametrize("name", TONEMAPS)
+def test_tonemaps_are_those_of_the_image_module(name):
+    config = cfg.from_dict({"output": {"tonemap": name}, "target": {"tonemap": name}})
+    assert config.output.tonemap == config.target.tonemap == name
+
+
+# ---- overrides ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text, keys, value",
+    [
+        ("fit.epochs=10", ("fit", "epochs"), 10),
+        ("seed = 3", ("seed",), 3),
+        ("input.envmap=maps/a b.exr", ("input", "envmap"), "maps/a b.exr"),
+        ('input.envmap="a=b"', ("input", "envmap"), "a=b"),
+        ("loss.ssim=[1, 1e4]", ("loss", "ssim"), [1, 1e4]),
+        ("renderer.spp=auto", ("renderer", "spp"), "auto"),
+        ("output.report=false", ("output", "report"), False),
+        ("output.dir=", ("output", "dir"), ""),
+        ("scene.parameters.roughness=0.5", ("scene", "parameters", "roughness"), 0.5),
+        ("fit.epochs=1\nseed=2", ("fit", "epochs"), "1\nseed=2"),
+        ("seed=0x", ("seed",), "0x"),
+    ],
+)
+def test_overrides_are_toml_or_bare_words(text, keys, value):
+    assert cfg.parse_override(text) == (keys, value)
+
+
+@pytest.mark.parametrize("text", ["", "fit.epochs", "=3", "fit.=3", ".epochs=3", 3])
+def test_an_override_without_key_or_value_is_refused(text):
+    with pytest.raises(ConfigError, match="wanted table.key=value"):
+        cfg.parse_override(text)
+
+
+# ---- refusals ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text, parts",
+    [
+        ("[fit]\nepoch = 3", ["a.toml", "[fit] has no key epoch", "did you mean epochs?"]),
+        ("epochs = 3", ["unknown table or key epochs", "did you mean fit.epochs?"]),
+        ("[ouput]\ndir = 'x'", ["unknown table or key ouput", "did you mean output?"]),
+        ("[loss]\nrestart_period = 3", ["[loss] has no key", "did you mean fit.restart_period?"]),
+        ("[fit]\nxyzzy = 3", ["[fit] has no key xyzzy", "known: epochs, lr"]),
+        ("fit = 3", ["fit: came 3, wanted a table"]),
+        ("[seed]\na = 1", ["seed: came {'a': 1}, wanted an integer"]),
+        ('preset = "drift"', ["preset: came 'drift'", "did you mean draft?"]),
+        ('[representation]\nkind = "layer"', ["representation.kind: came 'layer'", "did you mean layers?"]),
+        ("[representation]\ncycles = 0", ["representation.cycles: came 0", "from 1 to 256"]),
+        ('[fit]\nschedule = "cosin"', ["fit.schedule: came 'cosin'", "did you mean cosine?"]),
+        ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
+        ("[target]\nkind = 'image'", ["target.file", "wanted the painted image"]),
+        ("[target]\nkind = 'strokes'", ["target.strokes: came none, wanted at least one"]),
+        (
+            "[[target.strokes]]\ntype = 'contrast'",
+            ["target.strokes: came 1, wanted none", 'kind = "strokes"'],
+        ),
+        (
+            "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
+            ["target.mask: came '", "m.png', wanted none"],
+        ),
+        ("[target]\nkind = 'imgae'", ["target.kind: came 'imgae'", "did you mean image?"]),
+        ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: came [0, 64], wanted rows below 64"]),
+        ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: came 0"]),
+        ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["came 0 for all"]),
+        ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
+        ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
+        ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
+        ("seed = " + "9" * 5000, ["not TOML"]),
+        ("seed = 0x" + "f" * 5000, ["seed: came a huge int"]),
+    ],
+)
+def test_a_refusal_says_where_what_and_what_to_do(text, parts):
+    message = refused(text)
+    for part in parts:
+        assert part in message
+
+
+def test_keys_of_many_parts_are_refused_before_they_are_parsed():
+    parts = "a." * 50_000  # tomllib would take minutes and gigabytes
+    forms = (f"{parts}a = 1", f"[{parts}a]", f"x = {{ {parts}a = 1 }}", f"a . 'b c' . \"d\".{parts}a = 1")
+    for text in forms:
+        assert "a.toml: not TOML: a key of more than 100 parts (at line 2)" in refused(f"\n{text}")
+    assert "did you mean" in refused("", f"input.envmp={{ {parts}a = 1 }}")  # not parsed: a string
+    points = "[0.1, 0.25], " * 2000 + "[1.0, 1.0]"
+    stroke = f"{{ type = 'light', points = [{points}], width = 0.1 }}"
+    assert (
+        len(cfg.loads(f"[target]\nkind = 'strokes'\nstrokes = [{stroke}]").target.strokes[0]["points"])
+        == 2001
+    )
+    assert cfg.loads(f"# {'a word. ' * 300}\n[input]\nenvmap = 'a.b.c/../..' # {'.' * 500}").input.envmap
+
+
+def test_a_refusal_is_short_whatever_the_file_holds():
+    long = "a" * 5000
+    assert "known: preset" in refused(f"{long} = 1")
+    assert "[fit] has no key 'aaa" in refused(f"[fit]\n{long} = 1")
+    twice = refused(f"[{long}]\n[{long}]")
+    assert "Cannot declare" in twice and twice.endswith("(at line 2, column 5002)")
+    assert "seed" in refused(f"seed = '{long}'")
+
+
+def test_an_error_names_the_override_it_came_from():
+    assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: came -3, wanted")
+    assert "did you mean epochs?" in refused("", "fit.epoch=3")
+    assert "wanted a table" in refused("", "fit=3")
+    assert "preset: came 'fast'" in refused("", preset="fast")
+
+
+def test_unreadable_files_are_refused(tmp_path):
+    def message(path):
+        with pytest.raises(ConfigError) as info:
+            cfg.load(path)
+        return str(info.value)
+
+    assert "no such configuration file" in message(tmp_path / "none.toml")
+    assert "a folder, wanted a TOML file" in message(tmp_path)
+    assert "cannot be read" in message("a\0b")
+    (tmp_path / "latin.toml").write_bytes(b"seed = 1\n# caf\xe9\n")
+    assert "latin.toml: not UTF-8 text at line 2" in message(tmp_path / "latin.toml")
+    (tmp_path / "large.toml").write_bytes(b"#" * (2 << 20))
+    assert "more than 1 MiB" in message(tmp_path / "large.toml")
+    assert "cannot be read" in message(tmp_path / "latin.toml" / "below")
+
+
+# ---- back to TOML ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", cfg.preset_names())
+def test_presets_come_back_equal(preset):
+    config = cfg.loads("", preset=preset)
+    assert cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="other.toml") == config
+
+
+words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
+numbers = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
+rates = st.floats(2.0**-100, 1e6)
+weights = rates | st.just(0.0) | st.tuples(rates, rates).map(list)
+
+
+def given_keys(**keys):
+    return st.fixed_dictionaries({}, optional=keys)
+
+
+tables = given_keys(
+    preset=st.sampled_from(cfg.preset_names()),
+    seed=st.integers(0, 2**32 - 1),
+    input=given_keys(
+        envmap=words.filter(bool),
+        rows=st.sampled_from(["upper", "all", [0, 3], [7, 31]]),
+        repair=st.booleans(),
+    ),
+    scene=given_keys(
+        file=words.filter(bool),
+        parameters=st.dictionaries(words, words | numbers | st.booleans() | st.integers(-9, 9), max_size=3),
+    ),
+    representation=given_keys(kind=st.sampled_from(KINDS), cycles=st.integers(1, 256) | st.just("auto")),
+    target=given_keys(file=words, mask=words, spp=st.integers(1, 4096))
+    | given_keys(rotate_degrees=st.floats(-360, 360, allow_subnormal=False, width=32)),
+    loss=given_keys(ssim=rates | st.tuples(rates, rates), luminance=weights, tv=weights),
+    optimizer=given_keys(lr=rates | st.just("auto"), iterations=st.integers(0, 10**7)),
+    renderer=given_keys(spp=st.integers(1, 512) | st.just("auto"), memory_gb=rates | st.just("auto")),
+    output=given_keys(dir=words, tonemap=st.sampled_from(list(TONEMAPS))),
+)
+
+
+@quick
+@given(tables)
+@example({"scene": {"parameters": {"most": 3.4028234663852886e38}}})
+@example({"input": {"envmap": "\x7f\"'\\\n\t\u2028é"}})
+@example({"scene": {"parameters": {"": 1e-5, "a b": -0.0, 'q"': 1e22}}})
+def test_any_configuration_comes_back_equal(table):
+    config = cfg.from_dict(table, base_dir="/maps", name="a.toml")
+    text = cfg.to_toml(config)
+    assert tomllib.loads(text)["seed"] == config.seed
+    assert cfg.loads(text, base_dir="/elsewhere", name="b.toml") == config
+
+
+# ---- junk --------------------------------------------------------------------------------------------------
+
+known = [f.name for f in dataclasses.fields(cfg.Config)]
+keys = st.sampled_from(known + [k for t in schema._TABLES.values() for k in t]) | st.text(max_size=5)
+anything = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=5)
+    | st.binary(max_size=3)
+    | st.dates()
+    | st.complex_numbers()
+    | st.sampled_from(["auto", "sunsky", "layers", "image", "strokes", "\ud800", "a\0b", 10**4000, math.inf]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys | st.integers(), inner, max_size=4),
+    max_leaves=8,
+)
+assignments = st.tuples(keys, st.sampled_from(["=", ".lr=", "."]), st.text(max_size=8)).map("".join)
+
+
+def only_config_errors(call):
+    """Junk is either understood, and then comes back equal, or refused with a message on one line."""
+    try:
+        config = call()
+    except ConfigError as error:
+        assert len(str(error).splitlines()) == 1 and len(str(error)) < 600
+    else:
+        assert cfg.loads(cfg.to_toml(config)) == config
+
+
+@quick
+@given(st.dictionaries(keys, st.dictionaries(keys, anything, max_size=3) | anything, max_size=4) | anything)
+def test_junk_tables_raise_nothing_but_config_errors(table):
+    only_config_errors(lambda: cfg.from_dict(table))
+
+
+@quick
+@given(st.sampled_from(list(schema._TABLES)), st.data())
+def test_junk_values_raise_nothing_but_config_errors(table, data):
+    key = data.draw(st.sampled_from(list(schema._TABLES[table])))
+    only_config_errors(lambda: cfg.from_dict({table: {key: data.draw(anything)}}))
+
+
+@quick
+@given(st.text(string.printable, max_size=60) | st.text(max_size=20))
+def test_junk_text_raises_nothing_but_config_errors(text):
+    only_config_errors(lambda: cfg.loads(text))
+
+
+@quick
+@given(st.lists(assignments, max_size=2))
+@example(["input.envmap=\udcff"])
+def test_junk_overrides_raise_nothing_but_config_errors(overrides):
+    only_config_errors(lambda: cfg.loads("", overrides=overrides))
+
+
+@quick
+@given(st.binary(max_size=40))
+def test_junk_files_raise_nothing_but_config_errors(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "junk.toml"
+    path.write_bytes(data)
+    only_config_errors(lambda: cfg.load(path))
+
+
+@pytest.mark.parametrize(
+    "text", ['vgg = "a.npz"', 'dists = "a.npz"', 'backbone = "a.npz"', 'heads = "a.npz"']
+)
+def test_perceptual_weights_come_in_pairs(text):
+    with pytest.raises(ConfigError, match="wanted both or none"):
+        cfg.loads(f"[perceptual]\n{text}")

@@ -1,0 +1,195 @@
+"""Targets: rendered under a known map, painted as a picture, or painted by strokes."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit import config
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import images
+from envedit.scene import scene
+from envedit.targets import painted_image, target
+from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
+
+SIZE = (12, 16)
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return scene.load(write_scene(tmp_path_factory.mktemp("scene"), SENSOR, BALL, LIGHT))
+
+
+def asking(seed=0, repair=False, **kwargs):
+    return config.Config(seed=seed, input=config.Input(repair=repair), target=config.Target(spp=4, **kwargs))
+
+
+def paint(path, picture):
+    """Write a picture (H, W, 3), also one that is not finite, as EXR."""
+    return exr(path, **{c: np.ascontiguousarray(picture[..., i], np.float32) for i, c in enumerate("RGB")})
+
+
+def png(path, values):
+    mi.Bitmap(np.ascontiguousarray(values)).write(str(path))
+    return path
+
+
+# ---- rendered under a known map --------------------------------------------------------------------------
+
+
+def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
+    envmap = sky(rng)
+    made = target.make(asking(5, rotate_degrees=40), ball, envmap)
+    np.testing.assert_array_equal(made.envmap, latlong.rotate(envmap, 40).astype(np.float32))
+    expected = ball.render(made.envmap, spp=4, seed=5 + target.SEED)
+    np.testing.assert_array_equal(made.picture, expected)
+    assert made.picture.shape == (12, 16, 3) and made.picture.dtype == made.envmap.dtype == np.float32
+    assert made.weight is None and made.warnings == () and "40 degrees" in made.source
+
+
+def test_a_turn_by_whole_texels_only_moves_columns(ball, rng):
+    envmap = sky(rng)
+    made = target.make(asking(rotate_degrees=360 * 3 / 16), ball, envmap)
+    assert min(np.abs(made.envmap - np.roll(envmap, shift, axis=1)).max() for shift in (3, -3)) < 1e-6
+    back = target.make(asking(rotate_degrees=-360 * 3 / 16), ball, made.envmap)
+    np.testing.assert_allclose(back.envmap, envmap, atol=1e-6)
+
+
+def test_target_shares_no_noise_with_other_renderings(ball, rng):
+    envmap = sky(rng)
+    made = target.make(asking(rotate_degrees=0), ball, envmap)
+    assert not np.array_equal(made.picture, ball.render(envmap, spp=4, seed=0))
+
+
+def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
+    other = sky(rng, 16, 32)
+    other[0, 0, 0] = -1
+    file = paint(tmp_path / "other.exr", other)
+    made = target.make(asking(1, file=str(file)), ball, sky(rng))
+    expected, info = images.load_envmap(file, 16)
+    np.testing.assert_array_equal(made.envmap, expected)
+    np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=1 + target.SEED))
+    assert str(file) in made.source
+    assert made.warnings == tuple(info["warnings"]) and "negative" in made.warnings[0]
+
+
+def test_a_map_that_is_not_finite_is_refused_or_repaired(ball, tmp_path, rng):
+    other = sky(rng)
+    other[3, 4] = np.nan
+    file = str(paint(tmp_path / "other.exr", other))
+    with pytest.raises(InputError, match=r"other\.exr.*row 3, column 4"):
+        target.make(asking(file=file), ball, sky(rng))
+    made = target.make(asking(file=file, repair=True), ball, sky(rng))
+    assert np.isfinite(made.picture).all() and np.isfinite(made.envmap).all()
+
+
+def test_a_missing_map_is_refused(ball, tmp_path, rng):
+    with pytest.raises(InputError, match=r"nowhere\.exr"):
+        target.make(asking(file=str(tmp_path / "nowhere.exr")), ball, sky(rng))
+
+
+def test_black_map_makes_a_black_target(ball):
+    made = target.make(asking(rotate_degrees=60), ball, np.zeros((8, 16, 3), np.float32))
+    assert not made.picture.any()
+
+
+def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
+    values = np.zeros((*SIZE, 3), np.uint8)
+    values[:6] = 255
+    settings = asking(rotate_degrees=30, mask=str(png(tmp_path / "m.png", values)))
+    made = target.make(settings, ball, sky(rng))
+    np.testing.assert_array_equal(made.weight[..., 0], values[..., 0] / 255)
+
+
+# ---- painted ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def seen(ball):
+    envmap = sky(np.random.default_rng(3))
+    return envmap, painted_image.initial(ball, envmap, asking())
+
+
+def a_stroke(**kwargs):
+    return {"type": "shadow", "rectangle": [0.25, 0.25, 0.75, 0.75], "amount": 0.5, **kwargs}
+
+
+def test_strokes_lie_on_the_initial_rendering(ball, seen):
+    envmap, initial = seen
+    made = target.make(asking(kind="strokes", strokes=(a_stroke(),)), ball, envmap)
+    np.testing.assert_array_equal(made.initial, initial)
+    np.testing.assert_allclose(made.picture[3:9, 4:12], 0.5 * initial[3:9, 4:12], rtol=1e-6)
+    np.testing.assert_array_equal(made.picture[:3], initial[:3])
+    assert made.envmap is None and made.asked == () and "1 strokes" in made.source
+
+
+def test_strokes_beside_the_picture_are_refused(ball, seen):
+    with pytest.raises(InputError, match=r"target\.strokes"):
+        beside = a_stroke(rectangle=[3, 3, 4, 4])
+        target.make(asking(kind="strokes", strokes=(beside,)), ball, seen[0])
+
+
+def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):
+    envmap, initial = seen
+    picture = initial.copy()
+    picture[2:5, 3:9] *= 2
+    file = paint(tmp_path / "painted.exr", picture)
+    from_file = target.make(asking(kind="image", file=str(file), rotate_degrees=0), ball, envmap)
+    from_array = target.make(asking(), ball, envmap, picture)
+    np.testing.assert_array_equal(from_array.picture, from_file.picture)
+    np.testing.assert_array_equal(from_array.weight, from_file.weight)
+    assert from_array.coverage.sum() == 3 * 6
+
+
+def test_mask_of_an_array_overrides_what_is_seen(ball, seen):
+    envmap, initial = seen
+    mask = np.zeros(SIZE)
+    mask[:2] = 0.5
+    made = target.make(asking(), ball, envmap, 2 * initial, mask)
+    np.testing.assert_array_equal(made.coverage[..., 0], mask)
+    np.testing.assert_array_equal(made.picture[2:], initial[2:])
+    np.testing.assert_allclose(made.picture[:2], 2 * initial[:2], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("picture", "mask", "says"),
+    [
+        (np.ones((3, 4, 3)), None, "shape"),
+        (np.full((*SIZE, 3), np.nan), None, "not finite"),
+        (np.ones((*SIZE, 3)), np.ones((4, 4)), "mask"),
+        (np.ones((*SIZE, 3)), np.full(SIZE, np.inf), "mask.*not finite"),
+        (np.ones((*SIZE, 3)), np.zeros(SIZE), "nothing"),
+    ],
+)
+def test_arrays_that_cannot_be_used(ball, seen, picture, mask, says):
+    with pytest.raises(InputError, match=says):
+        target.make(asking(), ball, seen[0], picture, mask)
+
+
+# ---- weights ---------------------------------------------------------------------------------------------
+
+
+def test_paint_and_rest_have_their_weights_whatever_their_size():
+    coverage = np.zeros((10, 10, 1))
+    coverage[0, :2] = 1
+    coverage[0, 2] = 0.5
+    weight = target.pixel_weight(coverage, np.zeros((10, 10), bool), paint=3, hold=1)
+    assert weight.mean() == pytest.approx(1, rel=1e-6)
+    painted_part = 3 * coverage / coverage.sum()
+    np.testing.assert_allclose(
+        weight / weight.sum(), (painted_part + (1 - coverage) / (1 - coverage).sum()) / 4, rtol=1e-5
+    )
+
+
+def test_what_tells_nothing_has_no_weight():
+    excluded = np.zeros((4, 5), bool)
+    excluded[1] = True
+    weight = target.pixel_weight(np.ones((4, 5, 1)), excluded, paint=1, hold=1)
+    assert not weight[1].any() and (weight[[0, 2, 3]] == weight[0, 0]).all()
+
+
+def test_a_target_without_weight_is_refused():
+    with pytest.raises(InputError, match="no pixel counts"):
+        target.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
+    with pytest.raises(ConfigError, match=r"target\.paint"):
+        asking(kind="strokes", strokes=(a_stroke(),), paint=0.0, hold=0.0)

@@ -1,0 +1,93 @@
+"""Checks of configuration values: what is refused, how it is told, and what is normalised."""
+
+import dataclasses
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from envedit import config as cfg
+from envedit.config import validators
+from envedit.core.errors import ConfigError
+from tests.oracles.builders import refused
+
+quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.mark.parametrize(
+    "key, values",
+    [
+        ("seed", ["-1", "4294967296", "1.0", "true", '"1"']),
+        ("variant", ['"scalar_rgb"', "1"]),
+        ("input.width", ["2", "3", "257", "256.0", "true", "32768", "[256]"]),
+        ("input.rows", ['"lower"', "[3]", "[5, 3]", "[-1, 3]", "[0, 1.5]", "{a = 1, b = 2}", "3"]),
+        ("input.envmap", ['""', "3", '"a\\u0000"', "1979-05-27"]),
+        ("input.elevation", ["-1", "91"]),
+        ("scene.height", ["-1"]),
+        ("scene.parameters", ["3", "{a = [1]}", "{a = nan}", "{a = {b = 1}}", "{a = 12:30:00}"]),
+        ("target.strokes", ["[1]", "{}", "3"]),
+        ("representation.hidden", ["0", "-128", "true"]),
+        ("representation.omega", ["0", "-30.0"]),
+        ("fit.epochs", ["-1", "1.5", "nan", '"many"']),
+        ("fit.lr", ["0", "-0.0", "-1e-4", "nan", "inf", "true", '"auto"', "1e-46", "1e39", "[1, 2]"]),
+        ("optimizer.lr", ["0", '"Auto"', "nan", "-1"]),
+        ("fit.awp_gamma", ["-0.1", "1.1"]),
+        ("fit.cache", ["1", '"yes"']),
+        ("loss.ssim", ["-1", "[1]", "[0, 1]", "[1, 0]", "[1, -1]", "[1, 2, 3]", '["a", 1]', "nan", "true"]),
+        ("renderer.spp", ["0", '"Auto"', "1.5", "true"]),
+        ("renderer.memory_gb", ["0", "-1", "nan"]),
+        ("renderer.cache", ["1", '"yes"']),
+        ("renderer.influence_threshold", ["-1e-3", "1.5", "nan", '"auto"']),
+        ("output.tonemap", ['"reinhard"', "1"]),
+        ("output.report", ["0"]),
+    ],
+)
+def test_values_out_of_type_or_range_are_refused_by_name(key, values):
+    for value in values:
+        message = refused(".".join(key.split(".")) + f" = {value}")
+        assert message.startswith(f"a.toml: {key}: came ") and ", wanted " in message
+        assert message.count("wanted") == 1
+
+
+def test_replacing_a_field_is_checked_as_well():
+    with pytest.raises(ConfigError, match=r"fit\.epochs: came -1, wanted an integer from 0"):
+        dataclasses.replace(cfg.Fit(), epochs=-1)
+    with pytest.raises(ConfigError, match=r"fit: came 3, wanted a table"):
+        cfg.Config(fit=3)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        cfg.Fit().epochs = 3
+
+
+def test_numbers_are_normalised():
+    config = cfg.from_dict({"fit": {"lr": np.float32(0.5), "epochs": np.int64(3)}, "loss": {"ssim": [1, 2]}})
+    assert type(config.fit.lr) is float and type(config.fit.epochs) is int
+    assert config.loss.ssim == (1.0, 2.0)
+    assert type(cfg.loads("[fit]\nlr = 1").fit.lr) is float
+
+
+words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
+numbers = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
+rates = st.floats(2.0**-100, 1e6)
+plain = st.recursive(
+    words | numbers | st.booleans() | st.integers(-(2**63), 2**63 - 1),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@quick
+@given(st.dictionaries(words, plain, max_size=3))
+def test_nested_values_are_written_and_come_back(table):
+    """TOML's own parser reads what is written."""
+    found = validators.plain(table)
+    assert tomllib.loads(f"a = {cfg.quote(found)}")["a"] == found == table
+
+
+def test_too_deep_a_value_is_refused():
+    deep = []
+    for _ in range(20):
+        deep = [deep]
+    with pytest.raises(validators.WantedError, match="not too deep"):
+        validators.plain(deep)

@@ -19,6 +19,7 @@ from envedit.losses import metrics
 from envedit.losses.perceptual import backbones, distances
 from envedit.representations.siren import fit
 from envedit.results import Found, Result
+from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
 from envedit.solve import initialization
 from envedit.solve.edit_job import Interrupted, Job, Stopped, Watch, keeping
@@ -28,8 +29,9 @@ __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
-INITIAL_SPP = 144
-"""Samples a pixel of the initial rendering, which is far from the target."""
+INITIAL_SPP = 256
+"""Samples a pixel of the initial rendering, which is far from the target: a power of four, so that the same
+seed gives the same bits."""
 
 
 @dataclass
@@ -119,7 +121,7 @@ def run(
         few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
         initial = wanted.initial
         if initial is None:
-            initial = lit.render(original, spp=few, seed=settings.seed + JUDGE_SEED)
+            initial, _, _ = rendered(lit, original, few, settings.seed + JUDGE_SEED, settings.renderer.cache)
     crop = original[first : last + 1]
     with clock("fit_s"):
         kind = settings.representation.kind

@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 
-KINDS = {"transport": "light transports of scenes", "fits": "SIRENs fitted to maps"}
+KINDS = {
+    "transport": "light transports of scenes",
+    "renderings": "renderings of initial and target maps",
+    "fits": "SIRENs fitted to maps",
+}
 
 
 def main(argv: list[str] | None = None) -> int:

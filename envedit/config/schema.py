@@ -264,7 +264,7 @@ class Renderer(Table):
     memory_gb: float | str = _key(
         2.0, or_auto(number(0, positive=True)), 'most memory the transport may take, GB, or "auto"'
     )
-    cache: bool = _key(True, boolean, "keep transports on disk and reuse them")
+    cache: bool = _key(True, boolean, "keep transports and renderings on disk and reuse them")
     influence_threshold: float = _key(
         1e-3,
         number(0, 1),

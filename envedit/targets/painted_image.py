@@ -16,6 +16,7 @@ from envedit import config
 from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError, place_of
 from envedit.images import images
+from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets.paint_detection import differs
 
@@ -55,7 +56,7 @@ class Painted:
 
 def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
     """Render the picture to paint on, (h, w, 3): the scene under the map as it is, at [target] spp."""
-    picture, _, _ = lit.sampled(envmap, settings.target.spp, settings.seed + SEED)
+    picture, _, _ = rendered(lit, envmap, settings.target.spp, settings.seed + SEED, settings.renderer.cache)
     return picture
 
 

@@ -16,6 +16,7 @@ from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.images import images
+from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import painted_image, strokes
 
@@ -164,7 +165,7 @@ def _rendered(settings, scene, envmap):
         true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
         source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
-    picture, spp, noise = scene.sampled(true, chosen.spp, settings.seed + SEED)
+    picture, spp, noise = rendered(scene, true, chosen.spp, settings.seed + SEED, settings.renderer.cache)
     weight = painted_image.read_mask(chosen.mask, picture.shape[:2]) if chosen.mask else None
     asked = (true,) if weight is None else (true, weight)
     source += f", {spp} samples a pixel"

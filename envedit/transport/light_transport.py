@@ -51,7 +51,7 @@ COLUMN_TOLERANCE = 0.03
 """Relative error of the coarse tier above which columns are added."""
 COLUMN_PATHS = (8, 48, 320)
 """Paths a pixel of a column, by its texel's share of the picture's light (:data:`COLUMN_SHARES`)."""
-FEW_PATHS, FEW_TOLERANCE = (8, 48, 48), 0.08
+FEW_PATHS, FEW_TOLERANCE = (8, 16, 48), 0.08
 """Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
 COLUMN_SHARES = (0.0, 0.01, 0.1)
 """Shares of the picture's light from which on a column has so many paths."""

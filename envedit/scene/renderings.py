@@ -1,0 +1,49 @@
+"""Renderings that are the same in every run of a scene and a map, kept on disk like the light transport."""
+
+from __future__ import annotations
+
+import hashlib
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core.array_cache import DiskCache, cache_folder
+from envedit.scene.scene import Scene
+
+MOST_BYTES = 500_000_000
+"""Size above which renderings that were not used for longest are dropped."""
+_RECIPE = 1  # raise when the same inputs give another rendering
+
+
+def rendered(scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: bool = True):
+    """Render as :meth:`.Scene.sampled`, or take what an earlier call rendered from disk.
+
+    The judged rendering of a result is not taken from here: it is made with fresh samples every time.
+
+    Parameters
+    ----------
+    scene, envmap, spp, seed
+        As of :meth:`.Scene.sampled`.
+    keep : bool
+        Keep renderings on disk and take them from there.
+
+    Returns
+    -------
+    picture, spp, noise
+        As of :meth:`.Scene.sampled`.
+    """
+    cache = DiskCache(cache_folder("renderings") if keep else None, MOST_BYTES)
+    image = np.ascontiguousarray(envmap, np.float32)
+    key = {
+        "version": [_RECIPE, mi.__version__, mi.variant()],
+        "scene": [scene.digest, scene.width, scene.height, np.asarray(scene.to_world).tolist()],
+        "map": [image.shape, hashlib.sha256(image.tobytes()).hexdigest()],
+        "samples": [spp, seed],
+    }
+    if (found := cache.load(key)) is not None:
+        noise = np.array(found["noise"]) if found["noise"].size else None
+        return np.array(found["picture"]), int(found["spp"]), noise
+    picture, taken, noise = scene.sampled(envmap, spp, seed)
+    stored = np.zeros(0) if noise is None else noise
+    cache.store(key, {"picture": picture, "spp": np.array(taken, np.int64), "noise": stored})
+    return picture, taken, noise

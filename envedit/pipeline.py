@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit import config, inputs, renderers, representations
 from envedit.core.errors import unwrapped
-from envedit.losses import metrics
+from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.representations.siren import fit
 from envedit.results import Found, Result
@@ -241,17 +241,8 @@ def run(
         scene=lit.path,
         reach=within,
         found=Found(representation, params, first, free),
-        deviation=_whole(job.deviation, original, rows),
+        posterior=job.posterior,
     )
-
-
-def _whole(deviation, original, rows):
-    """Put the active rows' standard deviation into a picture of the whole map; 0 where nothing changes."""
-    if deviation is None:
-        return None
-    whole = np.zeros(original.shape[:2], np.float32)
-    whole[rows] = deviation
-    return whole
 
 
 def _as_seen(traced, original, wanted):
@@ -285,6 +276,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips):
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.start, rows.stop - 1],
+        "natural": naturalness.natural(maps["edited"], maps["initial"], maps["target"]),
         "painted": None,
     }
     if coverage is not None:

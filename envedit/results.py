@@ -13,6 +13,7 @@ from envedit.images import images
 from envedit.representations import Representation
 from envedit.representations.layers.separation import Separation
 from envedit.solve.feasibility import Reach
+from envedit.solve.gauss_newton import Posterior
 
 
 @dataclass
@@ -42,8 +43,8 @@ class Result:
         The scene's file.
     reach : feasibility.Reach, optional
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
-    deviation : ndarray (H, W), optional
-        Standard deviation of the sky's log luminance gain, given the target; None where it is not known.
+    posterior : gauss_newton.Posterior, optional
+        How well the target determines the sky; None where that is not known.
     found : Found, optional
         What the map was decoded from, for :func:`at_full_resolution`.
     """
@@ -61,7 +62,7 @@ class Result:
     scene: Path | None = None
     reach: Reach | None = None
     found: Found | None = None
-    deviation: np.ndarray | None = None
+    posterior: Posterior | None = None
 
     @property
     def render(self) -> np.ndarray:

@@ -285,12 +285,18 @@ def _write(settings, folder, result, import_s, quiet, said):
 
 
 def _verdict(measured):
-    line = f"rendering {measured['initial']['psnr']:.1f} -> {measured['render']['psnr']:.1f} dB"
-    if measured["envmap"]:
-        line += f", map {measured['initial_envmap']['psnr']:.1f} -> {measured['envmap']['psnr']:.1f} dB"
     painted = measured["painted"]
     if painted and painted["towards"] is not None:
-        line += f", {100 * painted['towards']:.0f} % of the way to the paint"
+        line = f"{100 * painted['towards']:.0f} % of the way to the paint"
+        if painted["reachable"] is not None:
+            line += f" ({100 * painted['reachable']:.0f} % are feasible)"
+        line += (
+            f", changed elsewhere by {painted['elsewhere']:.3f}" if painted["elsewhere"] is not None else ""
+        )
+    else:
+        line = f"rendering {measured['initial']['psnr']:.1f} -> {measured['render']['psnr']:.1f} dB"
+        if measured["envmap"]:
+            line += f", map {measured['initial_envmap']['psnr']:.1f} -> {measured['envmap']['psnr']:.1f} dB"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 

@@ -23,6 +23,7 @@ from envedit.report.preview import (
     display,
     fit_finite,
     influence_image,
+    share_image,
 )
 
 _STYLE = """
@@ -128,6 +129,15 @@ def _difference_figure(a, b, caption, kind, tonemap):
     return _figure(pixels, caption, f'<div class="scale"></div>{ends}')
 
 
+def _identified_figure(identified):
+    """List the figure of how well the rendering determines the sky, if that is known."""
+    if identified is None:
+        return []
+    ends = '<div class="ends"><span>not at all</span><span>fully</span></div>'
+    caption = "how well the rendering determines the brightness of the sky, smoothed over some 15 degrees"
+    return [_figure(share_image(identified), caption, f'<div class="scale rising"></div>{ends}')]
+
+
 def _influence_figure(influence, frozen):
     low, high = INFLUENCE_RANGE
     ends = f'<div class="ends"><span>{low:g}</span><span>{high:g}</span></div>'
@@ -209,6 +219,7 @@ def write_report(
     maps,
     influence=None,
     frozen=None,
+    identified=None,
     separation=None,
     unreachable=None,
     warnings=(),
@@ -233,6 +244,8 @@ def write_report(
         As for `preview`. Differences are drawn between the names ``initial``, ``target`` and ``edited``.
     influence, frozen : array (H, W), optional
         As for `envedit.report.preview.influence_image`.
+    identified : array (H, W), optional
+        Share of the prior's variance of the sky's gain that the target removes.
     separation : separation.Separation, optional
         Lights and background of the rows that were edited.
     unreachable : array (h, w, 3), optional
@@ -305,6 +318,9 @@ def write_report(
     asked = [] if unreachable is None else [_unreachable_figure(unreachable, painted.get("reachable"))]
 
     # The page
+    seen = []
+    if influence is not None:
+        seen = [_influence_figure(influence, frozen), *_identified_figure(identified)]
     curves = curves_svg(history) or f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
     page = [
@@ -317,9 +333,7 @@ def write_report(
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>' if names else "",
         f"<h2>Differences</h2>{_grid(differences)}" if differences else "",
         f"<h2>Lights and background</h2>{_grid(parts)}" if parts else "",
-        f"<h2>What this view determines</h2>{_grid([_influence_figure(influence, frozen)])}"
-        if influence is not None
-        else "",
+        f"<h2>What this view determines</h2>{_grid(seen)}" if seen else "",
         f"<h2>What was painted</h2>{_grid(asked)}" if asked else "",
         f"<h2>Losses</h2>{curves}",
         "<h2>Quality</h2>",

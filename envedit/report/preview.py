@@ -263,6 +263,11 @@ def influence_image(influence, frozen=None):
     return pixels
 
 
+def share_image(share):
+    """Draw shares from 0 to 1, (H, W), in the colours of :func:`influence_image`: (H, W, 3) uint8."""
+    return _rising(np.asarray(share, np.float64))
+
+
 def influence(path, values, frozen=None) -> None:
     """Draw ``influence.png``: :func:`influence_image` at 512 pixels or more, over its scale.
 

@@ -68,6 +68,7 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
             maps=result.maps,
             influence=result.influence,
             frozen=result.frozen,
+            identified=None if result.posterior is None else result.posterior.identified,
             separation=result.separation,
             unreachable=None if result.reach is None else feasibility.unreachable(result.reach),
             warnings=result.warnings,
@@ -97,8 +98,8 @@ def _maps(settings, folder, result):
         images.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
         preview.influence(folder / "influence.png", result.influence, result.frozen)
         layers["influence"] = result.influence
-    if result.deviation is not None:
-        layers["deviation"] = result.deviation
+    if result.posterior is not None:
+        layers["deviation"] = result.posterior.deviation
     layered_exr.write(folder / "edited_layers.exr", layers)
     if result.reach is not None:
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))

@@ -78,8 +78,8 @@ class Job:
         Told of progress.
     dists : distances.Dists, optional
         As for :class:`.adam_loop.Objective`.
-    deviation : ndarray (rows, W), optional
-        Standard deviation of the sky's log gain, where :meth:`optimise` knows it.
+    posterior : gauss_newton.Posterior, optional
+        How well the target determines the sky, where :meth:`optimise` knows it.
     """
 
     settings: config.Config
@@ -93,7 +93,7 @@ class Job:
     folder: Path | None
     watch: Watch
     dists: object = None
-    deviation: np.ndarray | None = None
+    posterior: gauss_newton.Posterior | None = None
 
     @property
     def newton(self) -> bool:
@@ -226,7 +226,7 @@ class Job:
 
             most = min(chosen.iterations, gauss_newton.ITERATIONS)
             found = gauss_newton.solve(self._problem(), params, self._sigma, most, after_step, run)
-        self.deviation = found.deviation
+        self.posterior = found.posterior
         return found.params, adam_loop.State(step=len(found.history), history=found.history)
 
     def _look_at_the_last(self, adam, state):

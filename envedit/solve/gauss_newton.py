@@ -120,6 +120,26 @@ class Run:
         return cls(*parts, damping, scale, list(history))
 
 
+@dataclass(frozen=True)
+class Posterior:
+    """How well a picture determines the sky.
+
+    Attributes
+    ----------
+    deviation, prior : ndarray (H, W)
+        Standard deviation of the log luminance gain with and without the picture; 0 outside the active rows.
+    """
+
+    deviation: np.ndarray
+    prior: np.ndarray
+
+    @property
+    def identified(self) -> np.ndarray:
+        """Share of the prior's variance that the picture removes, (H, W): 0 nothing is known, 1 all is."""
+        share = np.square(self.deviation / np.maximum(self.prior, 1e-12))
+        return np.where(self.prior > 0, np.clip(1 - share, 0, 1), 0).astype(np.float32)
+
+
 @dataclass
 class Solution:
     """What :func:`solve` found.
@@ -132,14 +152,14 @@ class Solution:
         A row a step: ``loss`` F, its parts ``data`` and ``prior``, ``sigma``, ``damping``, ``step_ms``.
     loss : float
         F.
-    deviation : ndarray (rows, W)
-        Standard deviation of the sky's log luminance gain, given the picture.
+    posterior : Posterior
+        How well the picture determines the sky.
     """
 
     params: dict
     history: list[dict]
     loss: float
-    deviation: np.ndarray
+    posterior: Posterior
 
 
 class Problem:
@@ -303,15 +323,19 @@ class Problem:
             found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
         return found
 
-    def deviation(self, normal: Normal) -> np.ndarray:
-        """Return the standard deviation of the log luminance gain of the active rows, (rows, W)."""
+    def posterior(self, normal: Normal) -> Posterior:
+        """Return what the normal equations at the solution say of the log luminance gain."""
         n = self.nodes
         lower = np.linalg.cholesky(normal.hessian)
         mean = np.zeros((len(lower), n))
         for c in range(3):
             mean[c * n + np.arange(n), np.arange(n)] = 1 / 3
         half = np.linalg.solve(lower, mean)
-        return self.blocks.spread(half.T @ half)
+        prior = np.diag(1 / (3 * self._precisions[0]))
+        spread = [self.blocks.spread(covariance) for covariance in (half.T @ half, prior)]
+        whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
+        whole[:, self.rows] = spread
+        return Posterior(*whole)
 
     def _slopes(self, point):
         """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
@@ -510,7 +534,7 @@ def solve(
             break
     normal = normal or problem.normal(point, run.start, sigma)
     loss = problem.misfit(point.residual, sigma) + problem.penalty(run.state, run.start)
-    return Solution(problem.params(run.state), run.history, loss, problem.deviation(normal))
+    return Solution(problem.params(run.state), run.history, loss, problem.posterior(normal))
 
 
 def _solved(lower, values):

@@ -55,6 +55,7 @@ class _Clock:
         return {
             "import_s": None,
             **{f"{part}_s": round(self.seconds.get(f"{part}_s", 0.0), 3) for part in parts},
+            "solve_s": round(self.seconds.get("start_s", 0.0) + self.seconds.get("edit_s", 0.0), 3),
             "report_s": None,
             "total_s": round(total, 3),
             "per_iteration_ms": float(np.median(steps)) if steps else None,

@@ -1,10 +1,10 @@
 r"""Edit scenes that nobody here made, under every sky: turned maps and other maps as targets.
 
-    ENVEDIT_DATA=... python -m experiments.solver.public [--out runs/public] [--scenes matpreview principled] \
-        [--maps NAME ...] [--set table.key=value ...]
+    ENVEDIT_DATA=... python -m experiments.solver.public [--out runs/public] \
+        [--scenes matpreview principled] [--maps NAME ...] [--set table.key=value ...]
 
-Every run is ``python -m envedit.run`` with its own folder; one that is done (it has metrics.json) is skipped. Writes
-table.md and a contact sheet for each scene: original, true map, edited map, target, edited rendering.
+Every run is ``python -m envedit.run`` with its own folder; one that is done (it has metrics.json) is skipped.
+Writes table.md and a contact sheet for each scene: original, true map, edited map, target, edited rendering.
 """
 
 import argparse
@@ -39,7 +39,8 @@ def jobs(out: Path, scenes, names):
             for label, target in targets.items():
                 asked = f"rotate_degrees = {target}" if isinstance(target, int) else f'file = "{target}"'
                 text = (
-                    f'[input]\nenvmap = "{files[name]}"\nwidth = 256\n[scene]\nfile = "{root / SCENES[scene]}"\n'
+                    f'[input]\nenvmap = "{files[name]}"\nwidth = 256\n'
+                    f'[scene]\nfile = "{root / SCENES[scene]}"\n'
                     f"width = 128\n[target]\n{asked}\n"
                 )
                 yield scene, name, label, out / f"{scene}-{name}-{label}", text, files[name], target
@@ -57,8 +58,8 @@ def line(scene, name, label, found) -> str:
     return (
         f"| {scene} | {name} | {label} | {found['render']['psnr']:.1f} ({found['initial']['psnr']:.1f}) | "
         f"{found['envmap']['psnr']:.1f} ({found['initial_envmap']['psnr']:.1f}) | "
-        f"{100 * natural['colours_outside']:.1f} % | {natural['seam']:.1f} | {natural['high_frequency']:.2f} | "
-        f"{found['timing']['solve_s']:.1f} |"
+        f"{100 * natural['colours_outside']:.1f} % | {natural['seam']:.1f} | "
+        f"{natural['high_frequency']:.2f} | {found['timing']['solve_s']:.1f} |"
     )
 
 
@@ -74,10 +75,11 @@ def summary(rows) -> list[str]:
             outside = [100 * f["natural"]["colours_outside"] for f in some]
             render, solve = [f["render"]["psnr"] for f in some], [f["timing"]["solve_s"] for f in some]
             lines.append(
-                f"- {what}, {len(some)} runs: rendering {np.mean(render):.1f} dB (worst {min(render):.1f}), map "
-                f"{np.mean(gain):+.1f} dB over the unedited one (worst {min(gain):+.1f}, below 0 in "
-                f"{sum(g < 0 for g in gain)}), colours outside {np.mean(outside):.1f} % (most {max(outside):.1f} %, "
-                f"over 5 % in {sum(o > 5 for o in outside)}), solve median {np.median(solve):.1f} s"
+                f"- {what}, {len(some)} runs: rendering {np.mean(render):.1f} dB (worst {min(render):.1f}), "
+                f"map {np.mean(gain):+.1f} dB over the unedited one (worst {min(gain):+.1f}, below 0 in "
+                f"{sum(g < 0 for g in gain)}), colours outside {np.mean(outside):.1f} % "
+                f"(most {max(outside):.1f} %, over 5 % in {sum(o > 5 for o in outside)}), "
+                f"solve median {np.median(solve):.1f} s"
             )
     return lines
 

@@ -70,9 +70,8 @@ def main():
             points.append((seconds, loss, true))
         curves[name] = np.array(points)
         seconds, loss, true = points[-1]
-        print(
-            f"{name}: {len(points) - 1} steps, {seconds:.2f} s, F {points[0][1]:.4g} -> {loss:.4g}, map {true:.2f} dB"
-        )
+        course = f"F {points[0][1]:.4g} -> {loss:.4g}, map {true:.2f} dB"
+        print(f"{name}: {len(points) - 1} steps, {seconds:.2f} s, {course}")
     draw(given.out, curves)
 
 

@@ -250,6 +250,7 @@ def test_a_last_step_that_leads_to_no_map_is_taken_back(tmp_path, rng, recorded)
     assert np.array_equal(found.envmap[4:], whole.envmap[4:])
 
 
+@pytest.mark.slow
 def test_a_map_that_is_never_finite_leaves_the_original(tmp_path, rng, monkeypatch):
     original, decode = sunny(rng), representations.Pixels.decode
     monkeypatch.setattr(
@@ -344,6 +345,7 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
     assert names(out) == {"edited.exr", "checkpoint.npz"}
 
 
+@pytest.mark.slow
 def test_a_metric_that_is_not_finite_is_null_and_told(tmp_path, rng, monkeypatch, capsys):
     compare = pipeline.metrics.compare
     monkeypatch.setattr(pipeline.metrics, "compare", lambda *a: compare(*a) | {"ssim": math.nan})
@@ -353,6 +355,7 @@ def test_a_metric_that_is_not_finite_is_null_and_told(tmp_path, rng, monkeypatch
     assert "metrics.json: render.ssim was not finite and is null" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_full_map_that_is_not_finite_does_not_cost_the_result(tmp_path, rng, monkeypatch, capsys):
     def fails(*arguments):
         raise NumericalError("the carried map is not finite at row 3, column 4")

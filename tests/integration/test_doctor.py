@@ -37,6 +37,7 @@ def test_a_library_that_is_not_there(monkeypatch):
     assert "libllvm19" in found.lines[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "version, says", [(14, "LLVM 14 .* is too old"), (15, r"LLVM 15\.\S+ \(.*\) stops the process")]
 )

@@ -239,6 +239,7 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
     assert pixels(out / "edited.exr")[:4].mean() < 0.9 * pixels(tmp_path / "map.exr")[:4].mean()
 
 
+@pytest.mark.slow
 def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share_no_noise(tmp_path, rng):
     path = world(
         tmp_path, rng, representation={"kind": "pixels"}, optimizer={"iterations": 0}, output={"spp": 256}
@@ -289,7 +290,7 @@ def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
 
 
 @pytest.mark.parametrize("value", slow_but([0.0, 1e-30], 0.0))
-@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
+@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "layers"))
 def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
     path = world(tmp_path, rng, representation={"kind": kind})
     images.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
@@ -406,6 +407,7 @@ def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
     assert (out / "earlier-note").read_text() == "mine" and content(out / "earlier-3") == kept[2]
 
 
+@pytest.mark.slow
 def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
@@ -425,6 +427,7 @@ def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path,
     assert "metrics.json" not in names(out) and call(out / "config.toml", "--quiet") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="links")
 def test_an_input_is_known_by_any_name(tmp_path, rng, capsys):
     path, out = world(tmp_path, rng), tmp_path / "c_out"
@@ -459,6 +462,7 @@ def test_a_finished_run_has_nothing_to_resume(done, capsys):
     assert content(folder) == before
 
 
+@pytest.mark.slow
 def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, capsys):
     path, out = world(tmp_path, rng), tmp_path / "c_out"
     assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
@@ -473,6 +477,7 @@ def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, c
     assert content(out) == before
 
 
+@pytest.mark.slow
 def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(tmp_path, rng):
     path = world(tmp_path, rng)
     written = path.read_bytes()
@@ -538,6 +543,7 @@ def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, 
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_results_are_written_names_the_checkpoint(tmp_path, rng, capsys, monkeypatch):
     path = world(tmp_path, rng, representation={"kind": "pixels"})
     with monkeypatch.context() as patch:

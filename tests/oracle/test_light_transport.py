@@ -412,6 +412,7 @@ def test_capacity_is_never_exceeded(lamp_scene):
     assert np.isfinite(picture(none, sun(4, 0))).all() and np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes(lamp_scene):
     def run(seed):
         t = build(lamp_scene, spp=32, seed=seed)

@@ -15,7 +15,6 @@ from envedit.representations.layers import lights
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights, rotation_vector
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 from tests.oracles.plain import single
-from tests.oracles.tiers import slow_but
 
 H, W = 25, 48
 UP = np.array([0.0, 1.0, 0.0])
@@ -430,9 +429,10 @@ def over(light, name):
 PATHS = ["texel borders", "seam", "over the pole", "past the pole", "over the nadir", "half a turn"]
 
 
-@pytest.mark.parametrize("name", slow_but(PATHS, "seam"))
-@pytest.mark.parametrize("top", slow_but([3, 11], 11))
-@pytest.mark.parametrize("by", slow_but(["radiance", "flux"], "radiance"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize("top", [3, 11])
+@pytest.mark.parametrize("by", ["radiance", "flux"])
 def test_gradient_along_a_path_adds_up_to_the_change(name, top, by, rng):
     """Many copies of a light, one at every step of the path: a linear loss is the sum of theirs."""
     light, count = patch(rng, top, 46), 3000

@@ -171,6 +171,7 @@ LAYOUTS = [("vgg", "max", (21, 18)), ("vgg", "hanning", (9, 14)), ("alex", "max"
 LAYOUTS += [("squeeze", "max", (30, 25)), ("squeeze", "max", (17, 18))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, pooling, size", LAYOUTS)
 def test_features_match_plain_numpy(backbones, kind, pooling, size, rng):
     x = rng.normal(size=(*size, 3))
@@ -299,6 +300,7 @@ def test_dists_matches_plain_numpy(dists, size):
     assert dists(single(x), single(y))[0] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_lpips_matches_plain_numpy(lpips, kind):
     x, y, _ = drawn.images(*SMALL[kind])
@@ -327,6 +329,7 @@ def test_dists_with_the_published_weights(backbones, data):
     assert Dists(backbones["vgg"], file)(single(x), single(y))[0] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dists", "alex", "squeeze"])
 def test_gradient_against_differences_and_both_modes(dists, lpips, name):
     x, y, directions = drawn.images(31, 33)

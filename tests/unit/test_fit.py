@@ -455,6 +455,7 @@ def test_every_texel_belongs_to_one_grid_with_its_point(height, width, stride, c
     assert sorted(seen) == list(range(height * width))
 
 
+@pytest.mark.slow
 def test_grids_take_turns_at_random(rng, monkeypatch):
     image, used, plain = sky(rng, 23, 31), [], fit.Objective.gradient
 
@@ -547,6 +548,7 @@ def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     assert fit.fit(image, NETWORK, QUICK, folder=tmp_path).cached
 
 
+@pytest.mark.slow
 def test_other_settings_are_another_fit(tmp_path, rng):
     image = sky(rng)
     quick = dataclasses.replace(QUICK, epochs=1)

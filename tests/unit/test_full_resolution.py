@@ -106,6 +106,7 @@ def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
     assert carried(made, params, working, source)[0].tobytes() == source.tobytes()
 
 
+@pytest.mark.slow
 def test_bands_do_not_show(sunny, rng, monkeypatch):
     source, working, made, params = sunny
     params = sent(made, params, toward(50, 90))
@@ -209,6 +210,7 @@ def test_a_moved_sun_keeps_its_flux_and_stays_sharp(sunny, where):
         assert source[left].max() > 1e3 * np.median(source[left])
 
 
+@pytest.mark.slow
 def test_no_outline_is_left_of_a_smooth_light():
     """An aureole that the region of the light cuts off: no edge where it was nor where it has gone."""
     height, width = 512, 1024

@@ -161,6 +161,7 @@ def test_same_image_has_the_same_parameters_and_bits():
 # ---- other resolutions -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(128, 256), (256, 512), (32, 64), (77, 131), (65, 129)])
 def test_other_resolutions_keep_flux_and_irradiance(shape, sunny):
     made, params = sunny
@@ -213,6 +214,7 @@ def test_rows_of_a_map(first, last, sunny):
         assert np.isfinite(gone).all() and gone.max() < 0.01 * image.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finer", [2, 0.5, 4])
 def test_rows_at_another_resolution(finer):
     first, last = 8, 48

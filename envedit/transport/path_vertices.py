@@ -19,7 +19,7 @@ from envedit.transport.recording import LANES, bsdf_weight, connect
 from envedit.transport.sparse_matrix import SLICE
 from envedit.transport.texel_sampling import Grid
 
-VERTEX_BYTES, ESCAPE_BYTES = 216, 36
+VERTEX_BYTES, ESCAPE_BYTES = 216, 48
 """Memory of a kept vertex and of a path that leaves the scene."""
 _SHADING = mi.BSDFFlags.Smooth
 
@@ -98,7 +98,8 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
 
 def _vertices(event, count, first):
     """Take the vertices that a light can reach; None if there are none."""
-    lit = event.active & mi.has_flag(event.si.bsdf().flags(), _SHADING) & (dr.max(event.throughput) > 0)
+    # A filter with negative lobes makes negative throughputs; NaN is kept: what uses it counts what it loses.
+    lit = event.active & mi.has_flag(event.si.bsdf().flags(), _SHADING) & dr.any(event.throughput != 0)
     keep = np.flatnonzero(lit.numpy()).astype(np.uint32)
     if not len(keep):
         return None

@@ -11,6 +11,7 @@ from envedit.transport import exact_columns, path_vertices
 from envedit.transport.exact_columns import ExactColumns
 from envedit.transport.texel_sampling import Grid
 from tests.oracles import column_tracer
+from tests.oracles.kernels import compiled
 from tests.oracles.scenes import HEIGHT, METAL, WIDTH, ball, load, stage
 from tests.oracles.tiers import slow_but
 
@@ -103,7 +104,8 @@ def test_without_memory_for_paths_the_bits_are_the_same(air):
     kept, fresh = columns_of(air), columns_of(air, paths_bytes=0)
     first = traced(kept)
     assert traced(fresh).tobytes() == first.tobytes()
-    assert kept._kept and not fresh._kept and kept.bytes > fresh.bytes == 4 * len(fresh._store)
+    assert kept._kept and not fresh._kept and kept.kept_bytes > fresh.kept_bytes == 0
+    assert kept.bytes == fresh.bytes == 4 * len(fresh._store)
     assert traced(kept).tobytes() == traced(fresh).tobytes() == first.tobytes()
 
 
@@ -167,26 +169,26 @@ def test_memory_of_kept_paths_is_what_is_stated(name):
         size_of([b.si, b.throughput, b.bounce, b.path, b.pixel, b.taps, b.light, b.at]) for b in blocks
     )
     assert real <= sum(b.bytes for b in blocks) <= 1.25 * real
-    assert columns.bytes == 4 * len(columns._store) + sum(b.bytes for b in blocks)
+    assert columns.kept_bytes == sum(b.bytes for b in blocks)
 
 
 def test_kept_paths_stay_within_their_memory(air, monkeypatch):
     monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)
     needed = columns_of(air)
     first = traced(needed).tobytes()
-    need = needed.bytes - 4 * len(needed._store)
+    need = needed.kept_bytes
     for room, keeps in ((need, True), (need - 1, False), (need // 2, False)):
         columns = columns_of(air, paths_bytes=room)
         assert traced(columns).tobytes() == first
         assert ((COUNT, SEED) in columns._kept) is keeps
-        assert columns.bytes - 4 * len(columns._store) <= room
+        assert columns.kept_bytes <= room
     # Paths of another number share the memory; those of another seed make room.
     columns = columns_of(air, paths_bytes=int(1.5 * need))
     for count, seed, kept in ((COUNT, SEED, [COUNT]), (2, SEED, [COUNT, 2]), (COUNT, 9, [COUNT])):
         traced(columns, count=count, seed=seed)
         assert [c for c, s in columns._kept if s == seed] == kept
         assert all(s == seed for _, s in columns._kept)
-        assert columns.bytes - 4 * len(columns._store) <= int(1.5 * need)
+        assert columns.kept_bytes <= int(1.5 * need)
 
 
 def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
@@ -195,6 +197,17 @@ def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
     columns.trace(TEXELS, COUNT, SEED, blocks=1)
     assert not columns._kept
     assert traced(columns).tobytes() == traced(columns_of(air)).tobytes()
+
+
+@pytest.mark.parametrize("name", slow_but(["in the air", "pair"], "in the air"))
+def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
+    monkeypatch.setattr(path_vertices, "LANES", 200 * COUNT)  # two blocks of 200 pixels and one of 176
+    columns = columns_of(load(name))
+    columns.trace(TEXELS[1:2], COUNT, SEED, blocks=1)
+    for texels, seed in ((TEXELS[1:2], SEED), (TEXELS, SEED + 1), (TEXELS[3:5], SEED + 1)):
+        launched, fresh = compiled(lambda t=texels, s=seed: columns.trace(t, COUNT, s))
+        assert launched > 10 and fresh == 0
+    assert len(columns._kept[COUNT, SEED + 1]) == 3
 
 
 # ---- what is not finite ------------------------------------------------------------------------------------

@@ -130,18 +130,11 @@ class Job:
             return starts[0]
         reached, trials = [], NEWTON_TRIAL if self.newton else TRIAL_STEPS
         for params, _ in starts:
-            if self.newton:
-                reached.append(gauss_newton.solve(self._problem(), params, self._sigma, trials).loss)
-                continue
-            few = replace(self.settings.optimizer, iterations=TRIAL_STEPS)
-            wanted = self.wanted.aim, self.wanted.weight
-            objective = adam_loop.Objective(self.settings.loss, *wanted, crop, TRIAL_STEPS, self.dists)
             try:
-                _, state = self._loop(params, objective, few)
-                loss = state.history[-1]["loss"]
-                reached.append(loss if np.isfinite(loss) else np.inf)
+                loss = self._tried(params, crop, trials)
             except NumericalError:  # a start that goes nowhere is no reason to stop
-                reached.append(np.inf)
+                loss = np.inf
+            reached.append(loss if np.isfinite(loss) else np.inf)
         least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
         losses = ", ".join(f"{loss:.3g}" for loss in reached)
         chosen = [
@@ -149,6 +142,15 @@ class Job:
             f"start {least + 1} of {len(starts)}: losses after {trials} steps {losses}",
         ]
         return starts[least][0], chosen
+
+    def _tried(self, params, crop, steps):
+        """Return the loss after a few steps from a start."""
+        if self.newton:
+            return gauss_newton.solve(self._problem(), params, self._sigma, steps).loss
+        few = replace(self.settings.optimizer, iterations=steps)
+        wanted = self.wanted.aim, self.wanted.weight
+        objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists)
+        return self._loop(params, objective, few)[1].history[-1]["loss"]
 
     def optimise(self, params, crop, resume):
         """Optimise from the start, or from the checkpoint; returns parameters and state."""
@@ -207,15 +209,17 @@ class Job:
             self.renderer.restore(traced)
             self.wanted = self.wanted.aimed_at(picture)
             run = gauss_newton.Run.of_arrays(arrays, state.history)
-        saved = time.perf_counter()
+        saved, most = time.perf_counter(), min(chosen.iterations, gauss_newton.ITERATIONS)
 
         with ctrl_c() as interrupt:
 
             def after_step(run, point):
                 nonlocal saved
-                done, last = len(run.history), run.history[-1]["loss"]
-                self.watch.progress(done, chosen.iterations, f"loss {last:.4g}")
+                done = len(run.history)
+                if done:
+                    self.watch.progress(done, most, f"loss {run.history[-1]['loss']:.4g}")
                 due = time.perf_counter() - saved >= chosen.checkpoint_s
+                due |= run.finished or done == most  # what follows may be interrupted too
                 if self.folder and (due or interrupt.is_set()):
                     state = adam_loop.State(step=done, history=run.history)
                     asked = self.folder, what, state, run.arrays(), self.renderer.state(), self.wanted.aim
@@ -224,7 +228,6 @@ class Job:
                 if interrupt.is_set():
                     raise Interrupted(point.edited, done)
 
-            most = min(chosen.iterations, gauss_newton.ITERATIONS)
             found = gauss_newton.solve(self._problem(), params, self._sigma, most, after_step, run)
         self.posterior = found.posterior
         return found.params, adam_loop.State(step=len(found.history), history=found.history)

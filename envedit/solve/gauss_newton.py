@@ -94,6 +94,8 @@ class Run:
         ``size`` (lights, 1), logarithms and radians.
     damping, scale : float
         Of the next step; the threshold s.
+    finished : bool
+        No further step is made.
     history : list of dict
         A row a step: ``loss`` F, its parts ``data`` and ``prior``, ``sigma``, ``damping``, ``step_ms``.
     """
@@ -102,12 +104,13 @@ class Run:
     start: dict
     damping: float = 1e-3
     scale: float = np.inf
+    finished: bool = False
     history: list[dict] = field(default_factory=list)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
-        return both | {"numbers": np.array([self.damping, self.scale])}
+        return both | {"numbers": np.array([self.damping, self.scale, self.finished])}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -116,8 +119,8 @@ class Run:
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
         ]
-        damping, scale = arrays["numbers"].tolist()
-        return cls(*parts, damping, scale, list(history))
+        damping, scale, finished = arrays["numbers"].tolist()
+        return cls(*parts, damping, scale, bool(finished), list(history))
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ class Problem:
     weight : ndarray (h, w, 1), optional
         How much each pixel counts, 1 on average.
     free : ndarray of bool (rows, W), optional
-        Active texels that may change; None: all.
+        Active texels whose gain is free, as :meth:`.Layers.keep` was told; None: all.
     prior : Prior
         How far a sky changes.
     """
@@ -224,18 +227,19 @@ class Problem:
 
     # ---- F -------------------------------------------------------------------------------------------------
 
-    def evaluate(self, state: dict) -> Point:
-        """Compose and render the map of a state."""
+    def evaluate(self, state: dict, resolve: bool = True) -> Point:
+        """Compose and render the map of a state; ``resolve``: trace columns for texels that became bright."""
         crop = self.layers.decode(self.params(state)).numpy()
-        if self.free is not None:
-            crop = np.where(self.free[..., None], crop, self.envmap[self.rows])
         edited = self.envmap.copy()
         edited[self.rows] = crop
         if not np.isfinite(crop).all():
             return Point(state, edited, None, None)
-        self.transport.resolve(edited, limit=32)
+        if resolve:
+            self.transport.resolve(edited, limit=32)
         rendering = self.transport.apply(tensor(edited))
         shown = display_curve.to_display(rendering).numpy()
+        if not np.isfinite(shown).all():
+            return Point(state, edited, None, None)
         return Point(state, edited, rendering.numpy(), np.float64(shown) - self.target)
 
     def penalty(self, state: dict, start: dict) -> float:
@@ -345,9 +349,10 @@ class Problem:
             self.layers.rows,
         )
         sky = np.maximum(point.edited[self.rows] - core.numpy(), 0).reshape(-1, 3)
-        base = self.layers.base.reshape(-1, 3)
-        gain = np.exp(self.layers.log_gain(self.params(point.state)).reshape(-1, 3))
-        grey = base * (1 - VEIL) + (base @ np.float32(LUMINANCE))[:, None] * VEIL
+        # In double precision: products of three radiances leave the range of the other.
+        sky, base = np.float64(sky), np.float64(self.layers.base.reshape(-1, 3))
+        gain = np.exp(np.float64(self.layers.log_gain(self.params(point.state)).reshape(-1, 3)))
+        grey = base * (1 - VEIL) + (base @ LUMINANCE)[:, None] * VEIL
         more = base + (gain - 1) * grey
         slopes = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
         if self.free is not None:
@@ -491,7 +496,7 @@ def solve(
     iterations : int
         Most steps.
     after_step : callable, optional
-        Called after every step; what it raises ends the solution.
+        Called after every step, and when no further one lowers F; what it raises ends the solution.
     run : Run, optional
         To continue an earlier solution, in place of ``params``.
 
@@ -501,12 +506,12 @@ def solve(
         If the start is not finite.
     """
     start = problem.state(params)
-    run = run or Run(start, start)
-    point = problem.evaluate(run.state)
+    # A continued run has the columns with which its last point was rendered.
+    run, fresh = run or Run(start, start), run is None
+    point = problem.evaluate(run.state, resolve=fresh)
     if point.residual is None:
         raise NumericalError("the edit cannot begin: the map that the search found is not finite")
-    normal = None
-    while len(run.history) < iterations:
+    while len(run.history) < iterations and not run.finished:
         began = time.perf_counter()
         spread = 1.4826 * float(np.median(np.abs(point.residual)))
         run.scale = max(sigma, min(spread, run.scale / 2))
@@ -523,16 +528,15 @@ def solve(
                     break
             run.damping = max(10 * run.damping, 1e-2)
         little = better is None or before - data - penalty < LITTLE * before
+        run.finished = little and run.scale <= 1.01 * sigma
         if better is not None:
             point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
             row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}
             ms = round(1000 * (time.perf_counter() - began), 3)
             run.history.append({"iteration": len(run.history), **row, "damping": run.damping, "step_ms": ms})
-            if after_step:
-                after_step(run, point)
-        if little and run.scale <= 1.01 * sigma:
-            break
-    normal = normal or problem.normal(point, run.start, sigma)
+        if after_step and (better is not None or run.finished):
+            after_step(run, point)
+    normal = problem.normal(point, run.start, sigma)
     loss = problem.misfit(point.residual, sigma) + problem.penalty(run.state, run.start)
     return Solution(problem.params(run.state), run.history, loss, problem.posterior(normal))
 

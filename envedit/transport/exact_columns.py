@@ -68,8 +68,13 @@ class ExactColumns:
 
     @property
     def bytes(self) -> int:
-        """Bytes of the store and of the paths that are kept."""
-        return 4 * len(self._store) + sum(b.bytes for kept in self._kept.values() for b in kept)
+        """Bytes of the store."""
+        return 4 * len(self._store)
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the paths that are kept: what was traced before decides, unlike :attr:`bytes`."""
+        return sum(b.bytes for kept in self._kept.values() for b in kept)
 
     @property
     def lost(self) -> int:
@@ -118,7 +123,7 @@ class ExactColumns:
             yield from self._kept[count, seed]
             return
         self._kept = {key: kept for key, kept in self._kept.items() if key[1] == seed}
-        made, room = [], self.paths_bytes - sum(b.bytes for kept in self._kept.values() for b in kept)
+        made, room = [], self.paths_bytes - self.kept_bytes
         traced = path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, seed + 7919)
         for block in traced:
             made.append(block)

@@ -258,7 +258,7 @@ class LightTransport:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes held by both tiers."""
+        """Bytes held by both tiers, without the camera paths that are kept for further columns."""
         return self.forward.bytes + self.reverse.bytes + self._exact.bytes
 
     def summary(self) -> dict:

@@ -19,7 +19,7 @@ from envedit.transport.recording import LANES, bsdf_weight, connect
 from envedit.transport.sparse_matrix import SLICE
 from envedit.transport.texel_sampling import Grid
 
-VERTEX_BYTES, ESCAPE_BYTES = 216, 36
+VERTEX_BYTES, ESCAPE_BYTES = 216, 48
 """Memory of a kept vertex and of a path that leaves the scene."""
 _SHADING = mi.BSDFFlags.Smooth
 
@@ -98,7 +98,8 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
 
 def _vertices(event, count, first):
     """Take the vertices that a light can reach; None if there are none."""
-    lit = event.active & mi.has_flag(event.si.bsdf().flags(), _SHADING) & (dr.max(event.throughput) > 0)
+    # A filter with negative lobes makes negative throughputs; NaN is kept: what uses it counts what it loses.
+    lit = event.active & mi.has_flag(event.si.bsdf().flags(), _SHADING) & dr.any(event.throughput != 0)
     keep = np.flatnonzero(lit.numpy()).astype(np.uint32)
     if not len(keep):
         return None
@@ -117,10 +118,11 @@ def _sort(block, parts):
     if not parts:
         return
     bounce, path, pixel = (np.concatenate([part[2][i] for part in parts]) for i in range(3))
+    sizes = [len(part[2][0]) for part in parts]
     order = np.argsort(pixel, kind="stable").astype(np.uint32)  # by bounce and path they are sorted already
     index = on_device(mi.UInt32, order)
-    block.si = dr.gather(mi.SurfaceInteraction3f, _concatenated([part[0] for part in parts]), index)
-    block.throughput = dr.gather(mi.Color3f, _concatenated([part[1] for part in parts]), index)
+    block.si = dr.gather(mi.SurfaceInteraction3f, _concatenated([part[0] for part in parts], sizes), index)
+    block.throughput = dr.gather(mi.Color3f, _concatenated([part[1] for part in parts], sizes), index)
     dr.eval(block.si, block.throughput)
     block.vertices = len(order)
     block.bounce, block.path, block.pixel = (on_device(mi.UInt32, v[order]) for v in (bounce, path, pixel))
@@ -150,33 +152,61 @@ def _escapes(event, grid, count):
 def _join(block, parts):
     if not parts:
         return
+    sizes = [len(part[2]) for part in parts]
     block.taps = [
-        (_concatenated([part[0][i][0] for part in parts]), _concatenated([part[0][i][1] for part in parts]))
-        for i in range(4)
+        tuple(_concatenated([part[0][i][k] for part in parts], sizes) for k in (0, 1)) for i in range(4)
     ]
-    block.light = _concatenated([part[1] for part in parts])
+    block.light = _concatenated([part[1] for part in parts], sizes)
     at = np.concatenate([part[2] for part in parts]).astype(np.uint32)
     block.at, block.escapes = on_device(mi.UInt32, at), len(at)
 
 
-def _concatenated(parts):
-    """Concatenate arrays, or structures of them member by member."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    kind = type(first)
+def _concatenated(parts, sizes):
+    """Concatenate arrays of so many elements, or structures of them member by member.
+
+    Not by ``dr.concat``, whose kernels have the sizes in them; and a single part too, for its literals would
+    make other kernels later.
+    """
+    starts = np.cumsum([0, *sizes[:-1]])
+    places = [
+        dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, int(start))
+        for size, start in zip(sizes, starts, strict=True)
+    ]
+    leaves = [list(_leaves(part)) for part in parts]
+    joined = [dr.empty(type(leaf), sum(sizes)) for leaf in leaves[0]]
+    for place, one in zip(places, leaves, strict=True):
+        for target, leaf in zip(joined, one, strict=True):
+            dr.scatter(target, leaf, place)
+    dr.eval(joined)
+    return _of_leaves(parts[0], iter(joined))
+
+
+def _leaves(value):
+    """Yield the flat arrays that a structure consists of; pointers as the numbers that they are."""
+    kind = type(value)
     if members := getattr(kind, "DRJIT_STRUCT", None):
-        joined = kind()
         for name in members:
-            setattr(joined, name, _concatenated([getattr(part, name) for part in parts]))
-        return joined
+            yield from _leaves(getattr(value, name))
+    elif dr.depth_v(kind) > 1:
+        for member in value:
+            yield from _leaves(member)
+    else:
+        yield dr.reinterpret_array(mi.UInt32, value) if kind.__name__.endswith("Ptr") else value
+
+
+def _of_leaves(like, leaves):
+    """Put flat arrays together to a structure like another."""
+    kind = type(like)
+    if members := getattr(kind, "DRJIT_STRUCT", None):
+        made = kind()
+        for name in members:
+            setattr(made, name, _of_leaves(getattr(like, name), leaves))
+        return made
     if dr.depth_v(kind) > 1:
-        members = [_concatenated([part[i] for part in parts]) for i in range(len(first))]
-        return kind(*members) if members else first
-    if kind.__name__.endswith("Ptr"):  # pointers are concatenated as the numbers that they are
-        numbers = dr.concat([dr.reinterpret_array(mi.UInt32, part) for part in parts])
-        return dr.reinterpret_array(kind, numbers)
-    return dr.concat(parts)
+        members = [_of_leaves(member, leaves) for member in like]
+        return kind(*members) if members else like
+    leaf = next(leaves)
+    return dr.reinterpret_array(kind, leaf) if kind.__name__.endswith("Ptr") else leaf
 
 
 def on_device(kind, values: np.ndarray):

@@ -60,6 +60,39 @@ def test_matrix_without_entries_gives_zero(rows):
     assert matrix.entries == 0
 
 
+@pytest.mark.parametrize("shape", [(1, 5), (7, 3), (8, 8), (64, 1), (37, 101)])
+@pytest.mark.parametrize("vectors", [1, 3])
+def test_transposed_is_the_dense_transpose_of_some_rows(rng, shape, vectors):
+    entry = entries(rng, shape, 4 * shape[0])
+    matrix, full = ColourMatrix(*entry, shape), dense(*entry, shape)
+    for some in (np.arange(shape[0]), rng.permutation(shape[0])[: 1 + shape[0] // 3]):
+        values = rng.standard_normal((vectors, len(some), 3)).astype(np.float32)
+        got = matrix.transposed(some, values)
+        expected = np.einsum("ijc,kic->kjc", full[some], values.astype(np.float64))
+        magnitude = np.einsum(
+            "ijc,kic->kjc", np.abs(dense(*entry[:2], np.abs(entry[2]), shape))[some], np.abs(values)
+        )
+        assert got.shape == (vectors, shape[1], 3) and got.dtype == np.float32
+        # Products and the result are rounded, sums are in float64; entries may share a place.
+        assert (np.abs(got - expected) <= 4 * 2.0**-24 * magnitude).all()
+    restored = ColourMatrix.from_arrays(matrix.arrays())
+    assert restored.transposed(some, values).tobytes() == got.tobytes()
+
+
+def test_transposed_without_rows_entries_or_vectors_is_zero(rng):
+    matrix = ColourMatrix(*entries(rng, (9, 4), 20), (9, 4))
+    assert not matrix.transposed(np.zeros(0, np.int64), np.zeros((2, 0, 3))).any()
+    assert matrix.transposed(np.arange(3), np.zeros((0, 3, 3))).shape == (0, 4, 3)
+    nothing = np.zeros(0, np.uint32)
+    empty = ColourMatrix(nothing, nothing, np.zeros((0, 3), np.float32), (9, 4))
+    assert not empty.transposed(np.arange(9), np.ones((2, 9, 3))).any()
+    alone = ColourMatrix(
+        np.array([5], np.uint32), np.array([2], np.uint32), np.ones((1, 3), np.float32), (9, 4)
+    )
+    np.testing.assert_array_equal(alone.transposed(np.array([4, 5]), np.full((1, 2, 3), 7.0))[0, 2], 7)
+    assert not alone.transposed(np.array([4, 6]), np.full((1, 2, 3), 7.0)).any()
+
+
 @pytest.mark.parametrize("shape, count", [((37, 101), 200), ((9, 4), 0), ((1, 5), 3)])
 def test_a_matrix_of_its_own_arrays_gives_the_same_bits(shape, count, rng):
     first = ColourMatrix(*entries(rng, shape, count), shape)

@@ -1,0 +1,638 @@
+"""Gauss-Newton on layers: derivatives, the prior, a problem of known solution, extremes.
+
+The transport is a dense matrix, the map 48 texels wide and the picture 12 pixels: a cell of the block
+transport is then a texel and a block a pixel, and the Jacobian is exact.
+"""
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong
+from envedit.core.errors import NumericalError
+from envedit.losses import display_curve
+from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import DARK, rotation_vector
+from envedit.solve import gauss_newton
+from envedit.solve.gauss_newton import ANGLE, Problem, Run, solve
+from tests.oracles.dense_transport import DenseTransport
+from tests.oracles.matrix_renderer import same, without_times
+from tests.oracles.plain import plain_display
+
+GRID, FILM = (24, 48), (10, 12)
+SUN = (7, 20)
+PRIOR = gauss_newton.Prior()
+
+
+def lamp(place=SUN, radiance=200.0):
+    """A disc of 8 degrees on black."""
+    d = latlong.directions(*GRID)
+    angle = np.degrees(np.arccos(np.clip(d @ d[place], -1, 1)))[..., None]
+    return np.where(angle < 8, radiance * np.array([1, 0.8, 0.6]), 0).astype(np.float32)
+
+
+def clouds(rng):
+    return (0.3 + 0.3 * rng.random((*GRID, 3))).astype(np.float32)
+
+
+def shown(transport, image):
+    return transport.apply(mi.TensorXf(np.asarray(image, np.float32))).numpy()
+
+
+def problem_of(image, transport, target, cycles=3, free=None, **options):
+    """Return a problem and the parameters to start from."""
+    layers = Layers(cycles=cycles)
+    params = layers.encode(image)
+    layers.keep(free)
+    return Problem(layers, transport, image, target, free=free, **options), params
+
+
+def copy(state):
+    return {name: value.copy() for name, value in state.items()}
+
+
+def moved(problem, state, unknowns, k, h):
+    """Return a state with one unknown changed: channel by channel the nodes, then what ``unknowns`` names."""
+    state, n = copy(state), problem.nodes
+    if k < 3 * n:
+        state["gain"][k % n, k // n] += h
+        return state
+    name, i, axis = unknowns[k - 3 * n]
+    if name == "turn":
+        there = gauss_newton._rotated(problem.direction(state, i), h * axis)
+        state["turn"][i] = rotation_vector(problem.layers.lights.centres[i], there)
+    else:
+        state[name][i, axis] += h
+    return state
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A sky with a lamp, part of it frozen, and a state where every unknown has moved."""
+    rng = np.random.default_rng(0)
+    image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
+    target = shown(transport, image) * np.exp(rng.normal(0, 0.5, (*FILM, 3))).astype(np.float32)
+    weight = 0.5 + rng.random((*FILM, 1))
+    free = latlong.directions(*GRID)[..., 1] > -0.7
+    problem, params = problem_of(image, transport, target, weight=weight, free=free)
+    assert len(problem.layers.separation.lights) == 1 and not problem.layers.lights.glowing
+    start = problem.state(params)
+    state, centre = copy(start), problem.layers.lights.centres[0]
+    state["gain"] = rng.normal(0, 0.3, state["gain"].shape)
+    state["flux"][0] += [0.1, -0.2, 0.3]
+    state["size"][0] = 0.05
+    # Off the texels' centres, where the derivative jumps.
+    state["turn"][0] = rotation_vector(centre, gauss_newton._rotated(centre, np.array([0.03, 0.05, -0.04])))
+    return problem, params, start, state
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------
+
+STEPS = {"gain": 0.01, "flux": 0.01, "turn": ANGLE, "size": 0.002}
+# Display values are good to 1e-7, differences of F over a step to 1e-4 of its slope. A light's direction is
+# differentiated over 0.7 degrees, a twentieth of a texel, and its size forwards, over 10 %.
+CLOSE = {"gain": 2e-3, "flux": 2e-3, "turn": 0.05, "size": 0.2}
+
+
+def names_of(problem, normal):
+    return ["gain"] * (3 * problem.nodes) + [name for name, _, _ in normal.unknowns]
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.1, 1.0])  # most residuals in the linear part, some, none
+def test_gradient_is_that_of_finite_differences(case, sigma):
+    problem, _, start, state = case
+    point = problem.evaluate(state)
+    size = np.sqrt((point.residual**2).mean(axis=2))
+    assert (size > sigma).mean() == pytest.approx({0.02: 0.97, 0.1: 0.87, 1.0: 0}[sigma], abs=0.05)
+    normal = problem.normal(point, start, sigma)
+    names = names_of(problem, normal)
+    assert sorted(set(names)) == ["flux", "gain", "size", "turn"]
+
+    def f(x):
+        return problem.misfit(problem.evaluate(x).residual, sigma) + problem.penalty(x, start)
+
+    for kind, h in STEPS.items():
+        some = [k for k, name in enumerate(names) if name == kind][:: 4 if kind == "gain" else 1]
+        slope = [
+            f(moved(problem, state, normal.unknowns, k, h)) - f(moved(problem, state, normal.unknowns, k, -h))
+            for k in some
+        ]
+        slope = np.array(slope) / (4 * h)  # of F / 2
+        np.testing.assert_allclose(
+            normal.gradient[some], slope, rtol=0, atol=CLOSE[kind] * np.abs(slope).max(), err_msg=kind
+        )
+        assert np.abs(slope).max() > 0
+
+
+def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
+    problem, _, start, state = case
+    sigma, n = 0.1, problem.nodes
+    point = problem.evaluate(state)
+    normal = problem.normal(point, start, sigma)
+    names = names_of(problem, normal)
+    columns, radiance = [], np.float64(point.rendering)
+    slope = (plain_display(radiance * (1 + 1e-6)) - plain_display(radiance * (1 - 1e-6))) / (2e-6 * radiance)
+    for k, name in enumerate(names):
+        if name == "size":  # likewise forwards
+            ends, width = (moved(problem, state, normal.unknowns, k, 0.1), state), 0.1
+        else:
+            h = STEPS[name]
+            ends, width = [moved(problem, state, normal.unknowns, k, s * h) for s in (1, -1)], 2 * h
+        ends = [np.float64(problem.evaluate(end).rendering) for end in ends]
+        columns.append((slope * (ends[0] - ends[1]) / width).ravel())
+    jacobian = np.stack(columns, axis=1)
+    size = np.sqrt((point.residual**2).mean(axis=2, keepdims=True))
+    # A picture of fewer than 256 pixels: A = 1.
+    huber = np.where(size <= sigma, 1, sigma / size) * problem.weight / sigma**2
+    huber = np.broadcast_to(huber, point.residual.shape).ravel()
+    expected = jacobian.T @ (huber[:, None] * jacobian) + plain_precision(problem, names)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (np.abs(normal.hessian - expected) / scale).max() < 2e-3
+    np.testing.assert_allclose(normal.hessian, normal.hessian.T, rtol=1e-5, atol=1e-5 * normal.hessian.max())
+    # Negative control: data and prior both matter.
+    assert np.abs(np.diag(expected) / np.diag(plain_precision(problem, names)) - 1).max() > 1
+    assert (np.diag(plain_precision(problem, names))[: 3 * n] > 0.1 * np.diag(expected)[: 3 * n]).any()
+
+
+def plain_precision(problem, names, prior=PRIOR):
+    """Return K, written node by node."""
+    n = problem.nodes
+    matrix, node = np.zeros((len(names), len(names))), 0
+    axes = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+    for level, (rows, columns) in enumerate(problem.sizes):
+        sd = np.array([np.sqrt(3) * prior.luminance, prior.chroma, prior.tint]) / 2**level
+        block = axes.T @ np.diag(sd**-2) @ axes
+        for _ in range(rows * columns):
+            at = node + n * np.arange(3)
+            matrix[np.ix_(at, at)] = block
+            node += 1
+    for k, name in enumerate(names[3 * n :], 3 * n):
+        matrix[k, k] = getattr(prior, name) ** -2.0
+    return matrix
+
+
+def test_frozen_texels_have_no_slope_and_lights_may_cross_them(case):
+    problem, params, start, state = case
+    frozen = ~problem.free
+    assert frozen.any() and not problem._slopes(problem.evaluate(state)).reshape(*GRID, 3)[frozen].any()
+    edited = problem.evaluate(state).edited
+    np.testing.assert_array_equal(edited[frozen], problem.envmap[frozen])
+    away = copy(start)
+    down = latlong.directions(*GRID)[22, 10]
+    away["turn"][0] = rotation_vector(problem.layers.lights.centres[0], down)
+    edited = problem.evaluate(away).edited
+    assert frozen[22, 10] and edited[22, 10].max() > 10  # the map that a run ends with
+    np.testing.assert_array_equal(edited, problem.layers.decode(problem.params(away)).numpy())
+
+
+def test_state_and_params_are_inverse(case):
+    problem, _, _, state = case
+    again = problem.state(problem.params(state))
+    for name in state:
+        np.testing.assert_allclose(again[name], state[name], rtol=1e-6, atol=1e-7)
+    assert problem.lit(state) == [0]  # spare ones are dark
+
+
+# ---- F -----------------------------------------------------------------------------------------------------
+
+
+def huber(size, sigma):
+    return size**2 if size <= sigma else sigma * (2 * size - sigma)
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.3])
+def test_misfit_is_hubers_loss_of_a_pixel(case, sigma, rng):
+    problem, *_ = case
+    residual = rng.normal(0, 0.2, (*FILM, 3))
+    size = np.sqrt((residual**2).mean(axis=2))
+    total = sum(w * huber(s, sigma) for w, s in zip(problem.weight.ravel(), size.ravel(), strict=True))
+    assert problem.misfit(residual, sigma) == pytest.approx(3 * total / sigma**2, rel=1e-6)
+    assert problem.misfit(0 * residual, sigma) == 0
+
+
+def test_misfit_is_continuous_with_its_slope_at_the_threshold(case):
+    problem, *_ = case
+    sigma, h = 0.1, 1e-4
+    before, at, after = (problem.misfit(np.full((*FILM, 3), sigma + d), sigma) for d in (-h, 0, h))
+    assert at == pytest.approx(3 * problem.weight.sum(), rel=1e-6)
+    slopes = (at - before) / h, (after - at) / h
+    assert slopes[0] == pytest.approx(slopes[1], rel=2 * h / sigma)
+    far = [problem.misfit(np.full((*FILM, 3), k), sigma) for k in (1.0, 2.0, 3.0)]
+    assert far[2] - far[1] == pytest.approx(far[1] - far[0], rel=1e-9)  # linear
+
+
+def test_large_pictures_have_no_more_independent_pixels(rng):
+    image, transport = clouds(rng), DenseTransport.random(rng, (24, 32), GRID)
+    problem, params = problem_of(image, transport, 2 * shown(transport, image))
+    residual = problem.evaluate(problem.state(params)).residual
+    size = np.sqrt((residual**2).mean(axis=2))
+    sums = 3 * sum(huber(s, 0.1) for s in size.ravel()) / 0.1**2
+    assert problem.misfit(residual, 0.1) == pytest.approx(sums * 256 / (24 * 32), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "colour, expected",
+    [
+        ([1, 1, 1], 1 / PRIOR.luminance**2),
+        ([1, 0, -1], 2 / PRIOR.chroma**2),
+        ([1, -2, 1], 6 / PRIOR.tint**2),
+        ([3, 0, 0], 9 / 9 / PRIOR.luminance**2 + 9 / 2 / PRIOR.chroma**2 + 9 / 6 / PRIOR.tint**2),
+    ],
+)
+def test_penalty_of_a_node(case, colour, expected):
+    """A gain of e everywhere in a coarsest node is one standard deviation; a grid finer it is two."""
+    problem, _, start, _ = case
+    first = 0
+    for level, (rows, columns) in enumerate(problem.sizes):
+        state = copy(start)
+        state["gain"][first] = colour
+        assert problem.penalty(state, start) == pytest.approx(expected * 4**level, rel=1e-9)
+        first += rows * columns
+
+
+def test_penalty_of_a_light(case):
+    problem, _, start, _ = case
+    assert problem.penalty(start, start) == 0
+    centre = problem.layers.lights.centres[0]
+    changes = {
+        "flux": (np.array([0.3, 0.0, -0.6]), (0.3**2 + 0.6**2) / PRIOR.flux**2),
+        "size": (np.array([0.2]), (0.2 / PRIOR.size) ** 2),
+        "turn": (
+            rotation_vector(
+                centre,
+                gauss_newton._rotated(
+                    centre, 0.1 * np.cross(centre, [0, 1, 0]) / np.linalg.norm(np.cross(centre, [0, 1, 0]))
+                ),
+            ),
+            (0.1 / PRIOR.turn) ** 2,
+        ),
+    }
+    for name, (value, expected) in changes.items():
+        state = copy(start)
+        state[name][0] = value
+        assert problem.penalty(state, start) == pytest.approx(expected, rel=1e-6), name
+        state[name][0] = start[name][0]
+        state[name][1] = value + (DARK if name == "flux" else 0)  # of a light that is not there
+        assert problem.penalty(state, start) == 0
+
+
+# ---- a problem of known solution ---------------------------------------------------------------------------
+
+
+def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
+    """A grey sky so dark that display values are linear, and asked to change by a thousandth."""
+    monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # damped steps come close only one after the other
+    level, sigma = 4e-4, 1e-3
+    slope = 1e-3 ** (1 / 2.2) / 1e-3
+    transport = DenseTransport.random(rng, FILM, GRID)
+    image = np.full((*GRID, 3), level, np.float32)
+    target = np.float32(shown(transport, image) * (1 + 1e-3 * rng.normal(0, 1, (*FILM, 3))))
+    problem, params = problem_of(image, transport, target)
+    residual = slope * (np.float64(target) - shown(transport, image))
+    assert target.max() < 1e-3 and np.sqrt((residual**2).mean(axis=2)).max() < sigma
+
+    # exp(g) = 1 + g: a node's share of every texel, times what a pixel sees of it.
+    hats = []
+    for g in range(len(problem.sizes)):
+        rows, columns = problem.sizes[g]
+        share = np.zeros((GRID[0] * GRID[1], rows * columns))
+        for node, weight in problem.layers.gain.hats(g, GRID):
+            np.add.at(share, (np.arange(len(node)), node), weight)
+        hats.append(share)
+    jacobian = slope * level * np.float64(transport.weights[0]) @ np.concatenate(hats, axis=1)
+    jacobian = np.kron(np.eye(3), jacobian)
+    precision = plain_precision(problem, ["gain"] * (3 * problem.nodes))
+    by_channel = residual.reshape(-1, 3).T.ravel()
+    hessian = jacobian.T @ jacobian / sigma**2 + precision
+    expected = np.linalg.solve(hessian, jacobian.T @ by_channel / sigma**2)
+
+    solution = solve(problem, params, sigma, iterations=60)
+    got = problem.state(solution.params)["gain"].T.ravel()
+    # exp is linear to a hundredth, and the map rounded to 1e-4 of its change: flat directions of F show it.
+    least = ((jacobian @ expected - by_channel) ** 2).sum() / sigma**2 + expected @ precision @ expected
+    assert (got - expected) @ hessian @ (got - expected) < 1e-4 * least
+    assert np.linalg.norm(got - expected) < 0.02 * np.linalg.norm(expected)
+    assert solution.loss == pytest.approx(least, rel=2e-3)
+    without = np.linalg.lstsq(jacobian, by_channel, rcond=None)[0]
+    assert np.linalg.norm(without - expected) > 0.1 * np.linalg.norm(expected)  # the prior has its say
+    assert np.linalg.norm(expected) > 1e-3
+
+    # What is left unknown: the diagonal of hats (J'J / s^2 + K)^-1 hats', of the mean over channels.
+    mean = np.kron(np.full((1, 3), 1 / 3), np.concatenate(hats, axis=1))
+    variance = np.einsum("tn,nm,tm->t", mean, np.linalg.inv(hessian), mean, optimize=True)
+    np.testing.assert_allclose(solution.deviation.ravel(), np.sqrt(variance), rtol=1e-2)
+
+
+# ---- standard deviation ------------------------------------------------------------------------------------
+
+
+def prior_deviation(problem, prior=PRIOR):
+    variance = 0
+    for level in range(len(problem.sizes)):
+        share = np.zeros((GRID[0] * GRID[1], np.prod(problem.sizes[level])))
+        for node, weight in problem.layers.gain.hats(level, GRID):
+            np.add.at(share, (np.arange(len(node)), node), weight)
+        variance = variance + (share**2).sum(axis=1) * (prior.luminance / 2**level) ** 2
+    return np.sqrt(variance).reshape(GRID)
+
+
+def test_deviation_is_the_priors_where_nothing_is_seen(rng):
+    image, target = clouds(rng), np.full((*FILM, 3), 0.5, np.float32)
+    blind = DenseTransport(np.zeros((FILM[0] * FILM[1], GRID[0] * GRID[1])), FILM, GRID)
+    for prior in (PRIOR, dataclasses.replace(PRIOR, luminance=0.3)):
+        problem, params = problem_of(image, blind, target, prior=prior)
+        solution = solve(problem, params)
+        np.testing.assert_allclose(solution.deviation, prior_deviation(problem, prior), rtol=1e-4)
+        assert solution.deviation.dtype == np.float32
+        assert not problem.state(solution.params)["gain"].any()
+
+
+def test_deviation_shrinks_with_what_is_known(rng):
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    half = transport.weights[0].copy()
+    half[:, GRID[0] * GRID[1] // 2 :] = 0  # of the upper half alone
+    target, found = shown(transport, image), {}
+    for name, weights in {
+        "half": half,
+        "all": transport.weights[0],
+        "twice": 2 * transport.weights[0],
+    }.items():
+        seen = DenseTransport(weights, FILM, GRID)
+        for sigma in (0.2, 0.02, gauss_newton.SIGMA):
+            problem, params = problem_of(image, seen, shown(seen, image))
+            start = problem.state(params)
+            normal = problem.normal(problem.evaluate(start), start, sigma)
+            found[name, sigma] = problem.deviation(normal)
+            assert (found[name, sigma] <= prior_deviation(problem) * (1 + 1e-4)).all(), (name, sigma)
+    for name in ("half", "all", "twice"):
+        for more, less in ((gauss_newton.SIGMA, 0.02), (0.02, 0.2)):
+            assert (found[name, more] <= found[name, less] * (1 + 1e-4)).all()
+            assert found[name, more].mean() < 0.95 * found[name, less].mean()
+    assert found["all", 0.02].mean() < found["half", 0.02].mean()
+    upper, lower = found["half", 0.02][:9].mean(), found["half", 0.02][-9:].mean()
+    assert upper < 0.7 * lower
+    assert target.any()
+
+
+def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
+    image, transport = clouds(rng), DenseTransport.random(rng, (24, 24), GRID, even=0.8)
+    problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
+    start = problem.state(params)
+    normal = problem.normal(problem.evaluate(start), start, gauss_newton.SIGMA)
+    deviation = problem.deviation(normal)
+    assert np.isfinite(deviation).all() and (deviation > 0).all()
+    assert (deviation <= prior_deviation(problem) * (1 + 1e-4)).all()
+
+
+# ---- steps -------------------------------------------------------------------------------------------------
+
+
+def followed(problem, params, **options):
+    """Solve, and check that no step raises F, that what is told is so, and that all is finite."""
+    points, damping = [], []
+
+    def note(run, point):
+        points.append(point)
+        damping.append(run.damping)
+
+    solution = solve(problem, params, after_step=note, **options)
+    start = problem.state(params)
+    before, scale = problem.evaluate(start), np.inf
+    sigma = options.get("sigma", gauss_newton.SIGMA)
+    for row, point in zip(solution.history, points, strict=False):
+        f = problem.misfit(point.residual, row["sigma"]) + problem.penalty(point.state, start)
+        assert f == pytest.approx(row["loss"], rel=1e-9) == row["data"] + row["prior"]
+        earlier = problem.misfit(before.residual, row["sigma"]) + problem.penalty(before.state, start)
+        assert f < earlier
+        assert sigma <= row["sigma"] <= max(scale, sigma)
+        before, scale = point, row["sigma"]
+    assert [row["iteration"] for row in solution.history] == list(range(len(solution.history)))
+    assert all(np.isfinite(list(row.values())).all() for row in solution.history)
+    assert all(np.isfinite(value.numpy()).all() for value in solution.params.values())
+    assert np.isfinite(solution.deviation).all()
+    assert solution.loss <= problem.misfit(problem.evaluate(start).residual, sigma) * (1 + 1e-9)
+    last = problem.evaluate(problem.state(solution.params))
+    assert np.isfinite(last.edited).all() and (last.edited >= 0).all()
+    return solution, last
+
+
+def test_a_change_that_layers_can_make_is_found(rng):
+    image = clouds(rng) + lamp()
+    transport = DenseTransport.random(rng, (20, 24), GRID, even=0.5)
+    layers = Layers(cycles=3)
+    params = layers.encode(image)
+    nodes = params["gain.0"].numpy() + 0.5 * rng.normal(0, 1, params["gain.0"].shape[:2])[..., None]
+    turned = np.zeros((3, 3), np.float32)
+    centre = layers.lights.centres[0]
+    end = gauss_newton._rotated(centre, np.array([0.0, np.radians(5), 0.0]))
+    turned[0] = rotation_vector(centre, end) / layers.scales["turn"]
+    true = layers.decode(
+        params | {"gain.0": mi.TensorXf(nodes.astype(np.float32)), "turn": mi.TensorXf(turned)}
+    )
+    problem, params = problem_of(image, transport, shown(transport, true.numpy()))
+    solution, last = followed(problem, params)
+    start = problem.evaluate(problem.state(params))
+    assert np.abs(last.residual).mean() < 0.05 * np.abs(start.residual).mean()
+    assert problem.direction(last.state, 0) @ end > np.cos(np.radians(1.0))
+    assert 3 <= len(solution.history) <= gauss_newton.ITERATIONS
+
+
+def test_scale_falls_by_half_at_most_and_ends_at_sigma(case):
+    problem, params, start, _ = case
+    solution, _ = followed(problem, params, sigma=0.05, iterations=30)
+    scales = [row["sigma"] for row in solution.history]
+    residual = problem.evaluate(start).residual
+    assert scales[0] == pytest.approx(1.4826 * np.median(np.abs(residual)))
+    assert all(b >= a / 2 * (1 - 1e-12) and b <= a for a, b in zip(scales, scales[1:], strict=False))
+    assert scales[-1] == 0.05
+    assert problem.misfit(residual, 0.05) > solution.loss
+
+
+def test_a_step_that_raises_f_is_damped(case, monkeypatch):
+    """Steps three times too long overshoot: they are taken back until the damping shortens them."""
+    problem, params, _, _ = case
+    step, dampings = Problem.step, []
+
+    def far(self, state, normal, damping):
+        dampings.append(damping)
+        found, times = step(self, state, normal, damping), 6 if damping < 0.5 else 1
+        return {name: state[name] + times * (found[name] - state[name]) for name in found}
+
+    monkeypatch.setattr(Problem, "step", far)
+    solution, _ = followed(problem, params, sigma=0.1)
+    assert len(dampings) > len(solution.history) > 1 and max(dampings) >= 0.5
+    rises = [b / a for a, b in zip(dampings, dampings[1:], strict=False) if b > a]
+    assert rises and min(rises) >= 10 * (1 - 1e-9)
+
+
+def test_no_step_is_longer_than_its_limit(case):
+    problem, _, start, state = case
+    normal = problem.normal(problem.evaluate(state), start, 0.01)
+    far = gauss_newton.Normal(normal.hessian, 1e6 * normal.gradient, normal.unknowns)
+    found = problem.step(state, far, 1e-3)
+    largest = gauss_newton.LARGEST
+    for name in ("gain", "flux", "size"):
+        change = np.abs(found[name] - state[name])
+        assert 0.99 * largest[name] < change.max() <= largest[name] * (1 + 1e-9), name
+    turned = gauss_newton._between(problem.direction(state, 0), problem.direction(found, 0))
+    assert np.linalg.norm(turned) == pytest.approx(largest["turn"], rel=1e-6)
+    np.testing.assert_array_equal(found["flux"][1:], state["flux"][1:])
+
+
+def test_fewest_steps(case):
+    problem, params, start, _ = case
+    none = solve(problem, params, iterations=0)
+    assert none.history == [] and same(problem.state(none.params), start)
+    assert none.loss == pytest.approx(problem.misfit(problem.evaluate(start).residual, gauss_newton.SIGMA))
+    assert len(solve(problem, params, iterations=1).history) == 1
+
+
+# ---- a run in parts ----------------------------------------------------------------------------------------
+
+
+class Enough(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop", [1, 3, "last"])
+def test_run_goes_on_from_its_arrays_to_the_same_bits(case, stop):
+    problem, params, *_ = case
+    whole = solve(problem, params, sigma=0.05)
+    stop = len(whole.history) if stop == "last" else stop
+    kept = {}
+
+    def after_step(run, point):
+        if len(run.history) == stop:
+            kept.update(arrays={k: v.copy() for k, v in run.arrays().items()}, history=list(run.history))
+            raise Enough
+
+    with pytest.raises(Enough):
+        solve(problem, params, sigma=0.05, after_step=after_step)
+    run = Run.of_arrays(**kept)
+    before = problem.transport.resolved
+    again = solve(problem, params, sigma=0.05, run=run)
+    assert without_times(again.history) == without_times(whole.history)
+    assert again.loss == whole.loss
+    np.testing.assert_array_equal(again.deviation, whole.deviation)
+    assert same(problem.state(again.params), problem.state(whole.params))
+    # The columns of the last point are restored with the renderer: none are asked for again.
+    if stop == len(whole.history):
+        assert problem.transport.resolved == before
+
+
+# ---- extremes ----------------------------------------------------------------------------------------------
+
+
+def extreme(rng, image, target, **options):
+    transport = DenseTransport.random(rng, FILM, GRID)
+    problem, params = problem_of(np.asarray(image, np.float32), transport, target(transport), **options)
+    return problem, *followed(problem, params)
+
+
+def test_a_target_that_is_there_already_changes_nothing(rng):
+    image = clouds(rng) + lamp()
+    problem, solution, last = extreme(rng, image, lambda t: shown(t, image))
+    assert np.abs(last.state["gain"]).max() < 1e-6
+    np.testing.assert_allclose(last.edited, image, rtol=1e-5)
+    assert solution.loss < 1e-6
+
+
+def test_black_map_stays_black(rng):
+    problem, solution, last = extreme(
+        rng, np.zeros((*GRID, 3)), lambda t: np.full((*FILM, 3), 0.5, np.float32)
+    )
+    assert not last.edited.any() and not last.state["gain"].any()
+    np.testing.assert_allclose(solution.deviation, prior_deviation(problem), rtol=1e-4)
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_a_single_light_takes_its_flux(rng, factor):
+    image = lamp()
+    problem, _, last = extreme(rng, image, lambda t: factor * shown(t, image))
+    np.testing.assert_allclose(last.state["flux"][0], np.log(factor), atol=0.1)
+    assert problem.lit(last.state) == [0]
+
+
+@pytest.mark.parametrize("value", [0.0, 65504.0, 1e6, 1e30])
+def test_targets_of_any_radiance(rng, value):
+    image = clouds(rng) + lamp()
+    problem, solution, last = extreme(rng, image, lambda t: np.full((*FILM, 3), value, np.float32))
+    before = shown(problem.transport, image).mean()
+    assert solution.history and (last.rendering.mean() > before) == (value > before)
+
+
+@pytest.mark.parametrize("value", [1e6, 1e30])
+def test_maps_of_any_radiance(rng, value):
+    image = clouds(rng) + lamp(radiance=value)
+    problem, solution, last = extreme(rng, image, lambda t: 2 * shown(t, image))
+    assert np.abs(last.residual).mean() < 0.3
+
+
+def test_a_target_that_no_light_can_make(rng):
+    image = clouds(rng)
+    noise = np.where(rng.random((*FILM, 1)) < 0.5, 1e4, 0) * rng.random((*FILM, 3))
+    _, solution, last = extreme(rng, image, lambda t: np.float32(noise))
+    assert np.abs(last.residual).mean() > 0.2
+    assert np.abs(last.state["gain"]).max() < 12
+
+
+def test_pixels_that_nothing_explains_have_little_say(rng):
+    image = clouds(rng)
+    transport = DenseTransport.random(rng, FILM, GRID, even=0.6)
+    bright = shown(transport, np.float32(1.5 * image))
+    spoiled = bright.copy()
+    spoiled.reshape(-1, 3)[::10] = 50.0
+    found = []
+    for target in (bright, spoiled):
+        problem, params = problem_of(image, transport, target)
+        found.append(followed(problem, params)[1])
+    clean = np.ones(FILM[0] * FILM[1], bool)
+    clean[::10] = False
+    error = [
+        np.median(np.abs(f.rendering.reshape(-1, 3)[clean] / bright.reshape(-1, 3)[clean] - 1)) for f in found
+    ]
+    assert error[0] < 0.01 and error[1] < 0.08
+
+
+@pytest.mark.parametrize("name, value", [("gain.0", np.nan), ("flux", np.nan), ("turn", np.inf)])
+def test_a_start_that_is_not_finite_is_refused(case, name, value):
+    problem, params, *_ = case
+    array = params[name].numpy().copy()
+    array.ravel()[0] = value
+    with pytest.raises(NumericalError, match="the edit cannot begin: .* not finite"):
+        solve(problem, params | {name: mi.TensorXf(array)})
+
+
+def test_a_start_whose_rendering_is_not_finite_is_refused(rng):
+    image = np.full((*GRID, 3), 1e30, np.float32)
+    transport = DenseTransport(np.full((FILM[0] * FILM[1], GRID[0] * GRID[1]), 1e8), FILM, GRID)
+    problem, params = problem_of(image, transport, np.ones((*FILM, 3), np.float32))
+    with pytest.raises(NumericalError, match="cannot begin"):
+        solve(problem, params)
+
+
+def test_steps_to_what_is_not_finite_are_not_taken(case, monkeypatch):
+    problem, params, *_ = case
+    step, calls = Problem.step, []
+
+    def spoiled(self, state, normal, damping):
+        found = step(self, state, normal, damping)
+        calls.append(damping)
+        if len(calls) % 2:
+            found["gain"][0] = np.nan
+        return found
+
+    monkeypatch.setattr(Problem, "step", spoiled)
+    solution, last = followed(problem, params, sigma=0.05)
+    assert len(solution.history) > 1 and len(calls) > len(solution.history)
+    assert last.residual is not None
+
+
+def test_residual_is_of_display_values(case):
+    problem, _, start, _ = case
+    point = problem.evaluate(start)
+    expected = plain_display(np.float64(point.rendering)) - problem.target
+    np.testing.assert_allclose(point.residual, expected, atol=2e-6)
+    assert display_curve.LOW == 1e-3

@@ -1,0 +1,251 @@
+"""Columns from kept path vertices: those of every path traced anew for every texel, and always the same."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong
+from envedit.scene import camera_paths, scene
+from envedit.transport import exact_columns, path_vertices
+from envedit.transport.exact_columns import ExactColumns
+from envedit.transport.texel_sampling import Grid
+from tests.oracles import column_tracer
+from tests.oracles.kernels import compiled
+from tests.oracles.scenes import HEIGHT, METAL, WIDTH, ball, load, stage
+from tests.oracles.tiers import slow_but
+
+BOUNCES, COUNT, SEED = 3, 8, 3
+ROOM = 10**9
+# Both poles, both sides of the seam, above and below the horizon.
+TEXELS = np.array([5, 4 * WIDTH + 9, 6 * WIDTH + 31, 9 * WIDTH, 10 * WIDTH + 20, 15 * WIDTH + 3])
+
+
+def columns_of(s, paths_bytes=ROOM, capacity=8, bounces=BOUNCES):
+    grid = Grid(HEIGHT, WIDTH, s.to_world, latlong.solid_angles(HEIGHT, WIDTH))
+    return ExactColumns(s, grid, bounces, capacity, paths_bytes)
+
+
+def traced(columns, texels=TEXELS, count=COUNT, seed=SEED):
+    columns.trace(texels, count, seed)
+    return columns.read(texels)
+
+
+def expected(columns, texels=TEXELS, count=COUNT, seed=SEED):
+    return column_tracer.columns(columns.scene, columns.grid, texels, count, columns.bounces, seed)
+
+
+@pytest.fixture(scope="module")
+def air():
+    return load("in the air")
+
+
+# ---- against columns traced one by one ---------------------------------------------------------------------
+
+SCENES = [
+    "statue", "sphere", "mirror", "pair", "glass", "sphere, alpha 0.02", "plastic and principled",
+    "in the air", "turned and cropped", "mitchell filter", "red wall and a lamp",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", slow_but(SCENES, "statue", "in the air"))
+def test_columns_are_those_traced_one_by_one(name):
+    columns = columns_of(load(name))
+    got, (slow, lost) = traced(columns), expected(columns)
+    # Values of some 30 terms, rounded to float32 as a product of six factors: 1e-6 relative.
+    np.testing.assert_allclose(got, slow, rtol=1e-6, atol=0)
+    assert columns.lost == lost == 0
+    assert (slow.max(axis=(1, 2)) > 0).sum() >= 3  # the ground hides others
+    other, _ = expected(columns, TEXELS + np.array([1, 1, -1, 1, 1, 1]))
+    assert np.abs(got - other).max() > 1e-3 * got.max()  # negative control: one texel further
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_paths_that_are_cut_short(bounces):
+    columns = columns_of(load("in the air"), bounces=bounces)
+    got, (slow, _) = traced(columns), expected(columns)
+    np.testing.assert_allclose(got, slow, rtol=1e-6, atol=0)
+    assert got.any()
+
+
+@pytest.mark.parametrize(
+    "size, count", slow_but([((1, 1), 1), ((1, 1), 5), ((3, 1), 1), ((9, 1), 1)], (1, 1))
+)
+def test_few_paths(size, count):
+    """Arrays of one element are scalars to Dr.Jit: a single vertex or escape must not count twice."""
+    film = {"width": size[0], "height": size[1]}
+    columns = columns_of(scene.load(stage(ball(METAL), film=film)))
+    for texels in (TEXELS, TEXELS[1:2]):
+        slow, _ = expected(columns, texels, count)
+        np.testing.assert_allclose(traced(columns, texels, count), slow, rtol=1e-6, atol=0)
+    assert slow.any()
+
+
+def test_a_block_with_a_single_vertex_and_a_single_escape(monkeypatch):
+    """Half of two pixels sees the sky and half the ground: one of each in a picture of 2 x 1."""
+    s = load("in the air")
+    grid = columns_of(s).grid
+    for pixel in range(0, s.width * s.height):
+        events = list(camera_paths.trace(s.mi, np.array([pixel]), 1, 0, SEED))
+        if dr.any(events[0].active)[0]:
+            break
+    assert dr.count(events[0].active)[0] == 1
+    taps, light, at = path_vertices._escapes(events[0], grid, 1)
+    assert len(at) == 2 and not at.any()
+    np.testing.assert_array_equal(np.array(light)[:, 1], 0)  # the repeated one counts for nothing
+    np.testing.assert_allclose(np.array(light)[:, 0], 1, rtol=1e-6)
+    assert sum(np.array(share)[0] for _, share in taps) == pytest.approx(1, rel=1e-6)
+
+
+# ---- the same bits -----------------------------------------------------------------------------------------
+
+
+def test_without_memory_for_paths_the_bits_are_the_same(air):
+    kept, fresh = columns_of(air), columns_of(air, paths_bytes=0)
+    first = traced(kept)
+    assert traced(fresh).tobytes() == first.tobytes()
+    assert kept._kept and not fresh._kept and kept.kept_bytes > fresh.kept_bytes == 0
+    assert kept.bytes == fresh.bytes == 4 * len(fresh._store)
+    assert traced(kept).tobytes() == traced(fresh).tobytes() == first.tobytes()
+
+
+def test_a_column_does_not_depend_on_those_beside_it(air, monkeypatch):
+    columns = columns_of(air)
+    whole = traced(columns).copy()
+    alone = columns_of(air)
+    for i in (4, 0, 2, 5, 1, 3):
+        np.testing.assert_array_equal(traced(alone, TEXELS[i : i + 1])[0], whole[i])
+    monkeypatch.setattr(exact_columns, "MOST_VALUES", 1)  # one texel at a time
+    assert traced(columns_of(air)).tobytes() == whole.tobytes()
+    monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)  # nine blocks of pixels in place of one
+    blocks = columns_of(air)
+    assert traced(blocks).tobytes() == whole.tobytes()
+    assert len(blocks._kept[COUNT, SEED]) == 9
+
+
+def test_columns_traced_again_replace_the_old_ones(air):
+    columns = columns_of(air)
+    first = traced(columns).copy()
+    other = traced(columns, seed=SEED + 1)
+    assert (first != other).mean() > 0.1
+    np.testing.assert_allclose(first.sum(), other.sum(), rtol=0.2)
+    assert traced(columns).tobytes() == first.tobytes()  # of other paths nothing is left
+    few = traced(columns, count=2).copy()
+    assert traced(columns, count=2).tobytes() == few.tobytes() != first.tobytes()
+
+
+def test_retraced_and_restored_columns_have_the_same_bits(air):
+    columns = columns_of(air)
+    columns.trace(TEXELS[:3], COUNT, SEED)
+    columns.trace(TEXELS[3:], 2, SEED)
+    before = columns.read(TEXELS).tobytes()
+    columns.retrace(SEED)
+    assert columns.read(TEXELS).tobytes() == before
+    other = columns_of(air, paths_bytes=0)
+    other.restore(columns.state(), SEED)
+    assert other.read(TEXELS).tobytes() == before
+    np.testing.assert_array_equal(other.texels, columns.texels)
+
+
+# ---- memory ------------------------------------------------------------------------------------------------
+
+
+def size_of(value):
+    """Return the bytes of arrays on the device, of structures and lists of them too."""
+    kind = type(value)
+    if dr.is_array_v(kind) and dr.depth_v(kind) == 1:
+        return dr.itemsize_v(value) * len(value)
+    if members := getattr(kind, "DRJIT_STRUCT", None):
+        return sum(size_of(getattr(value, name)) for name in members)
+    return sum(size_of(part) for part in value)
+
+
+@pytest.mark.parametrize("name", ["pair", "in the air"])
+def test_memory_of_kept_paths_is_what_is_stated(name):
+    columns = columns_of(load(name))
+    traced(columns)
+    blocks = columns._kept[COUNT, SEED]
+    real = sum(
+        size_of([b.si, b.throughput, b.bounce, b.path, b.pixel, b.taps, b.light, b.at]) for b in blocks
+    )
+    assert real <= sum(b.bytes for b in blocks) <= 1.25 * real
+    assert columns.kept_bytes == sum(b.bytes for b in blocks)
+
+
+def test_kept_paths_stay_within_their_memory(air, monkeypatch):
+    monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)
+    needed = columns_of(air)
+    first = traced(needed).tobytes()
+    need = needed.kept_bytes
+    for room, keeps in ((need, True), (need - 1, False), (need // 2, False)):
+        columns = columns_of(air, paths_bytes=room)
+        assert traced(columns).tobytes() == first
+        assert ((COUNT, SEED) in columns._kept) is keeps
+        assert columns.kept_bytes <= room
+    # Paths of another number share the memory; those of another seed make room.
+    columns = columns_of(air, paths_bytes=int(1.5 * need))
+    for count, seed, kept in ((COUNT, SEED, [COUNT]), (2, SEED, [COUNT, 2]), (COUNT, 9, [COUNT])):
+        traced(columns, count=count, seed=seed)
+        assert [c for c, s in columns._kept if s == seed] == kept
+        assert all(s == seed for _, s in columns._kept)
+        assert columns.kept_bytes <= int(1.5 * need)
+
+
+def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
+    monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)
+    columns = columns_of(air)
+    columns.trace(TEXELS, COUNT, SEED, blocks=1)
+    assert not columns._kept
+    assert traced(columns).tobytes() == traced(columns_of(air)).tobytes()
+
+
+@pytest.mark.parametrize("name", slow_but(["in the air", "pair"], "in the air"))
+def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
+    monkeypatch.setattr(path_vertices, "LANES", 200 * COUNT)  # two blocks of 200 pixels and one of 176
+    columns = columns_of(load(name))
+    columns.trace(TEXELS[1:2], COUNT, SEED, blocks=1)
+    for texels, seed in ((TEXELS[1:2], SEED), (TEXELS, SEED + 1), (TEXELS[3:5], SEED + 1)):
+        launched, fresh = compiled(lambda t=texels, s=seed: columns.trace(t, COUNT, s))
+        assert launched > 10 and fresh == 0
+    assert len(columns._kept[COUNT, SEED + 1]) == 3
+
+
+# ---- what is not finite ------------------------------------------------------------------------------------
+
+
+def test_contributions_that_are_not_finite_are_left_out_and_counted(air, monkeypatch):
+    columns = columns_of(air)
+    clean, real = traced(columns).copy(), path_vertices.connect
+    (block,) = columns._kept[COUNT, SEED]
+    bad = block.vertices // 2
+
+    def connect(*arguments):
+        value = real(*arguments)
+        return dr.select(dr.arange(mi.UInt32, block.vertices) == bad, dr.nan, value)
+
+    monkeypatch.setattr(path_vertices, "connect", connect)
+    got = traced(columns)
+    assert columns.lost == len(TEXELS)  # one vertex, every texel
+    pixel = int(np.array(block.pixel)[bad])
+    others = np.arange(clean.shape[1]) != pixel
+    np.testing.assert_array_equal(got[:, others], clean[:, others])
+    assert np.isfinite(got).all() and (got[:, pixel] <= clean[:, pixel]).all()
+
+
+def test_escapes_that_are_not_finite_are_left_out_and_counted(monkeypatch):
+    s, real = load("in the air"), path_vertices.bsdf_weight
+    columns = columns_of(s)
+    clean = traced(columns).copy()
+
+    def spoiled(pdf, sampled):
+        value = real(pdf, sampled)
+        return dr.select(dr.arange(mi.UInt32, dr.width(value)) % 2 == 0, dr.nan, value)
+
+    monkeypatch.setattr(path_vertices, "bsdf_weight", spoiled)
+    columns = columns_of(s)
+    got = traced(columns)
+    (block,) = columns._kept[COUNT, SEED]
+    bad = ~np.isfinite(np.array(block.light)).all(axis=0)
+    hits = sum((np.isin(np.array(t), TEXELS) & (np.array(share) > 0) & bad).sum() for t, share in block.taps)
+    assert columns.lost == hits > 0
+    assert np.isfinite(got).all() and got.sum() < clean.sum()

@@ -1,0 +1,57 @@
+"""A light transport that is a dense matrix, for what only asks to render and for the block transport."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.transport import block_transport
+from envedit.transport.sparse_matrix import ColourMatrix
+
+
+class DenseTransport:
+    """Multiply maps with a matrix of pixels by texels, the same or another one in every channel.
+
+    Parameters
+    ----------
+    weights : ndarray (h * w, H * W) or (3, h * w, H * W)
+        T.
+    shape, grid : (int, int)
+        Height and width of the picture and of the map.
+    """
+
+    def __init__(self, weights, shape, grid):
+        self.shape, self.grid, self.resolved = shape, grid, 0
+        self.weights = np.broadcast_to(
+            np.asarray(weights, np.float32), (3, shape[0] * shape[1], grid[0] * grid[1])
+        )
+        self._tensors = [mi.TensorXf(np.ascontiguousarray(w)) for w in self.weights]
+
+    @classmethod
+    def random(cls, rng, shape, grid, even=0.3):
+        """Make a transport whose pixels each see a few texels well and all of them a little."""
+        pixels, texels = shape[0] * shape[1], grid[0] * grid[1]
+        weights = np.full((pixels, texels), even / texels)
+        for row in weights:
+            row[rng.integers(0, texels, 4)] += (1 - even) / 4
+        return cls(weights, shape, grid)
+
+    def resolve(self, envmap, **options):
+        """Count how often it was asked for; every texel is exact."""
+        self.resolved += 1
+        return 0
+
+    def apply(self, envmap):
+        flat = dr.reshape(mi.TensorXf(envmap), (self.grid[0] * self.grid[1], 3))
+        rgb = [dr.matmul(w, flat[:, c : c + 1]).array for c, w in enumerate(self._tensors)]
+        return mi.TensorXf(dr.ravel(mi.Color3f(*rgb)), (*self.shape, 3))
+
+    def pictures(self, maps, rows):
+        whole = np.zeros((len(maps), *self.grid, 3))
+        whole[:, rows] = maps
+        found = np.einsum("cpt,ktc->kpc", self.weights, whole.reshape(len(maps), -1, 3), optimize=True)
+        return found.reshape(len(maps), *self.shape, 3).astype(np.float32)
+
+    def overview(self):
+        some, texel = np.nonzero(self.weights.any(axis=0))
+        entries = some.astype(np.uint32), texel.astype(np.uint32), self.weights[:, some, texel].T
+        return block_transport.make(ColourMatrix(*entries, self.weights.shape[1:]), self.shape, self.grid)

@@ -386,7 +386,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", slow_but(CASES, "layers, columns"))
 def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeypatch):
-    """Interrupted after 7, 14 and all 20 steps, which are no multiples of what the transport counts in."""
+    """Interrupted after 13 and all 20 steps; 13 is no multiple of what the transport counts in."""
     make, tables = CASES[name]
     picture = make(rng)
     if name == "pixels, no columns":  # an even map turned is the same map: ask for one twice as bright
@@ -396,11 +396,11 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
     whole = pipeline.run(settings)
     assert (whole.envmap != picture).any()
 
-    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_EVERY", 13)
     monkeypatch.setattr(adam_loop, "READ_SECONDS", 1e9)
     folder = tmp_path / "run"
     folder.mkdir()
-    for step in (7, 14, 20):
+    for step in (13, 20):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
             pipeline.run(settings, folder=folder, resume=True, watch=interrupting())
         assert stop.value.step == step and np.isfinite(stop.value.envmap).all()

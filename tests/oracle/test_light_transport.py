@@ -47,6 +47,7 @@ SUNS = {
     "the seam, last column": (5, WIDTH - 1),
     "the pole": (0, 5),
 }
+EVERY_SUN = ("sphere", "mirror", "matte", "turned and cropped", "in the air")
 SUNS_BELOW = {"below the horizon": (HEIGHT // 2, 22), "the lower pole": (HEIGHT - 1, 5)}
 MAPS = {
     "sunny sky": "puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr",
@@ -90,8 +91,10 @@ def test_pictures_are_those_of_mitsuba(recorded):
         assert disagreement(moved, under_noise) != ""
     assert_transpose(transports[0], noise(), some)
 
-    # Both tiers.
+    # Both tiers. What the pole and the seam do to a texel does not depend on the surface that it lights.
     suns = SUNS | (SUNS_BELOW if name == "in the air" else {})
+    if name not in EVERY_SUN:
+        suns = {what: SUNS[what] for what in ("the horizon", "the seam, last column")}
     for what, (row, column) in suns.items():
         image = sun(row, column)
         assert all(t.resolve(image) >= 1 for t in transports)
@@ -111,8 +114,9 @@ def test_pictures_are_those_of_mitsuba(recorded):
     assert not unseen, f"a bias would not have been seen: {unseen}"
 
 
-# Films and frames have no say in what a real map has beyond noise and a sun.
-SURFACES = [name for name in SCENES if name not in ("turned and cropped", "in the air", "mitchell filter")]
+# Other roughness, films and frames have no say in what a real map has beyond noise and a sun. The first of
+# the scenes, in their order, so that each one's transports are recorded once for both tests.
+SURFACES = list(SCENES)[: list(SCENES).index("glass") + 1]
 
 
 @pytest.mark.slow
@@ -134,7 +138,7 @@ def test_comparison_sees_one_percent():
     assert disagreement(1.01 * ours, references(s, noise())) != ""
 
 
-ALL_EXACT = ["sphere", "sphere, alpha 0.02", "mirror", "glass", "red wall and a lamp"]
+ALL_EXACT = ["sphere, alpha 0.02", "mirror", "glass", "red wall and a lamp"]
 
 
 @pytest.mark.slow

@@ -13,11 +13,11 @@ def waves(height=40, width=56):
 
 
 def single(a):
-    return mi.TensorXf(np.asarray(a, np.float32))
+    return dr.opaque(mi.TensorXf(np.asarray(a, np.float32)))  # aligned: the same kernels for all
 
 
 def double(a):
-    return mi.TensorXd(np.asarray(a, np.float64))
+    return dr.opaque(mi.TensorXd(np.asarray(a, np.float64)))
 
 
 def gradient(loss, x, *args, **kwargs):

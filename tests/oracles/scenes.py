@@ -68,14 +68,14 @@ CROP = {"width": 48, "height": 40}
 CROP |= {"crop_offset_x": 12, "crop_offset_y": 6, "crop_width": 24, "crop_height": 20}
 SCENES = {  # a shipped one by name and parameters, or a dict
     "sphere": ("sphere", {}),
-    "sphere, alpha 0.02": ("sphere", {"roughness": 0.02}),
-    "sphere, alpha 1": ("sphere", {"roughness": 1.0}),
     "mirror": ("mirror", {}),
     "matte": ("matte", {}),
     "statue": ("statue", {}),
     "pair": ("pair", {}),
     "mesh": ("mesh", {"mesh": "statue.ply", "up": "z", "turn": 30}),
     "glass": stage(ball({"type": "dielectric"})),
+    "sphere, alpha 0.02": ("sphere", {"roughness": 0.02}),
+    "sphere, alpha 1": ("sphere", {"roughness": 1.0}),
     "plastic and principled": stage(ball({"type": "plastic"}, -0.9, 0.8), ball(PRINCIPLED, 0.9, 0.8)),
     "red wall and a lamp": stage(ball(WHITE), WALL, LAMP),
     "turned and cropped": stage(ball(METAL), light=TURNED, film=CROP),

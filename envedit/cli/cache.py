@@ -7,8 +7,8 @@ import sys
 
 KINDS = {
     "transport": "light transports of scenes",
-    "renderings": "renderings of initial and target maps",
     "fits": "SIRENs fitted to maps",
+    "renderings": "renderings of initial and target maps",
 }
 
 

@@ -322,7 +322,7 @@ def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     # What is left unknown: the diagonal of hats (J'J / s^2 + K)^-1 hats', of the mean over channels.
     mean = np.kron(np.full((1, 3), 1 / 3), np.concatenate(hats, axis=1))
     variance = np.einsum("tn,nm,tm->t", mean, np.linalg.inv(hessian), mean, optimize=True)
-    np.testing.assert_allclose(solution.deviation.ravel(), np.sqrt(variance), rtol=1e-2)
+    np.testing.assert_allclose(solution.posterior.deviation.ravel(), np.sqrt(variance), rtol=1e-2)
 
 
 # ---- standard deviation ------------------------------------------------------------------------------------
@@ -344,8 +344,8 @@ def test_deviation_is_the_priors_where_nothing_is_seen(rng):
     for prior in (PRIOR, dataclasses.replace(PRIOR, luminance=0.3)):
         problem, params = problem_of(image, blind, target, prior=prior)
         solution = solve(problem, params)
-        np.testing.assert_allclose(solution.deviation, prior_deviation(problem, prior), rtol=1e-4)
-        assert solution.deviation.dtype == np.float32
+        np.testing.assert_allclose(solution.posterior.deviation, prior_deviation(problem, prior), rtol=1e-4)
+        assert solution.posterior.deviation.dtype == np.float32
         assert not problem.state(solution.params)["gain"].any()
 
 
@@ -364,7 +364,7 @@ def test_deviation_shrinks_with_what_is_known(rng):
             problem, params = problem_of(image, seen, shown(seen, image))
             start = problem.state(params)
             normal = problem.normal(problem.evaluate(start), start, sigma)
-            found[name, sigma] = problem.deviation(normal)
+            found[name, sigma] = problem.posterior(normal).deviation
             assert (found[name, sigma] <= prior_deviation(problem) * (1 + 1e-4)).all(), (name, sigma)
     for name in ("half", "all", "twice"):
         for more, less in ((gauss_newton.SIGMA, 0.02), (0.02, 0.2)):
@@ -381,7 +381,7 @@ def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
     problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
     start = problem.state(params)
     normal = problem.normal(problem.evaluate(start), start, gauss_newton.SIGMA)
-    deviation = problem.deviation(normal)
+    deviation = problem.posterior(normal).deviation
     assert np.isfinite(deviation).all() and (deviation > 0).all()
     assert (deviation <= prior_deviation(problem) * (1 + 1e-4)).all()
 
@@ -411,7 +411,7 @@ def followed(problem, params, **options):
     assert [row["iteration"] for row in solution.history] == list(range(len(solution.history)))
     assert all(np.isfinite(list(row.values())).all() for row in solution.history)
     assert all(np.isfinite(value.numpy()).all() for value in solution.params.values())
-    assert np.isfinite(solution.deviation).all()
+    assert np.isfinite(solution.posterior.deviation).all()
     assert solution.loss <= problem.misfit(problem.evaluate(start).residual, sigma) * (1 + 1e-9)
     last = problem.evaluate(problem.state(solution.params))
     assert np.isfinite(last.edited).all() and (last.edited >= 0).all()
@@ -515,7 +515,7 @@ def test_run_goes_on_from_its_arrays_to_the_same_bits(case, stop):
     again = solve(problem, params, sigma=0.05, run=run)
     assert without_times(again.history) == without_times(whole.history)
     assert again.loss == whole.loss
-    np.testing.assert_array_equal(again.deviation, whole.deviation)
+    np.testing.assert_array_equal(again.posterior.deviation, whole.posterior.deviation)
     assert same(problem.state(again.params), problem.state(whole.params))
     # The columns of the last point are restored with the renderer: none are asked for again.
     if stop == len(whole.history):
@@ -544,7 +544,7 @@ def test_black_map_stays_black(rng):
         rng, np.zeros((*GRID, 3)), lambda t: np.full((*FILM, 3), 0.5, np.float32)
     )
     assert not last.edited.any() and not last.state["gain"].any()
-    np.testing.assert_allclose(solution.deviation, prior_deviation(problem), rtol=1e-4)
+    np.testing.assert_allclose(solution.posterior.deviation, prior_deviation(problem), rtol=1e-4)
 
 
 @pytest.mark.parametrize("factor", [0.25, 4.0])

@@ -1,7 +1,6 @@
 """Painted pictures: what was painted is found in every format, and what tells nothing is said."""
 
 import struct
-import types
 import zlib
 
 import mitsuba as mi
@@ -632,14 +631,14 @@ def test_what_is_not_exported(initial, tmp_path):
     assert (tmp_path / "there.png").read_bytes() == b"mine" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_the_run_renders_the_exported_picture_again():
+def test_the_run_renders_the_exported_picture_again(monkeypatch):
     """The seed is stated, and not that of a rendering that is judged."""
     seen = []
 
-    def sampled(envmap, spp, seed):
+    def rendered(lit, envmap, spp, seed, keep):
         seen.append((spp, seed))
         return envmap, spp, None
 
-    lit = types.SimpleNamespace(sampled=sampled)
-    assert painted_image.initial(lit, "map", settings(spp=32)) == "map"
+    monkeypatch.setattr(painted_image, "rendered", rendered)
+    assert painted_image.initial(None, "map", settings(spp=32)) == "map"
     assert seen == [(32, 3 + painted_image.SEED)]

@@ -58,7 +58,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
 
 @pytest.mark.slow
 def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
-    settings = config.loads("", overrides=SMALL)
+    settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100"])
     fresh, launched, columns, normal = [], [], [], gauss_newton.Problem.normal
 
     def counted(problem, *arguments):
@@ -66,15 +66,20 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
         launched.append(len(kernels))
         fresh.append(sum(not k["cache_hit"] or k["cache_disk"] for k in kernels))
         columns.append(len(problem.transport.columns))
+        if len(fresh) == 5:  # a texel that becomes bright gets a column
+            bright = problem.envmap.copy()
+            bright[4, len(fresh)] = 1e5
+            problem.transport.resolve(bright)
         return normal(problem, *arguments)
 
     monkeypatch.setattr(gauss_newton.Problem, "normal", counted)
+    monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # some steps more
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         result = pipeline.run(settings)
-    assert len(fresh) == len(result.history) + 1 > 5 and min(launched) > 5
+    assert len(fresh) > len(result.history) > 5 and min(launched) > 5
     assert sum(fresh[:3]) > 10 and fresh[3:] == [0] * len(fresh[3:])
-    assert columns[-1] > columns[3]  # else nothing was traced
+    assert columns[-1] > columns[3]
 
 
 @pytest.mark.slow

@@ -448,8 +448,11 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
         picture[2, 5] = 1e6
     tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
     if name == "frozen":
-        tables = {"renderer": {"spp": 32, "max_depth": 3, "influence_threshold": 0.5}}
-    settings = settings_of(tmp_path, picture, **tables)
+        tables = {
+            "renderer": {"spp": 32, "max_depth": 3, "influence_threshold": 1.0},
+            "input": {"rows": "all"},
+        }
+    settings = settings_of(tmp_path, picture, representation={"cycles": 4}, **tables)
     whole = pipeline.run(settings)
     steps = len(whole.history)
     assert steps >= 3 and set(whole.history[0]) == {

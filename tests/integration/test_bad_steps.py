@@ -214,7 +214,24 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
 
     monkeypatch.setattr(edit_job.Job, "_loop", ended)
     wanted = types.SimpleNamespace(aim=None, weight=None)
-    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, edit_job.Watch())
+    fake = types.SimpleNamespace(models_edit=False)
+    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, fake, None, None, edit_job.Watch())
+    assert not work.newton
+    check_trials(work)
+
+    def solved(problem, params, *_):
+        if ends[params] is lost:
+            raise NumericalError("it cannot begin")
+        return types.SimpleNamespace(loss=ends[params])
+
+    monkeypatch.setattr(edit_job.Job, "newton", True)
+    monkeypatch.setattr(edit_job.Job, "_sigma", 0.01)
+    monkeypatch.setattr(edit_job.Job, "_problem", lambda self: None)
+    monkeypatch.setattr(edit_job.gauss_newton, "solve", solved)
+    check_trials(work)
+
+
+def check_trials(work):
     for order, best in (((0, 1, 2, 3), 2), ((1, 0, 2), 2), ((3, 1, 0), 0), ((1, 3), 1), ((0, 1, 3), 0)):
         params, notes = work.best([(i, [f"start {i}"]) for i in order], None)
         assert params == best and f"start {order.index(best) + 1} of {len(order)}" in notes[-1]
@@ -298,7 +315,7 @@ def spoil_renderer(monkeypatch, steps):
 def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
     path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
-    assert call(path, "--quiet", *changed(optimizer__iterations=6)) == 0
+    assert call(path, "--quiet", *changed(optimizer__iterations=6, optimizer__kind="adam")) == 0
     assert measured(out)["non_finite_steps"] == 2 and measured(out)["iterations"] == 6
     lines = (out / "history.csv").read_text().splitlines()
     empty = [i for i, line in enumerate(lines[1:]) if line.split(",")[1] == ""]

@@ -7,7 +7,7 @@ import drjit as dr
 import pytest
 
 from envedit import config, pipeline
-from envedit.solve import adam_loop
+from envedit.solve import adam_loop, gauss_newton
 from envedit.transport.light_transport import LightTransport
 
 SMALL = [
@@ -30,7 +30,7 @@ SMALL = [
 )
 def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monkeypatch):
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
-    settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}"])
+    settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}", "optimizer.kind=adam"])
     fresh, columns, launched = {}, [], []
     compare, render = adam_loop.Objective.__call__, LightTransport.render
 
@@ -54,6 +54,32 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
     assert {step: count for step, count in fresh.items() if step >= 3 and count} == {}
     # Else nothing was traced after the first step, and nothing shown.
     assert columns[-1] > columns[1] or not light_moves
+
+
+@pytest.mark.slow
+def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
+    settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100"])
+    fresh, launched, columns, normal = [], [], [], gauss_newton.Problem.normal
+
+    def counted(problem, *arguments):
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        launched.append(len(kernels))
+        fresh.append(sum(not k["cache_hit"] or k["cache_disk"] for k in kernels))
+        columns.append(len(problem.transport.columns))
+        if len(fresh) == 5:  # a texel that becomes bright gets a column
+            bright = problem.envmap.copy()
+            bright[4, len(fresh)] = 1e5
+            problem.transport.resolve(bright)
+        return normal(problem, *arguments)
+
+    monkeypatch.setattr(gauss_newton.Problem, "normal", counted)
+    monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # some steps more
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        result = pipeline.run(settings)
+    assert len(fresh) > len(result.history) > 5 and min(launched) > 5
+    assert sum(fresh[:3]) > 10 and fresh[3:] == [0] * len(fresh[3:])
+    assert columns[-1] > columns[3]
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from tests.oracles.tiers import slow_but
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 PIXELS = {"representation": {"kind": "pixels"}}
+ADAM = {"optimizer": {"iterations": 20, "kind": "adam"}}
 STROKES = [{"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}]
 
 
@@ -378,9 +379,15 @@ CASES = {
         },
     ),
     "transport recorded afresh": (sunny, PIXELS | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
-    "layers, columns": (sunny, {}),
-    "layers, transport recorded afresh": (sunny, {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
-    "layers, painted, columns": (sunny, {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}}),
+    "layers, columns": (sunny, ADAM),
+    "layers, transport recorded afresh": (
+        sunny,
+        ADAM | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}},
+    ),
+    "layers, painted, columns": (
+        sunny,
+        ADAM | {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}},
+    ),
 }
 
 
@@ -415,6 +422,56 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
 
     resumed = pipeline.run(settings, folder=folder, resume=True)
     assert resumed.envmap.tobytes() == whole.envmap.tobytes()
+    assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
+    assert without_times(resumed.history) == without_times(whole.history)
+    assert without_timing(resumed.metrics) == without_timing(whole.metrics)
+
+
+def stopping_at(step):
+    """Return a Watch that sends Ctrl-C after one step of the edit."""
+    stages = []
+
+    def progress(done, total, text):
+        if stages[-1] == "editing" and done == step:
+            signal.raise_signal(signal.SIGINT)
+
+    return pipeline.Watch(stages.append, progress)
+
+
+@pytest.mark.parametrize(
+    "name", slow_but([("sunny",), ("smooth",), ("painted",), ("a sun of 1e6",), ("frozen",)], "sunny")
+)
+def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path, rng):
+    """Interrupted in the first step, in the middle, in the last, and where nothing is left to do."""
+    picture = {"smooth": smooth, "sunny": sunny}.get(name, sunny)(rng)
+    if name == "a sun of 1e6":
+        picture[2, 5] = 1e6
+    tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
+    if name == "frozen":
+        tables = {
+            "renderer": {"spp": 32, "max_depth": 3, "influence_threshold": 1.0},
+            "input": {"rows": "all"},
+        }
+    settings = settings_of(tmp_path, picture, representation={"cycles": 4}, **tables)
+    whole = pipeline.run(settings)
+    steps = len(whole.history)
+    assert steps >= 3 and set(whole.history[0]) == {
+        "iteration", "loss", "data", "prior", "sigma", "damping", "step_ms"
+    }  # fmt: skip
+    assert name != "frozen" or whole.frozen.any()
+
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for step in sorted({1, steps // 2, steps}):
+        with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
+            pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))
+        assert stop.value.step == step and np.isfinite(stop.value.envmap).all()
+        with np.load(folder / checkpoint.NAME) as stored:
+            assert json.loads(stored["meta"].tobytes())["state"]["step"] == step
+    assert stop.value.envmap.tobytes() == whole.envmap.tobytes()
+    resumed = pipeline.run(settings, folder=folder, resume=True)
+    assert resumed.envmap.tobytes() == whole.envmap.tobytes()
+    assert resumed.deviation.tobytes() == whole.deviation.tobytes()
     assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
     assert without_times(resumed.history) == without_times(whole.history)
     assert without_timing(resumed.metrics) == without_timing(whole.metrics)

@@ -491,7 +491,7 @@ def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr(adam_loop._PlaceRows, "eval", press)
-    assert call(world(tmp_path, rng), "--quiet") == 130
+    assert call(world(tmp_path, rng), "--quiet", *changed(optimizer__kind="adam")) == 130
     assert "interrupted" in capsys.readouterr().err
 
 

@@ -308,11 +308,16 @@ class Problem:
                 gradient[k] += (state[name] - start[name])[i, axis] / sd**2
         return Normal(hessian, gradient, lights.unknowns)
 
-    def step(self, state: dict, normal: Normal, damping: float) -> dict:
-        """Return the state after a damped step."""
+    def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
+        """Return the state after a damped step; None if the step is not finite."""
         damped = normal.hessian.copy()
         damped[np.diag_indices_from(damped)] *= 1 + damping
-        step = -_solved(np.linalg.cholesky(damped), normal.gradient)
+        try:
+            step = -_solved(np.linalg.cholesky(damped), normal.gradient)
+        except np.linalg.LinAlgError:  # radiance beyond what squares of single precision hold
+            return None
+        if not np.isfinite(step).all():
+            return None
         n, found = self.nodes, {name: value.copy() for name, value in state.items()}
         found["gain"] += np.clip(step[: 3 * n], -LARGEST["gain"], LARGEST["gain"]).reshape(3, n).T
         turns = {}
@@ -330,13 +335,16 @@ class Problem:
     def posterior(self, normal: Normal) -> Posterior:
         """Return what the normal equations at the solution say of the log luminance gain."""
         n = self.nodes
-        lower = np.linalg.cholesky(normal.hessian)
-        mean = np.zeros((len(lower), n))
+        prior = np.diag(1 / (3 * self._precisions[0]))
+        mean = np.zeros((len(normal.hessian), n))
         for c in range(3):
             mean[c * n + np.arange(n), np.arange(n)] = 1 / 3
-        half = np.linalg.solve(lower, mean)
-        prior = np.diag(1 / (3 * self._precisions[0]))
-        spread = [self.blocks.spread(covariance) for covariance in (half.T @ half, prior)]
+        try:
+            half = np.linalg.solve(np.linalg.cholesky(normal.hessian), mean)
+            covariance = half.T @ half if np.isfinite(half).all() else prior
+        except np.linalg.LinAlgError:  # nothing can be said beyond the prior
+            covariance = prior
+        spread = [self.blocks.spread(one) for one in (covariance, prior)]
         whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
         whole[:, self.rows] = spread
         return Posterior(*whole)
@@ -519,8 +527,9 @@ def solve(
         normal = problem.normal(point, run.start, run.scale)
         better = None
         for _ in range(TRIES):
-            tried = problem.evaluate(problem.step(run.state, normal, run.damping))
-            if tried.residual is not None:
+            moved = problem.step(run.state, normal, run.damping)
+            tried = None if moved is None else problem.evaluate(moved)
+            if tried is not None and tried.residual is not None:
                 data = problem.misfit(tried.residual, run.scale)
                 penalty = problem.penalty(tried.state, run.start)
                 if data + penalty < before:

@@ -471,7 +471,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
     assert stop.value.envmap.tobytes() == whole.envmap.tobytes()
     resumed = pipeline.run(settings, folder=folder, resume=True)
     assert resumed.envmap.tobytes() == whole.envmap.tobytes()
-    assert resumed.deviation.tobytes() == whole.deviation.tobytes()
+    assert resumed.posterior.deviation.tobytes() == whole.posterior.deviation.tobytes()
     assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
     assert without_times(resumed.history) == without_times(whole.history)
     assert without_timing(resumed.metrics) == without_timing(whole.metrics)

@@ -94,6 +94,7 @@ def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
         "reach",
         "start",
         "edit",
+        "solve",
         "judge",
         "full",
         "report",

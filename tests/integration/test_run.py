@@ -23,7 +23,7 @@ from envedit import config, pipeline
 from envedit.cli import run
 from envedit.images import images
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint
+from envedit.solve import adam_loop, checkpoint, gauss_newton
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
 from tests.oracles.builders import read_png, sky
@@ -33,6 +33,7 @@ from tests.oracles.runs import (
     call,
     changed,
     content,
+    differing,
     measured,
     names,
     no_constant,
@@ -595,6 +596,36 @@ def stop_at_checkpoint(process, file, number):
     finally:
         process.kill()
     return process.returncode, out, err
+
+
+def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, rng, monkeypatch, capsys):
+    settings = {"representation": {"cycles": 4}, "optimizer": {"kind": "gauss-newton", "iterations": 5}}
+    path, out = world(tmp_path, rng, **settings), tmp_path / "c_out"
+    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+    normal, calls = gauss_newton.Problem.normal, []
+
+    def pressed(*arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return normal(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(gauss_newton.Problem, "normal", pressed)
+        assert call(path, "--quiet") == 130
+    assert len(calls) == 2 and "--resume" in capsys.readouterr().err
+    assert names(out) == {"checkpoint.npz", "edited.exr"}
+    assert call(path, "--quiet", "--resume") == 0
+    assert names(out) == FILES | INFLUENCE and differing(out, tmp_path / "whole") == set()
+
+    rows = rows_of(out)
+    assert list(rows[0]) == ["iteration", "loss", "data", "prior", "sigma", "damping", "step_ms"]
+    assert [int(row["iteration"]) for row in rows] == list(range(len(rows))) and 2 < len(rows) <= 5
+    for row, other in zip(rows, rows_of(tmp_path / "whole"), strict=True):
+        values = {name: float(value) for name, value in row.items()}
+        assert all(math.isfinite(value) and value >= 0 for value in values.values())
+        assert values["loss"] == pytest.approx(values["data"] + values["prior"], rel=1e-5)
+        assert row | {"step_ms": ""} == other | {"step_ms": ""}
 
 
 @pytest.mark.slow

@@ -387,6 +387,29 @@ def test_texels_that_deserve_it_get_columns(lamp_scene):
     assert (np.diff(radiance) <= 0).all()  # brightest first
 
 
+@pytest.mark.parametrize("rows", [slice(0, HEIGHT), slice(3, 11)])
+def test_pictures_of_few_texels_are_those_of_the_whole_map(lamp_scene, rng, rows):
+    t = build(lamp_scene, spp=32)
+    maps = np.zeros((3, rows.stop - rows.start, WIDTH, 3))
+    maps[0, 2, 9] = 5.0, 1.0, 0.1
+    maps[1, 1:4, 3:8] = rng.normal(size=(3, 5, 3))  # a derivative has any sign
+    for exact in (0, 2, 30):  # coarse texels, both tiers, exact columns alone
+        bright = np.ones((HEIGHT, WIDTH, 3), np.float32)
+        bright[rows][np.nonzero(maps.any(axis=(0, 3)))] = 1e4
+        assert t.resolve(bright, limit=exact) <= exact
+        got = t.pictures(maps, rows)
+        assert got.shape == (3, *t.shape, 3) and got.dtype == np.float32 and not got[2].any()
+        whole = np.zeros((3, HEIGHT, WIDTH, 3), np.float32)
+        whole[:, rows] = maps
+        expected = np.stack([t.linear(mi.TensorXf(image)).numpy() for image in whole])
+        size = np.stack([t.linear(mi.TensorXf(np.abs(image))).numpy() for image in whole])
+        assert np.abs(expected).max() > 0.01
+        # Sums of some hundred terms in float32, of any sign: to 1e-5 of the sum of their sizes.
+        assert (np.abs(got - expected) <= 1e-5 * size + 1e-12).all(), exact
+    assert len(t.columns) >= 16
+    assert not t.pictures(0 * maps, rows).any()
+
+
 def test_limit_bounds_the_new_columns(lamp_scene):
     t = build(lamp_scene, spp=32)
     image = noise()

@@ -32,6 +32,19 @@ def test_a_cropped_film_keeps_its_crop_and_refuses_a_size(tmp_path):
         scene.load(path, width=8)
 
 
+def test_names_of_plugins_in_capitals_are_those_of_mitsuba_3(tmp_path, rng):
+    plane = '<shape type="rectangle"><bsdf type="diffuse"/></shape>'
+    image = sky(rng)
+    expected = scene.load(write_scene(tmp_path, SENSOR, plane, LIGHT)).render(image, spp=4)
+    capital = plane.replace("rectangle", "Rectangle").replace("diffuse", "Diffuse")
+    light = LIGHT.replace("constant", "Constant")
+    loaded = scene.load(write_scene(tmp_path, SENSOR, capital, light, name="capital.xml"))
+    np.testing.assert_array_equal(loaded.render(image, spp=4), expected)
+    assert np.ptp(expected) > 0.1
+    with pytest.raises(InputError, match="oblong"):
+        scene.load(write_scene(tmp_path, SENSOR, plane.replace("rectangle", "Oblong"), LIGHT))
+
+
 @pytest.mark.parametrize("key", ["width", "height"])
 @pytest.mark.parametrize("value", ['<integer name="KEY" value="0"/>', '<string name="KEY" value="big"/>'])
 def test_a_film_without_a_size_is_refused(tmp_path, key, value):

@@ -39,6 +39,26 @@ def test_every_key_says_what_it_means():
     assert "turbidity : float" in cfg.Input.__doc__ and "variant : str" in cfg.Config.__doc__
 
 
+@pytest.mark.parametrize("solver", ["auto", "gauss-newton", "adam"])
+def test_layers_through_a_transport_take_every_solver(solver):
+    assert cfg.loads("").optimizer.kind == "auto"
+    config = cfg.loads(f'[optimizer]\nkind = "{solver}"')
+    assert config.optimizer.kind == solver
+    assert cfg.loads(cfg.to_toml(config)).optimizer.kind == solver
+
+
+@pytest.mark.parametrize(
+    "tables", [f"[representation]\nkind = '{kind}'" for kind in KINDS[1:]] + ["[renderer]\nkind = 'path'"]
+)
+def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
+    message = refused(tables + "\n[optimizer]\nkind = 'gauss-newton'")
+    assert "optimizer.kind" in message and "wanted adam or auto" in message
+    for solver in ("auto", "adam"):
+        assert cfg.loads(tables + f"\n[optimizer]\nkind = '{solver}'").optimizer.kind == solver
+    assert "optimizer.kind" in refused(tables, "optimizer.kind=gauss-newton")
+    assert "optimizer.kind" in refused(tables + "\n[optimizer]\nkind = 'newton'")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_representation_is_accepted_and_comes_back(kind):
     config = cfg.loads(f'[representation]\nkind = "{kind}"')

@@ -452,7 +452,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
             "renderer": {"spp": 32, "max_depth": 3, "influence_threshold": 1.0},
             "input": {"rows": "all"},
         }
-    settings = settings_of(tmp_path, picture, representation={"cycles": 4}, **tables)
+    settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     steps = len(whole.history)
     assert steps >= 3 and set(whole.history[0]) == {
@@ -487,6 +487,7 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
         picture,
         input={"width": 64},
         scene={"file": "mirror", "width": 48},
+        representation={"cycles": "auto"},
         target={"rotate_degrees": 90},
         renderer={"spp": "auto"},
     )

@@ -257,7 +257,7 @@ def test_layers_are_traced_with_few_paths(kind, few, tmp_path, rng, monkeypatch)
         return build(cls, *arguments, **keys)
 
     monkeypatch.setattr(LightTransport, "build", classmethod(noted))
-    tables = {"representation": {"kind": kind}, "optimizer": {"iterations": 1}}
+    tables = {"representation": {"kind": kind, "cycles": "auto"}, "optimizer": {"iterations": 1}}
     picture = np.repeat(np.repeat(sunny(rng), 3, axis=0), 3, axis=1)
     pipeline.run(settings_of(tmp_path, picture, input={"width": 3 * WIDTH}, **tables))
     assert asked == ([few, few] if few else [few]), "layers look at T a second time"

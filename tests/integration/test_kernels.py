@@ -78,7 +78,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
         dr.kernel_history_clear()
         result = pipeline.run(settings)
     assert len(fresh) > 5 and len(result.history) > 3 and min(launched) > 5
-    assert sum(fresh[:3]) > 10 and fresh[3:] == [0] * len(fresh[3:])
+    assert fresh[3:] == [0] * len(fresh[3:])
     assert columns[-1] > columns[3]
 
 

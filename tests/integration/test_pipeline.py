@@ -257,7 +257,7 @@ def test_layers_are_traced_with_few_paths(kind, few, tmp_path, rng, monkeypatch)
         return build(cls, *arguments, **keys)
 
     monkeypatch.setattr(LightTransport, "build", classmethod(noted))
-    tables = {"representation": {"kind": kind}, "optimizer": {"iterations": 1}}
+    tables = {"representation": {"kind": kind, "cycles": "auto"}, "optimizer": {"iterations": 1}}
     picture = np.repeat(np.repeat(sunny(rng), 3, axis=0), 3, axis=1)
     pipeline.run(settings_of(tmp_path, picture, input={"width": 3 * WIDTH}, **tables))
     assert asked == ([few, few] if few else [few]), "layers look at T a second time"
@@ -452,7 +452,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
             "renderer": {"spp": 32, "max_depth": 3, "influence_threshold": 1.0},
             "input": {"rows": "all"},
         }
-    settings = settings_of(tmp_path, picture, representation={"cycles": 4}, **tables)
+    settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     steps = len(whole.history)
     assert steps >= 3 and set(whole.history[0]) == {
@@ -487,6 +487,7 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
         picture,
         input={"width": 64},
         scene={"file": "mirror", "width": 48},
+        representation={"cycles": "auto"},
         target={"rotate_degrees": 90},
         renderer={"spp": "auto"},
     )

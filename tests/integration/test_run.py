@@ -599,7 +599,7 @@ def stop_at_checkpoint(process, file, number):
 
 
 def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, rng, monkeypatch, capsys):
-    settings = {"representation": {"cycles": 4}, "optimizer": {"kind": "gauss-newton", "iterations": 5}}
+    settings = {"optimizer": {"kind": "gauss-newton", "iterations": 5}}
     path, out = world(tmp_path, rng, **settings), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     normal, calls = gauss_newton.Problem.normal, []

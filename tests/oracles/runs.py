@@ -24,7 +24,7 @@ TINY = {
     "input": {"width": 16},
     "scene": {"width": 24},
     "target": {"spp": 16},
-    "representation": {"hidden": 16, "depth": 1},  # of the default kind
+    "representation": {"hidden": 16, "depth": 1, "cycles": 4},  # of the default kind
     "fit": {"epochs": 4},
     "optimizer": {"iterations": 4},
     "renderer": {"spp": 32, "max_depth": 3},
@@ -132,7 +132,7 @@ def settings_of(folder, picture, **tables):
         "input": {"envmap": "map.exr", "width": WIDTH},
         "scene": {"file": "scene.xml", "width": 24},
         "target": {"spp": 16},
-        "representation": {"hidden": 16, "depth": 1},  # of the default kind
+        "representation": {"hidden": 16, "depth": 1, "cycles": 4},  # of the default kind
         "fit": {"epochs": 4},
         "optimizer": {"iterations": 20},
         "renderer": {"spp": 32, "max_depth": 3},

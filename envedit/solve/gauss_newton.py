@@ -498,7 +498,7 @@ def solve(
     problem : Problem
         What is minimised.
     params : dict
-        Where lights start, and are drawn to; the gain starts at zero.
+        Where lights start, and are drawn to; the gain starts at zero, unless no step is asked for.
     sigma : float
         Standard error that display values are known to.
     iterations : int
@@ -514,7 +514,8 @@ def solve(
         If the start is not finite.
     """
     start = problem.state(params)
-    start["gain"][:] = 0  # a gain that explains the picture alone, as the search has it, is far from any sky
+    if iterations:  # a gain that explains the picture alone, as the search has it, is far from any sky
+        start["gain"][:] = 0
     # A continued run has the columns with which its last point was rendered.
     run, fresh = run or Run(start, start), run is None
     point = problem.evaluate(run.state, resolve=fresh)

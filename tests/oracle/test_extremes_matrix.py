@@ -5,7 +5,7 @@ import pytest
 
 from envedit import pipeline
 from envedit.core import latlong, radiance
-from envedit.core.errors import InputError, NumericalError
+from envedit.core.errors import InputError
 from envedit.images import images
 from envedit.representations import LogPixels, Pixels
 from envedit.representations.layers.layers import Layers
@@ -87,7 +87,7 @@ def test_pixels_hold_what_logarithms_cannot():
 @pytest.mark.slow
 @pytest.mark.parametrize(("value", "error", "says"), [
     (1e10, None, ""),
-    (1e30, NumericalError, "not finite"),
+    (1e30, None, ""),
     (3e38, InputError, "layers: 1 texels are brighter than 1.27e[+]30, the first at row 2, column 5"),
 ])  # fmt: skip
 def test_whole_runs_end_finite_or_with_a_reason(value, error, says, tmp_path):

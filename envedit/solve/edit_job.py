@@ -146,7 +146,7 @@ class Job:
     def _tried(self, params, crop, steps):
         """Return the loss after a few steps from a start."""
         if self.newton:
-            return gauss_newton.solve(self._problem(), params, self._sigma, steps).loss
+            return gauss_newton.solve(self._problem(), params, self._sigma, steps, trial=True).loss
         few = replace(self.settings.optimizer, iterations=steps)
         wanted = self.wanted.aim, self.wanted.weight
         objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists)

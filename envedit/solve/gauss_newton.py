@@ -155,14 +155,14 @@ class Solution:
         A row a step: ``loss`` F, its parts ``data`` and ``prior``, ``sigma``, ``damping``, ``step_ms``.
     loss : float
         F.
-    posterior : Posterior
-        How well the picture determines the sky.
+    posterior : Posterior or None
+        How well the picture determines the sky; None of a trial.
     """
 
     params: dict
     history: list[dict]
     loss: float
-    posterior: Posterior
+    posterior: Posterior | None
 
 
 class Problem:
@@ -490,6 +490,7 @@ def solve(
     iterations: int = ITERATIONS,
     after_step: Callable[[Run, Point], None] | None = None,
     run: Run | None = None,
+    trial: bool = False,
 ) -> Solution:
     """Minimise F.
 
@@ -507,6 +508,8 @@ def solve(
         Called after every step, and when no further one lowers F; what it raises ends the solution.
     run : Run, optional
         To continue an earlier solution, in place of ``params``.
+    trial : bool
+        Only :attr:`Solution.loss` is asked for: no posterior is computed.
 
     Raises
     ------
@@ -547,9 +550,9 @@ def solve(
             run.history.append({"iteration": len(run.history), **row, "damping": run.damping, "step_ms": ms})
         if after_step and (better is not None or run.finished):
             after_step(run, point)
-    normal = problem.normal(point, run.start, sigma)
     loss = problem.misfit(point.residual, sigma) + problem.penalty(run.state, run.start)
-    return Solution(problem.params(run.state), run.history, loss, problem.posterior(normal))
+    posterior = None if trial else problem.posterior(problem.normal(point, run.start, sigma))
+    return Solution(problem.params(run.state), run.history, loss, posterior)
 
 
 def _solved(lower, values):

@@ -219,7 +219,7 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     assert not work.newton
     check_trials(work)
 
-    def solved(problem, params, *_):
+    def solved(problem, params, *_, trial):
         if ends[params] is lost:
             raise NumericalError("it cannot begin")
         return types.SimpleNamespace(loss=ends[params])

@@ -17,6 +17,7 @@ from envedit import config, inputs, renderers, representations
 from envedit.core.errors import unwrapped
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
+from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
 from envedit.results import Found, Result
 from envedit.scene.renderings import rendered
@@ -127,11 +128,13 @@ def run(
     with clock("fit_s"):
         kind = settings.representation.kind
         watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
+        horizon, said = _horizon(settings, original)
         representation = representations.make(
             settings,
             fit.default_folder(),
             lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"),
             (first, height),
+            horizon,
         )
         params = representation.encode(crop, settings.seed)
     with clock("transport_s"):
@@ -158,7 +161,7 @@ def run(
             frozen = np.zeros((height, width), bool)
             frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
 
-    notes, free = [], ~frozen[rows] if traced and frozen.any() else None
+    notes, free = said, ~frozen[rows] if traced and frozen.any() else None
     within = None
     if traced and wanted.coverage is not None:
         with clock("reach_s"):
@@ -244,6 +247,18 @@ def run(
         found=Found(representation, params, first, free),
         posterior=job.posterior,
     )
+
+
+def _horizon(settings, original):
+    """Return what the rows below the horizon do, and a note on it."""
+    chosen = settings.input.horizon
+    if settings.representation.kind != "layers" or settings.input.rows != "all":
+        return "free", []
+    if chosen != "auto":
+        return chosen, []
+    chosen = below_horizon.kind_of(original)
+    said = "follow the sky as its mirror" if chosen == "mirror" else "are ground, and keep their brightness"
+    return chosen, [f"rows below the horizon {said}"]
 
 
 def _as_seen(traced, original, wanted):

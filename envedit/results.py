@@ -13,7 +13,7 @@ from envedit.images import images
 from envedit.representations import Representation
 from envedit.representations.layers.separation import Separation
 from envedit.solve.feasibility import Reach
-from envedit.solve.gauss_newton import Posterior
+from envedit.solve.map_problem import Posterior
 
 
 @dataclass

@@ -59,7 +59,13 @@ class Input(Table):
     envmap: str = _key("sunsky", string, 'HDR lat-long image, or "sunsky": Mitsuba\'s analytic sky')
     width: int = _key(256, integer(6, MOST_DIM, even=True), "working width, texels; height is half")
     rows: str | tuple[int, int] = _key(
-        "upper", row_range, 'rows the edit may change: "upper" half, "all", or [first, last] inclusive'
+        "all", row_range, 'rows the edit may change: "all", the "upper" half, or [first, last] inclusive'
+    )
+    horizon: str = _key(
+        "auto",
+        choice("auto", "mirror", "keep", "free"),
+        'layers, all rows: those below the horizon follow the sky as its blurred "mirror", "keep" but for a '
+        'fade, or are "free" as the sky is; "auto" tells a mirror from ground',
     )
     azimuth: float = _key(90.0, number(-360, 360), "sunsky: azimuth of the sun, degrees")
     elevation: float = _key(35.0, number(0, 90), "sunsky: elevation of the sun above the horizon, degrees")

@@ -11,12 +11,17 @@ from envedit.representations.siren import fit
 from envedit.representations.siren.siren import Siren
 
 
-def make(settings: config.Config, folder=None, progress=None, rows=None) -> Representation:
-    """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map."""
+def make(
+    settings: config.Config, folder=None, progress=None, rows=None, horizon: str = "free"
+) -> Representation:
+    """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
+
+    ``horizon`` is of layers alone (:class:`.Layers`).
+    """
     kind = settings.representation.kind
     if kind == "layers":
         cycles = settings.representation.cycles
-        return Layers(rows, CYCLES if cycles == "auto" else cycles)
+        return Layers(rows, CYCLES if cycles == "auto" else cycles, horizon)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":

@@ -1,21 +1,8 @@
-r"""The edit with layers as one problem of maximum a posteriori, solved by Gauss-Newton steps.
+"""Gauss-Newton steps with Levenberg's and Marquardt's damping, for the problem of ``map_problem.py``.
 
-Unknowns x: the log gain g of every node, and of every light that is lit its log flux per channel, its
-direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and
-E(x) the map that the layers compose, minimised is
-
-    F(x) = 1/A sum_p w_p rho_s(|d((T E(x))_p) - d(t_p)|) / sigma^2  +  x' K x
-
-* rho_s is Huber's loss: quadratic up to s, linear beyond. Pixels that no light can explain (caustics, shadow
-  edges, paint) then do not outvote the others. s = sigma at the end; at first s = sigma is as large as the
-  residual, and at most halved at every step, so that a start that is far away is not judged by its outliers.
-* A is the number of pixels whose errors go together, a share of the picture (:data:`INDEPENDENT`).
-* K is the inverse covariance of a sky's change (:class:`Prior`): luminance, blue-amber and green-magenta each
-  with their standard deviation, smaller by half for every finer grid; of lights flux, size and direction.
-
-The residual is exact, through T. The Jacobian is that of the block transport (``block_transport.py``): blocks
-of pixels by cells of texels, times the gain's hats under the present sky; pictures of lights are exact. A
-step solves the normal equations with Levenberg's and Marquardt's damping, and is kept if it lowers F.
+A step solves the normal equations, and is kept if it lowers F. Huber's threshold s and sigma are at first as
+large as the residual, and at most halved at every step: a start that is far away is not judged by its
+outliers.
 """
 
 from __future__ import annotations
@@ -24,63 +11,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import drjit as dr
 import numpy as np
 
-from envedit.core import latlong
-from envedit.core.arrays import tensor
-from envedit.core.color import LUMINANCE
 from envedit.core.errors import NumericalError
-from envedit.losses import display_curve
-from envedit.representations.layers.layers import VEIL, Layers
-from envedit.representations.layers.lights import DARK, rotation_vector
+from envedit.solve.map_problem import SIGMA, Point, Posterior, Problem
 
-SIGMA = 0.005
-"""Standard error of display values that a pixel is known to, where it was not measured."""
-INDEPENDENT = 256
-"""Residuals of a picture that count as independent, per channel: neighbouring pixels err together."""
 ITERATIONS, LITTLE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
 TRIES = 5
 """Dampings that are tried in one step."""
-ANGLE = np.radians(0.7)
-"""Rotation by which the derivative by a light's direction is told."""
-LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
-"""Largest step of an unknown: beyond it the linear model does not hold."""
-_AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-
-
-@dataclass(frozen=True)
-class Prior:
-    """How far a sky changes: standard deviations, the same for every scene and map.
-
-    Attributes
-    ----------
-    luminance : float
-        Of the mean log gain on the coarsest grid: 1 is a factor of e.
-    chroma : float
-        Of its blue-amber difference, along which daylight varies: 0.3 is 30 %.
-    tint : float
-        Of its green-magenta difference, which skies hardly have.
-    flux : float
-        Of a light's log flux per channel.
-    turn : float
-        Of a light's direction, radians from where the search has put it.
-    size : float
-        Of a light's log size.
-    """
-
-    luminance: float = 1.0
-    chroma: float = 0.3
-    tint: float = 0.1
-    flux: float = 1.5
-    turn: float = np.radians(10.0)
-    size: float = 0.3
-
-    def precisions(self, sizes) -> np.ndarray:
-        """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n)."""
-        fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
-        return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
 
 
 @dataclass
@@ -123,26 +62,6 @@ class Run:
         return cls(*parts, damping, scale, bool(finished), list(history))
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """How well a picture determines the sky.
-
-    Attributes
-    ----------
-    deviation, prior : ndarray (H, W)
-        Standard deviation of the log luminance gain with and without the picture; 0 outside the active rows.
-    """
-
-    deviation: np.ndarray
-    prior: np.ndarray
-
-    @property
-    def identified(self) -> np.ndarray:
-        """Share of the prior's variance that the picture removes, (H, W): 0 nothing is known, 1 all is."""
-        share = np.square(self.deviation / np.maximum(self.prior, 1e-12))
-        return np.where(self.prior > 0, np.clip(1 - share, 0, 1), 0).astype(np.float32)
-
-
 @dataclass
 class Solution:
     """What :func:`solve` found.
@@ -163,324 +82,6 @@ class Solution:
     history: list[dict]
     loss: float
     posterior: Posterior | None
-
-
-class Problem:
-    """F and its derivatives for one picture.
-
-    Parameters
-    ----------
-    layers : Layers
-        After ``encode``.
-    transport : LightTransport
-        T; gets exact columns for texels that become bright.
-    envmap : ndarray (H, W, 3)
-        The original.
-    picture : ndarray (h, w, 3)
-        The target, linear radiance.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts, 1 on average.
-    free : ndarray of bool (rows, W), optional
-        Active texels whose gain is free, as :meth:`.Layers.keep` was told; None: all.
-    prior : Prior
-        How far a sky changes.
-    """
-
-    def __init__(self, layers: Layers, transport, envmap, picture, weight=None, free=None, prior=None):
-        self.layers, self.transport, self.envmap, self.free = layers, transport, envmap, free
-        self.prior = prior or Prior()
-        first, _ = layers.rows
-        self.rows = slice(first, first + layers.shape[0])
-        self.target = display_curve.to_display(tensor(picture)).numpy()
-        shape = picture.shape[:2]
-        self.weight = np.ones((*shape, 1), np.float32) if weight is None else np.float32(weight)
-        self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
-        self.sizes = layers.gain.sizes
-        self.nodes = sum(rows * columns for rows, columns in self.sizes)
-        self.blocks = _Blocks(layers, transport, envmap.shape[:2])
-        self._precisions = self.prior.precisions(self.sizes)
-
-    # ---- unknowns ------------------------------------------------------------------------------------------
-
-    def state(self, params: dict) -> dict[str, np.ndarray]:
-        """Return the parameters in their own units: logarithms and radians, float64."""
-        real = {k: np.float64(v.numpy()) * _numpy(self.layers.scales[k]) for k, v in params.items()}
-        grids = [real.pop(f"gain.{i}").reshape(-1, 3) for i in range(len(self.sizes))]
-        return real | {"gain": np.concatenate(grids)}
-
-    def params(self, state: dict) -> dict:
-        """Return the layers' parameters of a state."""
-        found, start = {}, 0
-        for i, size in enumerate(self.sizes):
-            stop = start + size[0] * size[1]
-            grid = state["gain"][start:stop].reshape(*size, 3)
-            unit = _numpy(self.layers.scales[f"gain.{i}"])
-            found[f"gain.{i}"] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
-            start = stop
-        for name in ("turn", "flux", "size"):
-            found[name] = tensor(state[name] / self.layers.scales[name])
-        return found
-
-    def lit(self, state: dict) -> list[int]:
-        """List the lights that there are."""
-        return [i for i, flux in enumerate(state["flux"]) if flux.max() > DARK + 1]
-
-    # ---- F -------------------------------------------------------------------------------------------------
-
-    def evaluate(self, state: dict, resolve: bool = True) -> Point:
-        """Compose and render the map of a state; ``resolve``: trace columns for texels that became bright."""
-        crop = self.layers.decode(self.params(state)).numpy()
-        edited = self.envmap.copy()
-        edited[self.rows] = crop
-        if not np.isfinite(crop).all():
-            return Point(state, edited, None, None)
-        if resolve:
-            self.transport.resolve(edited, limit=32)
-        rendering = self.transport.apply(tensor(edited))
-        shown = display_curve.to_display(rendering).numpy()
-        if not np.isfinite(shown).all():
-            return Point(state, edited, None, None)
-        return Point(state, edited, rendering.numpy(), np.float64(shown) - self.target)
-
-    def penalty(self, state: dict, start: dict) -> float:
-        """Return x' K x; ``start`` is where the search has put the lights."""
-        total = (self._precisions * (_AXES @ state["gain"].T) ** 2).sum()
-        for i in self.lit(state):
-            total += (((state["flux"] - start["flux"])[i] / self.prior.flux) ** 2).sum()
-            total += ((state["size"] - start["size"])[i, 0] / self.prior.size) ** 2
-            total += (self._angle(state, start, i) / self.prior.turn) ** 2
-        return float(total)
-
-    def _angle(self, state, start, i):
-        return float(np.linalg.norm(_between(self.direction(start, i), self.direction(state, i))))
-
-    def direction(self, state: dict, i: int) -> np.ndarray:
-        """Return where light ``i`` is, (3,)."""
-        return _rotated(self.layers.lights.centres[i], state["turn"][i])
-
-    def misfit(self, residual: np.ndarray, sigma: float) -> float:
-        """Return the first part of F."""
-        size = np.sqrt((residual**2).mean(axis=2, keepdims=True))
-        loss = np.where(size <= sigma, size**2, sigma * (2 * size - sigma))
-        return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
-
-    # ---- normal equations ----------------------------------------------------------------------------------
-
-    def normal(self, point: Point, start: dict, sigma: float) -> Normal:
-        """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2."""
-        state, n = point.state, self.nodes
-        size = np.sqrt((point.residual**2).mean(axis=2, keepdims=True))
-        robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
-        slope = display_curve.slope(point.rendering)
-        blocks, lights = self.blocks, self._lights(point)
-        jacobian = blocks.jacobian(self._slopes(point))
-        unknowns = 3 * n + len(lights.pictures)
-        hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-        squared, pulled = blocks.summed(slope**2 * robust), blocks.summed(slope * robust * point.residual)
-        seen = np.zeros((len(lights.pictures), n * 3))
-        for c, j in enumerate(jacobian):
-            part = slice(c * n, (c + 1) * n)
-            scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
-            hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
-            gradient[part] = j.T @ pulled[:, c]
-            if len(lights.pictures):
-                in_blocks = blocks.summed((lights.pictures * (slope**2 * robust))[..., c].transpose(1, 2, 0))
-                seen[:, part] = in_blocks.T @ j
-        if len(lights.pictures):
-            rest = slice(3 * n, unknowns)
-            flat = (lights.pictures * (slope * np.sqrt(robust))).reshape(len(lights.pictures), -1)
-            hessian[rest, rest] = flat @ flat.T
-            gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
-            hessian[rest, : 3 * n], hessian[: 3 * n, rest] = seen, seen.T
-        # K of the gain: diagonal in luminance, chroma and tint.
-        gradient[: 3 * n] += (_AXES.T @ (self._precisions * (_AXES @ state["gain"].T))).ravel()
-        node = np.arange(n)
-        for a, axis in enumerate(_AXES):
-            for c, d in np.ndindex(3, 3):
-                hessian[c * n + node, d * n + node] += axis[c] * axis[d] * self._precisions[a]
-        for k, (name, i, axis) in enumerate(lights.unknowns, 3 * n):
-            sd = getattr(self.prior, name)
-            hessian[k, k] += sd**-2.0
-            if name == "turn":
-                back = _between(self.direction(start, i), self.direction(state, i))
-                gradient[k] += back @ axis / sd**2
-            else:
-                gradient[k] += (state[name] - start[name])[i, axis] / sd**2
-        return Normal(hessian, gradient, lights.unknowns)
-
-    def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
-        """Return the state after a damped step; None if the step is not finite."""
-        damped = normal.hessian.copy()
-        damped[np.diag_indices_from(damped)] *= 1 + damping
-        try:
-            step = -_solved(np.linalg.cholesky(damped), normal.gradient)
-        except np.linalg.LinAlgError:  # radiance beyond what squares of single precision hold
-            return None
-        if not np.isfinite(step).all():
-            return None
-        n, found = self.nodes, {name: value.copy() for name, value in state.items()}
-        found["gain"] += np.clip(step[: 3 * n], -LARGEST["gain"], LARGEST["gain"]).reshape(3, n).T
-        turns = {}
-        for value, (name, i, axis) in zip(step[3 * n :], normal.unknowns, strict=True):
-            if name == "turn":
-                turns[i] = turns.get(i, 0.0) + value * axis
-            else:
-                found[name][i, axis] += np.clip(value, -LARGEST[name], LARGEST[name])
-        for i, turn in turns.items():
-            turn = turn * min(1.0, LARGEST["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
-            there = _rotated(self.direction(state, i), turn)
-            found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
-        return found
-
-    def posterior(self, normal: Normal) -> Posterior:
-        """Return what the normal equations at the solution say of the log luminance gain."""
-        n = self.nodes
-        prior = np.diag(1 / (3 * self._precisions[0]))
-        mean = np.zeros((len(normal.hessian), n))
-        for c in range(3):
-            mean[c * n + np.arange(n), np.arange(n)] = 1 / 3
-        try:
-            half = np.linalg.solve(np.linalg.cholesky(normal.hessian), mean)
-            covariance = half.T @ half if np.isfinite(half).all() else prior
-        except np.linalg.LinAlgError:  # nothing can be said beyond the prior
-            covariance = prior
-        spread = [self.blocks.spread(one) for one in (covariance, prior)]
-        whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
-        whole[:, self.rows] = spread
-        return Posterior(*whole)
-
-    def _slopes(self, point):
-        """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        core = self.layers.lights.core(
-            *(tensor(point.state[name]) for name in ("turn", "flux", "size")),
-            self.layers.shape,
-            self.layers.rows,
-        )
-        sky = np.maximum(point.edited[self.rows] - core.numpy(), 0).reshape(-1, 3)
-        # In double precision: products of three radiances leave the range of the other.
-        sky, base = np.float64(sky), np.float64(self.layers.base.reshape(-1, 3))
-        gain = np.exp(np.float64(self.layers.log_gain(self.params(point.state)).reshape(-1, 3)))
-        grey = base * (1 - VEIL) + (base @ LUMINANCE)[:, None] * VEIL
-        more = base + (gain - 1) * grey
-        slopes = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
-        if self.free is not None:
-            slopes = np.where(self.free.reshape(-1, 1), slopes, 0)
-        return slopes
-
-    def _lights(self, point) -> _Lights:
-        """Pictures by which a light's unknowns change the rendering, (k, h, w, 3), and what they are."""
-        state, lit, unknowns, pictures = point.state, self.lit(point.state), [], []
-        for i in lit:
-            alone = state["flux"].copy()
-            alone[np.arange(len(alone)) != i] = DARK
-            centre = self.direction(state, i)
-            across = np.cross(centre, [0.0, 1.0, 0.0])
-            across = (
-                across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0, 0])
-            )
-            now = self._core(state, alone)
-            cores = [now]
-            for axis in (across, np.cross(across, centre)):
-                ends = []
-                for sign in (1, -1):
-                    moved = {**state, "turn": state["turn"].copy()}
-                    there = _rotated(centre, sign * ANGLE * axis)
-                    moved["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
-                    ends.append(self._core(moved, alone))
-                cores.append((ends[0] - ends[1]) / (2 * ANGLE))
-                unknowns.append(("turn", i, axis))
-            larger = {**state, "size": state["size"] + 0.1}
-            cores.append((self._core(larger, alone) - now) / 0.1)
-            flux, *others = self.transport.pictures(np.stack(cores), self.rows)
-            pictures += others
-            unknowns.append(("size", i, 0))
-            for c in range(3):
-                one = np.zeros_like(flux)
-                one[..., c] = flux[..., c]
-                pictures.append(one)
-                unknowns.append(("flux", i, c))
-        shape = (len(pictures), *self.target.shape)
-        return _Lights(np.asarray(pictures, np.float32).reshape(shape), unknowns)
-
-    def _core(self, state, flux):
-        return self.layers.lights.core(
-            tensor(state["turn"]), tensor(flux), tensor(state["size"]), self.layers.shape, self.layers.rows
-        ).numpy()
-
-
-@dataclass(frozen=True)
-class Point:
-    """A state with its map, rendering and residual of display values; the last two None if not finite."""
-
-    state: dict
-    edited: np.ndarray
-    rendering: np.ndarray | None
-    residual: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Hessian (m, m) and gradient (m,) of F / 2; ``unknowns`` names those after the gain's."""
-
-    hessian: np.ndarray
-    gradient: np.ndarray
-    unknowns: list
-
-
-@dataclass(frozen=True)
-class _Lights:
-    pictures: np.ndarray
-    unknowns: list
-
-
-class _Blocks:
-    """The block transport with the gain's hats in its cells."""
-
-    def __init__(self, layers, transport, shape):
-        overview = transport.overview()
-        self.block_of, self.count = overview.block_of, len(overview.matrix[0])
-        first, _ = layers.rows
-        active = slice(first * shape[1], (first + layers.shape[0]) * shape[1])
-        self._shape = layers.shape
-        cells, omega = len(overview.omega), np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
-        self._total = np.bincount(overview.cell_of, omega, cells)
-        self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
-        # Hats are weighed by the sky's luminance: what is bright in a cell tells its gain.
-        sky = np.maximum(layers.separation.background.reshape(-1, 3) @ LUMINANCE, 1e-12) * self._omega
-        light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
-        hats = []
-        for level, (rows, columns) in enumerate(layers.gain.sizes):
-            nodes, one = rows * columns, 0.0
-            for node, share in layers.gain.hats(level, layers.shape):
-                one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
-            hats.append(one.reshape(cells, nodes) / light[:, None])
-        used = np.bincount(self._cell, minlength=cells) > 0
-        self._used = np.flatnonzero(used)
-        self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)
-        self._matrix = [tensor(np.ascontiguousarray(m[:, used])) for m in overview.matrix]
-
-    def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
-        """Return the change of a block's radiance by each node, (blocks, n), per channel."""
-        found = []
-        for c in range(3):
-            sky = np.bincount(self._cell, self._omega * slopes[:, c], self._cells) / np.maximum(
-                self._total, 1e-30
-            )
-            hats = tensor(sky[self._used, None].astype(np.float32) * self._hats)
-            found.append(dr.matmul(self._matrix[c], hats).numpy())
-        return found
-
-    def spread(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""
-        variance = np.einsum("kn,nm,km->k", self._hats, covariance, self._hats, optimize=True)
-        cells = np.zeros(self._cells)
-        cells[self._used] = np.sqrt(np.maximum(variance, 0))
-        return cells[self._cell].reshape(self._shape).astype(np.float32)
-
-    def summed(self, picture: np.ndarray) -> np.ndarray:
-        """Sum a picture (h, w, k) over blocks: (blocks, k)."""
-        flat = picture.reshape(-1, picture.shape[2])
-        return np.stack([np.bincount(self.block_of, v, self.count) for v in flat.T], axis=1)
 
 
 def solve(
@@ -517,8 +118,8 @@ def solve(
         If the start is not finite.
     """
     start = problem.state(params)
-    if iterations:  # a gain that explains the picture alone, as the search has it, is far from any sky
-        start["gain"][:] = 0
+    if iterations:
+        problem.clear(start)
     # A continued run has the columns with which its last point was rendered.
     run, fresh = run or Run(start, start), run is None
     point = problem.evaluate(run.state, resolve=fresh)
@@ -553,38 +154,3 @@ def solve(
     loss = problem.misfit(point.residual, sigma) + problem.penalty(run.state, run.start)
     posterior = None if trial else problem.posterior(problem.normal(point, run.start, sigma))
     return Solution(problem.params(run.state), run.history, loss, posterior)
-
-
-def _solved(lower, values):
-    """Solve L L' x = values by substitution, 64 rows at a time."""
-    size = 64
-    x = np.array(values, np.float64)
-    starts = range(0, len(x), size)
-    for k in starts:
-        part = slice(k, k + size)
-        x[part] = np.linalg.solve(lower[part, part], x[part] - lower[part, :k] @ x[:k])
-    for k in reversed(starts):
-        part, rest = slice(k, k + size), slice(k + size, None)
-        x[part] = np.linalg.solve(lower[part, part].T, x[part] - lower[rest, part].T @ x[rest])
-    return x
-
-
-def _numpy(unit):
-    return unit.numpy() if hasattr(unit, "numpy") else np.float64(unit)
-
-
-def _rotated(vector, turn):
-    """Rotate a vector by a rotation vector (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    if angle < 1e-12:
-        return np.array(vector, np.float64)
-    axis = np.asarray(turn) / angle
-    along = axis * (axis @ vector) * (1 - np.cos(angle))
-    return vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + along
-
-
-def _between(one, other):
-    """Return the rotation vector that brings a direction to another."""
-    axis = np.cross(one, other)
-    sine = float(np.linalg.norm(axis))
-    return axis * (np.arctan2(sine, one @ other) / max(sine, 1e-30))

@@ -153,9 +153,8 @@ def find(
     params = layers.refine(params, recordings.octaves)
     starts = _searched(layers, params, transport, wanted, original)
     if recordings.octaves:  # a mirror: images of lights, and caustics, are where the lights are now found
-        first = layers.rows[0]
         began = original.copy()
-        began[first : first + layers.shape[0]] = layers.decode(starts[0][0]).numpy()
+        began[layers.active] = layers.decode(starts[0][0]).numpy()
         weight, said = _trusted(began, recordings, wanted)
         if weight is not None:
             notes.append(said)

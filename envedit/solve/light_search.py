@@ -91,7 +91,7 @@ def start(
         places[i] = Place(direction if found.direction is not None else None, np.full(3, flux))
         pictures.append((i, scene.light(i, places[i])))
         if light.glow is not None:
-            factor *= 1 + glow_at(light.glow, overview.directions @ direction)
+            factor *= 1 + glow_at(light.glow, scene.cells @ direction)
     for i in range(len(lights), len(places)):
         if places[i].flux.max() > 0:
             notes.append("a light is born: the picture wants one where the map has none")
@@ -147,8 +147,10 @@ class Question:
         first, _ = layers.rows
         height, width = layers.shape
         rows = slice(first, first + height)
+        # Ground that is kept stays as it is; a mirror goes by the sky.
+        explained = layers.active if layers.mirrored else rows
         rest = envmap.copy()
-        rest[rows] = 0
+        rest[explained] = 0
         self.known = picture
         self.wanted = picture - transport.apply(tensor(rest)).numpy() if wanted is None else wanted
         self.active = np.zeros(envmap.shape[:2], bool)
@@ -156,16 +158,25 @@ class Question:
         self.active = self.active.ravel()
         self.start, self.rows = first * width, rows
         self.omega = np.repeat(latlong.lookup_solid_angles(*envmap.shape[:2]), width)
-        self.background = np.zeros((len(self.omega), 3))
-        self.background[self.active] = layers.separation.background.reshape(-1, 3)
-        self.directions = latlong.directions(*envmap.shape[:2])
+        background = np.zeros(envmap.shape)
+        background[explained] = layers.background() if layers.mirrored else layers.separation.background
+        self.background = background.reshape(-1, 3)
+        self.gained = np.zeros(envmap.shape[:2], bool)
+        self.gained[explained] = True
+        self.gained = self.gained.ravel()
+        self.directions = self._seen(latlong.directions(*envmap.shape[:2]))
+        self.cells = self._seen(transport.overview().directions)
         self.shape = envmap.shape
         self._gains = None
 
+    def _seen(self, directions):
+        """Directions by which gain and glow go: what mirrors the sky goes by what it mirrors."""
+        return np.abs(directions, where=[False, self.layers.mirrored, False], out=directions.copy())
+
     def given(self) -> Given:
         """Return what a pursuit is given."""
-        overview, rest = self.transport.overview(), (self.background, self.omega, self.active, self.start)
-        return Given(overview, self.weight, self.known, *rest)
+        rest = self.background, self.omega, self.active, self.start, self.cells
+        return Given(self.transport.overview(), self.weight, self.known, *rest)
 
     def render(self, values):
         """Picture (h, w, 3) of a map (H * W, 3) alone, without other lamps' light."""
@@ -210,12 +221,12 @@ class Question:
     def hats(self, level):
         """Radiance of what a gain adds, times each hat of a grid, in cells: (3, cells, nodes)."""
         overview = self.transport.overview()
-        base = self.background[self.active]
+        base = self.background[self.gained]
         base = (1 - VEIL) * base + VEIL * (base @ LUMINANCE)[:, None]
         rows, columns = self.layers.gain.sizes[level]
         cell, omega, cells, nodes = *self._cells(), len(overview.omega), rows * columns
         hats = np.zeros((3, cells * nodes))
-        for node, share in self.layers.gain.hats(level, self.layers.shape):
+        for node, share in self._hats(level):
             for c in range(3):
                 hats[c] += np.bincount(cell * nodes + node, share * omega * base[:, c], cells * nodes)
         total = np.bincount(overview.cell_of, self.omega, cells)
@@ -226,13 +237,17 @@ class Question:
         cell, omega = self._cells()
         cells = len(self.transport.overview().omega)
         logs = np.zeros((cells, 3))
-        for node, share in self.layers.gain.hats(level, self.layers.shape):
+        for node, share in self._hats(level):
             for c in range(3):
                 logs[:, c] += np.bincount(cell, share * omega * np.log(gain[node, c]), cells)
         return np.exp(logs / np.maximum(np.bincount(cell, omega, cells), 1e-30)[:, None])
 
+    def _hats(self, level):
+        layers = self.layers
+        return layers.hats(level) if layers.mirrored else layers.gain.hats(level, layers.shape)
+
     def _cells(self):
-        return self.transport.overview().cell_of[self.active], self.omega[self.active]
+        return self.transport.overview().cell_of[self.gained], self.omega[self.gained]
 
 
 def rotations(lights, places):

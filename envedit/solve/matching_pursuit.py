@@ -69,6 +69,8 @@ class Given:
         Texels that may change.
     start : int
         Texel from which those of the lights are counted.
+    directions : ndarray (cells, 3)
+        Directions by which gain and glow go in each cell of the overview.
     """
 
     overview: Overview
@@ -78,6 +80,7 @@ class Given:
     omega: np.ndarray
     active: np.ndarray
     start: int
+    directions: np.ndarray
 
     def flux(self, light: Light) -> np.ndarray:
         """Return the flux of a light's texels, (n, 3)."""
@@ -139,7 +142,7 @@ def place(
     # Whether lights are missing is asked only where much is left.
     missing = search.left() > UNEXPLAINED * search.asked()
     if missing:
-        search.allow(products(overview.directions, BIRTH_ORDER))
+        search.allow(products(given.directions, BIRTH_ORDER))
         atom = search.atoms(spare_flux, None)
     for _ in range(spare if missing else 0):
         score = search.scores(atom)
@@ -213,7 +216,7 @@ class Pursuit:
         self.background = np.where(np.isfinite(cells), cells, 0)
         share = overview.to_cells(given.active[:, None].astype(float), omega)[:, 0]
         self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
-        d = overview.directions
+        self.directions = d = given.directions
         self.cosine = d @ d[self.candidates].T
         self.wanted = [w * self.weight for w in wanted]
         self.residual = list(self.wanted)
@@ -249,7 +252,7 @@ class Pursuit:
 
     def atom_of(self, cells, flux, centre, glow):
         """Picture, (3, blocks, 1), of a light with flux (n, 3) in cells (n,) and its glow around a centre."""
-        found, shine = [], None if glow is None else glow_at(glow, self.overview.directions @ centre)
+        found, shine = [], None if glow is None else glow_at(glow, self.directions @ centre)
         for c in range(3):
             light = np.bincount(cells, flux[:, c], len(self.overview.omega)) / self.overview.omega
             if glow is not None:

@@ -1,44 +1,14 @@
 """The command ``envedit``: its sub-commands, a configuration to start from, what is kept between runs."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
-from envedit import __version__, config
+from envedit import config
 from envedit.cli import cache, init, main, run
 from envedit.core import array_cache, shipped
 from tests.oracles import ROOT
-
-
-def test_every_command_is_told_and_has_its_own_help(capsys):
-    for name in main.COMMANDS:
-        with pytest.raises(SystemExit) as stop:
-            main.main([name, "--help"])
-        assert stop.value.code == 0 and f"envedit {name}" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as stop:
-        main.main(["--help"])
-    said = capsys.readouterr().out
-    assert stop.value.code == 0 and all(name in said for name in main.COMMANDS)
-    assert all(name in said for name in (*shipped.configurations(), *shipped.scenes()))
-
-
-def test_what_is_no_command_is_refused(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main.main(["edit"])
-    assert stop.value.code == 2 and "usage: envedit COMMAND" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("module", ["envedit", "envedit.cli.main"])
-def test_the_package_is_the_command(module):
-    command = [sys.executable, "-m", module, "--version"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == f"envedit {__version__}"
-
-
-# ---- a shipped configuration -------------------------------------------------------------------------------
 
 
 def test_results_of_a_shipped_configuration_lie_where_the_command_was_called(tmp_path, monkeypatch):

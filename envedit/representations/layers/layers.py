@@ -4,13 +4,16 @@
 
 E_0' is the original without the cores of its lights, G_l and C_l are glow and core of light l
 (``separation.py``, ``lights.py``), with index 0 before they moved, and g is the smooth gain of the sky
-(``gain.py``); s_l, the factor of a light's flux, is in G_l. Where f = exp(g) is above 1, E f is read as
+(``gain.py``); s_l, the factor of a light's flux, is in G_l. Rows below the horizon follow those above
+(``below_horizon.py``), or are edited like them. Where f = exp(g) is above 1, E f is read as
 E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`brightened`. Unmoved lights and no gain give the original
 back, bit for bit outside the cores: there is nothing to fit, the sky's own detail is kept, and the map has
 any resolution.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -19,10 +22,12 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave
 from envedit.representations.layers.lights import DARK, SPARE, Lights
 from envedit.representations.layers.separation import Separation, separate
 
+Horizon = Literal["mirror", "keep", "free"]
 VEIL = 0.2
 """Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
@@ -44,6 +49,9 @@ class Layers:
         First row of the images in their map, and the rows of that map.
     cycles : int
         Cycles of the gain around the horizon, before :meth:`refine`.
+    horizon : str
+        What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
+        ``below_horizon.py``, or "free": edited as those above.
 
     Attributes
     ----------
@@ -54,7 +62,12 @@ class Layers:
     gain : GridGain
         The gain's grids.
     rows, shape : (int, int)
-        As given, and rows and columns of the image.
+        As given, and rows and columns that lights and gain act on: of the image, or of its sky where the
+        rows below the horizon follow.
+    whole : (int, int)
+        Rows and columns of the image.
+    below : Below or None
+        The rows that follow.
     free : ndarray of bool (rows, W) or None
         As :meth:`keep` was told.
     scales : dict
@@ -65,8 +78,11 @@ class Layers:
     models_edit, fitted = True, None
     Gain = GridGain
 
-    def __init__(self, rows: tuple[int, int] | None = None, cycles: int = CYCLES):
-        self.rows, self._cycles = rows, cycles
+    def __init__(
+        self, rows: tuple[int, int] | None = None, cycles: int = CYCLES, horizon: Horizon = "free"
+    ):
+        self.rows, self._cycles, self._horizon = rows, cycles, horizon
+        self.below: Below | None = None
         self.separation: Separation | None = None
         self.free: np.ndarray | None = None
 
@@ -81,12 +97,18 @@ class Layers:
         self.rows = self.rows or (0, image.shape[0])
         require_radiance(image, "layers", self.rows[0], BRIGHTEST)
         image = np.ascontiguousarray(image, np.float32)
+        self.whole, low = image.shape[:2], None
+        if self._horizon != "free" and self.rows == (0, len(image)):
+            up = sky_rows(len(image))
+            image, low = np.ascontiguousarray(image[:up]), image[up:]
         self.separation = separate(image, self.rows)
         self.lights = Lights(self.separation.lights, self.rows, image.shape[1])
         self.shape = image.shape[:2]
         core = self.separation.core
         base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)
         self.base = np.maximum(base, 0).astype(np.float32)
+        self._low = low
+        self.below = Below(low, self.base, self._horizon) if low is not None and len(low) else None
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1])
         self.scales = SCALES | self.gain.scales()
         self._prepared = {}
@@ -110,15 +132,18 @@ class Layers:
 
     def keep(self, free: np.ndarray | None) -> None:
         """Say which texels (rows, W) may change other than by a light's moving; None: all."""
-        self.free = free
+        self.free = None if free is None else free[: self.shape[0]]
         self._prepared = {}
 
     def decode(self, params: dict, shape: tuple[int, int] | None = None) -> mi.TensorXf:
-        """Compose the map at the resolution of the image, or at any other ``shape`` (rows, W)."""
+        """Compose the map at the resolution of the image, or at any other ``shape`` (rows, W).
+
+        Rows that follow have the resolution of the image.
+        """
         shape = tuple(shape or self.shape)
-        if shape not in self._prepared:
-            self._prepared[shape] = self._prepare(shape)
-        rows, d, base, before, gain, free = self._prepared[shape]
+        if self.below is not None and shape != self.shape:
+            raise ValueError(f"rows below the horizon follow at {self.whole} texels only, asked for {shape}")
+        rows, d, base, before, gain, free = self._at(shape)
         real = {name: value * self.scales[name] for name, value in params.items()}
         factor = dr.exp(self.gain.evaluate(real, gain))
         factor = dr.select(free, factor, 1) if free is not None else factor
@@ -126,16 +151,75 @@ class Layers:
         if self.lights.glowing:
             sky *= self.lights.glow(real["turn"], real["flux"], d) / before
         sky = mi.TensorXf(dr.ravel(sky), (*shape, 3))
+        if self.below is not None:
+            shape = self.whole
+            factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky)).array)
+            low = dr.ravel(brightened(self.below.radiance, factor))
+            sky = mi.TensorXf(dr.concat((sky.array, low)), (*shape, 3))
         return sky + self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
+
+    @property
+    def active(self) -> slice:
+        """Rows of the map that :meth:`decode` composes."""
+        return slice(self.rows[0], self.rows[0] + self.whole[0])
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether rows below the horizon mirror the sky."""
+        return self.below is not None and self.below.kind == "mirror"
+
+    @property
+    def followed(self) -> np.ndarray:
+        """Row of lights and gain that each row of the image goes by, (rows,)."""
+        own = np.arange(self.shape[0])
+        return own if self.below is None else np.concatenate([own, self.below.mirrored])
+
+    @property
+    def follows(self) -> np.ndarray:
+        """How far each row of the image goes by lights and gain, (rows,): 1, less where ground is kept."""
+        own = np.ones(self.shape[0])
+        return own if self.below is None else np.concatenate([own, self.below.fade])
+
+    def background(self) -> np.ndarray:
+        """Return the image without its lights and their glow, (rows, W, 3)."""
+        own = self.separation.background
+        if self.below is None:
+            return own
+        glow = self.separation.glow[self.below.mirrored] ** self.below.fade[:, None, None]
+        return np.concatenate([own, self._low / glow])
+
+    def hats(self, level: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """List what :meth:`.GridGain.hats` does, of all texels of the image, those that follow included."""
+        rows, taps = self.followed, []
+        for node, share in self.gain.hats(level, self.shape):
+            node, share = node.reshape(self.shape)[rows], share.reshape(self.shape)[rows]
+            taps.append((node.ravel(), (share * self.follows[:, None]).ravel()))
+        return taps
 
     def log_gain(self, params: dict) -> np.ndarray:
         """Return the logarithm of the gain (rows, W, 3) float32, at the resolution of the image.
 
-        Of all texels, also of those that :meth:`keep` excepts from it.
+        Of all texels that the gain acts on itself, also of those that :meth:`keep` excepts from it.
         """
         real = {name: value * self.scales[name] for name, value in params.items()}
         field = self.gain.evaluate(real, self.gain.prepare(self.shape, self.rows))
         return mi.TensorXf(dr.ravel(field), (*self.shape, 3)).numpy()
+
+    def glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
+        """Return 1 + s_i G_i (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
+
+        ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.
+        """
+        if i >= len(self.separation.lights) or self.separation.lights[i].glow is None:
+            return None
+        factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._at(self.shape)[1])
+        found = mi.TensorXf(dr.ravel(factor), (*self.shape, 3)).numpy()[self.followed]
+        return found if self.below is None else found ** self.follows[:, None, None]
+
+    def _at(self, shape):
+        if shape not in self._prepared:
+            self._prepared[shape] = self._prepare(shape)
+        return self._prepared[shape]
 
     def _prepare(self, shape):
         first, total = self.rows

@@ -143,13 +143,17 @@ class Lights:
         s_l is the factor of the light's flux: a glow is put out with its light.
         """
         factor = mi.Color3f(1)
-        for i, table in enumerate(self._glow):
-            if table is None:
-                continue
-            index = dr.opaque(mi.UInt32, i)
-            centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
-            factor *= 1 + _glow_of(table, dr.dot(d, centre)) * _exp(_colour(log_flux, index))
+        for i in range(len(self._glow)):
+            factor *= self.glow_of(i, turn, log_flux, d)
         return factor
+
+    def glow_of(self, i: int, turn, log_flux, d: mi.Vector3f) -> mi.Color3f:
+        """Evaluate 1 + s_i G_i of light ``i`` alone; 1 if it has no glow."""
+        if i >= len(self._glow) or self._glow[i] is None:
+            return mi.Color3f(1)
+        index = dr.opaque(mi.UInt32, i)
+        centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
+        return 1 + _glow_of(self._glow[i], dr.dot(d, centre)) * _exp(_colour(log_flux, index))
 
 
 def placed(point, centre, turn, size, sine, finer: float, grid: tuple[int, int]):

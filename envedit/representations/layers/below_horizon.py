@@ -1,0 +1,143 @@
+"""The rows below the horizon, which follow the sky above them.
+
+On PureSky maps they are a blurred mirror of the sky; on others they are photographed ground. Either way they
+are the original's, times a smooth factor that tells how the sky above has changed:
+
+    E_low = E0_low * R^f,    log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
+
+S and S_0 are the sky, without cores of lights, after the edit and before, m is the mirrored direction, K a
+Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
+:data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio. f is 1 for
+a mirror; for ground it falls off with the angle (:data:`FADE`): what was photographed keeps its brightness.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
+
+KINDS = "mirror", "keep"
+SMOOTH = 0.0125
+"""Median of |log luminance less its mean over 5x5 texels| below the horizon up to which it is no photograph:
+PureSky has 0.0008 to 0.005, maps with ground 0.03 to 0.11 (256 texels wide)."""
+VARIES = 1 / 512
+"""Least range of log luminance around the horizon of what can mirror a sky."""
+WIDTHS = 1.0, 0.3, 10.0
+"""Standard deviation of K: degrees at the horizon, more for each degree below it, at most."""
+BLENDED = 5.0
+"""Degrees below the horizon over which the blur sets in."""
+FADE = 10.0
+"""Degrees below the horizon at which ground follows by 1/e."""
+COLUMNS = 96
+"""Columns of the grid on which K is applied."""
+
+
+def sky_rows(total: int) -> int:
+    """Return how many rows of a map look up, the horizon's own included."""
+    return (total + 1) // 2
+
+
+def kind_of(envmap: np.ndarray) -> str:
+    """Tell what a map (H, W, 3) shows below the horizon: a "mirror" of the sky, or ground to "keep"."""
+    low = np.float64(envmap[sky_rows(len(envmap)) :]) @ LUMINANCE
+    if not low.size or not low.max() > 0:
+        return "keep"
+    logs = np.log(np.maximum(low, 1e-6 * low.max()))
+    # Neither the horizon, where the sky's own detail is near, nor the nadir, where columns meet.
+    logs = logs[len(logs) // 8 : max(3 * len(logs) // 4, len(logs) // 8 + 1)]
+    padded = np.pad(np.pad(logs, ((2, 2), (0, 0)), mode="edge"), ((0, 0), (2, 2)), mode="wrap")
+    mean = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).mean(axis=(2, 3))
+    smooth = np.median(np.abs(logs - mean)) <= SMOOTH
+    return "mirror" if smooth and np.ptp(logs, axis=1).max() > VARIES else "keep"
+
+
+class Below:
+    """The rows below the horizon of one map.
+
+    Parameters
+    ----------
+    radiance : ndarray (rows, W, 3)
+        The original's rows below the horizon.
+    sky : ndarray (sky_rows, W, 3)
+        The original's rows above, without cores of lights.
+    kind : str
+        "mirror" or "keep".
+
+    Attributes
+    ----------
+    mirrored : ndarray of int64 (rows,)
+        The row of the sky that each row mirrors.
+    fade : ndarray (rows,)
+        f of each row.
+    """
+
+    def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str):
+        (up, width, _), low = sky.shape, len(radiance)
+        total = up + low
+        self.kind, self.shape = kind, radiance.shape[:2]
+        self.radiance = dr.opaque(mi.Color3f(np.ascontiguousarray(radiance.reshape(-1, 3).T, np.float32)))
+        self._faint = float(max(1e-6 * sky.mean(), 1e-30))
+        angle = np.degrees(np.pi * np.arange(up, total) / max(total - 1, 1)) - 90
+        self.fade = np.ones(low) if kind == "mirror" else np.exp(-angle / FADE)
+        blend = np.clip(angle / BLENDED, 0, 1)
+        self._sharp, self._soft = (tensor((s * self.fade)[:, None]) for s in (1 - blend, blend))
+        self.mirrored = np.arange(low)[::-1]
+        texel = self.mirrored[:, None] * (3 * width) + np.arange(3 * width)
+        self._mirrored = dr.opaque(mi.UInt32(texel.ravel().astype(np.uint32)))
+        columns = min(COLUMNS, width)
+        rows = max(1, columns // 4)
+        theta = np.pi * np.arange(up) / max(total - 1, 1)
+        down = _tents((theta / (np.pi / 2)) * rows - 0.5, rows)
+        across = _tents((np.arange(width) + 0.5) / width * columns - 0.5, columns, periodic=True)
+        weight = down * latlong.solid_angles(total, width)[:up, None]
+        share = weight.sum(axis=0)[:, None] * across.sum(axis=0)
+        self._grid = rows, columns
+        self._down = tensor(weight.T)
+        self._across = tensor(np.kron(across, np.eye(3)))
+        self._share = tensor(1 / np.maximum(np.repeat(share, 3, axis=1), 1e-30))
+        self._kernel = tensor(_kernel(rows, columns))
+        self._up = tensor(down[self.mirrored])
+        self._back = tensor(np.kron(across.T, np.eye(3)))
+        before = tensor(sky)
+        self._before, self._before_soft = before, self._blurred(before)
+
+    def log_factor(self, sky: mi.TensorXf) -> mi.TensorXf:
+        """Return log R^f (rows, W, 3) under a sky (sky_rows, W, 3) without cores."""
+        soft = dr.log((self._blurred(sky) + self._faint) / (self._before_soft + self._faint))
+        soft = dr.matmul(dr.matmul(self._up, soft), self._back)
+        sharp = dr.log((sky.array + self._faint) / (self._before.array + self._faint))
+        sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
+        return dr.reshape(sharp * self._sharp + soft * self._soft, (*self.shape, 3))
+
+    def _blurred(self, sky):
+        """Average a sky over K, on the coarse grid: (rows, 3 columns)."""
+        rows, columns = self._grid
+        flat = dr.reshape(sky, (sky.shape[0], 3 * sky.shape[1]))
+        coarse = dr.matmul(dr.matmul(self._down, flat), self._across) * self._share
+        soft = dr.matmul(self._kernel, dr.reshape(coarse, (rows * columns, 3)))
+        return dr.reshape(soft, (rows, 3 * columns))
+
+
+def _tents(place, count, periodic=False):
+    """Return linear weights (n, count) of a grid's nodes at places in units of their distance."""
+    if periodic:
+        apart = np.abs(place[:, None] - np.arange(count)) % count
+        return np.maximum(1 - np.minimum(apart, count - apart), 0)
+    return np.maximum(1 - np.abs(np.clip(place, 0, count - 1)[:, None] - np.arange(count)), 0)
+
+
+def _kernel(rows, columns):
+    """Return K between the nodes of a grid over the upper half: each row sums to 1."""
+    theta = (np.arange(rows) + 0.5) / rows * np.pi / 2
+    phi = 2 * np.pi * (np.arange(columns) + 0.5) / columns
+    d = latlong.on_sphere(theta[:, None], phi).reshape(-1, 3)
+    angle = np.degrees(np.arccos(np.clip(d @ d.T, -1, 1)))
+    least, more, most = WIDTHS
+    width = np.minimum(least + more * (90 - np.degrees(theta)), most).repeat(columns)
+    kernel = np.exp(-0.5 * (angle / width[:, None]) ** 2) * np.sin(theta).repeat(columns)
+    return kernel / kernel.sum(axis=1, keepdims=True)

@@ -1,0 +1,68 @@
+"""The derivative of a picture by the gain of the sky, in blocks of pixels and cells of texels."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
+
+
+class BlockJacobian:
+    """The block transport with the gain's hats in its cells."""
+
+    def __init__(self, layers, transport, shape):
+        overview = transport.overview()
+        self.block_of, self.count = overview.block_of, len(overview.matrix[0])
+        active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])
+        self._shape = layers.whole
+        cells, omega = len(overview.omega), np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
+        self._total = np.bincount(overview.cell_of, omega, cells)
+        self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
+        # Hats are weighed by the sky's luminance: what is bright in a cell tells its gain.
+        sky = np.maximum(layers.background().reshape(-1, 3) @ LUMINANCE, 1e-12) * self._omega
+        light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
+        hats = []
+        for level, (rows, columns) in enumerate(layers.gain.sizes):
+            nodes, one = rows * columns, 0.0
+            for node, share in layers.hats(level):
+                one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
+            hats.append(one.reshape(cells, nodes) / light[:, None])
+        used = np.bincount(self._cell, minlength=cells) > 0
+        self._used = np.flatnonzero(used)
+        self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)
+        self._matrix = [tensor(np.ascontiguousarray(m[:, used])) for m in overview.matrix]
+
+    def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
+        """Return the change of a block's radiance by each node, (blocks, n), per channel."""
+        found = []
+        for c in range(3):
+            sky = np.bincount(self._cell, self._omega * slopes[:, c], self._cells) / np.maximum(
+                self._total, 1e-30
+            )
+            hats = tensor(sky[self._used, None].astype(np.float32) * self._hats)
+            found.append(dr.matmul(self._matrix[c], hats).numpy())
+        return found
+
+    def picture(self, change: np.ndarray) -> np.ndarray:
+        """Return what a change of the active rows, (rows, W, 3), does to every pixel: (pixels, 3)."""
+        found = []
+        for c, matrix in enumerate(self._matrix):
+            cells = np.bincount(self._cell, self._omega * change[..., c].ravel(), self._cells)
+            cells = (cells / np.maximum(self._total, 1e-30))[self._used]
+            found.append(dr.matmul(matrix, tensor(cells[:, None].astype(np.float32))).numpy()[:, 0])
+        return np.stack(found, axis=1)[self.block_of]
+
+    def spread(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""
+        variance = np.einsum("kn,nm,km->k", self._hats, covariance, self._hats, optimize=True)
+        cells = np.zeros(self._cells)
+        cells[self._used] = np.sqrt(np.maximum(variance, 0))
+        return cells[self._cell].reshape(self._shape).astype(np.float32)
+
+    def summed(self, picture: np.ndarray) -> np.ndarray:
+        """Sum a picture (h, w, k) over blocks: (blocks, k)."""
+        flat = picture.reshape(-1, picture.shape[2])
+        return np.stack([np.bincount(self.block_of, v, self.count) for v in flat.T], axis=1)

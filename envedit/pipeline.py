@@ -13,17 +13,15 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit import config, inputs, renderers, representations
+from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
-from envedit.representations.layers import below_horizon
-from envedit.representations.siren import fit
+from envedit.preparation import Preparation
 from envedit.results import Found, Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
-from envedit.solve import initialization
-from envedit.solve.edit_job import Interrupted, Job, Stopped, Watch, keeping
+from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
 from envedit.targets import target
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
@@ -124,82 +122,26 @@ def run(
         initial = wanted.initial
         if initial is None:
             initial, _, _ = rendered(lit, original, few, settings.seed + JUDGE_SEED, settings.renderer.cache)
-    crop = original[first : last + 1]
-    with clock("fit_s"):
-        kind = settings.representation.kind
-        watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
-        horizon, said = _horizon(settings, original)
-        representation = representations.make(
-            settings,
-            fit.default_folder(),
-            lambda done, total, loss: watch.progress(done, total, f"loss {loss:.4g}"),
-            (first, height),
-            horizon,
-        )
-        params = representation.encode(crop, settings.seed)
-    with clock("transport_s"):
-        watch.stage(
-            "tracing light transport"
-            if settings.renderer.kind == "transport"
-            else "preparing the path tracer"
-        )
-
-        def count(done, total):
-            watch.progress(done, total, "")
-
-        renderer = renderers.make(settings, lit, (height, width), count)
-        traced = renderer.transport
-        if representation.models_edit:
-            recordings = initialization.recordings(
-                settings, lit, (height, width), representation, wanted, traced, count
-            )
-            if traced:
-                renderer = traced = recordings.transport
-        # Now: a resumed run may take up a later recording, but must freeze the same texels.
-        rows, frozen = slice(first, last + 1), None
-        if traced:
-            frozen = np.zeros((height, width), bool)
-            frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
-
-    notes, free = said, ~frozen[rows] if traced and frozen.any() else None
-    within = None
+    rows = slice(first, last + 1)
+    start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
+    start.trace()
+    traced, within, notes = start.renderer.transport, None, []
     if traced and wanted.coverage is not None:
         with clock("reach_s"):
             watch.stage("asking what any light could do")
             within = reaches.reachable(
-                traced, original, wanted.picture, wanted.weight, rows, free, wanted.coverage[..., 0], initial
+                traced, original, wanted.picture, wanted.weight, rows, None, wanted.coverage[..., 0], initial
             )
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
             wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
-    if representation.models_edit:
-        with clock("start_s"):
-            watch.stage("searching for lights")
-            representation.keep(free)
-            free = None  # the gain keeps to them, while a light may move across the others
-            ready = initialization.find(representation, params, recordings, wanted, original)
-            wanted, notes = ready.wanted, notes + ready.notes
-            del recordings  # the second one is not needed any more
-    job = Job(
-        settings=settings,
-        lit=lit,
-        original=original,
-        first=first,
-        free=free,
-        wanted=wanted,
-        representation=representation,
-        renderer=renderer,
-        folder=folder,
-        watch=watch,
-        dists=dists,
-    )
-    if representation.models_edit:
-        with clock("start_s"):
-            params, placed = job.best(ready.starts, crop)
-            notes += placed
+    edit = start.edit(wanted)
+    job, frozen, representation = edit.job, edit.frozen, edit.job.representation
+    renderer, notes = job.renderer, notes + edit.notes
+    traced = renderer.transport
     with clock("edit_s"):
         watch.stage("editing")
-        params, state = job.optimise(params, crop, resume)
+        params, state = job.optimise(edit.params, edit.crop, resume)
         edited = job.decode(params)
         wanted = job.wanted  # a resumed run has the picture that it began with
 
@@ -223,6 +165,7 @@ def run(
         "iterations": state.step,
         "non_finite_steps": state.bad_steps,
         "transport": None,
+        "turn_degrees": edit.degrees,
     }
     if traced:
         share = float(frozen[rows].mean())
@@ -244,21 +187,9 @@ def run(
         separation=representation.separation,
         scene=lit.path,
         reach=within,
-        found=Found(representation, params, first, free),
+        found=Found(representation, params, first, job.free, edit.degrees),
         posterior=job.posterior,
     )
-
-
-def _horizon(settings, original):
-    """Return what the rows below the horizon do, and a note on it."""
-    chosen = settings.input.horizon
-    if settings.representation.kind != "layers" or settings.input.rows != "all":
-        return "free", []
-    if chosen != "auto":
-        return chosen, []
-    chosen = below_horizon.kind_of(original)
-    said = "follow the sky as its mirror" if chosen == "mirror" else "are ground, and keep their brightness"
-    return chosen, [f"rows below the horizon {said}"]
 
 
 def _as_seen(traced, original, wanted):

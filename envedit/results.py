@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from envedit import config, inputs
+from envedit.core import latlong
 from envedit.export import full_resolution
 from envedit.images import images
 from envedit.representations import Representation
@@ -72,12 +73,16 @@ class Result:
 
 @dataclass(frozen=True)
 class Found:
-    """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`."""
+    """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`.
+
+    ``turn_degrees`` is by how much the map was turned before (:func:`.latlong.rotate`).
+    """
 
     representation: Representation
     params: dict
     first_row: int
     free: np.ndarray | None
+    turn_degrees: float = 0.0
 
 
 def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
@@ -93,7 +98,9 @@ def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | N
     source, _ = images.load_envmap(settings.envmap, None, settings.repair)
     if source.shape[1] <= settings.width:
         return None
-    found, before = result.found, result.maps["initial"]
+    found = result.found
+    before = latlong.rotate(result.maps["initial"], found.turn_degrees)
+    source = latlong.rotate(source, found.turn_degrees)
     first, last = inputs.active_rows(settings.rows, before.shape[0])
     rows = first, last - first + 1
     return full_resolution.carry(

@@ -30,7 +30,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "input": {"width": 256, "rows": "upper"},
         "scene": {"width": 256},
-        "representation": {"kind": "siren", "hidden": 256, "depth": 6, "omega": 30.0, "coordinates": "plane"},
+        "representation": {"kind": "siren", "hidden": 256, "depth": 6, "omega": 30.0, "coordinates": "plane",
+                           "turn": False},
         "fit": {
             "epochs": 1500, "lr": 5e-5, "schedule": "warm-restarts", "restart_period": 100,
             "log_mse": 0.85, "log_ssim": 0.25, "hdr": 1e-2, "awp_gamma": 0.01, "awp_lr": 1e-4, "awp_every": 1,

@@ -156,6 +156,11 @@ class Representation(Table):
         or_auto(integer(1, 256)),
         "layers: finest detail of the gain, cycles around the horizon; auto: 12, or what the picture tells",
     )
+    turn: str | bool = _key(
+        "auto",
+        or_auto(boolean),
+        'turn the whole sky about the vertical first; "auto": where that explains the target, not for paint',
+    )
     hidden: int = _key(128, integer(1, 4096), "siren: width of a layer")
     depth: int = _key(3, integer(0, 64), "siren: hidden sine layers after the first")
     omega: float = _key(30.0, number(0, positive=True), "siren: angular frequency of the sine layers")

@@ -128,10 +128,10 @@ class Job:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         if len(starts) == 1:
             return starts[0]
-        reached, trials = [], NEWTON_TRIAL if self.newton else TRIAL_STEPS
+        reached, trials = [], self.trials
         for params, _ in starts:
             try:
-                loss = self._tried(params, crop, trials)
+                loss = self.tried(params, crop)
             except NumericalError:  # a start that goes nowhere is no reason to stop
                 loss = np.inf
             reached.append(loss if np.isfinite(loss) else np.inf)
@@ -143,8 +143,14 @@ class Job:
         ]
         return starts[least][0], chosen
 
-    def _tried(self, params, crop, steps):
+    @property
+    def trials(self) -> int:
+        """Steps that tell which of two starts is better."""
+        return NEWTON_TRIAL if self.newton else TRIAL_STEPS
+
+    def tried(self, params, crop) -> float:
         """Return the loss after a few steps from a start."""
+        steps = self.trials
         if self.newton:
             return gauss_newton.solve(self._problem(), params, self._sigma, steps, trial=True).loss
         few = replace(self.settings.optimizer, iterations=steps)

@@ -27,14 +27,16 @@ SMOOTH = 0.0125
 PureSky has 0.0008 to 0.005, maps with ground 0.03 to 0.11 (256 texels wide)."""
 VARIES = 1 / 512
 """Least range of log luminance around the horizon of what can mirror a sky."""
-WIDTHS = 1.0, 0.3, 10.0
-"""Standard deviation of K: degrees at the horizon, more for each degree below it, at most."""
+NARROWEST, WIDENING = 1.0, 0.3
+"""Standard deviation of K: degrees at the horizon, and more for each degree below it."""
+WIDEST = 3.0, 6.0, 10.0, 15.0, 20.0
+"""What it grows to at most, degrees: of these, that under which the original mirrors its own sky best."""
 BLENDED = 5.0
 """Degrees below the horizon over which the blur sets in."""
 FADE = 10.0
 """Degrees below the horizon at which ground follows by 1/e."""
-COLUMNS = 96
-"""Columns of the grid on which K is applied."""
+COLUMNS, COARSE = 96, 48
+"""Columns of the grid on which K is applied, and on which its width is chosen."""
 
 
 def sky_rows(total: int) -> int:
@@ -74,6 +76,8 @@ class Below:
         The row of the sky that each row mirrors.
     fade : ndarray (rows,)
         f of each row.
+    widest : float
+        Greatest standard deviation of K, degrees.
     """
 
     def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str):
@@ -89,34 +93,79 @@ class Below:
         self.mirrored = np.arange(low)[::-1]
         texel = self.mirrored[:, None] * (3 * width) + np.arange(3 * width)
         self._mirrored = dr.opaque(mi.UInt32(texel.ravel().astype(np.uint32)))
-        columns = min(COLUMNS, width)
-        rows = max(1, columns // 4)
-        theta = np.pi * np.arange(up) / max(total - 1, 1)
-        down = _tents((theta / (np.pi / 2)) * rows - 0.5, rows)
-        across = _tents((np.arange(width) + 0.5) / width * columns - 0.5, columns, periodic=True)
-        weight = down * latlong.solid_angles(total, width)[:up, None]
-        share = weight.sum(axis=0)[:, None] * across.sum(axis=0)
-        self._grid = rows, columns
-        self._down = tensor(weight.T)
-        self._across = tensor(np.kron(across, np.eye(3)))
-        self._share = tensor(1 / np.maximum(np.repeat(share, 3, axis=1), 1e-30))
-        self._kernel = tensor(_kernel(rows, columns))
-        self._up = tensor(down[self.mirrored])
-        self._back = tensor(np.kron(across.T, np.eye(3)))
+        self._blur = _Blur((up, width), total, COLUMNS)
+        self._up = tensor(self._blur.down[self.mirrored])
+        self._back = tensor(np.kron(self._blur.across.T, np.eye(3)))
+        self.widest = WIDEST[2] if kind == "keep" else self._best_width(radiance, sky, total)
+        self._blur.widen(self.widest)
         before = tensor(sky)
-        self._before, self._before_soft = before, self._blurred(before)
+        self._before, self._before_soft = before, self._blur(before)
+
+    def _best_width(self, radiance, sky, total):
+        """Choose the widest K by how well K S_0 tells the variation of each row around the horizon."""
+        blur = _Blur(sky.shape[:2], total, COARSE)
+        omega = latlong.solid_angles(total, sky.shape[1])[sky.shape[0] :]
+
+        def varying(image):
+            logs = np.log(np.float64(image) @ LUMINANCE + self._faint)
+            return logs - logs.mean(axis=1, keepdims=True)
+
+        shown, errors = varying(radiance), []
+        for widest in WIDEST:
+            blur.widen(widest)
+            soft = blur(tensor(sky)).numpy().reshape(*blur.grid, 3)
+            soft = np.einsum("ri,ijx,cj->rcx", blur.down[self.mirrored], soft, blur.across)
+            errors.append(omega @ np.square(varying(soft) - shown).mean(axis=1))
+        return WIDEST[int(np.argmin(errors))]
 
     def log_factor(self, sky: mi.TensorXf) -> mi.TensorXf:
         """Return log R^f (rows, W, 3) under a sky (sky_rows, W, 3) without cores."""
-        soft = dr.log((self._blurred(sky) + self._faint) / (self._before_soft + self._faint))
+        soft = dr.log((self._blur(sky) + self._faint) / (self._before_soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
         sharp = dr.log((sky.array + self._faint) / (self._before.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
         return dr.reshape(sharp * self._sharp + soft * self._soft, (*self.shape, 3))
 
-    def _blurred(self, sky):
-        """Average a sky over K, on the coarse grid: (rows, 3 columns)."""
-        rows, columns = self._grid
+
+class _Blur:
+    """K of a sky (rows, W, 3), on a grid of its own.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the sky.
+    total : int
+        Rows of its map.
+    columns : int
+        Of the grid, at most.
+    """
+
+    def __init__(self, shape, total, columns):
+        up, width = shape
+        columns = min(columns, width)
+        rows = max(1, columns // 4)
+        place = 2 * np.arange(up) / max(total - 1, 1) * rows - 0.5
+        self.grid, self.down = (rows, columns), _tents(place, rows)
+        self.across = _tents((np.arange(width) + 0.5) / width * columns - 0.5, columns, periodic=True)
+        weight = self.down * latlong.solid_angles(total, width)[:up, None]
+        share = weight.sum(axis=0)[:, None] * self.across.sum(axis=0)
+        self._down = tensor(weight.T)
+        self._across = tensor(np.kron(self.across, np.eye(3)))
+        self._share = tensor(1 / np.maximum(np.repeat(share, 3, axis=1), 1e-30))
+
+    def widen(self, widest: float) -> None:
+        """Make K for a greatest standard deviation, degrees; each of its rows sums to 1."""
+        rows, columns = self.grid
+        theta = (np.arange(rows) + 0.5) / rows * np.pi / 2
+        d = latlong.on_sphere(theta[:, None], 2 * np.pi * (np.arange(columns) + 0.5) / columns).reshape(-1, 3)
+        angle = np.degrees(np.arccos(np.clip(d @ d.T, -1, 1)))
+        width = np.minimum(NARROWEST + WIDENING * (90 - np.degrees(theta)), widest).repeat(columns)
+        kernel = np.exp(-0.5 * (angle / width[:, None]) ** 2) * np.sin(theta).repeat(columns)
+        self._kernel = tensor(kernel / kernel.sum(axis=1, keepdims=True))
+
+    def __call__(self, sky: mi.TensorXf) -> mi.TensorXf:
+        """Average a sky over K, at the nodes of the grid: (rows, 3 columns)."""
+        rows, columns = self.grid
         flat = dr.reshape(sky, (sky.shape[0], 3 * sky.shape[1]))
         coarse = dr.matmul(dr.matmul(self._down, flat), self._across) * self._share
         soft = dr.matmul(self._kernel, dr.reshape(coarse, (rows * columns, 3)))
@@ -129,15 +178,3 @@ def _tents(place, count, periodic=False):
         apart = np.abs(place[:, None] - np.arange(count)) % count
         return np.maximum(1 - np.minimum(apart, count - apart), 0)
     return np.maximum(1 - np.abs(np.clip(place, 0, count - 1)[:, None] - np.arange(count)), 0)
-
-
-def _kernel(rows, columns):
-    """Return K between the nodes of a grid over the upper half: each row sums to 1."""
-    theta = (np.arange(rows) + 0.5) / rows * np.pi / 2
-    phi = 2 * np.pi * (np.arange(columns) + 0.5) / columns
-    d = latlong.on_sphere(theta[:, None], phi).reshape(-1, 3)
-    angle = np.degrees(np.arccos(np.clip(d @ d.T, -1, 1)))
-    least, more, most = WIDTHS
-    width = np.minimum(least + more * (90 - np.degrees(theta)), most).repeat(columns)
-    kernel = np.exp(-0.5 * (angle / width[:, None]) ** 2) * np.sin(theta).repeat(columns)
-    return kernel / kernel.sum(axis=1, keepdims=True)

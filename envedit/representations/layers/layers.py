@@ -78,9 +78,7 @@ class Layers:
     models_edit, fitted = True, None
     Gain = GridGain
 
-    def __init__(
-        self, rows: tuple[int, int] | None = None, cycles: int = CYCLES, horizon: Horizon = "free"
-    ):
+    def __init__(self, rows: tuple[int, int] | None = None, cycles: int = CYCLES, horizon: Horizon = "free"):
         self.rows, self._cycles, self._horizon = rows, cycles, horizon
         self.below: Below | None = None
         self.separation: Separation | None = None

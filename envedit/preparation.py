@@ -1,0 +1,229 @@
+"""From a configuration's map, scene and target to an edit that can be optimised.
+
+The sky may be turned as a whole first (``solve/turning.py``); lights are then told from the background, or a
+network is fitted, and it is found out where the edit starts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config, renderers, representations
+from envedit.core import latlong
+from envedit.core.errors import NumericalError
+from envedit.representations import Representation
+from envedit.representations.layers import below_horizon
+from envedit.representations.siren import fit
+from envedit.scene import scene
+from envedit.solve import initialization, map_problem, turning
+from envedit.solve.edit_job import Job, Watch
+from envedit.targets.target import Target
+
+TURNED = 0.5
+"""A turn is thought of where it leaves at most this share of the residual of the map as it is."""
+EXPLAINED = 2.0
+"""The same as F over the number of independent residuals: a turned sky that comes so close needs no rival."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """An edit that is ready to be optimised.
+
+    Attributes
+    ----------
+    job : Job
+        With the map, turned, as its original.
+    params : dict
+        Where it starts.
+    crop : ndarray (rows, W, 3)
+        Active rows of that map.
+    degrees : float
+        By how much it has been turned.
+    frozen : ndarray of bool (H, W) or None
+        Active texels that keep their value; None where the renderer does not know.
+    notes : list of str
+        What was chosen.
+    """
+
+    job: Job
+    params: dict
+    crop: np.ndarray
+    degrees: float
+    frozen: np.ndarray | None
+    notes: list[str]
+
+
+@dataclass
+class Preparation:
+    """What edits of one configuration have in common.
+
+    Attributes
+    ----------
+    settings : config.Config
+        What is to be done.
+    lit : scene.Scene
+        The scene.
+    original : ndarray (H, W, 3)
+        The map.
+    rows : slice
+        Its active rows.
+    folder : Path, optional
+        Of the checkpoint.
+    watch : Watch
+        Told of progress.
+    dists : distances.Dists, optional
+        As for :class:`.edit_job.Job`.
+    clock : callable
+        ``with clock(name):`` adds up seconds.
+    """
+
+    settings: config.Config
+    lit: scene.Scene
+    original: np.ndarray
+    rows: slice
+    folder: Path | None
+    watch: Watch
+    dists: object
+    clock: object
+    renderer: renderers.Renderer | None = None
+    _recordings: initialization.Recordings | None = None
+
+    def trace(self) -> None:
+        """Trace the light transport, or prepare the path tracer."""
+        with self.clock("transport_s"):
+            stored = self.settings.renderer.kind == "transport"
+            self.watch.stage("tracing light transport" if stored else "preparing the path tracer")
+            shape = self.original.shape[:2]
+            self.renderer = renderers.make(self.settings, self.lit, shape, self._count)
+
+    def edit(self, wanted: Target) -> Edit:
+        """Prepare the edit; the sky is turned where that explains the target better."""
+        turn = self._turn(wanted)
+        if turn is None or turn.degrees == 0:
+            return self._prepared(wanted, 0.0, [])
+        said = f"the sky is turned by {turn.degrees:.2f} degrees"
+        said += f": display residual {turn.still:.3f} -> {turn.error:.3f}"
+        turned = self._prepared(wanted, turn.degrees, [said])
+        if self.settings.representation.turn is True or not turned.job.newton:
+            return turned
+        with self.clock("start_s"):
+            loss = _loss(turned)
+            if loss <= EXPLAINED * 3 * map_problem.INDEPENDENT:
+                return turned
+        still = self._prepared(wanted, 0.0, [])
+        with self.clock("start_s"):
+            other = _loss(still)
+        chosen = turned if loss <= other else still
+        chosen.notes.append(f"F with the sky turned {loss:.4g}, as it is {other:.4g}")
+        return chosen
+
+    def _turn(self, wanted):
+        """Return the turn that may explain the target, or None."""
+        asked, transport = self.settings.representation.turn, self.renderer.transport
+        if asked is False or transport is None or self.rows != slice(0, len(self.original)):
+            return None
+        if asked == "auto" and wanted.coverage is not None:  # most of a painted picture is to stay
+            return None
+        with self.clock("start_s"):
+            self.watch.stage("turning the sky")
+            turn = turning.find(transport, self.original, wanted.picture, wanted.weight)
+        return turn if asked is True or turn.error < TURNED * turn.still else None
+
+    def _prepared(self, wanted, degrees, notes):
+        settings = self.settings
+        original = latlong.rotate(self.original, degrees)
+        crop, notes = original[self.rows], list(notes)
+        with self.clock("fit_s"):
+            kind = settings.representation.kind
+            self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
+            horizon, said = self._horizon()
+            notes += said
+            representation = representations.make(
+                settings,
+                fit.default_folder(),
+                lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
+                (self.rows.start, len(original)),
+                horizon,
+            )
+            params = representation.encode(crop, settings.seed)
+        with self.clock("transport_s"):
+            recordings = self._recorded(representation, wanted)
+        traced = self.renderer.transport
+        job = Job(
+            settings=settings,
+            lit=self.lit,
+            original=original,
+            first=self.rows.start,
+            free=None,
+            wanted=wanted,
+            representation=representation,
+            renderer=self.renderer,
+            folder=self.folder,
+            watch=self.watch,
+            dists=self.dists,
+        )
+        frozen = None
+        if recordings:
+            params = representation.refine(params, recordings.octaves)
+        if traced:
+            frozen = np.zeros(original.shape[:2], bool)
+            if not job.newton:  # its prior holds what the picture does not determine
+                known = traced.determined(self.rows, settings.renderer.influence_threshold)
+                frozen[self.rows] = ~known[self.rows]
+            job.free = ~frozen[self.rows] if frozen.any() else None
+        if recordings:
+            params, found = self._started(job, params, recordings, crop, degrees)
+            notes += found
+        return Edit(job, params, crop, degrees, frozen, notes)
+
+    def _recorded(self, representation: Representation, wanted):
+        """Return what is looked through for where layers start; None for what is fitted."""
+        if not representation.models_edit:
+            return None
+        if self._recordings is None:
+            shape, traced = self.original.shape[:2], self.renderer.transport
+            asked = self.settings, self.lit, shape, representation, wanted, traced, self._count
+            self._recordings = initialization.recordings(*asked)
+            if traced:
+                self.renderer = self._recordings.transport
+        return self._recordings
+
+    def _started(self, job, params, recordings, crop, degrees):
+        """Find where layers start: lights of a turned sky are where they must be."""
+        with self.clock("start_s"):
+            job.representation.keep(job.free)
+            job.free = None  # the gain keeps to them, while a light may move across the others
+            if degrees:
+                return params, recordings.notes
+            self.watch.stage("searching for lights")
+            ready = initialization.find(job.representation, params, recordings, job.wanted, job.original)
+            job.wanted = ready.wanted
+            params, placed = job.best(ready.starts, crop)
+            return params, ready.notes + placed
+
+    def _horizon(self):
+        """Return what the rows below the horizon do, and a note on it."""
+        chosen = self.settings.input.horizon
+        if self.settings.representation.kind != "layers" or self.settings.input.rows != "all":
+            return "free", []
+        if chosen != "auto":
+            return chosen, []
+        chosen = below_horizon.kind_of(self.original)
+        said = (
+            "follow the sky as its mirror" if chosen == "mirror" else "are ground and keep their brightness"
+        )
+        return chosen, [f"rows below the horizon {said}"]
+
+    def _count(self, done, total):
+        self.watch.progress(done, total, "")
+
+
+def _loss(edit: Edit) -> float:
+    """Return F after the first steps from where an edit starts; inf if it cannot begin."""
+    try:
+        return edit.job.tried(edit.params, edit.crop)
+    except NumericalError:
+        return np.inf

@@ -1,0 +1,110 @@
+"""By how much the whole sky has turned about the vertical, if it has.
+
+Every turn by whole texels is tried through the block transport; the best ones are rendered through T, and
+refined to a tenth of a texel. Misfits are those of the solver (``map_problem.py``): Huber's loss of display
+values over their standard error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.losses import display_curve
+from envedit.transport.light_transport import LightTransport
+
+CANDIDATES, APART = 3, 4
+"""Turns that are refined, and by how many texels they differ at least."""
+TENTH = 0.1
+"""Finest turn in texels; one nearer to a whole number is taken to be that: its texels keep their bits."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A turn of the sky.
+
+    Attributes
+    ----------
+    degrees : float
+        As for :func:`.latlong.rotate`.
+    error, still : float
+        Root mean square of the display residual with the turn alone, and without.
+    """
+
+    degrees: float
+    error: float
+    still: float
+
+
+def find(
+    transport: LightTransport, envmap: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None
+) -> Turn:
+    """Find the turn of a map that explains a picture best.
+
+    Parameters
+    ----------
+    transport : LightTransport
+        T; gets exact columns for the texels that become bright.
+    envmap : ndarray (H, W, 3)
+        The map.
+    picture : ndarray (h, w, 3)
+        What is wanted, linear radiance.
+    weight : ndarray (h, w, 1), optional
+        How much each pixel counts.
+    """
+    width = envmap.shape[1]
+    shown = display_curve.to_display(tensor(picture)).numpy()
+    count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
+    known: dict[float, float] = {}
+
+    def error(texels):
+        texels = round(texels % width / TENTH) * TENTH % width
+        if texels not in known:
+            turned = latlong.rotate(envmap, 360 * texels / width)
+            transport.resolve(turned, limit=64)
+            residual = display_curve.to_display(transport.apply(tensor(turned))).numpy() - shown
+            mean = (count * np.square(np.float64(residual))).mean()
+            known[texels] = float(np.sqrt(mean)) if np.isfinite(mean) else np.inf
+        return known[texels]
+
+    misfit, best = _at_a_glance(transport, envmap, picture, count), []
+    for shift in np.argsort(misfit, kind="stable"):
+        apart = [min(abs(shift - other), width - abs(shift - other)) for other in best]
+        if len(best) < CANDIDATES and (not apart or min(apart) >= APART):
+            best.append(int(shift))
+    texels = min(best, key=error)
+    for step in (4.0, 2.0, 1.0, 0.5, 0.3, TENTH):
+        texels = min((texels, texels - step, texels + step), key=error)
+    texels = round(texels / TENTH) * TENTH % width
+    return Turn(360 * texels / width, error(texels), error(0.0))
+
+
+def _at_a_glance(transport, envmap, picture, count):
+    """Return the squared display residual of blocks under each turn by whole texels, (W,)."""
+    overview = transport.overview()
+    height, width, _ = envmap.shape
+    wanted = display_curve.to_display(tensor(picture)).numpy()
+    wanted, share = overview.to_blocks(wanted), overview.to_blocks(count)
+    lamps = overview.to_blocks(transport.apply(tensor(np.zeros_like(envmap))).numpy())
+    omega = np.repeat(latlong.lookup_solid_angles(height, width), width).reshape(height, width)
+    total = np.bincount(overview.cell_of, omega.ravel())
+    cells = len(total)
+    # By rows of texels first: a turn keeps them.
+    column = overview.cell_of.reshape(height, width)
+    first = column[:, 0]
+    across = int(column[0].max()) + 1
+    tile = -(-width // across)
+    band = np.zeros((first.max() // across + 1, width, 3))
+    np.add.at(band, first // across, envmap * omega[..., None])
+    result = np.zeros(width)
+    starts = np.arange(0, width, tile)
+    for c in range(3):
+        turned = np.stack([np.add.reduceat(np.roll(band[..., c], -k, 1), starts, 1) for k in range(width)], 2)
+        means = turned.reshape(cells, width) / total[:, None]
+        blocks = overview.matrix[c] @ means.astype(np.float32) + lamps[:, c : c + 1]
+        shown = display_curve.to_display(tensor(blocks)).numpy()
+        result += (share * np.square(shown - wanted[:, c : c + 1])).sum(axis=0)
+    return np.where(np.isfinite(result), result, np.inf)

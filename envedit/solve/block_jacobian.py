@@ -19,6 +19,7 @@ class BlockJacobian:
         active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])
         self._shape = layers.whole
         cells, omega = len(overview.omega), np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
+        self._directions = overview.directions
         self._total = np.bincount(overview.cell_of, omega, cells)
         self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
         # Hats are weighed by the sky's luminance: what is bright in a cell tells its gain.
@@ -54,6 +55,19 @@ class BlockJacobian:
             cells = (cells / np.maximum(self._total, 1e-30))[self._used]
             found.append(dr.matmul(matrix, tensor(cells[:, None].astype(np.float32))).numpy()[:, 0])
         return np.stack(found, axis=1)[self.block_of]
+
+    def sky_cells(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """List the cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""
+        inside = np.zeros(self._cells)
+        own = self._cell[: shape[0] * shape[1]]
+        np.add.at(inside, own, self._omega[: len(own)])
+        cells = np.flatnonzero(inside[self._used] > 0.5 * self._total[self._used])
+        return cells, self._directions[self._used[cells]]
+
+    def lit(self, cells: np.ndarray) -> list[np.ndarray]:
+        """Return pictures of unit flux in each of some cells, (blocks, n), per channel."""
+        size = self._total[self._used[cells]]
+        return [m.numpy()[:, cells] / np.maximum(size, 1e-30) for m in self._matrix]
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""

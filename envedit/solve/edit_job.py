@@ -16,6 +16,7 @@ from envedit import config
 from envedit.core.errors import NumericalError, place_of
 from envedit.losses import optimizer
 from envedit.representations.layers.gain import LEVELS
+from envedit.representations.layers.lights import SPARE
 from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, gauss_newton
 from envedit.targets import target
@@ -234,7 +235,8 @@ class Job:
                 if interrupt.is_set():
                     raise Interrupted(point.edited, done)
 
-            found = gauss_newton.solve(self._problem(), params, self._sigma, most, after_step, run)
+            problem, births = self._problem(), SPARE if self.wanted.coverage is None else 0
+            found = gauss_newton.solve(problem, params, self._sigma, most, after_step, run, births=births)
         self.posterior = found.posterior
         return found.params, adam_loop.State(step=len(found.history), history=found.history)
 

@@ -20,6 +20,9 @@ ITERATIONS, LITTLE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
 TRIES = 5
 """Dampings that are tried in one step."""
+WORTH, BIRTH_STEPS = 8.0, 6
+"""By how much a further light must lower F, with residuals as they are taken for noise, to be tried and
+to be kept: a likelihood of e^4; and the steps after which that is asked."""
 
 
 @dataclass
@@ -92,6 +95,7 @@ def solve(
     after_step: Callable[[Run, Point], None] | None = None,
     run: Run | None = None,
     trial: bool = False,
+    births: int = 0,
 ) -> Solution:
     """Minimise F.
 
@@ -111,6 +115,8 @@ def solve(
         To continue an earlier solution, in place of ``params``.
     trial : bool
         Only :attr:`Solution.loss` is asked for: no posterior is computed.
+    births : int
+        Most lights that may be added.
 
     Raises
     ------
@@ -125,11 +131,21 @@ def solve(
     point = problem.evaluate(run.state, resolve=fresh)
     if point.residual is None:
         raise NumericalError("the edit cannot begin: the map that the search found is not finite")
-    while len(run.history) < iterations and not run.finished:
+    if fresh and iterations:
+        run, point = _with_births(problem, run, point, sigma, births)
+    point = _descended(problem, run, point, sigma, iterations, after_step)
+    loss = problem.loss(point, run.start, sigma)
+    posterior = None if trial else problem.posterior(problem.normal(point, run.start, sigma))
+    return Solution(problem.params(run.state), run.history, loss, posterior)
+
+
+def _descended(problem, run, point, sigma, most, after_step):
+    """Make steps until none lowers F, or there are ``most`` in all; returns where they end."""
+    while len(run.history) < most and not run.finished:
         began = time.perf_counter()
         spread = 1.4826 * float(np.median(np.abs(point.residual)))
         run.scale = max(sigma, min(spread, run.scale / 2))
-        before = problem.misfit(point.residual, run.scale) + problem.penalty(run.state, run.start)
+        before = problem.loss(point, run.start, run.scale)
         normal = problem.normal(point, run.start, run.scale)
         better = None
         for _ in range(TRIES):
@@ -151,6 +167,36 @@ def solve(
             run.history.append({"iteration": len(run.history), **row, "damping": run.damping, "step_ms": ms})
         if after_step and (better is not None or run.finished):
             after_step(run, point)
-    loss = problem.misfit(point.residual, sigma) + problem.penalty(run.state, run.start)
-    posterior = None if trial else problem.posterior(problem.normal(point, run.start, sigma))
-    return Solution(problem.params(run.state), run.history, loss, posterior)
+    return point
+
+
+def _with_births(problem, run, point, sigma, births):
+    """Add lights while some steps with one more lead farther than without; returns run and point."""
+    for _ in range(births):
+        still = run.state | {"gain": np.zeros_like(run.state["gain"])}
+        began = problem.evaluate(still)
+        spread = max(sigma, 1.4826 * float(np.median(np.abs(began.residual))))
+        born = problem.birth(began, problem.normal(began, run.start, spread))
+        if born is None or born[1] < WORTH:
+            break
+        state, start = born[0], {name: value.copy() for name, value in run.start.items()}
+        new = [i for i in problem.lit(state) if i not in problem.lit(run.state)]
+        for name in ("turn", "flux", "size"):
+            start[name][new] = state[name][new]
+        rivals = [run, Run(state, start, history=list(run.history))]
+        most, ends = len(run.history) + BIRTH_STEPS, []
+        for rival in rivals:
+            first = point if rival is run else problem.evaluate(rival.state)
+            if first.residual is None:
+                ends.append(None)
+                continue
+            ends.append(_descended(problem, rival, first, sigma, most, None))
+        scale = max(rival.scale for rival in rivals)
+        losses = [
+            np.inf if end is None else problem.loss(end, rival.start, scale)
+            for rival, end in zip(rivals, ends, strict=True)
+        ]
+        if not losses[1] + WORTH < losses[0]:
+            return run, ends[0]
+        run, point = rivals[1], ends[1]
+    return run, point

@@ -38,6 +38,8 @@ ANGLE = np.radians(0.7)
 """Rotation by which the derivative by a light's direction is told."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
 """Largest step of an unknown: beyond it the linear model does not hold."""
+SIZES = (-3.0, 1.5)
+"""Logarithms of sizes that a light may take on: a lobe is of points, and must not fall apart."""
 _AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 
 
@@ -118,6 +120,32 @@ class Normal:
     hessian: np.ndarray
     gradient: np.ndarray
     unknowns: list
+    blocks: Blocks | None = None
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What normal equations are made of, by blocks of pixels.
+
+    Attributes
+    ----------
+    jacobian : list of ndarray (blocks, n)
+        Of the gain, per channel.
+    squared, pulled : ndarray (blocks, 3)
+        Sums of weight times slope squared, and of weight, slope and residual.
+    lights : list of ndarray (blocks, k)
+        Sums of weight times slope squared times pictures of lights, per channel; empty without lights.
+    """
+
+    jacobian: list[np.ndarray]
+    squared: np.ndarray
+    pulled: np.ndarray
+    lights: list[np.ndarray]
+
+    @property
+    def by_channel(self):
+        """Jacobian and weight of each channel."""
+        return self.jacobian, self.squared.T
 
 
 @dataclass(frozen=True)
@@ -211,6 +239,10 @@ class Problem:
             return Point(state, edited, None, None)
         return Point(state, edited, rendering.numpy(), np.float64(shown) - self.target)
 
+    def loss(self, point: Point, start: dict, sigma: float) -> float:
+        """Return F."""
+        return self.misfit(point.residual, sigma) + self.penalty(point.state, start)
+
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
         total = (self._precisions * (_AXES @ state["gain"].T) ** 2).sum()
@@ -252,7 +284,7 @@ class Problem:
         unknowns = 3 * n + len(lights.pictures)
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         squared, pulled = blocks.summed(slope**2 * robust), blocks.summed(slope * robust * point.residual)
-        seen = np.zeros((len(lights.pictures), n * 3))
+        seen, lit = np.zeros((len(lights.pictures), n * 3)), []
         for c, j in enumerate(jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
@@ -261,6 +293,7 @@ class Problem:
             if len(lights.pictures):
                 in_blocks = blocks.summed((lights.pictures * (slope**2 * robust))[..., c].transpose(1, 2, 0))
                 seen[:, part] = in_blocks.T @ j
+                lit.append(in_blocks)
         if len(lights.pictures):
             rest = slice(3 * n, unknowns)
             flat = (lights.pictures * (slope * np.sqrt(robust))).reshape(len(lights.pictures), -1)
@@ -286,7 +319,45 @@ class Problem:
                 gradient[k] += precision * (back @ axis)
             else:
                 gradient[k] += precision * (state[name] - start[name])[i, axis]
-        return Normal(hessian, gradient, lights.unknowns)
+        return Normal(hessian, gradient, lights.unknowns, Blocks(jacobian, squared, pulled, lit))
+
+    def birth(self, point: Point, normal: Normal) -> tuple[dict, float] | None:
+        """Light a spare light where that lowers F most, beside all other unknowns; None where none does.
+
+        Returns the state, and by how much F falls.
+
+        Candidates are the cells of the block transport. With a the picture of a light in display values, r
+        the residual, W its weights, H and g those of the normal equations and c the mixed part of the larger
+        Hessian, F falls by (a'W r - c' H^-1 g)^2 / (a'W a - c' H^-1 c) for the best strength of the light.
+        """
+        layers, own = self.layers, self.layers.lights.count - SPARE
+        dark = [i for i in range(own, layers.lights.count) if i not in self.lit(point.state)]
+        if not dark:
+            return None
+        i, blocks = dark[0], normal.blocks
+        cells, directions = self.blocks.sky_cells(layers.shape)
+        atoms = [m * f for m, f in zip(self.blocks.lit(cells), layers.lights.flux[i], strict=True)]
+        mixed = np.concatenate(
+            [j.T @ (w[:, None] * a) for j, w, a in zip(*blocks.by_channel, atoms, strict=True)]
+        )
+        if blocks.lights:
+            mixed = np.concatenate([mixed, sum(b.T @ a for b, a in zip(blocks.lights, atoms, strict=True))])
+        pull = sum(a.T @ p for a, p in zip(atoms, blocks.pulled.T, strict=True))
+        power = sum((a * a).T @ w for a, w in zip(atoms, blocks.squared.T, strict=True))
+        try:
+            half = np.linalg.solve(np.linalg.cholesky(normal.hessian), np.c_[mixed, normal.gradient])
+        except np.linalg.LinAlgError:
+            return None
+        along = half[:, :-1].T @ half[:, -1] - pull
+        rest = power - np.square(half[:, :-1]).sum(axis=0)
+        strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > 1e-6 * power)
+        best = int(np.argmax(np.maximum(strength, 0) * along))
+        if not strength[best] > 0 or not np.isfinite(strength[best]):
+            return None
+        born = {name: value.copy() for name, value in point.state.items()}
+        born["turn"][i] = rotation_vector(layers.lights.centres[i], directions[best])
+        born["flux"][i], born["size"][i] = np.log(strength[best]), 0.0
+        return born, float(strength[best] * along[best])
 
     def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
         """Return the state after a damped step; None if the step is not finite."""
@@ -306,6 +377,7 @@ class Problem:
                 turns[i] = turns.get(i, 0.0) + value * axis
             else:
                 found[name][i, axis] += np.clip(value, -LARGEST[name], LARGEST[name])
+        found["size"] = np.clip(found["size"], *SIZES)
         for i, turn in turns.items():
             turn = turn * min(1.0, LARGEST["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
             there = _rotated(self.direction(state, i), turn)

@@ -142,7 +142,14 @@ class _LayersAt:
         self.turn, self.flux, self.size = (self.real[k].numpy() for k in ("turn", "flux", "size"))
         self.moved = (self.turn != 0).any(axis=1) | (self.size != 0).any(axis=1)
         self.relit = layers.lights.glowing and bool(self.turn.any() or self.flux[: -lights.SPARE].any())
-        self.gain = layers.log_gain(params)
+        # Of rows that follow those above the horizon, all that they are multiplied by.
+        self.gain = np.concatenate([layers.log_gain(params), layers.log_below(params)])
+        self.edge = None if layers.below is None else layers.shape[0]
+        self.free = layers.free
+        if self.edge is not None and self.free is not None:
+            self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
+        above = np.full(self.height, True) if self.edge is None else grid.place < self.edge - 0.5
+        self.follows = dr.opaque(mi.UInt32, int(above.sum()))
         # Of lights that stay, what their cores are multiplied by; of those that move, nothing is left.
         own = layers.lights.count - lights.SPARE
         strength = lights.flux_factor(self.flux[:own])
@@ -203,10 +210,10 @@ class _LayersAt:
         size = len(source)
         image = self._load(source)
         row, column = self.grid.texels(size)
-        gain = flat(mi.Float, self.grid.along_rows(self.gain, start, size))
+        gain = flat(mi.Float, self.grid.along_rows(self.gain, start, size, self.edge))
         log = self.grid.across(mi.Color3f, gain, row, column)
-        if self.layers.free is not None:
-            inner = flat(mi.Float, self.grid.inner(self.layers.free, start, size))
+        if self.free is not None:
+            inner = flat(mi.Float, self.grid.inner(self.free, start, size))
             log *= self.grid.across(mi.Float, inner, row, column, corners=True)
         factor = dr.exp(log)
         same = factor == 1
@@ -221,6 +228,7 @@ class _LayersAt:
             still = dr.zeros(mi.TensorXf, self.turn.shape)
             before = self.layers.lights.glow(still, still, d)
             ratio = self.layers.lights.glow(self.real["turn"], self.real["flux"], d) / before
+            ratio = dr.select(self._follow(start, row), 1, ratio)
             sky *= ratio
             same &= ratio == 1
         if core is not None:
@@ -277,6 +285,10 @@ class _LayersAt:
         x, z = (dr.gather(mi.Float, t, column) for t in self._phi)
         return mi.Vector3f(sin * x, cos, -sin * z)
 
+    def _follow(self, start, row):
+        """Which texels of a band are of rows that follow those above the horizon."""
+        return row + dr.opaque(mi.UInt32, start) >= self.follows
+
     def _any_label(self, start, size):
         if self.survey is None:
             return False
@@ -297,6 +309,7 @@ class _LayersAt:
         if self.layers.lights.glowing:
             still = dr.zeros(mi.TensorXf, self.turn.shape)
             below *= self.layers.lights.glow(still, still, d)
+        light = dr.select(self._follow(start, row), -1, light)
         core = dr.select(light >= 0, dr.maximum(image - below, 0) * (1 - share[1]), 0)
         return light, share[0], core
 

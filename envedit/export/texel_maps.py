@@ -59,9 +59,16 @@ class Places:
         for fresh in range(self.start, self.stop, max(size, 1)):
             yield min(fresh, self.stop - size), fresh, size
 
-    def along_rows(self, values, start, size):
-        """Interpolate values (rows, w, C) at rows of the source; float32 (size, w, C)."""
-        return _between(values, np.clip(self.place[start : start + size], 0, self.count - 1))
+    def along_rows(self, values, start, size, edge=None):
+        """Interpolate values (rows, w, C) at rows of the source; float32 (size, w, C).
+
+        Nothing is interpolated across the edge before row ``edge`` of the values.
+        """
+        place = np.clip(self.place[start : start + size], 0, self.count - 1)
+        if edge is not None:
+            above = place < edge - 0.5
+            place = np.where(above, np.minimum(place, edge - 1), np.clip(place, edge, self.count - 1))
+        return _between(values, place)
 
     def inner(self, mask, start, size):
         """Interpolate a mask (rows, w) by its corners, 0 wherever a texel is not in it; (size, w + 1)."""

@@ -157,11 +157,15 @@ class _Blur:
         """Make K for a greatest standard deviation, degrees; each of its rows sums to 1."""
         rows, columns = self.grid
         theta = (np.arange(rows) + 0.5) / rows * np.pi / 2
-        d = latlong.on_sphere(theta[:, None], 2 * np.pi * (np.arange(columns) + 0.5) / columns).reshape(-1, 3)
-        angle = np.degrees(np.arccos(np.clip(d @ d.T, -1, 1)))
-        width = np.minimum(NARROWEST + WIDENING * (90 - np.degrees(theta)), widest).repeat(columns)
-        kernel = np.exp(-0.5 * (angle / width[:, None]) ** 2) * np.sin(theta).repeat(columns)
-        self._kernel = tensor(kernel / kernel.sum(axis=1, keepdims=True))
+        # The same around the horizon: angles between nodes of two rows, by how many columns they are apart.
+        d = latlong.on_sphere(theta[:, None], 2 * np.pi * np.arange(columns) / columns)
+        angle = np.degrees(np.arccos(np.clip(np.einsum("ik,jck->ijc", d[:, 0], d), -1, 1)))
+        width = np.minimum(NARROWEST + WIDENING * (90 - np.degrees(theta)), widest)
+        kernel = np.exp(-0.5 * (angle / width[:, None, None]) ** 2) * np.sin(theta)[:, None]
+        kernel = (kernel / kernel.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
+        apart = (np.arange(columns) - np.arange(columns)[:, None]) % columns
+        whole = kernel[:, :, apart].transpose(0, 2, 1, 3)
+        self._kernel = tensor(whole.reshape(rows * columns, rows * columns))
 
     def __call__(self, sky: mi.TensorXf) -> mi.TensorXf:
         """Average a sky over K, at the nodes of the grid: (rows, 3 columns)."""

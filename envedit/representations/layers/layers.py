@@ -141,20 +141,32 @@ class Layers:
         shape = tuple(shape or self.shape)
         if self.below is not None and shape != self.shape:
             raise ValueError(f"rows below the horizon follow at {self.whole} texels only, asked for {shape}")
-        rows, d, base, before, gain, free = self._at(shape)
+        rows = self._at(shape)[0]
         real = {name: value * self.scales[name] for name, value in params.items()}
-        factor = dr.exp(self.gain.evaluate(real, gain))
-        factor = dr.select(free, factor, 1) if free is not None else factor
-        sky = brightened(base, factor)
-        if self.lights.glowing:
-            sky *= self.lights.glow(real["turn"], real["flux"], d) / before
-        sky = mi.TensorXf(dr.ravel(sky), (*shape, 3))
+        sky = self._sky(real, shape)
         if self.below is not None:
             shape = self.whole
             factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky)).array)
             low = dr.ravel(brightened(self.below.radiance, factor))
             sky = mi.TensorXf(dr.concat((sky.array, low)), (*shape, 3))
         return sky + self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
+
+    def _sky(self, real, shape):
+        """Background and glow (rows, W, 3)."""
+        _, d, base, before, gain, free = self._at(shape)
+        factor = dr.exp(self.gain.evaluate(real, gain))
+        factor = dr.select(free, factor, 1) if free is not None else factor
+        sky = brightened(base, factor)
+        if self.lights.glowing:
+            sky *= self.lights.glow(real["turn"], real["flux"], d) / before
+        return mi.TensorXf(dr.ravel(sky), (*shape, 3))
+
+    def log_below(self, params: dict) -> np.ndarray:
+        """Return the log factor of the rows that follow, (rows, W, 3); without such rows, none."""
+        if self.below is None:
+            return np.zeros((0, self.shape[1], 3), np.float32)
+        real = {name: value * self.scales[name] for name, value in params.items()}
+        return self.below.log_factor(self._sky(real, self.shape)).numpy()
 
     @property
     def active(self) -> slice:

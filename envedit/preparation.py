@@ -26,6 +26,8 @@ TURNED = 0.5
 """A turn is thought of where it leaves at most this share of the residual of the map as it is."""
 EXPLAINED = 2.0
 """The same as F over the number of independent residuals: a turned sky that comes so close needs no rival."""
+PREFERRED = 0.05
+"""By this share F may be larger with the sky turned: nothing has to be made up where the sun was."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class Preparation:
         still = self._prepared(wanted, 0.0, [])
         with self.clock("start_s"):
             other = _loss(still)
-        chosen = turned if loss <= other else still
+        chosen = turned if loss <= (1 + PREFERRED) * other else still
         chosen.notes.append(f"F with the sky turned {loss:.4g}, as it is {other:.4g}")
         return chosen
 

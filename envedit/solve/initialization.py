@@ -24,6 +24,9 @@ from envedit.transport.light_transport import LightTransport
 AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
 """Added to the run's seed for the second recording of T, which tells its noise; its most samples a pixel and
 exact columns."""
+MIRRORED = 0.8
+"""Share of the sky whose detail a picture must tell, as a mirror does. On glossy scenes, which tell less, finer
+grids made maps worse (matpreview, principled: by 1 to 4 dB) and put colours into them that no sky has."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,8 @@ def recordings(
     told = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
     shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
     notes = [f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"]
+    if told and told[0].share < MIRRORED:
+        told, notes = [], [f"{notes[0]}: not enough, {100 * MIRRORED:.0f} % of the sky"]
     if told and traced and settings.renderer.spp == "auto":
         most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:

@@ -18,7 +18,7 @@ import numpy as np
 from envedit import config, inputs, renderers
 from envedit.losses import metrics
 from envedit.representations import Layers
-from envedit.solve import adam_loop, gauss_newton, light_search
+from envedit.solve import adam_loop, gauss_newton, light_search, map_problem
 from envedit.targets import target
 from experiments import puresky
 
@@ -51,7 +51,7 @@ def main():
 
     curves = {}
     for name in ("Gauss-Newton", "Adam"):
-        problem = gauss_newton.Problem(layers, transport, original, wanted.picture)
+        problem = map_problem.Problem(layers, transport, original, wanted.picture)
         start = problem.state(params)
         for _ in range(2):  # the first time compiles the kernels
             seen = Seen(problem)
@@ -65,7 +65,7 @@ def main():
         points = []
         for seconds, state in [(0.0, start), *seen.states]:
             point = problem.evaluate(state)
-            loss = problem.misfit(point.residual, gauss_newton.SIGMA) + problem.penalty(state, start)
+            loss = problem.misfit(point.residual, map_problem.SIGMA) + problem.penalty(state, start)
             true = metrics.compare(point.edited[rows], wanted.envmap[rows], "gamma")["psnr"]
             points.append((seconds, loss, true))
         curves[name] = np.array(points)

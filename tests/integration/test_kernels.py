@@ -7,7 +7,7 @@ import drjit as dr
 import pytest
 
 from envedit import config, pipeline
-from envedit.solve import adam_loop, gauss_newton
+from envedit.solve import adam_loop, gauss_newton, map_problem
 from envedit.transport.light_transport import LightTransport
 
 SMALL = [
@@ -59,7 +59,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
 @pytest.mark.slow
 def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
     settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100"])
-    fresh, launched, columns, normal = [], [], [], gauss_newton.Problem.normal
+    fresh, launched, columns, normal = [], [], [], map_problem.Problem.normal
 
     def counted(problem, *arguments):
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
@@ -72,7 +72,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
             problem.transport.resolve(bright)
         return normal(problem, *arguments)
 
-    monkeypatch.setattr(gauss_newton.Problem, "normal", counted)
+    monkeypatch.setattr(map_problem.Problem, "normal", counted)
     monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # some steps more
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

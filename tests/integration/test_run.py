@@ -23,7 +23,7 @@ from envedit import config, pipeline
 from envedit.cli import run
 from envedit.images import images
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, gauss_newton
+from envedit.solve import adam_loop, checkpoint, map_problem
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
 from tests.oracles.builders import read_png, sky
@@ -602,7 +602,7 @@ def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, 
     settings = {"optimizer": {"kind": "gauss-newton", "iterations": 5}}
     path, out = world(tmp_path, rng, **settings), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
-    normal, calls = gauss_newton.Problem.normal, []
+    normal, calls = map_problem.Problem.normal, []
 
     def pressed(*arguments):
         calls.append(arguments)
@@ -611,7 +611,7 @@ def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, 
         return normal(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(gauss_newton.Problem, "normal", pressed)
+        patch.setattr(map_problem.Problem, "normal", pressed)
         assert call(path, "--quiet") == 130
     assert len(calls) == 2 and "--resume" in capsys.readouterr().err
     assert names(out) == {"checkpoint.npz", "edited.exr"}

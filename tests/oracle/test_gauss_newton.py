@@ -15,9 +15,10 @@ from envedit.core.errors import NumericalError
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, rotation_vector
-from envedit.solve import checkpoint, gauss_newton
+from envedit.solve import checkpoint, gauss_newton, map_problem
 from envedit.solve.adam_loop import State
-from envedit.solve.gauss_newton import ANGLE, Problem, Run, solve
+from envedit.solve.gauss_newton import Run, solve
+from envedit.solve.map_problem import ANGLE, Problem
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.matrix_renderer import same, without_times
 from tests.oracles.plain import plain_display
@@ -25,7 +26,7 @@ from tests.oracles.tiers import slow_but
 
 GRID, FILM = (24, 48), (10, 12)
 SUN = (7, 20)
-PRIOR = gauss_newton.Prior()
+PRIOR = map_problem.Prior()
 
 
 def lamp(place=SUN, radiance=200.0):
@@ -63,7 +64,7 @@ def moved(problem, state, unknowns, k, h):
         return state
     name, i, axis = unknowns[k - 3 * n]
     if name == "turn":
-        there = gauss_newton._rotated(problem.direction(state, i), h * axis)
+        there = map_problem._rotated(problem.direction(state, i), h * axis)
         state["turn"][i] = rotation_vector(problem.layers.lights.centres[i], there)
     else:
         state[name][i, axis] += h
@@ -86,7 +87,7 @@ def case():
     state["flux"][0] += [0.1, -0.2, 0.3]
     state["size"][0] = 0.05
     # Off the texels' centres, where the derivative jumps.
-    state["turn"][0] = rotation_vector(centre, gauss_newton._rotated(centre, np.array([0.03, 0.05, -0.04])))
+    state["turn"][0] = rotation_vector(centre, map_problem._rotated(centre, np.array([0.03, 0.05, -0.04])))
     return problem, params, start, state
 
 
@@ -264,7 +265,7 @@ def test_penalty_of_a_light(case):
         "turn": (
             rotation_vector(
                 centre,
-                gauss_newton._rotated(
+                map_problem._rotated(
                     centre, 0.1 * np.cross(centre, [0, 1, 0]) / np.linalg.norm(np.cross(centre, [0, 1, 0]))
                 ),
             ),
@@ -363,14 +364,14 @@ def test_deviation_shrinks_with_what_is_known(rng):
         "twice": 2 * transport.weights[0],
     }.items():
         seen = DenseTransport(weights, FILM, GRID)
-        for sigma in (0.2, 0.02, gauss_newton.SIGMA):
+        for sigma in (0.2, 0.02, map_problem.SIGMA):
             problem, params = problem_of(image, seen, shown(seen, image))
             start = problem.state(params)
             normal = problem.normal(problem.evaluate(start), start, sigma)
             found[name, sigma] = problem.posterior(normal).deviation
             assert (found[name, sigma] <= prior_deviation(problem) * (1 + 1e-4)).all(), (name, sigma)
     for name in ("half", "all", "twice"):
-        for more, less in ((gauss_newton.SIGMA, 0.02), (0.02, 0.2)):
+        for more, less in ((map_problem.SIGMA, 0.02), (0.02, 0.2)):
             assert (found[name, more] <= found[name, less] * (1 + 1e-4)).all()
             assert found[name, more].mean() < 0.95 * found[name, less].mean()
     assert found["all", 0.02].mean() < found["half", 0.02].mean()
@@ -383,7 +384,7 @@ def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
     image, transport = clouds(rng), DenseTransport.random(rng, (24, 24), GRID, even=0.8)
     problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
     start = problem.state(params)
-    normal = problem.normal(problem.evaluate(start), start, gauss_newton.SIGMA)
+    normal = problem.normal(problem.evaluate(start), start, map_problem.SIGMA)
     deviation = problem.posterior(normal).deviation
     assert np.isfinite(deviation).all() and (deviation > 0).all()
     assert (deviation <= prior_deviation(problem) * (1 + 1e-4)).all()
@@ -403,7 +404,7 @@ def followed(problem, params, **options):
     solution = solve(problem, params, after_step=note, **options)
     start = problem.state(params)
     before, scale = problem.evaluate(start), np.inf
-    sigma = options.get("sigma", gauss_newton.SIGMA)
+    sigma = options.get("sigma", map_problem.SIGMA)
     for row, point in zip(solution.history, points, strict=False):
         f = problem.misfit(point.residual, row["sigma"]) + problem.penalty(point.state, start)
         assert f == pytest.approx(row["loss"], rel=1e-9) == row["data"] + row["prior"]
@@ -429,7 +430,7 @@ def test_a_change_that_layers_can_make_is_found(rng):
     nodes = params["gain.0"].numpy() + 0.5 * rng.normal(0, 1, params["gain.0"].shape[:2])[..., None]
     turned = np.zeros((3, 3), np.float32)
     centre = layers.lights.centres[0]
-    end = gauss_newton._rotated(centre, np.array([0.0, np.radians(5), 0.0]))
+    end = map_problem._rotated(centre, np.array([0.0, np.radians(5), 0.0]))
     turned[0] = rotation_vector(centre, end) / layers.scales["turn"]
     true = layers.decode(
         params | {"gain.0": mi.TensorXf(nodes.astype(np.float32)), "turn": mi.TensorXf(turned)}
@@ -473,13 +474,13 @@ def test_a_step_that_raises_f_is_damped(case, monkeypatch):
 def test_no_step_is_longer_than_its_limit(case):
     problem, _, start, state = case
     normal = problem.normal(problem.evaluate(state), start, 0.01)
-    far = gauss_newton.Normal(normal.hessian, 1e6 * normal.gradient, normal.unknowns)
+    far = map_problem.Normal(normal.hessian, 1e6 * normal.gradient, normal.unknowns)
     found = problem.step(state, far, 1e-3)
-    largest = gauss_newton.LARGEST
+    largest = map_problem.LARGEST
     for name in ("gain", "flux", "size"):
         change = np.abs(found[name] - state[name])
         assert 0.99 * largest[name] < change.max() <= largest[name] * (1 + 1e-9), name
-    turned = gauss_newton._between(problem.direction(state, 0), problem.direction(found, 0))
+    turned = map_problem._between(problem.direction(state, 0), problem.direction(found, 0))
     assert np.linalg.norm(turned) == pytest.approx(largest["turn"], rel=1e-6)
     np.testing.assert_array_equal(found["flux"][1:], state["flux"][1:])
 
@@ -488,7 +489,7 @@ def test_fewest_steps(case):
     problem, params, start, _ = case
     none = solve(problem, params, iterations=0)
     assert none.history == [] and same(problem.state(none.params), start)
-    assert none.loss == pytest.approx(problem.misfit(problem.evaluate(start).residual, gauss_newton.SIGMA))
+    assert none.loss == pytest.approx(problem.misfit(problem.evaluate(start).residual, map_problem.SIGMA))
     assert len(solve(problem, params, iterations=1).history) == 1
 
 

@@ -148,6 +148,7 @@ def run(
     with clock("judge_s"), keeping(edited):
         watch.stage("rendering the result")
         final, judged, _ = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
+    notes += [job.note] if job.note else []
     notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}

@@ -25,9 +25,9 @@ from envedit.targets.target import Target
 TURNED = 0.5
 """A turn is thought of where it leaves at most this share of the residual of the map as it is."""
 EXPLAINED = 2.0
-"""The same as F over the number of independent residuals: a turned sky that comes so close needs no rival."""
+"""Residual over the standard error of display values up to which a turned sky needs no rival."""
 PREFERRED = 0.05
-"""By this share F may be larger with the sky turned: nothing has to be made up where the sun was."""
+"""By this share the residual of the sky as it is must be smaller: where it turns, nothing is made up."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +111,13 @@ class Preparation:
         turned = self._prepared(wanted, turn.degrees, [said])
         if self.settings.representation.turn is True or not turned.job.newton:
             return turned
-        with self.clock("start_s"):
-            loss = _loss(turned)
-            if loss <= EXPLAINED * 3 * map_problem.INDEPENDENT:
-                return turned
+        if turn.error <= EXPLAINED * map_problem.SIGMA:
+            return turned
         still = self._prepared(wanted, 0.0, [])
         with self.clock("start_s"):
-            other = _loss(still)
-        chosen = turned if loss <= (1 + PREFERRED) * other else still
-        chosen.notes.append(f"F with the sky turned {loss:.4g}, as it is {other:.4g}")
+            loss, other = _loss(turned), _loss(still)
+        chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
+        chosen.notes.append(f"likelihood (AIC) with the sky turned {loss:.5g}, as it is {other:.5g}")
         return chosen
 
     def _turn(self, wanted):
@@ -224,7 +222,7 @@ class Preparation:
 
 
 def _loss(edit: Edit) -> float:
-    """Return F after the first steps from where an edit starts; inf if it cannot begin."""
+    """Return the loss after the first steps from where an edit starts; inf if it cannot begin."""
     try:
         return edit.job.tried(edit.params, edit.crop)
     except NumericalError:

@@ -18,12 +18,14 @@ from envedit.losses import optimizer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.lights import SPARE
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, gauss_newton
+from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
 from envedit.targets import target
 
-TRIAL_STEPS, NEWTON_TRIAL, TRIAL_GAIN = 30, 6, 0.05
-"""Steps of Adam and of Gauss-Newton after which the better of two starts is chosen, and by which share of the
-loss it must be better."""
+TRIAL_STEPS, NEWTON_TRIAL = 30, 6
+"""Steps of Adam and of Gauss-Newton after which the better of two starts is chosen."""
+TRIAL_GAIN, LIKELIER = 0.05, 20.0
+"""By which share of the loss it must be better with Adam, and by how much lower with Gauss-Newton: twice the
+logarithm of the places that a light could have had, some 20,000."""
 
 
 class Interrupted(Exception):
@@ -79,8 +81,10 @@ class Job:
         Told of progress.
     dists : distances.Dists, optional
         As for :class:`.adam_loop.Objective`.
-    posterior : gauss_newton.Posterior, optional
+    posterior : map_problem.Posterior, optional
         How well the target determines the sky, where :meth:`optimise` knows it.
+    note : str
+        What the solver has to say.
     """
 
     settings: config.Config
@@ -94,7 +98,8 @@ class Job:
     folder: Path | None
     watch: Watch
     dists: object = None
-    posterior: gauss_newton.Posterior | None = None
+    posterior: map_problem.Posterior | None = None
+    note: str = ""
 
     @property
     def newton(self) -> bool:
@@ -136,7 +141,7 @@ class Job:
             except NumericalError:  # a start that goes nowhere is no reason to stop
                 loss = np.inf
             reached.append(loss if np.isfinite(loss) else np.inf)
-        least = int(np.argmin(reached)) if min(reached) < (1 - TRIAL_GAIN) * reached[0] else 0
+        least = int(np.argmin(reached)) if self.better(min(reached), reached[0]) else 0
         losses = ", ".join(f"{loss:.3g}" for loss in reached)
         chosen = [
             *starts[least][1],
@@ -148,6 +153,10 @@ class Job:
     def trials(self) -> int:
         """Steps that tell which of two starts is better."""
         return NEWTON_TRIAL if self.newton else TRIAL_STEPS
+
+    def better(self, loss: float, usual: float) -> bool:
+        """Say whether one start is so much better than the usual one that it is to be taken."""
+        return loss < usual - LIKELIER if self.newton else loss < (1 - TRIAL_GAIN) * usual
 
     def tried(self, params, crop) -> float:
         """Return the loss after a few steps from a start."""
@@ -199,13 +208,13 @@ class Job:
 
     def _problem(self):
         wanted = self.wanted.aim, self.wanted.weight, self.representation.free
-        return gauss_newton.Problem(self.representation, self.renderer.transport, self.original, *wanted)
+        return map_problem.Problem(self.representation, self.renderer.transport, self.original, *wanted)
 
     @property
     def _sigma(self):
         """Standard error of display values: what was measured of the target, but not below the usual."""
         noise = self.wanted.noise
-        return gauss_newton.SIGMA if noise is None else max(gauss_newton.SIGMA, float(np.median(noise)))
+        return map_problem.SIGMA if noise is None else max(map_problem.SIGMA, float(np.median(noise)))
 
     def _solve(self, params, resume):
         """Make Gauss-Newton steps from the start, or from the checkpoint."""
@@ -235,9 +244,12 @@ class Job:
                 if interrupt.is_set():
                     raise Interrupted(point.edited, done)
 
-            problem, births = self._problem(), SPARE if self.wanted.coverage is None else 0
-            found = gauss_newton.solve(problem, params, self._sigma, most, after_step, run, births=births)
-        self.posterior = found.posterior
+            rendered = self.wanted.coverage is None  # paint is no noisy picture, and asks for what it shows
+            births = SPARE if rendered else 0
+            found = gauss_newton.solve(
+                self._problem(), params, self._sigma, most, after_step, run, births=births, sparing=rendered
+            )
+        self.posterior, self.note = found.posterior, found.note
         return found.params, adam_loop.State(step=len(found.history), history=found.history)
 
     def _look_at_the_last(self, adam, state):

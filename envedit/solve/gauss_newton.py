@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from envedit.core.errors import NumericalError
-from envedit.solve.map_problem import SIGMA, Point, Posterior, Problem
+from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
@@ -76,15 +76,20 @@ class Solution:
     history : list of dict
         A row a step: ``loss`` F, its parts ``data`` and ``prior``, ``sigma``, ``damping``, ``step_ms``.
     loss : float
-        F.
+        Akaike's (1974) criterion, lower for what is likelier: F at the noise that the residual shows, twice
+        that noise's logarithm for each independent residual, and two for every unknown that the picture
+        determines, where any was changed.
     posterior : Posterior or None
         How well the picture determines the sky; None of a trial.
+    note : str
+        What a user should know.
     """
 
     params: dict
     history: list[dict]
     loss: float
-    posterior: Posterior | None
+    posterior: Posterior | None = None
+    note: str = ""
 
 
 def solve(
@@ -96,6 +101,7 @@ def solve(
     run: Run | None = None,
     trial: bool = False,
     births: int = 0,
+    sparing: bool = True,
 ) -> Solution:
     """Minimise F.
 
@@ -117,6 +123,8 @@ def solve(
         Only :attr:`Solution.loss` is asked for: no posterior is computed.
     births : int
         Most lights that may be added.
+    sparing : bool
+        Stay at the start where steps lower the misfit by no more than noise would let them.
 
     Raises
     ------
@@ -134,17 +142,33 @@ def solve(
     if fresh and iterations:
         run, point = _with_births(problem, run, point, sigma, births)
     point = _descended(problem, run, point, sigma, iterations, after_step)
-    loss = problem.loss(point, run.start, sigma)
-    posterior = None if trial else problem.posterior(problem.normal(point, run.start, sigma))
-    return Solution(problem.params(run.state), run.history, loss, posterior)
+    normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
+    loss, note = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined, ""
+    if sparing and run.history:
+        before = replace(run, state=run.start)
+        first = problem.evaluate(before.state, resolve=False)
+        least = _unlikeliness(problem, before, first, sigma)
+        if least <= loss:
+            note = (
+                f"the start as it is: steps take {normal.determined:.0f} unknowns and gain no more than noise"
+            )
+            run, point, loss = before, first, least
+            normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
+    posterior = None if trial else problem.posterior(normal)
+    return Solution(problem.params(run.state), run.history, loss, posterior, note)
+
+
+def _unlikeliness(problem, run, point, sigma):
+    """Return -2 log posterior at the noise that the residual shows, but for a constant."""
+    noise = problem.noise(point.residual, sigma)
+    return problem.loss(point, run.start, noise) + 6 * INDEPENDENT * float(np.log(noise))
 
 
 def _descended(problem, run, point, sigma, most, after_step):
     """Make steps until none lowers F, or there are ``most`` in all; returns where they end."""
     while len(run.history) < most and not run.finished:
         began = time.perf_counter()
-        spread = 1.4826 * float(np.median(np.abs(point.residual)))
-        run.scale = max(sigma, min(spread, run.scale / 2))
+        run.scale = max(problem.noise(point.residual, sigma), run.scale / 2 if np.isfinite(run.scale) else 0)
         before = problem.loss(point, run.start, run.scale)
         normal = problem.normal(point, run.start, run.scale)
         better = None
@@ -159,7 +183,7 @@ def _descended(problem, run, point, sigma, most, after_step):
                     break
             run.damping = max(10 * run.damping, 1e-2)
         little = better is None or before - data - penalty < LITTLE * before
-        run.finished = little and run.scale <= 1.01 * sigma
+        run.finished = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
         if better is not None:
             point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
             row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}

@@ -25,8 +25,8 @@ AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
 """Added to the run's seed for the second recording of T, which tells its noise; its most samples a pixel and
 exact columns."""
 MIRRORED = 0.8
-"""Share of the sky whose detail a picture must tell, as a mirror does. On glossy scenes, which tell less, finer
-grids made maps worse (matpreview, principled: by 1 to 4 dB) and put colours into them that no sky has."""
+"""Share of the sky whose detail a picture must tell, as a mirror does. Glossy scenes tell less: there finer
+grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that no sky has."""
 
 
 @dataclass(frozen=True)

@@ -115,12 +115,26 @@ class Point:
 
 @dataclass(frozen=True)
 class Normal:
-    """Hessian (m, m) and gradient (m,) of F / 2; ``unknowns`` names those after the gain's."""
+    """Hessian (m, m) and gradient (m,) of F / 2.
+
+    ``precision`` is K in the Hessian, ``unknowns`` names those after the gain's, ``blocks`` is what the
+    Hessian was made of.
+    """
 
     hessian: np.ndarray
     gradient: np.ndarray
+    precision: np.ndarray
     unknowns: list
-    blocks: Blocks | None = None
+    blocks: Blocks
+
+    @property
+    def determined(self) -> float:
+        """How many unknowns the picture determines: the trace of H^-1 (H - K)."""
+        try:
+            shares = np.linalg.solve(self.hessian, self.precision)
+        except np.linalg.LinAlgError:
+            return float(len(self.hessian))
+        return float(len(self.hessian) - np.trace(shares))
 
 
 @dataclass(frozen=True)
@@ -239,6 +253,20 @@ class Problem:
             return Point(state, edited, None, None)
         return Point(state, edited, rendering.numpy(), np.float64(shown) - self.target)
 
+    def noise(self, residual: np.ndarray, least: float) -> float:
+        """Return the standard error under which the misfit is what independent residuals of it have.
+
+        Huber's concomitant scale (his proposal 2): the first part of F is then their number. At least
+        ``least``.
+        """
+        low, high = least, max(least, float(np.abs(residual).max()))
+        if self.misfit(residual, low) <= 3 * INDEPENDENT:
+            return low
+        for _ in range(40):
+            middle = np.sqrt(low * high)
+            low, high = (middle, high) if self.misfit(residual, middle) > 3 * INDEPENDENT else (low, middle)
+        return float(high)
+
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""
         return self.misfit(point.residual, sigma) + self.penalty(point.state, start)
@@ -300,26 +328,37 @@ class Problem:
             hessian[rest, rest] = flat @ flat.T
             gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
             hessian[rest, : 3 * n], hessian[: 3 * n, rest] = seen, seen.T
-        # K of the gain: diagonal in luminance, chroma and tint.
-        gradient[: 3 * n] += (_AXES.T @ (self._precisions * (_AXES @ state["gain"].T))).ravel()
+        precision, back = self._precision(lights.unknowns), self._from_prior(state, start, lights.unknowns)
+        hessian += precision
+        gradient += precision @ back
+        return Normal(hessian, gradient, precision, lights.unknowns, Blocks(jacobian, squared, pulled, lit))
+
+    def _precision(self, unknowns):
+        """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
+        n = self.nodes
+        precision = np.zeros((3 * n + len(unknowns),) * 2)
         node = np.arange(n)
         for a, axis in enumerate(_AXES):
             for c, d in np.ndindex(3, 3):
-                hessian[c * n + node, d * n + node] += axis[c] * axis[d] * self._precisions[a]
-        for k, (name, i, axis) in enumerate(lights.unknowns, 3 * n):
+                precision[c * n + node, d * n + node] += axis[c] * axis[d] * self._precisions[a]
+        for k, (name, _, axis) in enumerate(unknowns, 3 * n):
             if name == "flux":
-                row = self.prior.flux_precision[axis]
-                hessian[k, k - axis : k - axis + 3] += row
-                gradient[k] += row @ self._flux_change(state, start, i)
-                continue
-            precision = getattr(self.prior, name) ** -2.0
-            hessian[k, k] += precision
-            if name == "turn":
-                back = _between(self.direction(start, i), self.direction(state, i))
-                gradient[k] += precision * (back @ axis)
+                precision[k, k - axis : k - axis + 3] = self.prior.flux_precision[axis]
             else:
-                gradient[k] += precision * (state[name] - start[name])[i, axis]
-        return Normal(hessian, gradient, lights.unknowns, Blocks(jacobian, squared, pulled, lit))
+                precision[k, k] = getattr(self.prior, name) ** -2.0
+        return precision
+
+    def _from_prior(self, state, start, unknowns):
+        """How far the unknowns are from where the prior draws them."""
+        found = [state["gain"].T.ravel()]
+        for name, i, axis in unknowns:
+            if name == "flux":
+                found.append([self._flux_change(state, start, i)[axis]])
+            elif name == "turn":
+                found.append([_between(self.direction(start, i), self.direction(state, i)) @ axis])
+            else:
+                found.append([(state[name] - start[name])[i, axis]])
+        return np.concatenate(found)
 
     def birth(self, point: Point, normal: Normal) -> tuple[dict, float] | None:
         """Light a spare light where that lowers F most, beside all other unknowns; None where none does.

@@ -149,6 +149,9 @@ def run(
         watch.stage("rendering the result")
         final, judged, _ = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
     notes += [job.note] if job.note else []
+    if representation.models_edit:
+        kept = 100 * float((edited == job.original)[rows].all(axis=2).mean())
+        notes.append(f"{kept:.3g} % of the active texels keep their bits")
     notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}

@@ -19,7 +19,7 @@ from envedit.core.errors import NumericalError, place_of
 from envedit.export.ratio_transfer import Ratio
 from envedit.export.texel_maps import Places, as_image
 from envedit.representations.layers import lights
-from envedit.representations.layers.layers import Layers, brightened
+from envedit.representations.layers.layers import Layers, brightened, unseen_kept
 from envedit.representations.layers.separation import grown
 
 POINTS_AT_ONCE = 1 << 20
@@ -105,6 +105,8 @@ def carry(
     for start, fresh, size in grid.bands():
         band = slice(start, start + size)
         made = work.band(source[band], start)
+        if representation.models_edit:
+            made = unseen_kept(source[band], made)
         if free is not None:
             made = np.where(free[grid.row[band]][:, grid.column][..., None], made, source[band])
         if (bad := ~np.isfinite(made)).any():

@@ -16,6 +16,7 @@ from envedit import config
 from envedit.core.errors import NumericalError, place_of
 from envedit.losses import optimizer
 from envedit.representations.layers.gain import LEVELS
+from envedit.representations.layers.layers import unseen_kept
 from envedit.representations.layers.lights import SPARE
 from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
@@ -119,7 +120,7 @@ class Job:
             raise NumericalError(f"the edited map is not finite at {where}: lower [optimizer] lr")
         edited = self.original.copy()
         edited[rows] = crop
-        return edited
+        return unseen_kept(self.original, edited) if self.representation.models_edit else edited
 
     def last_good(self, adam: optimizer.Adam) -> np.ndarray:
         """Return the last map that is finite: after the last step, before it, or else the original."""
@@ -231,6 +232,11 @@ class Job:
 
             def after_step(run, point):
                 nonlocal saved
+                if run is None:
+                    self.watch.progress(0, most, "trying lights")
+                    if interrupt.is_set():
+                        raise Interrupted(point.edited, 0)
+                    return
                 done = len(run.history)
                 if done:
                     self.watch.progress(done, most, f"loss {run.history[-1]['loss']:.4g}")

@@ -97,7 +97,7 @@ def solve(
     params: dict,
     sigma: float = SIGMA,
     iterations: int = ITERATIONS,
-    after_step: Callable[[Run, Point], None] | None = None,
+    after_step: Callable[[Run | None, Point], None] | None = None,
     run: Run | None = None,
     trial: bool = False,
     births: int = 0,
@@ -116,7 +116,9 @@ def solve(
     iterations : int
         Most steps.
     after_step : callable, optional
-        Called after every step, and when no further one lowers F; what it raises ends the solution.
+        Called after every step, and when no further one lowers F, with where the solution is; with None in
+        place of the run while lights are tried, when there is nothing to go on from yet. What it raises ends
+        the solution.
     run : Run, optional
         To continue an earlier solution, in place of ``params``.
     trial : bool
@@ -140,7 +142,10 @@ def solve(
     if point.residual is None:
         raise NumericalError("the edit cannot begin: the map that the search found is not finite")
     if fresh and iterations:
-        run, point = _with_births(problem, run, point, sigma, births)
+        problem.transport.warm_up()
+        run, point = _with_births(
+            problem, run, point, sigma, min(iterations, BIRTH_STEPS), births, after_step
+        )
     point = _descended(problem, run, point, sigma, iterations, after_step)
     normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     loss, note = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined, ""
@@ -194,8 +199,13 @@ def _descended(problem, run, point, sigma, most, after_step):
     return point
 
 
-def _with_births(problem, run, point, sigma, births):
+def _with_births(problem, run, point, sigma, iterations, births, after_step):
     """Add lights while some steps with one more lead farther than without; returns run and point."""
+
+    def tried(_, point):
+        if after_step:
+            after_step(None, point)
+
     for _ in range(births):
         still = run.state | {"gain": np.zeros_like(run.state["gain"])}
         began = problem.evaluate(still)
@@ -208,13 +218,13 @@ def _with_births(problem, run, point, sigma, births):
         for name in ("turn", "flux", "size"):
             start[name][new] = state[name][new]
         rivals = [run, Run(state, start, history=list(run.history))]
-        most, ends = len(run.history) + BIRTH_STEPS, []
+        most, ends = min(len(run.history) + BIRTH_STEPS, iterations), []
         for rival in rivals:
             first = point if rival is run else problem.evaluate(rival.state)
             if first.residual is None:
                 ends.append(None)
                 continue
-            ends.append(_descended(problem, rival, first, sigma, most, None))
+            ends.append(_descended(problem, rival, first, sigma, most, tried))
         scale = max(rival.scale for rival in rivals)
         losses = [
             np.inf if end is None else problem.loss(end, rival.start, scale)

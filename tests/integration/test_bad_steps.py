@@ -204,7 +204,7 @@ def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
 def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     """Neither is one that stops, nor the first by default if it is they."""
     lost = object()
-    ends = {0: 1.0, 1: math.nan, 2: 0.5, 3: lost}
+    ends = {0: 100.0, 1: math.nan, 2: 50.0, 3: lost}
     monkeypatch.setattr(adam_loop, "Objective", lambda *_: None)
 
     def ended(self, params, *_):
@@ -213,7 +213,7 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
         return None, adam_loop.State(history=[{"loss": ends[params]}])
 
     monkeypatch.setattr(edit_job.Job, "_loop", ended)
-    wanted = types.SimpleNamespace(aim=None, weight=None)
+    wanted = types.SimpleNamespace(aim=None, weight=None, coverage=None)
     fake = types.SimpleNamespace(models_edit=False)
     work = edit_job.Job(config.Config(), None, None, 0, None, wanted, fake, None, None, edit_job.Watch())
     assert not work.newton

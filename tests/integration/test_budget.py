@@ -104,7 +104,7 @@ def test_what_is_given_in_pixels_of_the_rendering_is_not_budgeted(target):
 def test_active_rows_stay_the_same_part_of_the_sky(rows, wanted):
     given = config.Input(envmap="sunsky", width=256, rows=tuple(rows))
     assert budget._at_width(given, 64).rows == wanted
-    assert budget._at_width(config.Input(envmap="sunsky"), 64).rows == "upper"
+    assert budget._at_width(config.Input(envmap="sunsky"), 64).rows == "all"
 
 
 def test_a_picture_keeps_its_shape():

@@ -58,7 +58,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
 
 @pytest.mark.slow
 def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
-    settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100"])
+    settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100", "representation.turn=false"])
     fresh, launched, columns, normal = [], [], [], map_problem.Problem.normal
 
     def counted(problem, *arguments):

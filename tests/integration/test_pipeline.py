@@ -173,9 +173,9 @@ PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
 def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
     settings = settings_of(
-        tmp_path, sky(rng, 32, 64) + 0.1, input={"rows": "all", "width": 64},
+        tmp_path, sky(rng, 32, 64) + 0.1, input={"rows": "all", "horizon": "free", "width": 64},
         representation={"kind": kind, "hidden": 16, "depth": 1},
-        renderer={"spp": 256, "max_depth": 3}, optimizer={"iterations": 5, "lr": 1e-2},
+        renderer={"spp": 256, "max_depth": 3}, optimizer={"kind": "adam", "iterations": 5, "lr": 1e-2},
     )  # fmt: skip
     write_scene(tmp_path, PLATE, LIGHT, name="scene.xml")
     found = pipeline.run(settings)
@@ -207,7 +207,7 @@ def plated(folder, picture, **tables):
 
 @pytest.mark.slow
 def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
-    """The sun goes from one place that the plate sees to another; behind it no bit changes.
+    """The sun goes from one place that the plate sees to another; behind it the prior holds the sky.
 
     A plate tells how much light falls on it, not from where: the sun may go to other places.
     """
@@ -217,8 +217,11 @@ def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
     images.write_exr(tmp_path / "wanted.exr", wanted)
     target = {"file": "wanted.exr", "rotate_degrees": 0.0, "spp": 256}
     found = pipeline.run(plated(tmp_path, picture, target=target, optimizer={"iterations": 5}))
-    assert found.frozen.mean() > 0.2 and len(found.separation.lights) == 1
-    assert found.envmap[found.frozen].tobytes() == found.maps["initial"][found.frozen].tobytes()
+    assert not found.frozen.any() and len(found.separation.lights) == 1
+    x = latlong.directions(32, 64)[..., 0]
+    change = np.abs(np.log(found.envmap / found.maps["initial"])).max(axis=2)
+    assert change[x < -0.5].mean() < 0.2 * change[x > 0.5].mean()
+    assert any("keep their bits" in line for line in found.metrics["choices"])
     assert found.envmap[10, 12].max() < 3
     assert found.metrics["render"]["psnr"] > found.metrics["initial"]["psnr"] + 8
 
@@ -438,27 +441,20 @@ def stopping_at(step):
     return pipeline.Watch(stages.append, progress)
 
 
-@pytest.mark.parametrize(
-    "name", slow_but([("sunny",), ("smooth",), ("painted",), ("a sun of 1e6",), ("frozen",)], "sunny")
-)
-def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path, rng):
+@pytest.mark.parametrize("name", slow_but([("sunny",), ("painted",), ("a sun of 1e6",)], "sunny"))
+def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path, rng, monkeypatch):
     """Interrupted in the first step, in the middle, in the last, and where nothing is left to do."""
-    picture = {"smooth": smooth, "sunny": sunny}.get(name, sunny)(rng)
+    picture = sunny(rng)
     if name == "a sun of 1e6":
         picture[2, 5] = 1e6
     tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
-    if name == "frozen":
-        tables = {
-            "renderer": {"spp": 32, "max_depth": 3, "influence_threshold": 1.0},
-            "input": {"rows": "all"},
-        }
+    monkeypatch.setattr(edit_job, "SPARE", 0)
     settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     steps = len(whole.history)
     assert steps >= 3 and set(whole.history[0]) == {
         "iteration", "loss", "data", "prior", "sigma", "damping", "step_ms"
     }  # fmt: skip
-    assert name != "frozen" or whole.frozen.any()
 
     folder = tmp_path / "run"
     folder.mkdir()
@@ -539,7 +535,8 @@ def as_tables(settings):
     return {name: dataclasses.asdict(getattr(settings, name)) for name in tables}
 
 
-def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng):
+def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr(edit_job, "SPARE", 0)  # nothing is saved while lights are tried
     folder = tmp_path / "run"
     folder.mkdir()
     picture = sunny(rng)
@@ -617,7 +614,7 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
 
 def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):
     before = signal.getsignal(signal.SIGINT)
-    settings = settings_of(tmp_path, smooth(rng), optimizer={"iterations": 1})
+    settings = settings_of(tmp_path, sunny(rng), optimizer={"iterations": 1})
     pipeline.run(settings)
     assert signal.getsignal(signal.SIGINT) is before
     with pytest.raises(pipeline.Interrupted):

@@ -23,7 +23,7 @@ from envedit import config, pipeline
 from envedit.cli import run
 from envedit.images import images
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, map_problem
+from envedit.solve import adam_loop, checkpoint, edit_job, map_problem
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
 from tests.oracles.builders import read_png, sky
@@ -358,7 +358,7 @@ def test_quiet_prints_nothing(tmp_path, rng, capsys):
 
 def test_progress_goes_to_stderr_and_results_to_stdout(done):
     _, folder, out, err = done
-    stages = ["loading", "rendering the target", "fitting (siren)", "tracing light transport", "editing",
+    stages = ["loading", "rendering the target", "tracing light transport", "fitting (siren)", "editing",
               "rendering the result", "writing"]  # fmt: skip
     assert [line for line in err.splitlines() if line in stages] == stages
     assert "lights" not in err
@@ -368,7 +368,7 @@ def test_progress_goes_to_stderr_and_results_to_stdout(done):
 def test_layers_are_separated_and_searched_for_not_fitted(tmp_path, rng, capsys):
     assert call(world(tmp_path, rng)) == 0
     err = capsys.readouterr().err
-    stages = ["loading", "rendering the target", "separating lights", "tracing light transport",
+    stages = ["loading", "rendering the target", "tracing light transport", "separating lights",
               "searching for lights", "editing", "rendering the result", "writing"]  # fmt: skip
     assert [line for line in err.splitlines() if line in stages] == stages and "fitting" not in err
 
@@ -504,6 +504,7 @@ def test_resume_in_an_empty_folder_is_a_run(tmp_path, rng):
 
 @pytest.mark.slow
 def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
+    monkeypatch.setattr(edit_job, "SPARE", 0)  # nothing is saved while lights are tried
     path, out = world(tmp_path, rng, optimizer={"iterations": 4, "checkpoint_s": 0.0}), tmp_path / "c_out"
     save = checkpoint.save
 
@@ -601,6 +602,7 @@ def stop_at_checkpoint(process, file, number):
 def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, rng, monkeypatch, capsys):
     settings = {"optimizer": {"kind": "gauss-newton", "iterations": 5}}
     path, out = world(tmp_path, rng, **settings), tmp_path / "c_out"
+    monkeypatch.setattr(edit_job, "SPARE", 0)  # nothing is saved while lights are tried
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     normal, calls = map_problem.Problem.normal, []
 

@@ -40,7 +40,7 @@ def carried_out(folder, picture, *arguments, **tables):
     images.write_exr(folder / "map.exr", picture)
     write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
     given = {
-        "input": {"envmap": "map.exr", "width": 16},
+        "input": {"envmap": "map.exr", "width": 16, "rows": "upper"},
         "scene": {"file": "scene.xml", "width": 24},
         "target": {"spp": 16},
         "fit": {"epochs": 4},

@@ -21,10 +21,10 @@ FILES = {
 }  # fmt: skip
 INFLUENCE = {"influence.exr", "influence.png"}
 TINY = {
-    "input": {"width": 16},
+    "input": {"width": 16, "rows": "upper"},
     "scene": {"width": 24},
     "target": {"spp": 16},
-    "representation": {"hidden": 16, "depth": 1, "cycles": 4},  # of the default kind
+    "representation": {"hidden": 16, "depth": 1, "cycles": 4, "turn": False},  # of the default kind
     "fit": {"epochs": 4},
     "optimizer": {"iterations": 4},
     "renderer": {"spp": 32, "max_depth": 3},
@@ -129,10 +129,10 @@ def settings_of(folder, picture, **tables):
     images.write_exr(folder / "map.exr", picture)
     write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
     given = {
-        "input": {"envmap": "map.exr", "width": WIDTH},
+        "input": {"envmap": "map.exr", "width": WIDTH, "rows": "upper"},
         "scene": {"file": "scene.xml", "width": 24},
         "target": {"spp": 16},
-        "representation": {"hidden": 16, "depth": 1, "cycles": 4},  # of the default kind
+        "representation": {"hidden": 16, "depth": 1, "cycles": 4, "turn": False},  # of the default kind
         "fit": {"epochs": 4},
         "optimizer": {"iterations": 20},
         "renderer": {"spp": 32, "max_depth": 3},

@@ -27,7 +27,8 @@ def test_every_preset_takes_effect_key_by_key(preset):
 
 def test_the_paper_preset_is_section_6():
     paper = cfg.loads("", preset="paper")
-    assert paper.representation == cfg.Representation("siren", "auto", 256, 6, 30.0, coordinates="plane")
+    siren = cfg.Representation("siren", "auto", False, 256, 6, 30.0, coordinates="plane")
+    assert paper.representation == siren
     fit = paper.fit
     assert (fit.epochs, fit.lr, fit.schedule, fit.restart_period) == (1500, 5e-5, "warm-restarts", 100)
     assert (fit.log_mse, fit.log_ssim, fit.hdr) == (0.85, 0.25, 1e-2)

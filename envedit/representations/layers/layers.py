@@ -28,10 +28,18 @@ from envedit.representations.layers.lights import DARK, SPARE, Lights
 from envedit.representations.layers.separation import Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
+UNSEEN = 1 / 512
+"""Relative change of radiance that nobody sees: a display with 256 steps has steps twice as large."""
 VEIL = 0.2
 """Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
+
+
+def unseen_kept(original: np.ndarray, edited: np.ndarray) -> np.ndarray:
+    """Give texels of an edited image the original's bits where no channel changes by over :data:`UNSEEN`."""
+    seen = np.abs(edited - original) > UNSEEN * original
+    return np.where(seen.any(axis=2, keepdims=True), edited, original)
 
 
 def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:

@@ -142,13 +142,13 @@ def solve(
     if point.residual is None:
         raise NumericalError("the edit cannot begin: the map that the search found is not finite")
     if fresh and iterations:
-        problem.transport.warm_up()
         run, point = _with_births(
             problem, run, point, sigma, min(iterations, BIRTH_STEPS), births, after_step
         )
     point = _descended(problem, run, point, sigma, iterations, after_step)
     normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
-    loss, note = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined, ""
+    loss, note = _unlikeliness(problem, run, point, sigma), ""
+    loss += 2 * normal.determined if run.history else 0
     if sparing and run.history:
         before = replace(run, state=run.start)
         first = problem.evaluate(before.state, resolve=False)

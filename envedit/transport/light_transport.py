@@ -356,7 +356,7 @@ class LightTransport:
             self._record()
             self._exact.retrace(self.seed)
         if step % RESOLVE_EVERY == 0:
-            self.warm_up()
+            self._warm_up()
             self._look(dr.detach(envmap).numpy())
         return self.apply(envmap)
 
@@ -366,7 +366,7 @@ class LightTransport:
         self._looks = np.where(is_main, np.minimum(self._looks, LASTING_LOOKS) + 1, 0).astype(np.uint8)
         self.resolve(envmap, limit=COLUMNS_A_LOOK, lasting=self._looks >= LASTING_LOOKS)
 
-    def warm_up(self):
+    def _warm_up(self):
         """Trace one column of each kind in the first step: what grows bright later needs no other kernel."""
         if len(self.columns) == 0 and self._exact.room:
             most = np.array([int(self.influence.argmax())])

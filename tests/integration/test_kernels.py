@@ -77,7 +77,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         result = pipeline.run(settings)
-    assert len(fresh) > 5 and len(result.history) > 3 and min(launched) > 5
+    assert len(fresh) > 5 and len(result.history) > 2 and min(launched) > 5
     assert fresh[3:] == [0] * len(fresh[3:])
     assert columns[-1] > columns[3]
 

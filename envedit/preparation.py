@@ -6,7 +6,7 @@ network is fitted, and it is found out where the edit starts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,12 @@ from envedit.solve import initialization, map_problem, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
-TURNED = 0.5
-"""A turn is thought of where it leaves at most this share of the residual of the map as it is."""
+TURNED, CLOSER = 0.5, 0.9
+"""A turn is thought of where it leaves at most this share of the residual of the map as it is; the second where
+that explains the target to its noise."""
 EXPLAINED = 2.0
-"""Residual over the standard error of display values up to which a turned sky needs no rival."""
+"""Residual over the standard error of display values up to which a turned sky needs no rival, and a map that
+is there already no edit."""
 PREFERRED = 0.05
 """By this share the residual of the sky as it is must be smaller: where it turns, nothing is made up."""
 
@@ -104,11 +106,15 @@ class Preparation:
     def edit(self, wanted: Target) -> Edit:
         """Prepare the edit; the sky is turned where that explains the target better."""
         turn = self._turn(wanted)
+        if turn is None and self._there_already(wanted):
+            idle = replace(self.settings, optimizer=replace(self.settings.optimizer, iterations=0))
+            said = "the target shows what is there already, to its noise: nothing is changed"
+            return replace(self, settings=idle)._prepared(wanted, 0.0, [said], search=False)
         if turn is None or turn.degrees == 0:
             return self._prepared(wanted, 0.0, [])
         said = f"the sky is turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.3f} -> {turn.error:.3f}"
-        turned = self._prepared(wanted, turn.degrees, [said])
+        turned = self._prepared(wanted, turn.degrees, [said], search=False)
         if self.settings.representation.turn is True or not turned.job.newton:
             return turned
         if turn.error <= EXPLAINED * map_problem.SIGMA:
@@ -130,9 +136,20 @@ class Preparation:
         with self.clock("start_s"):
             self.watch.stage("turning the sky")
             turn = turning.find(transport, self.original, wanted.picture, wanted.weight)
-        return turn if asked is True or turn.error < TURNED * turn.still else None
+        close = turn.error <= EXPLAINED * map_problem.SIGMA
+        worth = turn.error < (CLOSER if close else TURNED) * turn.still
+        return turn if asked is True or worth else None
 
-    def _prepared(self, wanted, degrees, notes):
+    def _there_already(self, wanted):
+        """Whether layers have nothing to do, as the map gives the target to the noise of both."""
+        transport = self.renderer.transport
+        if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
+            return False
+        with self.clock("start_s"):
+            error = turning.residual(transport, self.original, wanted.picture, wanted.weight)
+        return error <= EXPLAINED * map_problem.SIGMA
+
+    def _prepared(self, wanted, degrees, notes, search=True):
         settings = self.settings
         original = latlong.rotate(self.original, degrees)
         crop, notes = original[self.rows], list(notes)
@@ -175,7 +192,7 @@ class Preparation:
                 frozen[self.rows] = ~known[self.rows]
             job.free = ~frozen[self.rows] if frozen.any() else None
         if recordings:
-            params, found = self._started(job, params, recordings, crop, degrees)
+            params, found = self._started(job, params, recordings, crop, search)
             notes += found
         return Edit(job, params, crop, degrees, frozen, notes)
 
@@ -191,12 +208,12 @@ class Preparation:
                 self.renderer = self._recordings.transport
         return self._recordings
 
-    def _started(self, job, params, recordings, crop, degrees):
-        """Find where layers start: lights of a turned sky are where they must be."""
+    def _started(self, job, params, recordings, crop, search):
+        """Find where layers start; without a search, from what is there."""
         with self.clock("start_s"):
             job.representation.keep(job.free)
             job.free = None  # the gain keeps to them, while a light may move across the others
-            if degrees:
+            if not search:
                 return params, recordings.notes
             self.watch.stage("searching for lights")
             ready = initialization.find(job.representation, params, recordings, job.wanted, job.original)

@@ -18,6 +18,8 @@ from envedit.transport.light_transport import LightTransport
 
 CANDIDATES, APART = 3, 4
 """Turns that are refined, and by how many texels they differ at least."""
+COLUMNS = 64
+"""Exact columns that are traced for one map, at most."""
 TENTH = 0.1
 """Finest turn in texels; one nearer to a whole number is taken to be that: its texels keep their bits."""
 
@@ -56,7 +58,6 @@ def find(
         How much each pixel counts.
     """
     width = envmap.shape[1]
-    shown = display_curve.to_display(tensor(picture)).numpy()
     count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
     known: dict[float, float] = {}
 
@@ -64,10 +65,7 @@ def find(
         texels = round(texels % width / TENTH) * TENTH % width
         if texels not in known:
             turned = latlong.rotate(envmap, 360 * texels / width)
-            transport.resolve(turned, limit=64)
-            residual = display_curve.to_display(transport.apply(tensor(turned))).numpy() - shown
-            mean = (count * np.square(np.float64(residual))).mean()
-            known[texels] = float(np.sqrt(mean)) if np.isfinite(mean) else np.inf
+            known[texels] = residual(transport, turned, picture, weight)
         return known[texels]
 
     misfit, best = _at_a_glance(transport, envmap, picture, count), []
@@ -80,6 +78,18 @@ def find(
         texels = min((texels, texels - step, texels + step), key=error)
     texels = round(texels / TENTH) * TENTH % width
     return Turn(360 * texels / width, error(texels), error(0.0))
+
+
+def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
+    """Return the root mean square of a map's display residual; inf if it is not finite.
+
+    Parameters are those of :func:`find`.
+    """
+    transport.resolve(envmap, limit=COLUMNS)
+    off = np.float64(display_curve.to_display(transport.apply(tensor(envmap))).numpy())
+    off -= display_curve.to_display(tensor(picture)).numpy()
+    mean = (np.square(off) * (1 if weight is None else weight)).mean()
+    return float(np.sqrt(mean)) if np.isfinite(mean) else np.inf
 
 
 def _at_a_glance(transport, envmap, picture, count):

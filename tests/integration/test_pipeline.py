@@ -672,3 +672,50 @@ def test_a_configuration_s_files_are_looked_for_beside_it_from_python_too(tmp_pa
     assert api.edit(tmp_path / "c.toml")["base"] == tmp_path
     assert api.edit(tmp_path / "c.toml", base=tmp_path / "other")["base"] == tmp_path / "other"
     assert api.edit(config.load(tmp_path / "c.toml"))["base"] is None
+
+
+# ---- the whole sky -----------------------------------------------------------------------------------------
+
+
+def turned_world(tmp_path, rng, **tables):
+    """Return settings that ask for a sky of clouds and a sun turned by a quarter, all rows."""
+    d = latlong.directions(16, 32)
+    clouds = np.exp(0.5 * np.sin(3 * d[..., :1]) + 0.4 * np.sin(2 * d[..., 2:])) * [0.5, 0.7, 1.0]
+    picture = np.float32(clouds * (1 + 0.1 * rng.random((16, 32, 1))))
+    picture[4, 9] = 200
+    asked = {
+        "input": {"rows": "all", "width": 32},
+        "target": {"rotate_degrees": 90.0, "spp": 256},
+        "representation": {"turn": "auto"},
+        "renderer": {"spp": 128, "max_depth": 3},
+    }
+    for table, keys in tables.items():
+        asked[table] = asked.get(table, {}) | keys
+    return settings_of(tmp_path, picture, **asked), picture
+
+
+@pytest.mark.parametrize("kind", slow_but([("layers",), ("pixels",)], "layers"))
+def test_a_turned_sky_is_turned_back_to_the_bit(kind, tmp_path, rng):
+    kinds = {"turn": "auto", "kind": kind}
+    settings, picture = turned_world(tmp_path, rng, representation=kinds, optimizer={"iterations": 5})
+    found = pipeline.run(settings)
+    assert found.metrics["turn_degrees"] == pytest.approx(90) and found.found.turn_degrees == 90
+    assert any("turned by 90" in line for line in found.notes)
+    assert found.metrics["envmap"]["psnr"] > found.metrics["initial_envmap"]["psnr"] + 10
+    if kind == "layers":
+        assert found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()
+    # Initial and edited map stand in the user's frame.
+    assert found.maps["initial"].tobytes() == picture.tobytes()
+
+
+def test_a_sky_that_must_not_turn_does_not(tmp_path, rng):
+    settings, _ = turned_world(tmp_path, rng, representation={"turn": False}, optimizer={"iterations": 3})
+    found = pipeline.run(settings)
+    assert found.metrics["turn_degrees"] == 0 and not any("turned by 90.00" in line for line in found.notes)
+
+
+def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng):
+    settings, picture = turned_world(tmp_path, rng, target={"rotate_degrees": 0.0, "spp": 256})
+    found = pipeline.run(settings)
+    assert found.metrics["turn_degrees"] == 0
+    assert found.envmap.tobytes() == picture.tobytes()

@@ -683,3 +683,112 @@ def test_residual_is_of_display_values(case):
     expected = plain_display(np.float64(point.rendering)) - problem.target
     np.testing.assert_allclose(point.residual, expected, atol=2e-6)
     assert display_curve.LOW == 1e-3
+
+
+# ---- lights that are added ---------------------------------------------------------------------------------
+
+
+def lobe_in(image, transport, place, radiance):
+    """Return the rendering under a map with one more bright spot."""
+    return shown(transport, image + lamp(place, radiance))
+
+
+def test_a_light_is_added_where_the_target_has_one(rng):
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    place = (9, 30)
+    target = lobe_in(image, transport, place, 300.0)
+    problem, params = problem_of(image, transport, target)
+    without, found = (solve(problem, params, 0.01, births=births) for births in (0, 1))
+    state = problem.state(found.params)
+    (new,) = problem.lit(state)
+    assert not problem.lit(problem.state(without.params)) and found.loss < without.loss - gauss_newton.WORTH
+    angle = np.degrees(np.arccos(problem.direction(state, new) @ latlong.directions(*GRID)[place]))
+    assert angle < 12  # a cell is 15 degrees wide
+    assert [row["iteration"] for row in found.history] == list(range(len(found.history)))
+
+
+def test_no_light_is_added_where_none_is_missing(case):
+    problem, params, _, _ = case
+    whole = problem.evaluate(problem.state(params)).rendering
+    there = Problem(problem.layers, problem.transport, problem.envmap, whole * 0.9, free=problem.free)
+    ends = [there.state(solve(there, params, 0.1, births=births).params) for births in (0, 2)]
+    assert same(*ends)
+
+
+def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(case):
+    """Against the larger system, with the light's strength as one more unknown."""
+    problem, _, start, state = case
+    point, sigma = problem.evaluate(state), 0.1
+    normal = problem.normal(point, start, sigma)
+    born, gain = problem.birth(point, normal)
+    (new,) = set(problem.lit(born)) - set(problem.lit(state))
+    direction = problem.direction(born, new)
+    cells, directions = problem.blocks.sky_cells(problem.layers.shape)
+    cell = [int(np.argmax(directions @ direction))]
+    atom = (
+        np.stack([m[:, 0] for m in problem.blocks.lit(cells[cell])])
+        * problem.layers.lights.flux[new][:, None]
+    )
+    blocks = normal.blocks
+    mixed = np.concatenate(
+        [j.T @ (w * a) for j, w, a in zip(blocks.jacobian, blocks.squared.T, atom, strict=True)]
+        + [sum(b.T @ a for b, a in zip(blocks.lights, atom, strict=True))]
+    )
+    power = (blocks.squared.T * atom**2).sum()
+    larger = np.block([[normal.hessian, mixed[:, None]], [mixed[None], np.array([[power]])]])
+    pull = np.append(normal.gradient, (blocks.pulled.T * atom).sum())
+    strength = -np.linalg.solve(larger, pull)[-1]
+    assert np.exp(born["flux"][new]) == pytest.approx(np.full(3, strength), rel=1e-3)
+    fall = pull @ np.linalg.solve(larger, pull) - normal.gradient @ np.linalg.solve(
+        normal.hessian, normal.gradient
+    )
+    assert gain == pytest.approx(fall, rel=1e-3)
+
+
+# ---- glow and rows that follow ----------------------------------------------------------------------------
+
+
+def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(rng):
+    """Where every texel is a cell; a picture that sees no core."""
+    d = latlong.directions(*GRID)
+    angle = np.degrees(np.arccos(np.clip(d @ d[SUN], -1, 1)))[..., None]
+    image = np.float32((0.4 + 0.05 * rng.random((*GRID, 3))) * (1 + 4 * np.exp(-angle / 20)) + lamp())
+    transport = DenseTransport.random(rng, FILM, GRID, even=0.8)
+    problem, params = problem_of(image, transport, shown(transport, image))
+    assert problem.layers.lights.glowing and len(problem.layers.separation.lights) == 1
+    start = problem.state(params)
+    state = copy(start)
+    state["flux"][0] = -0.2
+    point = problem.evaluate(state)
+    normal, n = problem.normal(point, start, 1.0), problem.nodes
+    lights = problem._lights(point)
+    for k, (name, _, _) in enumerate(lights.unknowns):
+        if name == "size":
+            continue
+        h = STEPS[name]
+        ends = [problem.evaluate(moved(problem, state, normal.unknowns, 3 * n + k, s * h)) for s in (1, -1)]
+        slope = (ends[0].rendering - ends[1].rendering) / (2 * h)
+        # Cells are some texels, and the glow's own peak is narrower.
+        assert np.abs(lights.pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
+
+
+def test_gradient_where_rows_below_the_horizon_follow(rng):
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    layers = Layers((0, GRID[0]), cycles=3, horizon="mirror")
+    params = layers.encode(image)
+    target = shown(transport, image) * np.exp(rng.normal(0, 0.3, (*FILM, 3))).astype(np.float32)
+    problem = Problem(layers, transport, image, target)
+    start = problem.state(params)
+    point = problem.evaluate(start)
+    normal = problem.normal(point, start, 1.0)
+
+    def f(x):
+        return problem.misfit(problem.evaluate(x).residual, 1.0) + problem.penalty(x, start)
+
+    some = range(0, 3 * problem.nodes, 4)
+    slope = [
+        (f(moved(problem, start, [], k, 0.01)) - f(moved(problem, start, [], k, -0.01))) / 0.04 for k in some
+    ]
+    # The blur of the mirror is not in the Jacobian: nodes of rows that follow are those that they mirror.
+    got = normal.gradient[some]
+    assert np.dot(got, slope) > 0.95 * np.linalg.norm(got) * np.linalg.norm(slope)

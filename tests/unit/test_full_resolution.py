@@ -451,3 +451,34 @@ def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
         np.abs(fine - coarse).mean()
         < 0.02 * coarse.mean() + 3 * np.abs(coarse - lit.render(edited, spp=512, seed=2)).mean()
     )
+
+
+# ---- rows below the horizon that follow --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("finer", [2, 4])
+@pytest.mark.parametrize("kind", ["mirror", "keep"])
+def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer):
+    """Of a map whose lower half is the mirror of its sky, the sun moved; against the working map."""
+    height, width = WORKING[0] * finer, WORKING[1] * finer
+    up = sky(height, width, sun=(20.0, 200.0), seed=1)[: height // 2]
+    source = np.concatenate([up, np.minimum(up[::-1], 3)])
+    working = latlong.resize(source, *WORKING)
+    made = Layers((0, WORKING[0]), horizon=kind)
+    params = made.encode(working)
+    turn = np.zeros((made.lights.count, 3))
+    turn[0] = rotation_vector(made.lights.centres[0], toward(25.0, 90.0))
+    params = params | {"turn": mi.TensorXf(np.float32(turn / made.scales["turn"]))}
+    edited = made.decode(params).numpy()
+    full = full_resolution.carry(made, params, working, edited, source, (0, WORKING[0]))
+    assert full.shape == source.shape and np.isfinite(full).all()
+    small = latlong.resize(full, *WORKING)
+    low = slice(WORKING[0] // 2, None)
+    ratio = np.log(small[low] / edited[low])
+    assert np.abs(ratio).mean() < 0.02 and np.abs(np.log(edited[low] / working[low])).max() > 0.1
+    # The factor of the edit has no edge: across the horizon it steps no more than from row to row beside it.
+    change = np.log(full / source).mean(axis=2)
+    steps = np.abs(np.diff(change, axis=0)).mean(axis=1)
+    middle = height // 2 - 1
+    beside = np.r_[steps[middle - 4 : middle], steps[middle + 1 : middle + 5]]
+    assert steps[middle] < 3 * max(beside.max(), 1e-3)

@@ -22,9 +22,10 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 
 KINDS = "mirror", "keep"
-SMOOTH = 0.0125
-"""Median of |log luminance less its mean over 5x5 texels| below the horizon up to which it is no photograph:
-PureSky has 0.0008 to 0.005, maps with ground 0.03 to 0.11 (256 texels wide)."""
+SMOOTH, BOX = 0.0125, 7.0
+"""Median of |log luminance less its mean over a square of so many degrees| below the horizon up to which it
+is no photograph: PureSky has 0.001 to 0.007, maps with ground 0.03 to 0.14 (128 to 1024 texels wide; smaller
+maps, where the square still has three texels, as much more as they are smaller)."""
 VARIES = 1 / 512
 """Least range of log luminance around the horizon of what can mirror a sky."""
 NARROWEST, WIDENING = 1.0, 0.3
@@ -52,9 +53,11 @@ def kind_of(envmap: np.ndarray) -> str:
     logs = np.log(np.maximum(low, 1e-6 * low.max()))
     # Neither the horizon, where the sky's own detail is near, nor the nadir, where columns meet.
     logs = logs[len(logs) // 8 : max(3 * len(logs) // 4, len(logs) // 8 + 1)]
-    padded = np.pad(np.pad(logs, ((2, 2), (0, 0)), mode="edge"), ((0, 0), (2, 2)), mode="wrap")
-    mean = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).mean(axis=(2, 3))
-    smooth = np.median(np.abs(logs - mean)) <= SMOOTH
+    width = envmap.shape[1]
+    half = max(1, round(BOX / 360 * width / 2 - 0.5))
+    padded = np.pad(np.pad(logs, ((half, half), (0, 0)), mode="edge"), ((0, 0), (half, half)), mode="wrap")
+    mean = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1,) * 2).mean(axis=(2, 3))
+    smooth = np.median(np.abs(logs - mean)) <= SMOOTH * max(1.0, 128 / width)
     return "mirror" if smooth and np.ptp(logs, axis=1).max() > VARIES else "keep"
 
 

@@ -1,0 +1,72 @@
+"""The turn of a sky is found from any angle, to a tenth of a texel, and told from no turn at all."""
+
+import numpy as np
+import pytest
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.solve import turning
+from tests.oracles.dense_transport import DenseTransport
+
+FILM, GRID = (12, 16), (32, 64)
+
+
+def sky(rng):
+    d = latlong.directions(*GRID)
+    image = 0.3 + 0.2 * np.exp(np.sin(3 * d[..., :1]) + np.sin(2 * d[..., 2:])) + 0.1 * rng.random((*GRID, 3))
+    return image.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def traced():
+    return DenseTransport.random(np.random.default_rng(0), FILM, GRID, even=0.6)
+
+
+def rendered(transport, image):
+    return transport.apply(tensor(image)).numpy()
+
+
+@pytest.mark.parametrize("texels", [0.0, 0.5, 7.0, 21.3, 32.0, 63.9])
+def test_the_turn_is_found(texels, traced, rng):
+    image = sky(rng)
+    degrees = 360 * texels / GRID[1]
+    found = turning.find(traced, image, rendered(traced, latlong.rotate(image, degrees)))
+    off = abs(found.degrees - degrees) % 360
+    assert min(off, 360 - off) <= 1.01 * 360 / GRID[1] * turning.TENTH
+    assert found.error < 0.003 and (found.error < 0.2 * found.still or texels in (0.0, 63.9))
+
+
+def test_a_whole_number_of_texels_is_a_roll(traced, rng):
+    image = sky(rng)
+    found = turning.find(traced, image, rendered(traced, np.roll(image, -9, axis=1)))
+    assert latlong.rotate(image, found.degrees).tobytes() == np.roll(image, -9, axis=1).tobytes()
+
+
+def test_a_glance_shows_what_t_does_where_blocks_are_pixels_and_cells_texels(traced, rng):
+    """Against every turn rendered through T itself."""
+    image, picture = sky(rng), rendered(traced, sky(np.random.default_rng(5)))
+    count = 0.5 + rng.random((*FILM, 1))
+    glance = turning._at_a_glance(traced, image, picture, count)
+    shown = np.float64(turning.display_curve.to_display(tensor(picture)).numpy())
+    plain = []
+    for k in range(GRID[1]):
+        made = rendered(traced, np.roll(image, -k, axis=1))
+        made = np.float64(turning.display_curve.to_display(tensor(made)).numpy())
+        plain.append((count * (made - shown) ** 2).sum())
+    np.testing.assert_allclose(glance, plain, rtol=1e-3)
+
+
+def test_a_sky_that_is_not_there_under_any_turn(traced, rng):
+    image = sky(rng)
+    found = turning.find(traced, image, rendered(traced, 4 * sky(np.random.default_rng(7))))
+    assert found.error > 0.5 * found.still
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e30])
+def test_any_radiance(value, traced, rng):
+    image = sky(rng)
+    image[5, 9] = value
+    found = turning.find(traced, image, rendered(traced, latlong.rotate(image, 45)))
+    assert np.isfinite(found.degrees) and 0 <= found.degrees < 360
+    black = turning.find(traced, np.zeros_like(image), rendered(traced, image))
+    assert black.degrees == 0

@@ -23,8 +23,8 @@ from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
 TURNED, CLOSER = 0.5, 0.9
-"""A turn is thought of where it leaves at most this share of the residual of the map as it is; the second where
-that explains the target to its noise."""
+"""A turn is thought of where it leaves at most this share of the residual without; the second share is where
+the turn alone explains the target to its noise."""
 EXPLAINED = 2.0
 """Residual over the standard error of display values up to which a turned sky needs no rival, and a map that
 is there already no edit."""

@@ -38,8 +38,9 @@ ANGLE = np.radians(0.7)
 """Rotation by which the derivative by a light's direction is told."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
 """Largest step of an unknown: beyond it the linear model does not hold."""
-SIZES = (-3.0, 1.5)
-"""Logarithms of sizes that a light may take on: a lobe is of points, and must not fall apart."""
+SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 0.7)
+"""Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
+larger lobe would be seen."""
 _AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 
 
@@ -416,7 +417,9 @@ class Problem:
                 turns[i] = turns.get(i, 0.0) + value * axis
             else:
                 found[name][i, axis] += np.clip(value, -LARGEST[name], LARGEST[name])
-        found["size"] = np.clip(found["size"], *SIZES)
+        own = self.layers.lights.count - SPARE
+        found["size"][:own] = np.clip(found["size"][:own], *SIZES)
+        found["size"][own:] = np.clip(found["size"][own:], *LOBE_SIZES)
         for i, turn in turns.items():
             turn = turn * min(1.0, LARGEST["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
             there = _rotated(self.direction(state, i), turn)

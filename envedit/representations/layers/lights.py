@@ -29,9 +29,9 @@ DARK = -30.0
 """Logarithm of the flux of a light that is not there."""
 FAINTEST = 1e-3
 """Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
-LOBE_POINTS = 512
-LOBE_DEGREES = 2.0
-"""Points and radius of a lobe of size 1."""
+LOBE_POINTS = 1024
+LOBE_DEGREES, LOBE_REACH = 2.0, 2.5
+"""Points and radius of a lobe of size 1, and where it ends, in radii: farther out points would lie singly."""
 LOG_SIZES = (-6.0, 3.0)
 """Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
 MOST_LOG_FLUX = 30.0
@@ -253,13 +253,15 @@ def rotation_vector(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def lobe():
-    """Return the points of a Gaussian lobe: directions around the zenith, weights, and spacing in radians."""
+    """Return the points of a cut Gaussian lobe: directions around the zenith, weights, spacing in radians."""
     k = np.arange(LOBE_POINTS) + 0.5
     radius = math.radians(LOBE_DEGREES)
-    angle = radius * np.sqrt(-2 * np.log(1 - k / (LOBE_POINTS + 0.5)))
+    inside = 1 - math.exp(-0.5 * LOBE_REACH**2)
+    angle = radius * np.sqrt(-2 * np.log(1 - inside * k / LOBE_POINTS))
     turn = k * math.pi * (3 - math.sqrt(5))
     d = np.stack([np.sin(angle) * np.cos(turn), np.cos(angle), np.sin(angle) * np.sin(turn)], axis=1)
-    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), 3 * radius / math.sqrt(LOBE_POINTS)
+    # As far as points lie apart where they are fewest: near a pole single ones would be seen.
+    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), 8 * radius / math.sqrt(LOBE_POINTS)
 
 
 def _vector(tensor, i):

@@ -139,6 +139,9 @@ def run(
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, notes = job.renderer, notes + edit.notes
     traced = renderer.transport
+    if job.newton and (unused := _unused(settings)):
+        asked = ", ".join(unused)
+        warnings.append(f'{asked}: not used by Gauss-Newton steps; [optimizer] kind = "adam" uses them')
     with clock("edit_s"):
         watch.stage("editing")
         params, state = job.optimise(edit.params, edit.crop, resume)
@@ -193,6 +196,18 @@ def run(
         reach=within,
         found=Found(representation, params, first, job.free, edit.degrees),
         posterior=job.posterior,
+    )
+
+
+def _unused(settings):
+    """Name the keys that a user gave and only Adam reads."""
+    only = {
+        "loss": settings.loss.given,
+        "optimizer": {"lr", "beta2", "schedule"},
+        "renderer": {"refresh", "influence_threshold"},
+    }
+    return sorted(
+        f"{name}.{key}" for name, keys in only.items() for key in keys & getattr(settings, name).given
     )
 
 

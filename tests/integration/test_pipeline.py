@@ -719,3 +719,13 @@ def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng):
     found = pipeline.run(settings)
     assert found.metrics["turn_degrees"] == 0
     assert found.envmap.tobytes() == picture.tobytes()
+
+
+def test_keys_that_gauss_newton_does_not_use_are_named(tmp_path, rng):
+    asked = {"optimizer": {"iterations": 1, "lr": 0.1}, "loss": {"ssim": 0.5}}
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), **asked))
+    (said,) = [line for line in found.warnings if "not used by Gauss-Newton" in line]
+    assert "loss.ssim, optimizer.lr" in said and "renderer" not in said
+    asked["optimizer"]["kind"] = "adam"
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), **asked))
+    assert not any("Gauss-Newton" in line for line in found.warnings)

@@ -26,10 +26,10 @@ def jobs(out: Path, maps: dict[str, Path], overrides):
         for kind in KINDS:
             folder = out / f"{name}-{kind}"
             text = (
-                f'[input]\nenvmap = "{file}"\nwidth = 256\n'
+                f'[input]\nenvmap = "{file}"\nwidth = 256\nrows = "upper"\n'
                 f'[scene]\nfile = "sphere"\nparameters = {{ roughness = 0.3 }}\n'
                 f"[target]\nrotate_degrees = 60.0\nspp = 2048\n[output]\nspp = 2048\n"
-                f'[representation]\nkind = "{kind}"\n'
+                f'[representation]\nkind = "{kind}"\nturn = false\n'
             )
             yield name, kind, folder, text, [part for o in overrides for part in ("--set", o)]
 

@@ -31,6 +31,9 @@ class Method:
         """Return the configuration's tables under "paper" or "ours", with the preset."""
         tables = {"preset": PRESETS[settings], **self.tables}
         kind = tables["representation"]["kind"]
+        # The paper's task: the upper rows of a turned map, for models that cannot turn it.
+        tables["input"] = {"rows": "upper"} | tables.get("input", {})
+        tables["representation"] = tables["representation"] | {"turn": False}
         if settings == "paper" and kind in PIXEL_RATES:
             tables["optimizer"] = {"lr": PIXEL_RATES[kind]}
         return tables

@@ -236,9 +236,11 @@ def job_of(cell: Cell, setting: Setting, session: str = "") -> Job:
     measured anew beside whatever it is compared with.
     """
     base = {
-        "input": {"envmap": str(cell.file)},
+        # Where the sky turned, every setting would find the same map.
+        "input": {"envmap": str(cell.file), "rows": "upper"},
         "scene": SCENES[cell.scene],
         "target": {"rotate_degrees": ANGLE},
+        "representation": {"turn": False},
         "renderer": {"cache": False},
         "fit": {"cache": False},
     }

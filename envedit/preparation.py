@@ -106,11 +106,11 @@ class Preparation:
     def edit(self, wanted: Target) -> Edit:
         """Prepare the edit; the sky is turned where that explains the target better."""
         turn = self._turn(wanted)
-        if turn is None and self._there_already(wanted):
+        if self._there_already(wanted, turn):
             idle = replace(self.settings, optimizer=replace(self.settings.optimizer, iterations=0))
             said = "the target shows what is there already, to its noise: nothing is changed"
             return replace(self, settings=idle)._prepared(wanted, 0.0, [said], search=False)
-        if turn is None or turn.degrees == 0:
+        if turn is None or turn.degrees == 0 or not self._worth(turn):
             return self._prepared(wanted, 0.0, [])
         said = f"the sky is turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.3f} -> {turn.error:.3f}"
@@ -127,7 +127,7 @@ class Preparation:
         return chosen
 
     def _turn(self, wanted):
-        """Return the turn that may explain the target, or None."""
+        """Return the turn that explains the target best; None where the sky is not to turn."""
         asked, transport = self.settings.representation.turn, self.renderer.transport
         if asked is False or transport is None or self.rows != slice(0, len(self.original)):
             return None
@@ -135,16 +135,21 @@ class Preparation:
             return None
         with self.clock("start_s"):
             self.watch.stage("turning the sky")
-            turn = turning.find(transport, self.original, wanted.picture, wanted.weight)
+            return turning.find(transport, self.original, wanted.picture, wanted.weight)
+
+    def _worth(self, turn):
+        """Whether a turn is thought of."""
         close = turn.error <= EXPLAINED * map_problem.SIGMA
         worth = turn.error < (CLOSER if close else TURNED) * turn.still
-        return turn if asked is True or worth else None
+        return worth or self.settings.representation.turn is True
 
-    def _there_already(self, wanted):
+    def _there_already(self, wanted, turn):
         """Whether layers have nothing to do, as the map gives the target to the noise of both."""
         transport = self.renderer.transport
         if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
             return False
+        if turn is not None:
+            return turn.still <= EXPLAINED * map_problem.SIGMA and not self._worth(turn)
         with self.clock("start_s"):
             error = turning.residual(transport, self.original, wanted.picture, wanted.weight)
         return error <= EXPLAINED * map_problem.SIGMA

@@ -157,11 +157,6 @@ class Blocks:
     pulled: np.ndarray
     lights: list[np.ndarray]
 
-    @property
-    def by_channel(self):
-        """Jacobian and weight of each channel."""
-        return self.jacobian, self.squared.T
-
 
 @dataclass(frozen=True)
 class _Lights:
@@ -260,12 +255,13 @@ class Problem:
         Huber's concomitant scale (his proposal 2): the first part of F is then their number. At least
         ``least``.
         """
+        size = _sizes(residual)  # once: the bisection is part of every step
         low, high = least, max(least, float(np.abs(residual).max()))
-        if self.misfit(residual, low) <= 3 * INDEPENDENT:
+        if self._huber(size, low) <= 3 * INDEPENDENT:
             return low
         for _ in range(40):
             middle = np.sqrt(low * high)
-            low, high = (middle, high) if self.misfit(residual, middle) > 3 * INDEPENDENT else (low, middle)
+            low, high = (middle, high) if self._huber(size, middle) > 3 * INDEPENDENT else (low, middle)
         return float(high)
 
     def loss(self, point: Point, start: dict, sigma: float) -> float:
@@ -296,7 +292,9 @@ class Problem:
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
         """Return the first part of F."""
-        size = np.sqrt((residual**2).mean(axis=2, keepdims=True))
+        return self._huber(_sizes(residual), sigma)
+
+    def _huber(self, size, sigma):
         loss = np.where(size <= sigma, size**2, sigma * (2 * size - sigma))
         return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
 
@@ -305,7 +303,7 @@ class Problem:
     def normal(self, point: Point, start: dict, sigma: float) -> Normal:
         """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2."""
         state, n = point.state, self.nodes
-        size = np.sqrt((point.residual**2).mean(axis=2, keepdims=True))
+        size = _sizes(point.residual)
         robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
         slope = display_curve.slope(point.rendering)
         blocks, lights = self.blocks, self._lights(point)
@@ -377,9 +375,8 @@ class Problem:
         i, blocks = dark[0], normal.blocks
         cells, directions = self.blocks.sky_cells(layers.shape)
         atoms = [m * f for m, f in zip(self.blocks.lit(cells), layers.lights.flux[i], strict=True)]
-        mixed = np.concatenate(
-            [j.T @ (w[:, None] * a) for j, w, a in zip(*blocks.by_channel, atoms, strict=True)]
-        )
+        channels = zip(blocks.jacobian, blocks.squared.T, atoms, strict=True)
+        mixed = np.concatenate([j.T @ (w[:, None] * a) for j, w, a in channels])
         if blocks.lights:
             mixed = np.concatenate([mixed, sum(b.T @ a for b, a in zip(blocks.lights, atoms, strict=True))])
         pull = sum(a.T @ p for a, p in zip(atoms, blocks.pulled.T, strict=True))
@@ -508,6 +505,11 @@ class Problem:
         return self.layers.lights.core(
             tensor(state["turn"]), tensor(flux), tensor(state["size"]), self.layers.whole, self.layers.rows
         ).numpy()
+
+
+def _sizes(residual):
+    """Root mean square over the channels of every pixel, (h, w, 1)."""
+    return np.sqrt((residual**2).mean(axis=2, keepdims=True))
 
 
 def _solved(lower, values):

@@ -75,6 +75,8 @@ class Below:
 
     Attributes
     ----------
+    image : ndarray (rows, W, 3)
+        The radiance as given.
     mirrored : ndarray of int64 (rows,)
         The row of the sky that each row mirrors.
     fade : ndarray (rows,)
@@ -86,7 +88,7 @@ class Below:
     def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str):
         (up, width, _), low = sky.shape, len(radiance)
         total = up + low
-        self.kind, self.shape = kind, radiance.shape[:2]
+        self.kind, self.shape, self.image = kind, radiance.shape[:2], radiance
         self.radiance = dr.opaque(mi.Color3f(np.ascontiguousarray(radiance.reshape(-1, 3).T, np.float32)))
         self._faint = float(max(1e-6 * sky.mean(), 1e-30))
         angle = np.degrees(np.pi * np.arange(up, total) / max(total - 1, 1)) - 90

@@ -113,7 +113,6 @@ class Layers:
         core = self.separation.core
         base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)
         self.base = np.maximum(base, 0).astype(np.float32)
-        self._low = low
         self.below = Below(low, self.base, self._horizon) if low is not None and len(low) else None
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1])
         self.scales = SCALES | self.gain.scales()
@@ -204,7 +203,7 @@ class Layers:
         if self.below is None:
             return own
         glow = self.separation.glow[self.below.mirrored] ** self.below.fade[:, None, None]
-        return np.concatenate([own, self._low / glow])
+        return np.concatenate([own, self.below.image / glow])
 
     def hats(self, level: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """List what :meth:`.GridGain.hats` does, of all texels of the image, those that follow included."""

@@ -14,15 +14,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from envedit.core.errors import NumericalError
+from envedit.solve import added_light
 from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
 TRIES = 5
 """Dampings that are tried in one step."""
-WORTH, BIRTH_STEPS = 8.0, 6
-"""By how much a further light must lower F, with residuals as they are taken for noise, to be tried and
-to be kept: a likelihood of e^4; and the steps after which that is asked."""
+WORTH, ADDED_STEPS = 8.0, 6
+"""By how much a further light must lower F to be tried and to be kept: a likelihood of e^4; and the steps
+after which that is asked, by which a solution with one more light may be longer."""
 
 
 @dataclass
@@ -133,19 +134,12 @@ def solve(
     NumericalError
         If the start is not finite.
     """
-    start = problem.state(params)
-    if iterations:
-        problem.clear(start)
-    # A continued run has the columns with which its last point was rendered.
-    run, fresh = run or Run(start, start), run is None
-    point = problem.evaluate(run.state, resolve=fresh)
-    if point.residual is None:
-        raise NumericalError("the edit cannot begin: the map that the search found is not finite")
-    if fresh and iterations:
-        run, point = _with_births(
-            problem, run, point, sigma, min(iterations, BIRTH_STEPS), births, after_step
-        )
-    point = _descended(problem, run, point, sigma, iterations, after_step)
+    search = _Search(problem, sigma, iterations, births, after_step)
+    if run is None:
+        run, point = search.begun(problem.state(params))
+    else:  # it has the columns with which its last point was rendered
+        point = problem.evaluate(run.state, resolve=False)
+    run, point = search.solved(run, point)
     normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     loss, note = _unlikeliness(problem, run, point, sigma), ""
     loss += 2 * normal.determined if run.history else 0
@@ -169,68 +163,112 @@ def _unlikeliness(problem, run, point, sigma):
     return problem.loss(point, run.start, noise) + 6 * INDEPENDENT * float(np.log(noise))
 
 
-def _descended(problem, run, point, sigma, most, after_step):
-    """Make steps until none lowers F, or there are ``most`` in all; returns where they end."""
-    while len(run.history) < most and not run.finished:
-        began = time.perf_counter()
-        run.scale = max(problem.noise(point.residual, sigma), run.scale / 2 if np.isfinite(run.scale) else 0)
-        before = problem.loss(point, run.start, run.scale)
-        normal = problem.normal(point, run.start, run.scale)
-        better = None
-        for _ in range(TRIES):
-            moved = problem.step(run.state, normal, run.damping)
-            tried = None if moved is None else problem.evaluate(moved)
-            if tried is not None and tried.residual is not None:
-                data = problem.misfit(tried.residual, run.scale)
-                penalty = problem.penalty(tried.state, run.start)
-                if data + penalty < before:
-                    better = tried
-                    break
-            run.damping = max(10 * run.damping, 1e-2)
-        little = better is None or before - data - penalty < LITTLE * before
-        run.finished = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
-        if better is not None:
-            point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
-            row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}
-            ms = round(1000 * (time.perf_counter() - began), 3)
-            run.history.append({"iteration": len(run.history), **row, "damping": run.damping, "step_ms": ms})
-        if after_step and (better is not None or run.finished):
-            after_step(run, point)
-    return point
+class _Search:
+    """Descents with and without further lights."""
 
+    def __init__(self, problem, sigma, iterations, births, after_step):
+        self.problem, self.sigma, self.iterations = problem, sigma, iterations
+        self.births, self.after_step = births, after_step
 
-def _with_births(problem, run, point, sigma, iterations, births, after_step):
-    """Add lights while some steps with one more lead farther than without; returns run and point."""
+    def begun(self, start):
+        """Return the run that begins at a start, with lights beside it that lower F; and its point."""
+        problem = self.problem
+        more = problem.beyond(start) if self.iterations and self.births else None
+        if self.iterations:
+            problem.clear(start)
+        run = Run(start, start)
+        point = problem.evaluate(start)
+        if point.residual is None:
+            raise NumericalError("the edit cannot begin: the map that the search found is not finite")
+        if not self.iterations:
+            return run, point
+        if more is not None:
+            run, point = self._better(run, point, more)
+        for _ in range(self.births):
+            still = run.state | {"gain": np.zeros_like(run.state["gain"])}
+            began = problem.evaluate(still)
+            spread = max(self.sigma, 1.4826 * float(np.median(np.abs(began.residual))))
+            found = added_light.best(problem, began, problem.normal(began, run.start, spread))
+            if found is None or found[1] < WORTH:
+                break
+            before = run
+            run, point = self._better(run, point, found[0])
+            if run is before:
+                break
+        return run, point
 
-    def tried(_, point):
-        if after_step:
-            after_step(None, point)
+    def solved(self, run, point):
+        """Descend, then add lights while they lower F."""
+        while True:
+            point = self._descended(run, point, self._most(run), self.after_step)
+            if not self._room(run) or not run.history:
+                return run, point
+            noise = self.problem.noise(point.residual, self.sigma)
+            normal = self.problem.normal(point, run.start, noise)
+            found = added_light.best(self.problem, point, normal)
+            if found is None or found[1] < WORTH:
+                return run, point
+            before = run
+            run, point = self._better(run, point, found[0])
+            if run is before:
+                return run, point
 
-    for _ in range(births):
-        still = run.state | {"gain": np.zeros_like(run.state["gain"])}
-        began = problem.evaluate(still)
-        spread = max(sigma, 1.4826 * float(np.median(np.abs(began.residual))))
-        born = problem.birth(began, problem.normal(began, run.start, spread))
-        if born is None or born[1] < WORTH:
-            break
-        state, start = born[0], {name: value.copy() for name, value in run.start.items()}
-        new = [i for i in problem.lit(state) if i not in problem.lit(run.state)]
-        for name in ("turn", "flux", "size"):
-            start[name][new] = state[name][new]
-        rivals = [run, Run(state, start, history=list(run.history))]
-        most, ends = min(len(run.history) + BIRTH_STEPS, iterations), []
-        for rival in rivals:
-            first = point if rival is run else problem.evaluate(rival.state)
-            if first.residual is None:
-                ends.append(None)
-                continue
-            ends.append(_descended(problem, rival, first, sigma, most, tried))
-        scale = max(rival.scale for rival in rivals)
-        losses = [
-            np.inf if end is None else problem.loss(end, rival.start, scale)
-            for rival, end in zip(rivals, ends, strict=True)
-        ]
-        if not losses[1] + WORTH < losses[0]:
-            return run, ends[0]
-        run, point = rivals[1], ends[1]
-    return run, point
+    def _room(self, run):
+        return len(self.problem.added(run.state)) < self.births
+
+    def _most(self, run):
+        return self.iterations + min(ADDED_STEPS, self.iterations) * len(self.problem.added(run.state))
+
+    def _better(self, run, point, state):
+        """Return the better of a run and of one from a state with one light more, after some steps."""
+        start = {name: value.copy() for name, value in run.start.items()}
+        for i in self.problem.added(state):
+            if i not in self.problem.added(run.state):
+                for name in ("turn", "flux", "size"):
+                    start[name][i] = state[name][i]
+        rival = replace(run, state=state, start=start, history=list(run.history), finished=False)
+        first = self.problem.evaluate(state)
+        if first.residual is None:
+            return run, point
+        most = len(run.history) + min(ADDED_STEPS, self.iterations)
+        if not run.finished:
+            run = replace(run, history=list(run.history))
+            point = self._descended(run, point, most, self._tried)
+        end = self._descended(rival, first, most, self._tried)
+        scale = max(run.scale, rival.scale)
+        loss, other = (self.problem.loss(p, r.start, scale) for p, r in ((point, run), (end, rival)))
+        return (rival, end) if other + WORTH < loss else (run, point)
+
+    def _tried(self, _, point):
+        if self.after_step:
+            self.after_step(None, point)
+
+    def _descended(self, run, point, most, after_step):
+        """Make steps until none lowers F, or there are ``most`` in all; returns where they end."""
+        problem, sigma = self.problem, self.sigma
+        while len(run.history) < most and not run.finished:
+            began = time.perf_counter()
+            run.scale = max(problem.noise(point.residual, sigma), run.scale / 2 if np.isfinite(run.scale) else 0)
+            before = problem.loss(point, run.start, run.scale)
+            normal = problem.normal(point, run.start, run.scale)
+            better = None
+            for _ in range(TRIES):
+                moved = problem.step(run.state, normal, run.damping)
+                tried = None if moved is None else problem.evaluate(moved)
+                if tried is not None and tried.residual is not None:
+                    data = problem.misfit(tried.residual, run.scale)
+                    penalty = problem.penalty(tried.state, run.start)
+                    if data + penalty < before:
+                        better = tried
+                        break
+                run.damping = max(10 * run.damping, 1e-2)
+            little = better is None or before - data - penalty < LITTLE * before
+            run.finished = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
+            if better is not None:
+                point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
+                row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}
+                ms = round(1000 * (time.perf_counter() - began), 3)
+                run.history.append({"iteration": len(run.history), **row, "damping": run.damping, "step_ms": ms})
+            if after_step and (better is not None or run.finished):
+                after_step(run, point)
+        return point

@@ -119,7 +119,8 @@ class Normal:
     """Hessian (m, m) and gradient (m,) of F / 2.
 
     ``precision`` is K in the Hessian, ``unknowns`` names those after the gain's, ``blocks`` is what the
-    Hessian was made of.
+    Hessian was made of; so are weights ``robust`` (h, w, 1), ``slope`` of the display curve and ``residual``
+    (h, w, 3), and ``pictures`` (k, h, w, 3) of the unknowns that are named.
     """
 
     hessian: np.ndarray
@@ -127,6 +128,10 @@ class Normal:
     precision: np.ndarray
     unknowns: list
     blocks: Blocks
+    robust: np.ndarray
+    slope: np.ndarray
+    residual: np.ndarray
+    pictures: np.ndarray
 
     @property
     def determined(self) -> float:
@@ -227,6 +232,30 @@ class Problem:
         state["gain"][:] = 0
         own = [i for i in self.lit(state) if i < self.layers.lights.count - SPARE]
         state["flux"][own] = np.clip(state["flux"][own].mean(axis=1, keepdims=True), -1, 1)
+
+    def beyond(self, state: dict) -> dict | None:
+        """Return a state with a spare light where the map's own would need a flux that :meth:`clear` cuts.
+
+        A hazy light that is to be a sun stays what it is, with the sun beside it. None where no light does.
+        """
+        own = self.layers.lights.count - SPARE
+        mean = {i: state["flux"][i].mean() for i in self.lit(state) if i < own}
+        i = max(mean, key=mean.get, default=None)
+        if i is None or mean[i] <= 1:
+            return None
+        found = {name: value.copy() for name, value in state.items()}
+        self.clear(found)
+        fluxes = self.layers.lights.flux @ LUMINANCE
+        more = (np.exp(mean[i]) - np.exp(1.0)) * fluxes[i] / fluxes[own]
+        if not more > 0:
+            return None
+        found["turn"][own] = rotation_vector(self.layers.lights.centres[own], self.direction(state, i))
+        found["flux"][own], found["size"][own] = np.log(more), 0.0
+        return found
+
+    def added(self, state: dict) -> list[int]:
+        """List the spare lights that are lit."""
+        return [i for i in self.lit(state) if i >= self.layers.lights.count - SPARE]
 
     def lit(self, state: dict) -> list[int]:
         """List the lights that there are."""
@@ -330,7 +359,8 @@ class Problem:
         precision, back = self._precision(lights.unknowns), self._from_prior(state, start, lights.unknowns)
         hessian += precision
         gradient += precision @ back
-        return Normal(hessian, gradient, precision, lights.unknowns, Blocks(jacobian, squared, pulled, lit))
+        parts = Blocks(jacobian, squared, pulled, lit), robust, slope, point.residual, lights.pictures
+        return Normal(hessian, gradient, precision, lights.unknowns, *parts)
 
     def _precision(self, unknowns):
         """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
@@ -358,43 +388,6 @@ class Problem:
             else:
                 found.append([(state[name] - start[name])[i, axis]])
         return np.concatenate(found)
-
-    def birth(self, point: Point, normal: Normal) -> tuple[dict, float] | None:
-        """Light a spare light where that lowers F most, beside all other unknowns; None where none does.
-
-        Returns the state, and by how much F falls.
-
-        Candidates are the cells of the block transport. With a the picture of a light in display values, r
-        the residual, W its weights, H and g those of the normal equations and c the mixed part of the larger
-        Hessian, F falls by (a'W r - c' H^-1 g)^2 / (a'W a - c' H^-1 c) for the best strength of the light.
-        """
-        layers, own = self.layers, self.layers.lights.count - SPARE
-        dark = [i for i in range(own, layers.lights.count) if i not in self.lit(point.state)]
-        if not dark:
-            return None
-        i, blocks = dark[0], normal.blocks
-        cells, directions = self.blocks.sky_cells(layers.shape)
-        atoms = [m * f for m, f in zip(self.blocks.lit(cells), layers.lights.flux[i], strict=True)]
-        channels = zip(blocks.jacobian, blocks.squared.T, atoms, strict=True)
-        mixed = np.concatenate([j.T @ (w[:, None] * a) for j, w, a in channels])
-        if blocks.lights:
-            mixed = np.concatenate([mixed, sum(b.T @ a for b, a in zip(blocks.lights, atoms, strict=True))])
-        pull = sum(a.T @ p for a, p in zip(atoms, blocks.pulled.T, strict=True))
-        power = sum((a * a).T @ w for a, w in zip(atoms, blocks.squared.T, strict=True))
-        try:
-            half = np.linalg.solve(np.linalg.cholesky(normal.hessian), np.c_[mixed, normal.gradient])
-        except np.linalg.LinAlgError:
-            return None
-        along = half[:, :-1].T @ half[:, -1] - pull
-        rest = power - np.square(half[:, :-1]).sum(axis=0)
-        strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > 1e-6 * power)
-        best = int(np.argmax(np.maximum(strength, 0) * along))
-        if not strength[best] > 0 or not np.isfinite(strength[best]):
-            return None
-        born = {name: value.copy() for name, value in point.state.items()}
-        born["turn"][i] = rotation_vector(layers.lights.centres[i], directions[best])
-        born["flux"][i], born["size"][i] = np.log(strength[best]), 0.0
-        return born, float(strength[best] * along[best])
 
     def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
         """Return the state after a damped step; None if the step is not finite."""

@@ -34,16 +34,13 @@ def best(problem: Problem, point: Point, normal: Normal) -> tuple[dict, float] |
         None in place of both where no light lowers F, or none is spare.
     """
     layers, transport = problem.layers, problem.transport
-    dark = [
-        i
-        for i in range(layers.lights.count - SPARE, layers.lights.count)
-        if i not in problem.lit(point.state)
-    ]
+    spare = range(layers.lights.count - SPARE, layers.lights.count)
+    dark = [i for i in spare if i not in problem.added(point.state)]
+    if not dark:
+        return None
     try:
         model = _Model(problem, normal)
     except np.linalg.LinAlgError:
-        return None
-    if not dark:
         return None
     i, flux = dark[0], layers.lights.flux[dark[0]]
     cells, directions = problem.blocks.sky_cells(layers.shape)
@@ -87,8 +84,8 @@ class _Model:
     def of_cells(self, atoms):
         """Return strength and fall of F for pictures in blocks, (blocks, n) per channel."""
         blocks = self.normal.blocks
-        mixed = [j.T @ (w[:, None] * a) for j, w, a in zip(blocks.jacobian, blocks.squared.T, atoms, strict=True)]
-        mixed = np.concatenate(mixed)
+        channels = zip(blocks.jacobian, blocks.squared.T, atoms, strict=True)
+        mixed = np.concatenate([j.T @ (w[:, None] * a) for j, w, a in channels])
         if blocks.lights:
             mixed = np.concatenate([mixed, sum(b.T @ a for b, a in zip(blocks.lights, atoms, strict=True))])
         pull = sum(a.T @ p for a, p in zip(atoms, blocks.pulled.T, strict=True))
@@ -98,10 +95,9 @@ class _Model:
     def of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
         normal, blocks, count = self.normal, self.normal.blocks, len(pictures)
-        weights = (normal.slope**2 * normal.robust).reshape(-1, 3)
-        weighted = pictures * weights
-        in_blocks = self.problem.blocks.summed(weighted.transpose(1, 0, 2).reshape(*normal.slope.shape[:2], -1))
-        in_blocks = in_blocks.reshape(-1, count, 3)
+        weighted = pictures * (normal.slope**2 * normal.robust).reshape(-1, 3)
+        by_pixel = weighted.transpose(1, 0, 2).reshape(*normal.slope.shape[:2], -1)
+        in_blocks = self.problem.blocks.summed(by_pixel).reshape(-1, count, 3)
         mixed = np.concatenate([j.T @ in_blocks[..., c] for c, j in enumerate(blocks.jacobian)])
         if len(normal.pictures):
             flat = normal.pictures.reshape(len(normal.pictures), -1)

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from envedit import config
+from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError, place_of
-from envedit.losses import optimizer
+from envedit.losses import display_curve, optimizer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.layers import unseen_kept
 from envedit.representations.layers.lights import SPARE
@@ -22,6 +23,8 @@ from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
 from envedit.targets import target
 
+CHECKED_SPP, CHECKED_SEED = 64, 700_001
+"""Samples a pixel of renderings by which start and solution are compared, and what is added to the seed."""
 TRIAL_STEPS, NEWTON_TRIAL = 30, 6
 """Steps of Adam and of Gauss-Newton after which the better of two starts is chosen."""
 TRIAL_GAIN, LIKELIER = 0.05, 20.0
@@ -86,6 +89,8 @@ class Job:
         How well the target determines the sky, where :meth:`optimise` knows it.
     note : str
         What the solver has to say.
+    begun : gauss_newton.Run, optional
+        Of the last trial: :meth:`optimise` goes on from there.
     """
 
     settings: config.Config
@@ -101,6 +106,7 @@ class Job:
     dists: object = None
     posterior: map_problem.Posterior | None = None
     note: str = ""
+    begun: gauss_newton.Run | None = None
 
     @property
     def newton(self) -> bool:
@@ -135,14 +141,17 @@ class Job:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         if len(starts) == 1:
             return starts[0]
-        reached, trials = [], self.trials
+        reached, begun, trials = [], [], self.trials
         for params, _ in starts:
+            self.begun = None
             try:
                 loss = self.tried(params, crop)
             except NumericalError:  # a start that goes nowhere is no reason to stop
                 loss = np.inf
             reached.append(loss if np.isfinite(loss) else np.inf)
+            begun.append(self.begun)
         least = int(np.argmin(reached)) if self.better(min(reached), reached[0]) else 0
+        self.begun = begun[least]
         losses = ", ".join(f"{loss:.3g}" for loss in reached)
         chosen = [
             *starts[least][1],
@@ -163,7 +172,9 @@ class Job:
         """Return the loss after a few steps from a start."""
         steps = self.trials
         if self.newton:
-            return gauss_newton.solve(self._problem(), params, self._sigma, steps, trial=True).loss
+            found = gauss_newton.solve(self._problem(), params, self._sigma, steps, trial=True)
+            self.begun = found.run
+            return found.loss
         few = replace(self.settings.optimizer, iterations=steps)
         wanted = self.wanted.aim, self.wanted.weight
         objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists)
@@ -219,7 +230,7 @@ class Job:
 
     def _solve(self, params, resume):
         """Make Gauss-Newton steps from the start, or from the checkpoint."""
-        chosen, run = self.settings.optimizer, None
+        chosen, run = self.settings.optimizer, self.begun
         what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *self.wanted.asked])
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, arrays, traced, picture = found
@@ -251,12 +262,18 @@ class Job:
                     raise Interrupted(point.edited, done)
 
             rendered = self.wanted.coverage is None  # paint is no noisy picture, and asks for what it shows
-            births = SPARE if rendered else 0
-            found = gauss_newton.solve(
-                self._problem(), params, self._sigma, most, after_step, run, births=births, sparing=rendered
-            )
+            more = {"births": SPARE, "judge": self._display_error} if rendered else {"sparing": False}
+            asked = self._problem(), params, self._sigma, most, after_step, run
+            found = gauss_newton.solve(*asked, **more)
         self.posterior, self.note = found.posterior, found.note
         return found.params, adam_loop.State(step=len(found.history), history=found.history)
+
+    def _display_error(self, envmap):
+        """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
+        seed = (self.settings.seed + CHECKED_SEED) % 2**32
+        shown = display_curve.to_display(tensor(self.lit.render(envmap, CHECKED_SPP, seed)))
+        off = shown.numpy() - display_curve.to_display(tensor(self.wanted.aim)).numpy()
+        return float((np.square(off) * (1 if self.wanted.weight is None else self.wanted.weight)).mean())
 
     def _look_at_the_last(self, adam, state):
         """Take the last step back if it led to no map: the loop sees only what a next step starts from."""

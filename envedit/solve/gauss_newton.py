@@ -21,6 +21,9 @@ ITERATIONS, LITTLE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
 TRIES = 5
 """Dampings that are tried in one step."""
+NEAR, CLEARLY = 2.0, 0.95
+"""Noise of the start over that of the solution up to which their renderings are compared, and the share of
+the start's squared error that the solution's must be below."""
 WORTH, ADDED_STEPS = 8.0, 6
 """By how much a further light must lower F to be tried and to be kept: a likelihood of e^4; and the steps
 after which that is asked, by which a solution with one more light may be longer."""
@@ -80,6 +83,8 @@ class Solution:
         Akaike's (1974) criterion, lower for what is likelier: F at the noise that the residual shows, twice
         that noise's logarithm for each independent residual, and two for every unknown that the picture
         determines, where any was changed.
+    run : Run
+        From which a trial can be continued.
     posterior : Posterior or None
         How well the picture determines the sky; None of a trial.
     note : str
@@ -89,6 +94,7 @@ class Solution:
     params: dict
     history: list[dict]
     loss: float
+    run: Run
     posterior: Posterior | None = None
     note: str = ""
 
@@ -103,6 +109,7 @@ def solve(
     trial: bool = False,
     births: int = 0,
     sparing: bool = True,
+    judge: Callable[[np.ndarray], float] | None = None,
 ) -> Solution:
     """Minimise F.
 
@@ -128,33 +135,42 @@ def solve(
         Most lights that may be added.
     sparing : bool
         Stay at the start where steps lower the misfit by no more than noise would let them.
+    judge : callable, optional
+        Error of a map (H, W, 3) that is not told by T; asked where the start is nearly as good as the
+        solution (:data:`NEAR`), as steps may then follow the errors of T.
 
     Raises
     ------
     NumericalError
         If the start is not finite.
     """
-    search = _Search(problem, sigma, iterations, births, after_step)
+    search, start = _Search(problem, sigma, iterations, births, after_step), problem.state(params)
     if run is None:
-        run, point = search.begun(problem.state(params))
+        run, point = search.begun(start)
     else:  # it has the columns with which its last point was rendered
         point = problem.evaluate(run.state, resolve=False)
     run, point = search.solved(run, point)
     normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     loss, note = _unlikeliness(problem, run, point, sigma), ""
     loss += 2 * normal.determined if run.history else 0
+    whole = run
     if sparing and run.history:
-        before = replace(run, state=run.start)
-        first = problem.evaluate(before.state, resolve=False)
+        problem.clear(start)
+        before = replace(run, state=start, start=start)
+        first = problem.evaluate(start, resolve=False)
         least = _unlikeliness(problem, before, first, sigma)
+        near = problem.noise(first.residual, sigma) < NEAR * problem.noise(point.residual, sigma)
         if least <= loss:
             note = (
                 f"the start as it is: steps take {normal.determined:.0f} unknowns and gain no more than noise"
             )
+        elif judge is not None and near and CLEARLY * judge(first.edited) <= judge(point.edited):
+            note = "the start as it is: path traced it is as close to the target"
+        if note:
             run, point, loss = before, first, least
             normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     posterior = None if trial else problem.posterior(normal)
-    return Solution(problem.params(run.state), run.history, loss, posterior, note)
+    return Solution(problem.params(run.state), run.history, loss, whole, posterior, note)
 
 
 def _unlikeliness(problem, run, point, sigma):
@@ -185,8 +201,9 @@ class _Search:
         if more is not None:
             run, point = self._better(run, point, more)
         for _ in range(self.births):
-            still = run.state | {"gain": np.zeros_like(run.state["gain"])}
-            began = problem.evaluate(still)
+            began = point
+            if run.state["gain"].any():
+                began = problem.evaluate(run.state | {"gain": np.zeros_like(run.state["gain"])})
             spread = max(self.sigma, 1.4826 * float(np.median(np.abs(began.residual))))
             found = added_light.best(problem, began, problem.normal(began, run.start, spread))
             if found is None or found[1] < WORTH:
@@ -248,7 +265,8 @@ class _Search:
         problem, sigma = self.problem, self.sigma
         while len(run.history) < most and not run.finished:
             began = time.perf_counter()
-            run.scale = max(problem.noise(point.residual, sigma), run.scale / 2 if np.isfinite(run.scale) else 0)
+            halved = run.scale / 2 if np.isfinite(run.scale) else 0
+            run.scale = max(problem.noise(point.residual, sigma), halved)
             before = problem.loss(point, run.start, run.scale)
             normal = problem.normal(point, run.start, run.scale)
             better = None
@@ -267,8 +285,8 @@ class _Search:
             if better is not None:
                 point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
                 row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}
-                ms = round(1000 * (time.perf_counter() - began), 3)
-                run.history.append({"iteration": len(run.history), **row, "damping": run.damping, "step_ms": ms})
+                row |= {"damping": run.damping, "step_ms": round(1000 * (time.perf_counter() - began), 3)}
+                run.history.append({"iteration": len(run.history), **row})
             if after_step and (better is not None or run.finished):
                 after_step(run, point)
         return point

@@ -139,7 +139,12 @@ def recordings(
 
 
 def find(
-    layers: Layers, params: dict, recordings: Recordings, wanted: Target, original: np.ndarray
+    layers: Layers,
+    params: dict,
+    recordings: Recordings,
+    wanted: Target,
+    original: np.ndarray,
+    only_own: bool = False,
 ) -> Starts:
     """Find where to start; ``layers`` may get finer grids.
 
@@ -153,10 +158,12 @@ def find(
         What the picture should be.
     original : ndarray (H, W, 3)
         The map.
+    only_own : bool
+        As of :func:`.light_search.start`.
     """
     transport, notes = recordings.transport, list(recordings.notes)
     params = layers.refine(params, recordings.octaves)
-    starts = _searched(layers, params, transport, wanted, original)
+    starts = _searched(layers, params, transport, wanted, original, only_own)
     if recordings.octaves:  # a mirror: images of lights, and caustics, are where the lights are now found
         began = original.copy()
         began[layers.active] = layers.decode(starts[0][0]).numpy()
@@ -186,11 +193,11 @@ def _trusted(envmap, recordings, wanted):
     return (weight / max(float(weight.mean()), 1e-30)).astype(np.float32), said
 
 
-def _searched(layers, params, transport, wanted, original):
+def _searched(layers, params, transport, wanted, original, only_own=False):
     """List the starts of the searches, (parameters, notes)."""
     asked = wanted.picture, wanted.weight, original
     if wanted.coverage is None:
-        return [light_search.start(layers, params, transport, *asked)]
+        return [light_search.start(layers, params, transport, *asked, only_own)]
     begin = layers, params, transport, wanted.initial, *asked
     daring = (False, True) if (wanted.coverage < 1).any() else (False,)
     found = [painted_change.start(*begin, bold=bold) for bold in daring]

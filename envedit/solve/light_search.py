@@ -43,6 +43,7 @@ def start(
     picture: np.ndarray,
     weight: np.ndarray | None,
     envmap: np.ndarray,
+    only_own: bool = False,
 ) -> tuple[dict, list[str]]:
     """Find where the optimisation of layers starts.
 
@@ -60,6 +61,8 @@ def start(
         How much each pixel counts.
     envmap : ndarray (H, W, 3)
         The whole map.
+    only_own : bool
+        Place the map's own lights only: gain and further lights are found by Gauss-Newton steps.
 
     Returns
     -------
@@ -70,7 +73,8 @@ def start(
     """
     scene = Question(layers, transport, picture, weight, envmap)
     overview, lights = transport.overview(), layers.separation.lights
-    places = place(scene.given(), scene.wanted, lights, SPARE, layers.lights.flux[-1])
+    spare = 0 if only_own else SPARE
+    places = place(scene.given(), scene.wanted, lights, spare, layers.lights.flux[-1])
     notes, pictures = [], []
     factor = np.ones((len(overview.omega), 3))
     for i, (light, found) in enumerate(zip(lights, places, strict=False)):
@@ -89,6 +93,8 @@ def start(
         else:
             notes.append(f"{name}: starts where it was")
         places[i] = Place(direction if found.direction is not None else None, np.full(3, flux))
+        if only_own:
+            continue
         pictures.append((i, scene.light(i, places[i])))
         if light.glow is not None:
             factor *= 1 + glow_at(light.glow, scene.cells @ direction)
@@ -97,11 +103,14 @@ def start(
             notes.append("a light is born: the picture wants one where the map has none")
             pictures.append((i, scene.light(i, places[i])))
 
+    found = dict(params)
+    if only_own:
+        return found | scene.placed(places), notes
+
     # Flux and gain, from the coarse grid to the finest.
     stack = np.zeros((3, len(overview.matrix[0]), 0))
     if pictures:
         stack = np.stack([overview.to_blocks(p).T for _, p in pictures], axis=2)
-    found = dict(params)
     total = np.ones((len(pictures), 3))
     for level in range(LEVELS):
         if np.prod(layers.gain.sizes[level]) > len(overview.omega):
@@ -117,10 +126,7 @@ def start(
         total, stack = total * strength, stack * strength.T[:, None, :]
     for (i, _), s in zip(pictures, total, strict=True):
         places[i] = Place(places[i].direction, places[i].flux * s)
-    turn, flux = scene.parameters(places)
-    found["turn"] = tensor(turn / layers.scales["turn"])
-    found["flux"] = tensor(flux / layers.scales["flux"])
-    return found, notes
+    return found | scene.placed(places), notes
 
 
 class Question:
@@ -204,6 +210,12 @@ class Question:
     def parameters(self, places):
         """Rotation vectors and log fluxes of lights as they are placed."""
         return rotations(self.layers.lights, places)
+
+    def placed(self, places):
+        """Parameters of lights as they are placed."""
+        turn, flux = self.parameters(places)
+        scales = self.layers.scales
+        return {"turn": tensor(turn / scales["turn"]), "flux": tensor(flux / scales["flux"])}
 
     def light(self, i, found):
         """Picture of one light as it is placed, through exact columns."""

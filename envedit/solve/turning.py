@@ -1,8 +1,8 @@
 """By how much the whole sky has turned about the vertical, if it has.
 
 Every turn by whole texels is tried through the block transport; the best ones are rendered through T, and
-refined to a tenth of a texel. Misfits are those of the solver (``map_problem.py``): Huber's loss of display
-values over their standard error.
+refined to a tenth of a texel. The misfit is the mean over pixels of the residual of display values, not of
+its square: a few bright specks of caustics, which no two renderings share, do not decide.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Turn:
     degrees : float
         As for :func:`.latlong.rotate`.
     error, still : float
-        Root mean square of the display residual with the turn alone, and without.
+        Display residual, as of :func:`residual`, with the turn alone and without.
     """
 
     degrees: float
@@ -81,15 +81,16 @@ def find(
 
 
 def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
-    """Return the root mean square of a map's display residual; inf if it is not finite.
+    """Return a map's display residual, RMS over channels and mean over pixels; inf if it is not finite.
 
     Parameters are those of :func:`find`.
     """
     transport.resolve(envmap, limit=COLUMNS)
     off = np.float64(display_curve.to_display(transport.apply(tensor(envmap))).numpy())
     off -= display_curve.to_display(tensor(picture)).numpy()
-    mean = (np.square(off) * (1 if weight is None else weight)).mean()
-    return float(np.sqrt(mean)) if np.isfinite(mean) else np.inf
+    size = np.sqrt(np.square(off).mean(axis=2, keepdims=True))
+    mean = (size * (1 if weight is None else weight)).mean()
+    return float(mean) if np.isfinite(mean) else np.inf
 
 
 def _at_a_glance(transport, envmap, picture, count):

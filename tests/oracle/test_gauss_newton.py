@@ -15,7 +15,7 @@ from envedit.core.errors import NumericalError
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, rotation_vector
-from envedit.solve import checkpoint, gauss_newton, map_problem
+from envedit.solve import added_light, checkpoint, gauss_newton, map_problem
 from envedit.solve.adam_loop import State
 from envedit.solve.gauss_newton import Run, solve
 from envedit.solve.map_problem import ANGLE, Problem
@@ -720,25 +720,24 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(case):
     problem, _, start, state = case
     point, sigma = problem.evaluate(state), 0.1
     normal = problem.normal(point, start, sigma)
-    born, gain = problem.birth(point, normal)
-    (new,) = set(problem.lit(born)) - set(problem.lit(state))
-    direction = problem.direction(born, new)
-    cells, directions = problem.blocks.sky_cells(problem.layers.shape)
-    cell = [int(np.argmax(directions @ direction))]
-    atom = (
-        np.stack([m[:, 0] for m in problem.blocks.lit(cells[cell])])
-        * problem.layers.lights.flux[new][:, None]
-    )
-    blocks = normal.blocks
+    found, gain = added_light.best(problem, point, normal)
+    (new,) = set(problem.lit(found)) - set(problem.lit(state))
+    d = latlong.directions(*GRID)
+    row, column = np.unravel_index(np.argmax(d @ problem.direction(found, new)), GRID)
+    atom = problem.transport.probe(np.array([row * GRID[1] + column]))[0] * problem.layers.lights.flux[new]
+    atom = atom / latlong.lookup_solid_angles(*GRID)[row]
+    weights = (normal.slope**2 * normal.robust).reshape(-1, 3)
+    in_blocks = problem.blocks.summed((atom * weights).reshape(*FILM, 3))
     mixed = np.concatenate(
-        [j.T @ (w * a) for j, w, a in zip(blocks.jacobian, blocks.squared.T, atom, strict=True)]
-        + [sum(b.T @ a for b, a in zip(blocks.lights, atom, strict=True))]
+        [j.T @ w for j, w in zip(normal.blocks.jacobian, in_blocks.T, strict=True)]
+        + [normal.pictures.reshape(len(normal.pictures), -1) @ (atom * weights).ravel()]
     )
-    power = (blocks.squared.T * atom**2).sum()
+    power = (weights * atom**2).sum()
     larger = np.block([[normal.hessian, mixed[:, None]], [mixed[None], np.array([[power]])]])
-    pull = np.append(normal.gradient, (blocks.pulled.T * atom).sum())
+    pulled = (normal.slope * normal.robust * point.residual).reshape(-1, 3)
+    pull = np.append(normal.gradient, (pulled * atom).sum())
     strength = -np.linalg.solve(larger, pull)[-1]
-    assert np.exp(born["flux"][new]) == pytest.approx(np.full(3, strength), rel=1e-3)
+    assert np.exp(found["flux"][new]) == pytest.approx(np.full(3, strength), rel=1e-3)
     fall = pull @ np.linalg.solve(larger, pull) - normal.gradient @ np.linalg.solve(
         normal.hessian, normal.gradient
     )

@@ -19,6 +19,8 @@ class DenseTransport:
         Height and width of the picture and of the map.
     """
 
+    capacity = 256
+
     def __init__(self, weights, shape, grid):
         self.shape, self.grid, self.resolved = shape, grid, 0
         self.weights = np.broadcast_to(
@@ -50,6 +52,10 @@ class DenseTransport:
         whole[:, rows] = maps
         found = np.einsum("cpt,ktc->kpc", self.weights, whole.reshape(len(maps), -1, 3), optimize=True)
         return found.reshape(len(maps), *self.shape, 3).astype(np.float32)
+
+    def probe(self, texels):
+        """Return columns, (n, pixels, 3)."""
+        return self.weights[:, :, texels].transpose(2, 1, 0)
 
     def overview(self):
         some, texel = np.nonzero(self.weights.any(axis=0))

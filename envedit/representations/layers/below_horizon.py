@@ -119,7 +119,7 @@ class Below:
         for widest in WIDEST:
             blur.widen(widest)
             soft = blur(tensor(sky)).numpy().reshape(*blur.grid, 3)
-            soft = np.einsum("ri,ijx,cj->rcx", blur.down[self.mirrored], soft, blur.across)
+            soft = np.einsum("ri,ijx,cj->rcx", blur.down[self.mirrored], soft, blur.across, optimize=True)
             errors.append(omega @ np.square(varying(soft) - shown).mean(axis=1))
         return WIDEST[int(np.argmin(errors))]
 

@@ -380,9 +380,11 @@ def _end(middle, bright):
 
 def glow_at(table: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """Interpolate a :attr:`Light.glow` at angles given by their cosines; returns (..., 3)."""
-    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    # A view of channels apart: who asks for many angles takes them one by one.
-    return np.moveaxis(np.stack([np.interp(angle, GLOW_DEGREES, f, right=0.0) for f in table.T]), 0, -1)
+    place = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / GLOW_DEGREES[1]  # nodes are evenly apart
+    node = np.minimum(place.astype(np.intp), len(GLOW_DEGREES) - 2)
+    share = (place - node)[..., None]
+    inside = place[..., None] <= len(GLOW_DEGREES) - 1
+    return np.where(inside, table[node] + (table[node + 1] - table[node]) * share, 0.0)
 
 
 def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

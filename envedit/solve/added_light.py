@@ -20,8 +20,10 @@ SPACINGS, REACH = (2, 1), (2, 1)
 """Distances in texels of the exact columns around the best cell, and how many of them to each side."""
 
 
-def best(problem: Problem, point: Point, normal: Normal) -> tuple[dict, float] | None:
-    """Light a spare light where F falls most.
+def best(
+    problem: Problem, point: Point, normal: Normal, light: int | None = None
+) -> tuple[dict, float] | None:
+    """Light a spare light where F falls most; ``light`` if given, or else the first that is dark.
 
     Candidates are the cells of the block transport, then texels around the best one, through exact columns.
 
@@ -35,7 +37,7 @@ def best(problem: Problem, point: Point, normal: Normal) -> tuple[dict, float] |
     """
     layers, transport = problem.layers, problem.transport
     spare = range(layers.lights.count - SPARE, layers.lights.count)
-    dark = [i for i in spare if i not in problem.added(point.state)]
+    dark = [i for i in spare if i not in problem.added(point.state)] if light is None else [light]
     if not dark:
         return None
     try:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from envedit.core.errors import NumericalError
+from envedit.representations.layers.lights import DARK
 from envedit.solve import added_light
 from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
@@ -27,6 +28,8 @@ the start's squared error that the solution's must be below."""
 WORTH, ADDED_STEPS = 8.0, 6
 """By how much a further light must lower F to be tried and to be kept: a likelihood of e^4; and the steps
 after which that is asked, by which a solution with one more light may be longer."""
+SAME_PLACE = np.cos(np.radians(1.0))
+"""Cosine of the angle below which an added light is where it would be added again."""
 
 
 @dataclass
@@ -215,9 +218,10 @@ class _Search:
         return run, point
 
     def solved(self, run, point):
-        """Descend, then add lights while they lower F."""
+        """Descend, then put added lights where they lower F more, and add others while they lower it."""
         while True:
             point = self._descended(run, point, self._most(run), self.after_step)
+            run, point = self._placed_again(run, point)
             if not self._room(run) or not run.history:
                 return run, point
             noise = self.problem.noise(point.residual, self.sigma)
@@ -230,19 +234,40 @@ class _Search:
             if run is before:
                 return run, point
 
+    def _placed_again(self, run, point):
+        """Ask of every added light where it would be added now: it goes there, or out, if F says so.
+
+        It was placed where the sky was still as it had been.
+        """
+        problem = self.problem
+        for i in problem.added(run.state) if run.history and self.births else ():
+            without = {name: value.copy() for name, value in run.state.items()}
+            without["flux"][i] = DARK
+            dark = problem.evaluate(without, resolve=False)
+            noise = problem.noise(point.residual, self.sigma)
+            found = added_light.best(problem, dark, problem.normal(dark, run.start, noise), i)
+            if found is None or found[1] < WORTH:
+                run, point = self._better(run, point, without, [], -WORTH)
+            elif problem.direction(found[0], i) @ problem.direction(run.state, i) < SAME_PLACE:
+                run, point = self._better(run, point, found[0], [i])
+        return run, point
+
     def _room(self, run):
         return len(self.problem.added(run.state)) < self.births
 
     def _most(self, run):
         return self.iterations + min(ADDED_STEPS, self.iterations) * len(self.problem.added(run.state))
 
-    def _better(self, run, point, state):
-        """Return the better of a run and of one from a state with one light more, after some steps."""
+    def _better(self, run, point, state, new=None, margin=WORTH):
+        """Return the better of a run and of one from a state with some lights new, after some steps.
+
+        ``margin`` is by how much F must be lower; below zero, may be higher.
+        """
         start = {name: value.copy() for name, value in run.start.items()}
-        for i in self.problem.added(state):
-            if i not in self.problem.added(run.state):
-                for name in ("turn", "flux", "size"):
-                    start[name][i] = state[name][i]
+        if new is None:
+            new = [i for i in self.problem.added(state) if i not in self.problem.added(run.state)]
+        for name in ("turn", "flux", "size"):
+            start[name][new] = state[name][new]
         rival = replace(run, state=state, start=start, history=list(run.history), finished=False)
         first = self.problem.evaluate(state)
         if first.residual is None:
@@ -254,7 +279,7 @@ class _Search:
         end = self._descended(rival, first, most, self._tried)
         scale = max(run.scale, rival.scale)
         loss, other = (self.problem.loss(p, r.start, scale) for p, r in ((point, run), (end, rival)))
-        return (rival, end) if other + WORTH < loss else (run, point)
+        return (rival, end) if other + margin < loss else (run, point)
 
     def _tried(self, _, point):
         if self.after_step:

@@ -38,7 +38,7 @@ ANGLE = np.radians(0.7)
 """Rotation by which the derivative by a light's direction is told."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
 """Largest step of an unknown: beyond it the linear model does not hold."""
-SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 0.7)
+SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
 """Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
 larger lobe would be seen."""
 _AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
@@ -61,8 +61,8 @@ class Prior:
         sky's does.
     turn : float
         Of a light's direction, radians from where the search has put it.
-    size : float
-        Of a light's log size.
+    size, added_size : float
+        Of a light's log size: of the map's own, and of a light that is added, which may be haze or a sun.
     """
 
     luminance: float = 1.0
@@ -71,6 +71,7 @@ class Prior:
     flux: float = 1.5
     turn: float = np.radians(10.0)
     size: float = 0.3
+    added_size: float = 1.0
 
     def gain_precisions(self, sizes) -> np.ndarray:
         """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n)."""
@@ -303,8 +304,8 @@ class Problem:
         for i in self.lit(state):
             change = self._flux_change(state, start, i)
             total += change @ self.prior.flux_precision @ change
-            total += ((state["size"] - start["size"])[i, 0] / self.prior.size) ** 2
-            total += (self._angle(state, start, i) / self.prior.turn) ** 2
+            total += ((state["size"] - start["size"])[i, 0] / self._deviation("size", i)) ** 2
+            total += (self._angle(state, start, i) / self._deviation("turn", i)) ** 2
         return float(total)
 
     def _flux_change(self, state, start, i):
@@ -370,12 +371,18 @@ class Problem:
         for a, axis in enumerate(_AXES):
             for c, d in np.ndindex(3, 3):
                 precision[c * n + node, d * n + node] += axis[c] * axis[d] * self._precisions[a]
-        for k, (name, _, axis) in enumerate(unknowns, 3 * n):
+        for k, (name, i, axis) in enumerate(unknowns, 3 * n):
             if name == "flux":
                 precision[k, k - axis : k - axis + 3] = self.prior.flux_precision[axis]
             else:
-                precision[k, k] = getattr(self.prior, name) ** -2.0
+                precision[k, k] = self._deviation(name, i) ** -2.0
         return precision
+
+    def _deviation(self, name, i):
+        """Return the standard deviation of a light's direction or size."""
+        if name == "turn":
+            return self.prior.turn
+        return self.prior.size if i < self.layers.lights.count - SPARE else self.prior.added_size
 
     def _from_prior(self, state, start, unknowns):
         """How far the unknowns are from where the prior draws them."""

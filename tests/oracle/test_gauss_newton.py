@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from envedit.core.color import LUMINANCE
 from envedit.core.errors import NumericalError
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 from envedit.solve import added_light, checkpoint, gauss_newton, map_problem
 from envedit.solve.adam_loop import State
 from envedit.solve.gauss_newton import Run, solve
@@ -713,6 +714,59 @@ def test_no_light_is_added_where_none_is_missing(case):
     there = Problem(problem.layers, problem.transport, problem.envmap, whole * 0.9, free=problem.free)
     ends = [there.state(solve(there, params, 0.1, births=births).params) for births in (0, 2)]
     assert same(*ends)
+
+
+def test_an_added_light_is_put_where_it_is_needed_once_the_sky_has_changed(rng):
+    """A light in the wrong place, under the sky that the solution ends with, goes to the right one."""
+    image, transport, place = clouds(rng), DenseTransport.random(rng, FILM, GRID), (9, 30)
+    problem, params = problem_of(image, transport, lobe_in(image, transport, place, 300.0))
+    state, spare = problem.state(params), problem.layers.lights.count - SPARE
+    wrong, right = latlong.directions(*GRID)[4, 10], latlong.directions(*GRID)[place]
+    state["turn"][spare] = rotation_vector(problem.layers.lights.centres[spare], wrong)
+    state["flux"][spare] = 0.0
+    found = solve(problem, params, 0.01, run=Run(state, copy(state)), births=1)
+    there = problem.direction(problem.state(found.params), spare)
+    assert there @ right > np.cos(np.radians(12)) and there @ right > there @ wrong
+
+
+def test_a_light_that_explains_nothing_goes_out(rng):
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    problem, params = problem_of(image, transport, shown(transport, 1.5 * image))
+    state, spare = problem.state(params), problem.layers.lights.count - SPARE
+    state["flux"][spare] = -6.0
+    found = solve(problem, params, 0.05, run=Run(state, copy(state)), births=1)
+    assert not problem.lit(problem.state(found.params))
+
+
+def test_flux_that_no_sky_of_its_own_has_is_given_to_a_light_beside(case):
+    problem, _, start, _ = case
+    state, spare = copy(start), problem.layers.lights.count - SPARE
+    assert problem.beyond(state) is None
+    state["flux"][0] = np.log([10.0, 20.0, 40.0])
+    found = problem.beyond(state)
+    fluxes = problem.layers.lights.flux @ LUMINANCE
+    ratio = np.exp(found["flux"][[0, spare]]).mean(axis=1) * fluxes[[0, spare]]
+    assert ratio.sum() == pytest.approx(20 * fluxes[0], rel=1e-6) and ratio[0] == pytest.approx(
+        np.e * fluxes[0]
+    )
+    np.testing.assert_allclose(problem.direction(found, spare), problem.direction(state, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize(("errors", "stays"), [((1.0, 1.0), True), ((1.0, 0.97), True), ((1.0, 0.9), False)])
+def test_a_near_start_stays_unless_path_tracing_says_that_the_solution_is_closer(rng, errors, stays):
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    target = shown(transport, 1.3 * image) * np.exp(rng.normal(0, 0.3, (*FILM, 3)))
+    problem, params = problem_of(image, transport, np.float32(target))
+    asked = []
+
+    def judge(envmap):
+        asked.append(envmap)
+        return errors[len(asked) - 1]
+
+    found = solve(problem, params, 0.02, judge=judge)
+    assert stays == (not problem.state(found.params)["gain"].any())
+    np.testing.assert_array_equal(asked[0], image)
+    assert len(asked) == 2 and ("path traced" in found.note) == stays
 
 
 def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(case):

@@ -30,8 +30,9 @@ DARK = -30.0
 FAINTEST = 1e-3
 """Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
 LOBE_POINTS = 1024
-LOBE_DEGREES, LOBE_REACH = 2.0, 2.5
-"""Points and radius of a lobe of size 1, and where it ends, in radii: farther out points would lie singly."""
+LOBE_DEGREES, LOBE_REACH = 0.5, 2.5
+"""Points and radius of a lobe of size 1, a sun a little blurred, and where it ends, in radii: farther out
+points would lie singly."""
 LOG_SIZES = (-6.0, 3.0)
 """Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
 MOST_LOG_FLUX = 30.0

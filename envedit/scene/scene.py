@@ -29,10 +29,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import latlong, shipped
+from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
-from envedit.scene import parser
+from envedit.scene import film, parser
 
 __all__ = ["Scene", "load"]
 
@@ -201,19 +201,15 @@ class Scene:
         return self._checked(total / n), n * count, np.sqrt(variance)
 
     def _pass_samples(self):
-        """Most samples a pixel of one pass, a power of four.
-
-        So no pixel is split between threads, which would add its samples in any order, and the sampler has as
-        many strata across as down.
-        """
+        """Most samples a pixel of one pass: a power of four, for as many strata across as down."""
         return 4 ** (max(0, (_PASS_SAMPLES // (self.width * self.height)).bit_length() - 1) // 2)
 
     def _pass(self, count, seed, i, max_depth):
         """Render one pass, float64."""
+        installed_plugins.come_first()
         integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": False})
         pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-        picture = mi.render(self.mi, integrator=integrator, spp=count, seed=pass_seed)
-        return np.array(picture, dtype=np.float64)
+        return film.render(self.mi, integrator, count, pass_seed)
 
     def _checked(self, total):
         """Round to float32, refusing what is not finite."""
@@ -283,15 +279,21 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         if parameters:
             raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
         path, where, folders = None, "scene dict", (base,)
+        installed_plugins.come_first()
+        installed_plugins.check_dict(file, where)
         state = parser.told(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
         where, folders = str(path), (path.parent, base, *_search_paths(path))
         filled = _check_parameters(path, parameters or {})
-        state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
+        with installed_plugins.restored():
+            state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
     parser.told(where, mi.parser.transform_all, config, state)
 
     parser.lower_names(state)
+    installed_plugins.come_first()
+    for node in state.nodes:
+        installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
     emitter, to_world = parser.replace_environment(state, where)
     digest = hashlib.sha256(b"envedit scene 1")
     parser.set_film(state, where, width, height)

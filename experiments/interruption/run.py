@@ -162,10 +162,11 @@ def rows(path: Path) -> list[dict]:
 
 
 def timeless(path: Path, *folders: Path) -> str:
-    """Return a text without dates, seconds, the bars that show them, and the names of folders."""
+    """Return a text without dates, seconds and their bars, what a cache changes, and names of folders."""
     text = path.read_text()
     for folder in folders:
         text = text.replace(str(folder), "FOLDER")
+    text = re.sub(r"<tr><td>(fit|transport) (cached|seconds)</td><td>.*?</td></tr>", "", text)
     return re.sub(r"\d{4}-\d\d-\d\dT[\d:+]+|\b[\d.]+ m?s\b|width:[\d.]+rem", "TIME", text)
 
 

@@ -203,7 +203,7 @@ SCALED = '<emitter type="envmap"><transform name="to_world"><scale x="-1"/></tra
         ((SENSOR, '<shape type="sphere"><ref id="gold"/></shape>', LIGHT), 'unresolved reference to "gold"'),
         ((SENSOR, '<shape type="spere"/>', LIGHT), 'Plugin "spere" not found'),
         ((SENSOR, BALL.replace("<bsdf", '<float name="raduis" value="2"/><bsdf'), LIGHT), "raduis"),
-        ((SENSOR, BALL, LIGHT, "<shape"), r"Error parsing start element tag \(line \d+"),
+        ((SENSOR, BALL, LIGHT, "<shape"), r"line \d+: a tag is not well formed"),
         ((BALL, LIGHT), "no sensor"),
         ((SENSOR.replace("hdrfilm", "specfilm"), BALL, LIGHT), "hdrfilm"),
     ],

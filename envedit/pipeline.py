@@ -29,8 +29,7 @@ __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 JUDGE_SEED = 9_000_011
 """Seed of the renderings that are judged; the optimiser never sees their samples."""
 INITIAL_SPP = 256
-"""Samples a pixel of the initial rendering, which is far from the target: a power of four, so that the same
-seed gives the same bits."""
+"""Samples a pixel of the initial rendering, which is far from the target."""
 
 
 @dataclass

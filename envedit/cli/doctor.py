@@ -87,7 +87,7 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
     with tempfile.TemporaryFile() as errors:
         try:
             child = subprocess.run(
-                [sys.executable, "-c", program],
+                [sys.executable, "-P", "-c", program],  # -P: no module of the working folder
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
@@ -251,8 +251,11 @@ def _self_test(mi) -> float:
     """
     import numpy as np
 
+    from envedit.core import installed_plugins
+
     to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "rgb", "filter": {"type": "box"}}
+    installed_plugins.come_first()
     scene = mi.load_dict(
         {
             "type": "scene",

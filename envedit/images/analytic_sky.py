@@ -98,9 +98,12 @@ def _sunsky_emitter(sun_direction, **parameters):
     import drjit as dr
     import mitsuba as mi
 
+    from envedit.core import installed_plugins
+
     # A scene around it: the emitter needs one to know its bounds. Its texels are then evaluated like any
     # other.
     plugin = {"type": "sunsky", "sun_direction": sun_direction.tolist(), "sun_aperture": SUN_APERTURE}
+    installed_plugins.come_first()
     emitter = mi.load_dict({"type": "scene", "emitter": plugin | parameters}).environment()
 
     def radiance(d):

@@ -15,8 +15,8 @@ _MOST_VALUES = 4 * MAX_TEXELS  # over all channels: colour and alpha of the larg
 _MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
 
 
-def read(name, head, info, stored):
-    """Decode a file; arguments as in :mod:`.headers`."""
+def declared(name):
+    """Return the parts of a file, without pixels, once the sizes that they declare have been checked."""
     import OpenEXR
 
     try:
@@ -42,6 +42,15 @@ def read(name, head, info, stored):
                 f"{name}: the header declares tiles of {tile.xSize} x {tile.ySize} texels for an image of "
                 f"{width} x {height}; the file is damaged, or has to be saved in scanlines"
             )
+    return parts
+
+
+def read(name, head, info, stored):
+    """Decode a file; arguments as in :mod:`.headers`."""
+    import OpenEXR
+
+    parts = declared(name)
+    windows = [_window(p.header["dataWindow"]) for p in parts]
     index, names = _choose_channels(name, [p.header for p in parts], info)
     header = parts[index].header
     if stored:

@@ -14,11 +14,7 @@ from envedit.images.headers import check_declared, damaged
 
 def read(name, head, info, stored):
     """Decode a file; arguments as in :mod:`.headers`."""
-    if info["format"] == "png":
-        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
-    else:
-        size = _jpeg_header(name, info if stored else {})
-    check_declared(name, *size)
+    declared(name, head, info if stored else {})
     image = _bitmap(name)
     if image.dtype not in (np.uint8, np.uint16):
         raise damaged(name, f"unexpected samples of type {image.dtype}")
@@ -32,6 +28,15 @@ def read(name, head, info, stored):
     image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
     values = srgb_to_linear(np.arange(2**depth) / (2**depth - 1)).astype(np.float32)
     return values[image]
+
+
+def declared(name, head, info=None):
+    """Check the size that a file declares; marks of a JPEG file are noted in ``info``."""
+    if head.startswith(b"\x89PNG"):
+        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
+    else:
+        size = _jpeg_header(name, {} if info is None else info)
+    check_declared(name, *size)
 
 
 def _jpeg_header(name, info):

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError
+from envedit.scene import scene_files
 
 # Emitters at infinity that shine from every direction, with the rotation that brings an envmap's zenith (+y)
 # to theirs. Mitsuba's sky models stand upright on z.
@@ -161,6 +162,10 @@ def find_files(state, where: str, folders) -> None:
                 f"{place_of(state, node, where)}: the {kind} names a missing file: {name or '(empty)'}\n"
                 f"looked in {' and '.join(dict.fromkeys(map(str, folders)))}"
             )
+        kind = node.props.plugin_name()
+        if "fit_height" in node.props:  # a mesh of any kind, see fit_to_stage
+            kind = _MESHES.get(found[0].suffix.lower(), "")
+        scene_files.check(kind, str(found[0]))
         node.props["filename"] = str(found[0])
 
 
@@ -249,7 +254,8 @@ def hash_node(digest, node) -> None:
         digest.update(f"{key}=".encode())
         if key == "filename":
             try:
-                digest.update(hashlib.sha256(Path(value).read_bytes()).digest())
+                with open(value, "rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
             except OSError as error:
                 raise InputError(f"{value}: cannot be read ({error.strerror})") from None
         else:

@@ -11,7 +11,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from envedit.core import latlong
+from envedit.core import installed_plugins, latlong
 from envedit.core.errors import ConfigError
 from envedit.scene.scene import Scene
 
@@ -55,6 +55,7 @@ class PathTracer:
         self.depth = AUTO_DEPTH if max_depth == "auto" else max_depth
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
+        installed_plugins.come_first()
         self._integrator = mi.load_dict({"type": "prb", "max_depth": self.depth, "rr_depth": self.depth + 1})
         self._index = None
 

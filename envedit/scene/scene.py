@@ -21,7 +21,6 @@ import contextlib
 import difflib
 import hashlib
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,10 +28,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import latlong, shipped
+from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
-from envedit.scene import parser
+from envedit.scene import film, parser, scene_text
 
 __all__ = ["Scene", "load"]
 
@@ -201,19 +200,15 @@ class Scene:
         return self._checked(total / n), n * count, np.sqrt(variance)
 
     def _pass_samples(self):
-        """Most samples a pixel of one pass, a power of four.
-
-        So no pixel is split between threads, which would add its samples in any order, and the sampler has as
-        many strata across as down.
-        """
+        """Most samples a pixel of one pass: a power of four, for as many strata across as down."""
         return 4 ** (max(0, (_PASS_SAMPLES // (self.width * self.height)).bit_length() - 1) // 2)
 
     def _pass(self, count, seed, i, max_depth):
         """Render one pass, float64."""
+        installed_plugins.come_first()
         integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": False})
         pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-        picture = mi.render(self.mi, integrator=integrator, spp=count, seed=pass_seed)
-        return np.array(picture, dtype=np.float64)
+        return film.render(self.mi, integrator, count, pass_seed)
 
     def _checked(self, total):
         """Round to float32, refusing what is not finite."""
@@ -283,15 +278,22 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         if parameters:
             raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
         path, where, folders = None, "scene dict", (base,)
+        installed_plugins.come_first()
+        installed_plugins.check_dict(file, where)
         state = parser.told(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
-        where, folders = str(path), (path.parent, base, *_search_paths(path))
-        filled = _check_parameters(path, parameters or {})
-        state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
+        filled, searched = _check_parameters(path, parameters or {})
+        where, folders = str(path), (path.parent, base, *searched)
+        with installed_plugins.restored():
+            state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
+    scene_text.check_references(state, where)
     parser.told(where, mi.parser.transform_all, config, state)
 
     parser.lower_names(state)
+    installed_plugins.come_first()
+    for node in state.nodes:
+        installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
     emitter, to_world = parser.replace_environment(state, where)
     digest = hashlib.sha256(b"envedit scene 1")
     parser.set_film(state, where, width, height)
@@ -340,9 +342,13 @@ def find(file) -> Path:
     raise InputError(f"scene {file}: no such file; {hint}")
 
 
-def _check_parameters(path: Path, parameters: dict) -> dict[str, str]:
-    """Return the parameters as text, after comparing their names with the ``$names`` of the XML."""
-    used, defaults = _names(path, set())
+def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], list[Path]]:
+    """Return the parameters as text, after comparing their names with the ``$names`` of the XML.
+
+    And the folders of ``<path value="...">``, in which files are looked for too.
+    """
+    outline = scene_text.read(path, {str(name): str(value) for name, value in parameters.items()})
+    used, defaults = outline.used, outline.defaults
     for name in parameters:
         if name not in used | defaults:
             close = difflib.get_close_matches(str(name), used | defaults, 1)
@@ -367,39 +373,7 @@ def _check_parameters(path: Path, parameters: dict) -> dict[str, str]:
             kind = type(value).__name__
             raise ConfigError(f"scene.parameters: {name} is a {kind}, wanted text or a number")
         filled[name] = str(value)
-    return filled
-
-
-def _names(path: Path, seen: set) -> tuple[set, set]:
-    """Return the ``$names`` used in an XML file and those with a default, included files too."""
-    seen.add(path)
-    text = _without_comments(path)
-    used = set(re.findall(r"\$\{?([A-Za-z_]\w*)", text))
-    defaults = set()
-    for tag in re.findall(r"<default\b[^>]*>", text):
-        defaults |= set(re.findall(r"\bname\s*=\s*[\"']([^\"']*)", tag))
-    for tag in re.findall(r"<include\b[^>]*>", text):
-        for name in re.findall(r"\bfilename\s*=\s*[\"']([^\"'$]+)[\"']", tag):
-            included = path.parent / name
-            if included not in seen and included.is_file():
-                more = _names(included, seen)
-                used, defaults = used | more[0], defaults | more[1]
-    return used, defaults
-
-
-def _without_comments(path: Path) -> str:
-    """Return the text of an XML file without its comments."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"scene {path}: {error.strerror or error}") from None
-    return re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-
-
-def _search_paths(path: Path) -> list[Path]:
-    """Return the folders of ``<path value="...">`` in an XML file, in which files are looked for too."""
-    tags = "".join(re.findall(r"<path\b[^>]*>", _without_comments(path)))
-    return [path.parent / value for value in re.findall(r"\bvalue\s*=\s*[\"']([^\"'$]+)[\"']", tags)]
+    return filled, outline.folders
 
 
 def _whole(name: str, value, low: int) -> int:

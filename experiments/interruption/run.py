@@ -5,14 +5,17 @@ r"""Kill runs at random moments and see whether ``--resume`` ends them as if not
 
 A trial starts ``python -m envedit.run`` with empty caches, sends SIGKILL at a moment drawn evenly from the
 time that an undisturbed run takes, looks at what is left, and resumes. Every second trial is killed again
-while it resumes. The pictures of the results, byte for byte, and the metrics but for the times must be those
-of the undisturbed run, and no file that can be seen after a kill may be half written. Path tracing runs on
-one core, for on several Mitsuba adds in any order. What is done is skipped; exits with 1 if a trial fails.
+while it resumes. Every file of the results must have the bytes of the undisturbed run's, but for times and
+the folder's name, and no file that can be seen after a kill may be half written. Runs take all cores; path
+tracing takes one, for on several Mitsuba adds gradients in any order. What is done is skipped; exits with 1
+if a trial fails.
 """
 
 import argparse
+import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -39,7 +42,7 @@ width = 48
 height = 48
 [target]
 rotate_degrees = 60.0
-spp = 16
+spp = 100
 [representation]
 kind = "{kind}"
 hidden = 16
@@ -54,7 +57,7 @@ kind = "{renderer}"
 spp = {spp}
 max_depth = 3
 [output]
-spp = 64
+spp = 144
 """
 
 
@@ -133,18 +136,38 @@ def _keys(tables):
 
 
 def differing(folder: Path, reference: Path) -> list[str]:
-    """Name what differs from an undisturbed run: pictures by their bytes, metrics but for the times."""
+    """Name the files that differ from an undisturbed run's: by their bytes, but for times and folder."""
     names = {path.name for path in folder.iterdir()} | {path.name for path in reference.iterdir()}
     wrong = []
     for name in sorted(names):
         mine, theirs = folder / name, reference / name
         if not (mine.exists() and theirs.exists()):
             wrong.append(name)
-        elif name.endswith((".exr", ".png")):
-            wrong += [name] if mine.read_bytes() != theirs.read_bytes() else []
         elif name == "metrics.json":
             wrong += [name] if measured(mine) != measured(theirs) else []
+        elif name == "history.csv":
+            wrong += [name] if rows(mine) != rows(theirs) else []
+        elif name.endswith((".toml", ".json", ".html")):
+            same = timeless(mine, folder, reference) == timeless(theirs, folder, reference)
+            wrong += [] if same else [name]
+        else:
+            wrong += [name] if mine.read_bytes() != theirs.read_bytes() else []
     return wrong
+
+
+def rows(path: Path) -> list[dict]:
+    """Return a history without the times."""
+    with open(path, newline="") as file:
+        return [{key: row[key] for key in row if key != "step_ms"} for row in csv.DictReader(file)]
+
+
+def timeless(path: Path, *folders: Path) -> str:
+    """Return a text without dates, seconds and their bars, what a cache changes, and names of folders."""
+    text = path.read_text()
+    for folder in folders:
+        text = text.replace(str(folder), "FOLDER")
+    text = re.sub(r"<tr><td>(fit|transport) (cached|seconds)</td><td>.*?</td></tr>", "", text)
+    return re.sub(r"\d{4}-\d\d-\d\dT[\d:+]+|\b[\d.]+ m?s\b|width:[\d.]+rem", "TIME", text)
 
 
 def measured(path: Path) -> dict:

@@ -408,6 +408,7 @@ def test_the_experiment_sees_half_files_and_differences(tmp_path, whole):
     shutil.copy(reference / "metrics.json", folder)
     assert set(kills.differing(folder, reference)) == {
         "edited.exr", "influence.png", "preview.png", "checkpoint.npz", ".render_target.exr.1.exr",
+        "report.html", "config.toml", "history.csv",
     }  # fmt: skip
 
 

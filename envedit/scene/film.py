@@ -1,0 +1,90 @@
+"""From samples to pixels in a fixed order: the same seed gives the same bits with any number of threads.
+
+Mitsuba's film adds samples with atomics: where a pixel's samples lie with two threads, and wherever a filter
+is wider than a pixel, in the order in which the threads come to them; a NaN is dropped silently. Here the
+samples of a pixel are one block, summed by one thread in double precision. Rays and samples are those of
+Mitsuba's own loop.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medium=None) -> np.ndarray:
+    """Render the first sensor of a scene as ``mi.render`` does, with sums in a fixed order.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        Its film gives size, crop and filter; pixels are RGB without alpha.
+    integrator : mi.Integrator
+        A sampling integrator, such as ``path``.
+    spp : int
+        Samples a pixel; as many more as the sampler needs to fill its grid.
+    seed : int
+        Of the sampler.
+    medium : mi.Medium, optional
+        Around the camera; only volumetric integrators look at it.
+
+    Returns
+    -------
+    array (height, width, 3) float64
+        sum f(p - s) L(s) / sum f(p - s), over the samples s near a pixel p, f the film's filter.
+    """
+    sensor = scene.sensors()[0]
+    film = sensor.film()
+    rfilter = film.rfilter()
+    box = rfilter.is_box_filter()
+    border = rfilter.border_size() if film.sample_border() else 0
+    width, height = (int(n) for n in film.crop_size())
+    across, down = width + 2 * border, height + 2 * border
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    sampler.set_samples_per_wavefront(spp)
+    count = across * down * spp
+    sampler.seed(seed, count)
+
+    pixel = dr.arange(mi.UInt32, count) // spp
+    corner = mi.Point2f(mi.Float(pixel % across), mi.Float(pixel // across)) - border
+    inside = sampler.next_2d()
+    radiance = _radiance(scene, integrator, sampler, corner + inside, spp, medium)
+    dr.eval(radiance, inside)  # the sums below must not trace again
+
+    def summed(weight):
+        """Sum weighted radiance and weights of a pixel's samples, (down, across, 4)."""
+        parts = [dr.block_sum(mi.Float64(weight * channel), spp).numpy() for channel in (*radiance, 1)]
+        return np.stack(parts, axis=-1).reshape(down, across, 4)
+
+    if box:
+        total = summed(dr.full(mi.Float, 1, count))
+    else:
+        reach = int(np.ceil(rfilter.radius() - 0.5))
+        steps = range(-reach, reach + 1)
+        padded = np.zeros((down + 2 * reach, across + 2 * reach, 4))
+        for dy in steps:
+            vertical = rfilter.eval(dy + 0.5 - inside.y)
+            for dx in steps:
+                part = summed(vertical * rfilter.eval(dx + 0.5 - inside.x))
+                padded[reach + dy : reach + dy + down, reach + dx : reach + dx + across] += part
+        total = padded[reach : reach + down, reach : reach + across]
+    total = total[border : border + height, border : border + width]
+    return total[..., :3] / np.where(total[..., 3:] == 0, 1, total[..., 3:])
+
+
+def _radiance(scene, integrator, sampler, position, spp, medium):
+    """Trace one path a position, in pixels from the crop's corner."""
+    sensor = scene.sensors()[0]
+    lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time = time + sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(
+        time, 0, position / mi.Vector2f(sensor.film().crop_size()), lens
+    )
+    ray.scale_differential(spp**-0.5)
+    radiance, _, _ = integrator.sample(scene, sampler, ray, medium)
+    return mi.Color3f(mi.unpolarized_spectrum(weight * radiance))

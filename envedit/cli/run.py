@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from envedit.core import shipped
@@ -242,11 +243,16 @@ def _export_initial(settings, arguments):
     painted_image.check_export(file)
     with Progress(quiet=arguments.quiet) as progress:
         progress.stage("rendering the picture to paint on")
-        envmap, warnings = inputs.load_map(settings.input)
         lit = inputs.load_scene(settings.scene, arguments.base)
+        envmap, warnings = inputs.load_map(settings.input, lit)
+        notes = inputs.notes(settings.input, lit)
+        source = inputs.source_of(settings.input, lit)  # what the picture says that it was made from
+        settings = replace(settings, input=replace(settings.input, envmap=source))
         warnings += painted_image.export(file, painted_image.initial(lit, envmap, settings), settings)
     for line in warnings:
         print(f"envedit: warning: {line}", file=sys.stderr)
+    for line in notes:
+        _say(arguments.quiet, line)
     under = "linear" if file.suffix.lower() == ".exr" else f"under the '{settings.target.tonemap}' tonemap"
     ask = f'[target] kind = "image", file = "{file.absolute()}"'
     _say(arguments.quiet, f"{file}: {lit.width}x{lit.height}, {under}; paint on it, then set {ask}")
@@ -255,8 +261,6 @@ def _export_initial(settings, arguments):
 
 def _check_same(settings, folder):
     """Refuse to call the run in a folder complete when it was asked for something else."""
-    from dataclasses import replace
-
     from envedit import config
     from envedit.core.errors import ConfigError, InputError
     from envedit.report import manifest

@@ -199,7 +199,7 @@ def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[n
 # Writing
 
 
-def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) -> None:
+def write_exr(path, image, metadata: dict | None = None, panorama: bool = True, alpha=None) -> None:
     """Write an image as a float32 OpenEXR file, whole or not at all.
 
     Marked as lat-long, unless it is no ``panorama``, with Rec.709 primaries.
@@ -215,6 +215,8 @@ def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) 
         Attributes to add (str, int or float; anything else as its text), such as ``{"source": "sky.hdr"}``.
     panorama : bool
         Mark it as a lat-long map, which some viewers show as a sphere.
+    alpha : array (H, W), optional
+        Share of each pixel that is covered; the image is premultiplied by it.
 
     Raises
     ------
@@ -242,6 +244,8 @@ def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) 
         plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
         header[str(key)] = value if plain else str(value)
     planes = {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}
+    if alpha is not None:
+        planes["A"] = np.ascontiguousarray(alpha, np.float32)
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
 
 

@@ -45,7 +45,7 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
     weights = dataclasses.asdict(settings.perceptual)
     del weights["network"]  # the only one that is no file
     named = {
-        "envmap": settings.input.envmap,
+        "envmap": result.given.source,
         "scene": result.scene or "",
         "target": settings.target.file,
         "mask": settings.target.mask,
@@ -59,7 +59,7 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
         preview.preview(folder / "preview.png", result.renders, result.maps, settings.output.tonemap)
         html_report.write_report(
             folder / "report.html",
-            title=f"{Path(settings.input.envmap).stem}, {Path(settings.scene.file).stem}",
+            title=f"{Path(result.given.source).stem}, {Path(settings.scene.file).stem}",
             config_toml=text,
             metrics=result.metrics,
             manifest=facts,
@@ -85,13 +85,17 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
 
 def _maps(settings, folder, result):
     """Write maps and renderings."""
-    source = {"source": settings.input.envmap}
+    source = {"source": result.given.source}
     images.write_exr(folder / "edited.exr", result.envmap, source)
     for name, picture in result.renders.items():
         images.write_exr(
-            folder / f"render_{name}.exr", picture, {"source": settings.scene.file}, panorama=False
+            folder / f"render_{name}.exr",
+            picture,
+            {"source": settings.scene.file},
+            panorama=False,
+            alpha=result.alpha,
         )
-    initial = result.maps["initial"]
+    initial = result.given.stored
     layers = {"edited": result.envmap, "initial": initial, "difference": result.envmap - initial}
     if result.influence is not None:
         grey = result.influence[..., None].repeat(3, axis=2)
@@ -110,7 +114,7 @@ def _maps(settings, folder, result):
                 layered_exr.write(folder / "edited_full.exr", {"edited": full})
         except MemoryError:
             result.warnings.append(
-                f"{settings.input.envmap}: not enough memory to carry the edit to its size; "
+                f"{result.given.source}: not enough memory to carry the edit to its size; "
                 "edited.exr has it at working resolution"
             )
         except (InputError, NumericalError) as error:  # the file may be gone by now

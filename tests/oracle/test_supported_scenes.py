@@ -82,7 +82,7 @@ def test_a_kind_of_scene_is_rendered_as_by_mitsuba_or_refused(kind, tmp_path):
     expected = plain(used)
     if kind.name == "hidden emitters":
         np.testing.assert_allclose(lit.alpha, expected[..., 3], atol=0.1)
-        assert 0.2 < (lit.alpha == 0).mean() < 0.8 and not expected[lit.alpha == 0].any()
+        assert 0.2 < (lit.alpha == 0).mean() < 0.8 and expected[lit.alpha == 0].max() < 0.02
     else:
         assert lit.alpha is None
     expected = expected[..., :3]

@@ -180,7 +180,7 @@ def notes(settings: config.Input, lit: scene.Scene) -> list[str]:
     if settings.envmap == AUTO and source != SUNSKY:
         said.insert(0, f"map: the scene's own, {source}")
     if own.scale != 1:
-        whose = "it" if source == str(own.file) else "the map, which is not the scene's own"
+        whose = "it" if source == str(own.file) else "the map (which is not the scene's own)"
         said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}")
     return said
 

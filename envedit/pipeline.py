@@ -187,6 +187,7 @@ def run(
     return Result(
         envmap=stored,
         given=given,
+        to_world=lit.to_world,
         alpha=lit.alpha,
         renders=renders,
         maps=maps,

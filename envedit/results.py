@@ -49,6 +49,8 @@ class Result:
         How well the target determines the sky; None where that is not known.
     given : inputs.InputMap, optional
         The map that was edited.
+    to_world : ndarray (3, 3), optional
+        Rotation from the map's frame to the scene's.
     alpha : ndarray (h, w), optional
         Share of each pixel that sees a surface, where the scene hides what lights it.
     found : Found, optional
@@ -68,6 +70,7 @@ class Result:
     scene: Path | None = None
     reach: Reach | None = None
     given: inputs.InputMap | None = None
+    to_world: np.ndarray | None = None
     alpha: np.ndarray | None = None
     found: Found | None = None
     posterior: Posterior | None = None

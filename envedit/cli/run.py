@@ -202,7 +202,7 @@ def _edit(settings, arguments, folder, allowed, start):
         result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
     try:
-        return _write(settings, folder, result, import_s, arguments.quiet, said)
+        return _write(settings, folder, result, import_s, base, arguments.quiet, said)
     except KeyboardInterrupt:
         return _interrupted(folder, again)
 
@@ -276,10 +276,10 @@ def _check_same(settings, folder):
         raise InputError(f"{changed[0]}: has changed since the run in {folder}: run without --resume")
 
 
-def _write(settings, folder, result, import_s, quiet, said):
+def _write(settings, folder, result, import_s, base, quiet, said):
     from envedit.report import run_folder
 
-    for line in run_folder.write(settings, folder, result, import_s):
+    for line in run_folder.write(settings, folder, result, import_s, base):
         print(f"envedit: warning: {line}", file=sys.stderr)
     for line in result.notes[len(said) :]:
         _say(quiet, line)

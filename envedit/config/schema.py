@@ -299,6 +299,17 @@ class Output(Table):
     )
     report: bool = _key(True, boolean, "write preview.png and report.html")
     full: bool = _key(True, boolean, "write edited_full.exr, at the resolution of the input's file")
+    format: str = _key(
+        "exr", choice("exr", "hdr"), "file of the edited map: OpenEXR, or Radiance (.hdr), 8 bits a channel"
+    )
+    half: bool = _key(
+        False, boolean, "OpenEXR with 16 bits a channel; what is above 65504 is cut, with a warning"
+    )
+    scene: bool = _key(True, boolean, "write edited.xml, the scene lit by the edited map")
+
+    def _check_together(self) -> None:
+        if self.half and self.format != "exr":
+            raise ConfigError('output.half: got true with output.format "hdr", expected "exr"')
 
 
 def _table_key(table: type[Table]) -> Any:

@@ -47,7 +47,7 @@ QUIET_DECIBELS = 48.0
 QUIET_LEAST, QUIET_MOST = 256, 768
 """Samples a pixel between which a rendering of "auto" ends."""
 _QUIET_PASS = 64  # samples a pixel
-_ALPHA_SPP = 64
+_ALPHA_SPP = 256
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -307,23 +307,7 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: came {mi.variant()}, wanted one that ends in _rgb, such as llvm_ad_rgb")
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
-    config = mi.parser.ParserConfig(mi.variant())
-    config.merge_meshes = False  # shapes keep their names
-    config.unused_parameters = mi.LogLevel.Debug  # checked here, with the nearest name
-    base = Path(base or ".").absolute()
-    if isinstance(file, dict):
-        if parameters:
-            raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
-        path, where, folders = None, "scene dict", (base,)
-        state = parser.told(where, mi.parser.parse_dict, config, file)
-    else:
-        path = find(file)
-        where, folders = str(path), (path.parent, base, *_search_paths(path))
-        filled = _check_parameters(path, parameters or {})
-        state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
-    parser.told(where, mi.parser.transform_all, config, state)
-
-    parser.lower_names(state)
+    config, state, path, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders)
     asked = supported.take_integrator(state, where)
     notes = (*own.notes, *asked.notes, *supported.check_sensors(state, where))
@@ -353,6 +337,60 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
     columns, rows = (int(n) for n in scene.sensors()[0].film().crop_size())
     told = own, asked.max_depth, asked.hide_emitters, notes
     return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told)
+
+
+def _parsed(file, parameters, base):
+    """Parse a scene; returns Mitsuba's configuration and state, the file, its name and where files lie."""
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = False  # shapes keep their names
+    config.unused_parameters = mi.LogLevel.Debug  # checked here, with the nearest name
+    base = Path(base or ".").absolute()
+    if isinstance(file, dict):
+        if parameters:
+            raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
+        path, where, folders = None, "scene dict", (base,)
+        state = parser.told(where, mi.parser.parse_dict, config, file)
+    else:
+        path = find(file)
+        where, folders = str(path), (path.parent, base, *_search_paths(path))
+        filled = _check_parameters(path, parameters or {})
+        state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
+    parser.told(where, mi.parser.transform_all, config, state)
+    parser.lower_names(state)
+    return config, state, path, where, folders
+
+
+def relit(file, envmap: str, parameters=None, base=None) -> str:
+    """Return the XML of a scene that is lit by another map and otherwise as its author has it.
+
+    Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
+    and what plain Mitsuba does not know (``fit_height``, names in capitals) is written out. The environment
+    emitter becomes an ``envmap`` with the same rotation and ``scale``; a scene without an integrator gets
+    ``path``.
+
+    Parameters
+    ----------
+    file, parameters, base
+        As of :func:`load`.
+    envmap : str
+        Name of the map's file, as it shall stand in the XML.
+
+    Raises
+    ------
+    ConfigError, InputError
+        As of :func:`load`.
+    """
+    _, state, _, where, folders = _parsed(file, parameters, base)
+    own = supported.own_map(state, where, folders)
+    emitter, _ = parser.replace_environment(state, where)
+    parser.find_files(state, where, folders)
+    for node in state.nodes:
+        parser.smooth_limit(state, node)
+        parser.fit_to_stage(state, node)
+    emitter["filename"] = envmap
+    emitter["scale"] = own.scale
+    supported.ensure_integrator(state)
+    return mi.parser.write_string(state)
 
 
 # ----------------------------------------------------------------------------------------------------------

@@ -141,6 +141,20 @@ def take_integrator(state, where: str) -> Integrator:
     return Integrator(depth, hide, tuple(notes))
 
 
+def ensure_integrator(state) -> None:
+    """Give a scene without an integrator ``path``.
+
+    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+    """
+    if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
+        return
+    root = next(n for n in state.nodes if n.type == mi.ObjectType.Scene)
+    root.props["integrator"] = mi.Properties.ResolvedReference(len(state.nodes))
+    node = mi.parser.SceneNode()
+    node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
+    state.nodes.append(node)
+
+
 def _check_media(state, where, integrator, notes):
     """Refuse media that the scene's integrator would render; say that another one leaves them out."""
     media = [n for n in state.nodes if n.type == mi.ObjectType.Medium]

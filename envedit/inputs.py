@@ -2,36 +2,187 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from envedit import config
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError, NumericalError
+from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.images import analytic_sky, images
 from envedit.scene import scene
 
+SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
+"""Words for ``[input] envmap``: Mitsuba's analytic sky; the scene's own map; that one if there is one."""
 
-def load_map(settings: config.Input) -> tuple[np.ndarray, list[str]]:
+
+@dataclass(frozen=True)
+class InputMap:
+    """The map that is edited, as its file holds it and as it reaches the scene.
+
+    Everything is computed with :attr:`radiance` = ``scale`` * ``stored``; what is written goes back through
+    :meth:`as_stored`, so that it can stand in the scene in the place of the file.
+
+    Attributes
+    ----------
+    source : str
+        The file, or "sunsky".
+    stored : ndarray (H, W, 3) float32
+        Linear values as in the file, at the width asked for.
+    scale : float
+        What the scene's emitter multiplies them by.
+    size : (int, int)
+        Width and height of the file.
+    warnings : list of str
+        What was repaired, or is odd.
+    """
+
+    source: str
+    stored: np.ndarray
+    scale: float
+    size: tuple[int, int]
+    warnings: list[str]
+
+    @functools.cached_property
+    def radiance(self) -> np.ndarray:
+        """Linear radiance (H, W, 3) float32 that reaches the scene.
+
+        Raises
+        ------
+        InputError
+            It is more than :data:`.radiance.BRIGHTEST` somewhere.
+        """
+        return scaled(self.stored, self.scale, self.source)
+
+    def at_file_size(self, repair: bool) -> InputMap:
+        """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
+        if self.source == SUNSKY:
+            return self
+        stored, info = images.load_envmap(self.source, None, repair)
+        return InputMap(self.source, stored, self.scale, info["size"], list(info["warnings"]))
+
+    def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
+        """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
+
+        Parameters
+        ----------
+        edited : ndarray (H, W, 3)
+            Linear radiance in the scene.
+        degrees : float
+            By how much the map was turned before it was edited.
+
+        Raises
+        ------
+        NumericalError
+            A value is too large for the file: ``scale`` is too small.
+        """
+        if self.scale == 1:
+            return edited
+        with np.errstate(over="ignore"):
+            found = (edited / np.float64(self.scale)).astype(np.float32)
+        if not np.isfinite(found).all():
+            raise NumericalError(f"the edited map over the scene's scale, {self.scale:g}, leaves float32")
+        same = edited == latlong.rotate(self.radiance, degrees)
+        return np.where(same, latlong.rotate(self.stored, degrees), found)
+
+
+def scaled(stored: np.ndarray, scale: float, source: str) -> np.ndarray:
+    """Return radiance in the scene: ``scale`` times what a file holds; errors as of :class:`InputMap`."""
+    if scale == 1:
+        return stored
+    with np.errstate(over="ignore"):
+        radiance = (stored * np.float64(scale)).astype(np.float32)
+    require_radiance(radiance, f"{source} times the scene's scale, {scale:g}", brightest=BRIGHTEST)
+    return radiance
+
+
+def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
+    """Return the file of a configuration's map, or "sunsky".
+
+    Raises
+    ------
+    ConfigError
+        The scene's own map is asked for, and it names none.
+    InputError
+        The scene's own map is not there.
+    """
+    own = None if lit is None else lit.own.file
+    if settings.envmap == AUTO and own is None:
+        return SUNSKY
+    if settings.envmap not in (AUTO, SCENE):
+        return settings.envmap
+    if own is None:
+        where = "no scene is given" if lit is None else f"{lit.path} names no file in an emitter envmap"
+        raise ConfigError(f'input.envmap: got "scene", but {where}: name a map, or "sunsky"')
+    if not own.is_file():
+        raise InputError(f"{own}: the scene's own map is missing; name another with [input] envmap")
+    return str(own)
+
+
+def read_map(settings: config.Input, lit: scene.Scene | None, width: int | None = None) -> InputMap:
+    """Read the map of a configuration.
+
+    Parameters
+    ----------
+    settings : config.Input
+        Which map.
+    lit : scene.Scene, optional
+        Whose own map and scale; None: none, and 1.
+    width : int, optional
+        Texels across; None: as many as the file has (of the analytic sky: the working width).
+
+    Raises
+    ------
+    ConfigError, InputError
+        As of :func:`source_of` and :func:`.images.load_envmap`.
+    """
+    source, scale = source_of(settings, lit), 1.0 if lit is None else lit.own.scale
+    if source == SUNSKY:
+        width = width or settings.width
+        sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
+        return InputMap(source, sky, scale, (width, width // 2), [])
+    stored, info = images.load_envmap(source, width, settings.repair)
+    return InputMap(source, stored, scale, info["size"], list(info["warnings"]))
+
+
+def load_map(settings: config.Input, lit: scene.Scene | None = None) -> tuple[np.ndarray, list[str]]:
     """Load the map of a configuration at working width.
+
+    Parameters
+    ----------
+    settings : config.Input
+        Which map.
+    lit : scene.Scene, optional
+        The scene whose own map and scale count.
 
     Returns
     -------
     envmap : ndarray (H, W, 3) float32
-        Linear radiance.
+        Linear radiance that reaches the scene.
     warnings : list of str
         What was repaired, or is odd.
 
     Raises
     ------
-    InputError
-        As of :func:`.images.load_envmap`.
+    ConfigError, InputError
+        As of :func:`read_map` and :class:`InputMap`.
     """
-    if settings.envmap == "sunsky":
-        return analytic_sky.sunsky(
-            settings.width, settings.azimuth, settings.elevation, settings.turbidity
-        ), []
-    envmap, info = images.load_envmap(settings.envmap, settings.width, settings.repair)
-    return envmap, list(info["warnings"])
+    found = read_map(settings, lit, settings.width)
+    return found.radiance, found.warnings
+
+
+def notes(settings: config.Input, lit: scene.Scene) -> list[str]:
+    """Say which map a run took and what the scene's file has that is used otherwise."""
+    said, source, own = list(lit.notes), source_of(settings, lit), lit.own
+    if settings.envmap == AUTO and source != SUNSKY:
+        said.insert(0, f"map: the scene's own, {source}")
+    if own.scale != 1:
+        whose = "it" if source == str(own.file) else "the map (which is not the scene's own)"
+        said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}")
+    return said
 
 
 def active_rows(rows, height: int) -> tuple[int, int]:

@@ -108,11 +108,12 @@ def run(
         )
     with clock("target_s"):
         watch.stage("loading")
-        original, found = inputs.load_map(settings.input)
-        warnings += found
+        lit = inputs.load_scene(settings.scene, base)
+        given = inputs.read_map(settings.input, lit, settings.input.width)
+        original, said = given.radiance, inputs.notes(settings.input, lit)
+        warnings += given.warnings
         height, width, _ = original.shape
         first, last = inputs.active_rows(settings.input.rows, height)
-        lit = inputs.load_scene(settings.scene, base)
         renderers.check(settings, lit, (height, width))
         watch.stage("rendering the target")
         wanted = target.make(settings, lit, original, picture, mask)
@@ -141,24 +142,26 @@ def run(
     if job.newton and (unused := _unused(settings)):
         asked = ", ".join(unused)
         warnings.append(f'{asked}: not used by Gauss-Newton steps; [optimizer] kind = "adam" uses them')
-    with clock("edit_s"):
+    with clock("edit_s"), _in_file_units(given):
         watch.stage("editing")
         params, state = job.optimise(edit.params, edit.crop, resume)
         edited = job.decode(params)
         wanted = job.wanted  # a resumed run has the picture that it began with
 
-    with clock("judge_s"), keeping(edited):
+    with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
         final, judged, _ = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
     notes += [job.note] if job.note else []
     if representation.models_edit:
         kept = 100 * float((edited == job.original)[rows].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels keep their bits")
-    notes = [wanted.source, *renderer.choices, *notes, f"result rendered with {judged} samples a pixel"]
+    notes = [*said, wanted.source, *renderer.choices, *notes]
+    notes.append(f"result rendered with {judged} samples a pixel")
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
-    with keeping(edited):
-        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips)
+    with _in_file_units(given), keeping(edited):
+        stored = given.as_stored(edited, edit.degrees)
+        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit.alpha)
         predicted = traced.coarse_error(edited) if traced else None
     if state.bad_steps:
         warnings.append(
@@ -181,7 +184,10 @@ def run(
             notes.append(f"{100 * share:.3g} % of the active texels keep their value: {least}")
     measured["choices"] = notes
     return Result(
-        envmap=edited,
+        envmap=stored,
+        given=given,
+        to_world=lit.to_world,
+        alpha=lit.alpha,
         renders=renders,
         maps=maps,
         metrics=measured,
@@ -196,6 +202,16 @@ def run(
         found=Found(representation, params, first, job.free, edit.degrees),
         posterior=job.posterior,
     )
+
+
+@contextlib.contextmanager
+def _in_file_units(given):
+    """Let an edit that is cut short carry its map in the units of the file."""
+    try:
+        yield
+    except (Interrupted, Stopped) as stop:
+        stop.envmap = given.as_stored(stop.envmap)
+        raise
 
 
 def _unused(settings):
@@ -231,13 +247,14 @@ def _perceptual(settings):
     return dists, lpips
 
 
-def _measure(settings, renders, maps, rows, coverage, within, lpips):
+def _measure(settings, renders, maps, rows, coverage, within, lpips, alpha):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
     tonemap = settings.output.tonemap
     before, wanted, after = (renders[name] for name in ("initial", "target", "edited"))
+    seen = None if alpha is None else alpha > 0
     measured = {
-        "render": metrics.compare(after, wanted, tonemap, lpips),
-        "initial": metrics.compare(before, wanted, tonemap, lpips),
+        "render": metrics.compare(after, wanted, tonemap, lpips, seen),
+        "initial": metrics.compare(before, wanted, tonemap, lpips, seen),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.start, rows.stop - 1],

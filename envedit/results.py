@@ -10,7 +10,6 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core import latlong
 from envedit.export import full_resolution
-from envedit.images import images
 from envedit.representations import Representation
 from envedit.representations.layers.separation import Separation
 from envedit.solve.feasibility import Reach
@@ -24,10 +23,12 @@ class Result:
     Attributes
     ----------
     envmap : ndarray (H, W, 3)
-        The edited map; rows outside the active ones are the original's, bit for bit, and so are frozen texels
-        but where layers move a light or its glow across them.
+        The edited map in the units of its file, which the scene's ``scale`` multiplies; rows outside the
+        active ones are the original's, bit for bit, and so are frozen texels but where layers move a light or
+        its glow across them.
     renders, maps : dict
-        ``initial``, ``target``, ``edited``; linear radiance. ``maps["target"]`` is None where it is unknown.
+        ``initial``, ``target``, ``edited``; linear radiance, of maps as it reaches the scene.
+        ``maps["target"]`` is None where it is unknown.
     metrics : dict
         As in metrics.json.
     history : list of dict
@@ -46,6 +47,12 @@ class Result:
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
     posterior : gauss_newton.Posterior, optional
         How well the target determines the sky; None where that is not known.
+    given : inputs.InputMap, optional
+        The map that was edited.
+    to_world : ndarray (3, 3), optional
+        Rotation from the map's frame to the scene's.
+    alpha : ndarray (h, w), optional
+        Share of each pixel that sees a surface, where the scene hides what lights it.
     found : Found, optional
         What the map was decoded from, for :func:`at_full_resolution`.
     """
@@ -62,6 +69,9 @@ class Result:
     separation: Separation | None = None
     scene: Path | None = None
     reach: Reach | None = None
+    given: inputs.InputMap | None = None
+    to_world: np.ndarray | None = None
+    alpha: np.ndarray | None = None
     found: Found | None = None
     posterior: Posterior | None = None
 
@@ -86,23 +96,22 @@ class Found:
 
 
 def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
-    """Carry a result to the resolution of its input's file; None where that has no more texels.
+    """Carry a result to the resolution of its input's file, in its units; None where that has no more texels.
 
     Raises
     ------
     InputError, NumericalError
         If the file cannot be read any more, or the carried map is not finite.
     """
-    if settings.envmap == "sunsky":
+    if result.given.size[0] <= settings.width:
         return None
-    source, _ = images.load_envmap(settings.envmap, None, settings.repair)
-    if source.shape[1] <= settings.width:
-        return None
-    found = result.found
+    full, found = result.given.at_file_size(settings.repair), result.found
     before = latlong.rotate(result.maps["initial"], found.turn_degrees)
-    source = latlong.rotate(source, found.turn_degrees)
+    source = latlong.rotate(full.radiance, found.turn_degrees)
     first, last = inputs.active_rows(settings.rows, before.shape[0])
     rows = first, last - first + 1
-    return full_resolution.carry(
-        found.representation, found.params, before, result.envmap, source, rows, found.free
+    edited = result.maps["edited"]
+    carried = full_resolution.carry(
+        found.representation, found.params, before, edited, source, rows, found.free
     )
+    return full.as_stored(carried, found.turn_degrees)

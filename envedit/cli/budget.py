@@ -18,7 +18,6 @@ from envedit import config, inputs, pipeline
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError
-from envedit.images import images
 from envedit.scene.scene import QUIET_DECIBELS, QUIET_LEAST, QUIET_MOST
 
 LATE = 1.3
@@ -250,13 +249,10 @@ def choose(found: Calibration, budget: float, elapsed: float, work: Work) -> tup
 
 def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibration, Work]:
     """Measure this machine in this scene under this map."""
-    texels = 0
-    if settings.input.envmap == "sunsky":
-        envmap, _ = inputs.load_map(_at_width(settings.input, _MAP))
-    else:
-        envmap, info = images.load_envmap(settings.input.envmap, _MAP, settings.input.repair)
-        texels = info["size"][0] * info["size"][1]
     lit = inputs.load_scene(_film_at(settings.scene, _FILM), base)
+    given = inputs.read_map(settings.input, lit, _MAP)
+    envmap = given.radiance
+    texels = 0 if given.source == inputs.SUNSKY else given.size[0] * given.size[1]
     times, pictures = [], []
     for seed in range(3):
         begun = time.perf_counter()

@@ -17,7 +17,7 @@ TEMPLATE = """\
 preset = "standard"  # or "draft", a third of the time; "paper", the method of the paper, minutes
 
 [input]
-envmap = {envmap}  # an EXR or Radiance HDR file, lat-long; or "sunsky", Mitsuba's analytic sky
+envmap = {envmap}  # EXR or Radiance HDR, lat-long; "scene", its own; "sunsky", analytic; "auto"
 # azimuth = 90.0  # sunsky: of the sun, degrees
 # elevation = 35.0  # sunsky: of the sun above the horizon, degrees
 width = 256  # texels while editing; afterwards the edit is carried to the size of the file
@@ -64,8 +64,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--envmap",
         metavar="MAP",
-        default="sunsky",
-        help="an EXR or Radiance HDR file, or sunsky, Mitsuba's analytic sky (default: sunsky)",
+        default="auto",
+        help="an EXR or Radiance HDR file; scene, the one that the scene names; sunsky, Mitsuba's analytic "
+        "sky; or auto, the scene's if it names one (default: auto)",
     )
     parser.add_argument(
         "--out", metavar="FILE", default="edit.toml", help="file to write (default: edit.toml)"
@@ -90,7 +91,9 @@ def _write(arguments):
     file = Path(arguments.out)
     if os.path.lexists(file):
         raise ConfigError(f"{file}: exists already; delete it, or give another name with --out")
-    envmap = _named("--envmap", arguments.envmap, ("sunsky",), "an EXR or Radiance HDR file", file.parent)
+    envmap = _named(
+        "--envmap", arguments.envmap, ("auto", "scene", "sunsky"), "an EXR or Radiance HDR file", file.parent
+    )
     scene = _named("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML file", file.parent)
     text = TEMPLATE.format(
         name=file.name,

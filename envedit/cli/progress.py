@@ -1,13 +1,14 @@
-"""Progress of a long run: a bar on a terminal, plain lines now and then elsewhere."""
+"""Progress of a long run: a bar on a terminal, plain or JSON lines now and then elsewhere."""
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 
 from tqdm import tqdm
 
-LINE_SECONDS = 5.0
+LINE_SECONDS, JSON_SECONDS = 5.0, 0.5
 
 
 class Progress:
@@ -71,3 +72,36 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+class JsonProgress:
+    """Tell stages and progress as JSON lines on stderr; used like :class:`Progress`.
+
+    A stage begins with ``{"event": "stage", "stage": text}``; then, at most every :data:`JSON_SECONDS` and
+    when it is done, come ``{"event": "progress", "stage":, "done":, "total":, "text":}``.
+    """
+
+    def __init__(self, stream=None):
+        self.stream, self._stage, self._last = stream or sys.stderr, "", 0.0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        pass
+
+    def tell(self, event: str, **facts) -> None:
+        """Write one line."""
+        print(json.dumps({"event": event, **facts}), file=self.stream, flush=True)
+
+    def stage(self, text: str) -> None:
+        """Begin a stage."""
+        self._stage, self._last = text, time.monotonic()
+        self.tell("stage", stage=text)
+
+    def update(self, done: int, total: int, text: str = "") -> None:
+        """Tell that ``done`` of ``total`` parts of the stage are done."""
+        now = time.monotonic()
+        if now - self._last >= JSON_SECONDS or done == total:
+            self._last = now
+            self.tell("progress", stage=self._stage, done=done, total=total, text=text)

@@ -1,13 +1,19 @@
-"""``envedit run CONFIG``: carry out an edit; leaves the map, renderings, metrics and a report in a folder."""
+"""``envedit run``: carry out an edit; leaves the map, renderings, metrics and a report in a folder.
+
+The edit is that of a configuration, or of a scene and a few options. What is told goes to stdout as text, or
+with ``--json`` as one object at the end; progress, warnings and errors go to stderr, as text or JSON lines.
+"""
 
 from __future__ import annotations
 
 import argparse
 import difflib
+import json
 import os
 import re
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from envedit.core import shipped
@@ -23,16 +29,42 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.config is None:
         known = ", ".join(shipped.configurations())
         parser.error(f"got no CONFIG, expected a file, such as CONFIG.toml, or one of {known}")
+    arguments.facts = {}
     try:
         with unwrapped():
-            return _run(arguments, start)
+            code = _run(arguments, start)
     except EnveditError as error:
-        print(f"envedit: {error}", file=sys.stderr)
-        return error.exit_code
+        _tell(arguments, "error", str(error))
+        code = error.exit_code
     except KeyboardInterrupt:
         goes_on = "a fit under way goes on where it was last kept"
-        print(f"envedit: interrupted; there is no checkpoint to resume from ({goes_on})", file=sys.stderr)
-        return 130
+        _tell(arguments, "error", f"interrupted; there is no checkpoint to resume from ({goes_on})")
+        code = 130
+    if arguments.json:
+        print(json.dumps({"ok": code == 0, "exit_code": code, **arguments.facts}))
+    return code
+
+
+def _tell(arguments, kind, text):
+    """Write a warning or an error to stderr, and note it for the object of ``--json``."""
+    if kind == "error":
+        arguments.facts["error"] = text
+    else:
+        arguments.facts.setdefault("warnings", []).append(text)
+    if arguments.progress == "json":
+        from envedit.cli.progress import JsonProgress
+
+        JsonProgress().tell(kind, text=text)
+    else:
+        print(f"envedit: {'warning: ' if kind == 'warning' else ''}{text}", file=sys.stderr)
+
+
+def _progress(arguments):
+    """Return what shows progress."""
+    from envedit.cli.progress import JsonProgress, Progress
+
+    wanted = arguments.progress == "json" and not arguments.quiet
+    return JsonProgress() if wanted else Progress(quiet=arguments.quiet)
 
 
 def _load(name, preset, overrides):
@@ -50,6 +82,11 @@ def _load(name, preset, overrides):
     from envedit import config
     from envedit.core.errors import ConfigError
 
+    if _is_scene(name):
+        file = Path(name)
+        overrides = [f"scene.file={config.quote(name)}", *overrides]
+        label = str(file.with_name(f"{file.stem or 'scene'}.toml"))  # its stem names the folder of results
+        return config.loads("", Path.cwd(), label, preset, overrides), None, Path.cwd()
     by_name = None if os.path.isfile(name) else shipped.configuration(name)
     file = by_name or Path(name)
     if _missing(file):
@@ -63,6 +100,39 @@ def _load(name, preset, overrides):
         return config.load(file, preset, overrides), file, file.absolute().parent
     text = file.read_text(encoding="utf-8")
     return config.loads(text, Path.cwd(), str(file), preset, overrides), file, Path.cwd()
+
+
+def _is_scene(name):
+    """Tell a scene from a configuration: an XML file, or the name of a shipped scene."""
+    plain = not os.path.isfile(name) and name in shipped.scenes() and name not in shipped.configurations()
+    return name.lower().endswith(".xml") or plain
+
+
+def _quick(arguments):
+    """Return the overrides that --envmap, --paint, --target and --rotate stand for.
+
+    Raises
+    ------
+    ConfigError
+        They are given beside a configuration, which says the same.
+    """
+    from envedit import config
+    from envedit.core.errors import ConfigError
+
+    asked = {
+        "envmap": (("input.envmap", arguments.envmap),),
+        "paint": (("target.kind", "image"), ("target.file", arguments.paint)),
+        "target": (("target.file", arguments.target),),
+        "rotate": (("target.rotate_degrees", arguments.rotate),),
+    }
+    given = [name for name in asked if getattr(arguments, name) is not None]
+    if given and not _is_scene(arguments.config):
+        key = asked[given[0]][-1][0]
+        raise ConfigError(
+            f"--{given[0]}: got it beside a configuration, expected it beside a scene: "
+            f"set {key} in {arguments.config}, or --set {key}=..."
+        )
+    return [f"{key}={config.quote(value)}" for name in given for key, value in asked[name]]
 
 
 def _missing(file):
@@ -81,6 +151,9 @@ def _parser():
         prog="envedit run",
         description="Edit an HDR environment map so that a scene renders like a target.",
         epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n"
+        "  envedit run scene.xml --envmap sky.hdr --rotate 90\n"
+        "  envedit run scene.xml --export-initial paint_me.png\n"
+        "  envedit run scene.xml --paint paint_me.png\n"
         "  envedit run edits/move_shadow --out shadow --preset draft\n\n"
         f"shipped configurations: {', '.join(shipped.configurations())}\n"
         f"shipped scenes, for [scene] file: {', '.join(shipped.scenes())}\n\n"
@@ -89,8 +162,23 @@ def _parser():
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "config", metavar="CONFIG", nargs="?", help="a file, CONFIG.toml, or the name of a shipped one"
+        "config",
+        metavar="CONFIG",
+        nargs="?",
+        help="a file, CONFIG.toml, or the name of a shipped one; or SCENE.xml, or the name of a shipped "
+        "scene, with the options of the next group",
     )
+    quick = parser.add_argument_group(
+        "edits of a scene without a configuration",
+        "config.toml among the results says what was run; without a target the map is turned by 60 degrees",
+    )
+    quick.add_argument(
+        "--envmap", metavar="MAP", help="map to edit: a file, scene or sunsky (default: the scene's own)"
+    )
+    target = quick.add_mutually_exclusive_group()
+    target.add_argument("--paint", metavar="PICTURE", help="the rendering, painted over")
+    target.add_argument("--target", metavar="MAP", help="the rendering shall be as under this map")
+    target.add_argument("--rotate", metavar="DEGREES", type=float, help="... as under the map, turned")
     parser.add_argument(
         "--out",
         metavar="DIR",
@@ -126,6 +214,17 @@ def _parser():
         help="choose widths, steps and samples so that the run ends within 30, 30s or 2m",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print one JSON object at the end: folder, files, metrics, or error",
+    )
+    parser.add_argument(
+        "--progress",
+        choices=("text", "json"),
+        default="text",
+        help="progress on stderr as text or JSON lines",
+    )
     return parser
 
 
@@ -133,7 +232,7 @@ def _run(arguments, start):
     from envedit import config
     from envedit.report import output_folder
 
-    overrides = list(arguments.overrides)
+    overrides = [*_quick(arguments), *arguments.overrides]
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
     settings, arguments.config, arguments.base = _load(arguments.config, arguments.preset, overrides)
@@ -152,10 +251,12 @@ def _edit(settings, arguments, folder, allowed, start):
 
     named = (settings.input.envmap, settings.scene.file, settings.target.file, settings.target.mask)
     inputs = [path for path in named if path]
-    output_folder.prepare_folder(folder, output_folder.RESULTS, inputs, arguments.resume, [arguments.config])
+    spare = [] if arguments.config is None else [arguments.config]
+    output_folder.prepare_folder(folder, output_folder.RESULTS, inputs, arguments.resume, spare)
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
         _check_same(settings, folder)
-        _say(arguments.quiet, f"{folder}: this run is complete, there is nothing to resume")
+        _say(arguments, f"{folder}: this run is complete, there is nothing to resume")
+        _note_results(arguments, folder)
         return 0
 
     doctor.ensure(settings.variant)
@@ -167,19 +268,17 @@ def _edit(settings, arguments, folder, allowed, start):
     from envedit.images import images
 
     import_s = time.perf_counter() - start
-    from envedit.cli.progress import Progress
-
     said, base = [], arguments.base
     if allowed is not None:
         from envedit.cli import budget
 
         settings, note = budget.apply(settings, allowed, import_s, base)
         said.append(note)
-        _say(arguments.quiet, note)
+        _say(arguments, note)
 
     # What a budget has chosen is not in the configuration that would be continued.
     again = "" if allowed else "; continue with --resume"
-    with Progress(quiet=arguments.quiet) as progress:
+    with _progress(arguments) as progress:
         try:
             result = pipeline.run(
                 settings,
@@ -190,27 +289,26 @@ def _edit(settings, arguments, folder, allowed, start):
             )
         except pipeline.Interrupted as stop:
             images.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
-            kept = f"checkpoint and edited.exr so far are in {folder}{again}"
-            print(f"envedit: {stop}; {kept}", file=sys.stderr)
+            _tell(arguments, "error", f"{stop}; checkpoint and edited.exr so far are in {folder}{again}")
             return 130
         except KeyboardInterrupt:
-            return _interrupted(folder, again)
+            return _interrupted(arguments, folder, again)
         except pipeline.Stopped as stop:
             images.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
             raise
         result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
     try:
-        return _write(settings, folder, result, import_s, arguments.quiet, said)
+        return _write(arguments, settings, folder, result, import_s, said)
     except KeyboardInterrupt:
-        return _interrupted(folder, again)
+        return _interrupted(arguments, folder, again)
 
 
-def _interrupted(folder, again):
+def _interrupted(arguments, folder, again):
     """Say what a run that was interrupted outside the loop has left; raises if that is nothing."""
     if not (folder / "checkpoint.npz").exists():
         raise KeyboardInterrupt
-    print(f"envedit: interrupted; a checkpoint is in {folder}{again}", file=sys.stderr)
+    _tell(arguments, "error", f"interrupted; a checkpoint is in {folder}{again}")
     return 130
 
 
@@ -236,27 +334,30 @@ def _export_initial(settings, arguments):
     mi.set_variant(settings.variant)
     mi.set_log_level(mi.LogLevel.Error)
     from envedit import inputs
-    from envedit.cli.progress import Progress
     from envedit.targets import painted_image
 
     painted_image.check_export(file)
-    with Progress(quiet=arguments.quiet) as progress:
+    with _progress(arguments) as progress:
         progress.stage("rendering the picture to paint on")
-        envmap, warnings = inputs.load_map(settings.input)
         lit = inputs.load_scene(settings.scene, arguments.base)
+        envmap, warnings = inputs.load_map(settings.input, lit)
+        notes = inputs.notes(settings.input, lit)
+        source = inputs.source_of(settings.input, lit)  # what the picture says that it was made from
+        settings = replace(settings, input=replace(settings.input, envmap=source))
         warnings += painted_image.export(file, painted_image.initial(lit, envmap, settings), settings)
     for line in warnings:
-        print(f"envedit: warning: {line}", file=sys.stderr)
+        _tell(arguments, "warning", line)
+    for line in notes:
+        _say(arguments, line)
     under = "linear" if file.suffix.lower() == ".exr" else f"under the '{settings.target.tonemap}' tonemap"
     ask = f'[target] kind = "image", file = "{file.absolute()}"'
-    _say(arguments.quiet, f"{file}: {lit.width}x{lit.height}, {under}; paint on it, then set {ask}")
+    _say(arguments, f"{file}: {lit.width}x{lit.height}, {under}; paint on it, then set {ask}")
+    arguments.facts["files"] = {file.name: str(file.absolute())}
     return 0
 
 
 def _check_same(settings, folder):
     """Refuse to call the run in a folder complete when it was asked for something else."""
-    from dataclasses import replace
-
     from envedit import config
     from envedit.core.errors import ConfigError, InputError
     from envedit.report import manifest
@@ -272,16 +373,28 @@ def _check_same(settings, folder):
         raise InputError(f"{changed[0]}: has changed since the run in {folder}: run without --resume")
 
 
-def _write(settings, folder, result, import_s, quiet, said):
+def _write(arguments, settings, folder, result, import_s, said):
     from envedit.report import run_folder
 
-    for line in run_folder.write(settings, folder, result, import_s):
-        print(f"envedit: warning: {line}", file=sys.stderr)
+    for line in run_folder.write(settings, folder, result, import_s, arguments.base):
+        _tell(arguments, "warning", line)
     for line in result.notes[len(said) :]:
-        _say(quiet, line)
-    _say(quiet, _verdict(result.metrics))
-    _say(quiet, f"results in {folder.resolve()}")
+        _say(arguments, line)
+    _say(arguments, _verdict(result.metrics))
+    _say(arguments, f"results in {folder.resolve()}")
+    _note_results(arguments, folder)
     return 0
+
+
+def _note_results(arguments, folder):
+    """Note a finished run for the object of ``--json``: its folder, files and metrics.json."""
+    from envedit.report import output_folder
+
+    here = {
+        name: str((folder / name).resolve()) for name in output_folder.RESULTS if (folder / name).exists()
+    }
+    measured = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    arguments.facts |= {"folder": str(folder.resolve()), "files": here, "metrics": measured}
 
 
 def _verdict(measured):
@@ -300,8 +413,8 @@ def _verdict(measured):
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 
-def _say(quiet, line):
-    if not quiet:
+def _say(arguments, line):
+    if not (arguments.quiet or arguments.json):
         print(line)
 
 

@@ -68,6 +68,9 @@ _PATHS = (
 )  # fmt: skip
 
 
+_MAPS = "auto", "scene", "sunsky"  # words that ``[input] envmap`` takes in place of a file
+
+
 def checked_layer(layer: Any, where: str, top: Fields, tables: dict[str, Fields]) -> dict[str, Any]:
     """Check every table, key and value that one source gives, and normalise the values."""
     if not isinstance(layer, dict):
@@ -145,12 +148,12 @@ def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, An
 
 
 def resolve_paths(merged: dict[str, Any], base: Path, stem: str) -> None:
-    """Make the paths absolute in place; ``sunsky`` and the bare names of shipped scenes are no paths."""
+    """Make the paths absolute in place; words for maps and bare names of shipped scenes are no paths."""
     output = dict(merged.get("output", {}))
     output["dir"] = output.get("dir") or f"{stem}_out"
     merged["output"] = output
     for table, key in _PATHS:
         value = merged.get(table, {}).get(key, "")
         shipped = key == "file" and table == "scene" and Path(value).name == value and not Path(value).suffix
-        if value and not shipped and not (key == "envmap" and value == "sunsky"):
+        if value and not shipped and not (key == "envmap" and value in _MAPS):
             merged[table] = merged[table] | {key: str(base / value)}

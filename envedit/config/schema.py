@@ -56,7 +56,12 @@ _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+
 class Input(Table):
     """The environment map to edit."""
 
-    envmap: str = _key("sunsky", string, 'HDR lat-long image, or "sunsky": Mitsuba\'s analytic sky')
+    envmap: str = _key(
+        "auto",
+        string,
+        'HDR lat-long image; "scene": the one that the scene names; "sunsky": Mitsuba\'s analytic sky; '
+        '"auto": the scene\'s if it names one, else the analytic sky',
+    )
     width: int = _key(256, integer(6, MOST_DIM, even=True), "working width, texels; height is half")
     rows: str | tuple[int, int] = _key(
         "all", row_range, 'rows the edit may change: "all", the "upper" half, or [first, last] inclusive'
@@ -74,7 +79,7 @@ class Input(Table):
 
     def _check_together(self) -> None:
         if not self.envmap:
-            raise ConfigError('input.envmap: came "", wanted an image file or "sunsky"')
+            raise ConfigError('input.envmap: came "", wanted an image file, "scene", "sunsky" or "auto"')
         if not isinstance(self.rows, str) and self.rows[1] >= self.width // 2:
             raise ConfigError(
                 f"input.rows: came {list(self.rows)}, wanted rows below {self.width // 2}: "
@@ -294,6 +299,17 @@ class Output(Table):
     )
     report: bool = _key(True, boolean, "write preview.png and report.html")
     full: bool = _key(True, boolean, "write edited_full.exr, at the resolution of the input's file")
+    format: str = _key(
+        "exr", choice("exr", "hdr"), "file of the edited map: OpenEXR, or Radiance (.hdr), 8 bits a channel"
+    )
+    half: bool = _key(
+        False, boolean, "OpenEXR with 16 bits a channel; what is above 65504 is cut, with a warning"
+    )
+    scene: bool = _key(True, boolean, "write edited.xml, the scene lit by the edited map")
+
+    def _check_together(self) -> None:
+        if self.half and self.format != "exr":
+            raise ConfigError('output.half: got true with output.format "hdr", expected "exr"')
 
 
 def _table_key(table: type[Table]) -> Any:

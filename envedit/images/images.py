@@ -27,7 +27,7 @@ FORMATS = (
 )
 """Kind, first bytes and decoder of every format."""
 
-__all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_png"]
+__all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_hdr", "write_png"]
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -199,8 +199,10 @@ def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[n
 # Writing
 
 
-def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) -> None:
-    """Write an image as a float32 OpenEXR file, whole or not at all.
+def write_exr(
+    path, image, metadata: dict | None = None, panorama: bool = True, alpha=None, half: bool = False
+) -> None:
+    """Write an image as an OpenEXR file, of float32 unless asked for half, whole or not at all.
 
     Marked as lat-long, unless it is no ``panorama``, with Rec.709 primaries.
     Written under another name in the same folder and then renamed.
@@ -210,16 +212,20 @@ def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) 
     path : path-like
         The file; an existing one is replaced.
     image : array (H, W, 3)
-        Linear radiance, finite in float32. Never written as half: 65504 is less than many a sun.
+        Linear radiance, finite in float32; as half, at most :data:`.radiance.HALF_MAX`.
     metadata : dict, optional
         Attributes to add (str, int or float; anything else as its text), such as ``{"source": "sky.hdr"}``.
     panorama : bool
         Mark it as a lat-long map, which some viewers show as a sphere.
+    alpha : array (H, W), optional
+        Share of each pixel that is covered; the image is premultiplied by it.
+    half : bool
+        Write 16 bits a channel, 11 of them digits.
 
     Raises
     ------
     NumericalError
-        If a value is not finite in float32; names the first texel.
+        If a value is not finite in the file; names the first texel.
     InputError
         If the file cannot be written.
     """
@@ -241,8 +247,32 @@ def write_exr(path, image, metadata: dict | None = None, panorama: bool = True) 
             raise ConfigError(f"{name}: '{key}' cannot be used as the name of a metadata attribute")
         plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
         header[str(key)] = value if plain else str(value)
+    if half:
+        with np.errstate(over="ignore"):  # refused as an infinity
+            image = _checked(name, image.astype(np.float16)).astype(np.float16)
     planes = {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}
+    if alpha is not None:
+        planes["A"] = np.ascontiguousarray(alpha, np.float32)
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
+
+
+def write_hdr(path, image) -> None:
+    """Write an image as a Radiance file (:func:`.rgbe.encode`), whole or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; an existing one is replaced.
+    image : array (H, W, 3)
+        Linear radiance, finite and not negative.
+
+    Raises
+    ------
+    NumericalError, InputError
+        As :func:`write_exr`.
+    """
+    name = os.fsdecode(path)
+    write_atomically(name, rgbe.encode(np.maximum(_checked(name, image), 0)))
 
 
 def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:

@@ -100,3 +100,37 @@ def _radiance_pixels(name, data, height, width):
     stop = int(np.searchsorted(total, height * width)) + 1
     count[stop - 1] -= total[stop - 1] - height * width
     return pixels[np.repeat(source[:stop], count[:stop])].reshape(height, width, 4)
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Writing
+
+
+def encode(image: np.ndarray) -> bytes:
+    """Encode (H, W, 3) linear radiance, finite and not negative, as a Radiance file.
+
+    A texel's channels share the exponent of the largest and have 8 bits each, rounded to the nearest: an
+    error of at most 1/256 of the largest channel. What is below 2^-128 is 0.
+    """
+    height, width, _ = image.shape
+    values = np.minimum(image.astype(np.float64), _LARGEST)
+    exponent = np.frexp(values.max(axis=2))[1]
+    exponent += np.rint(np.ldexp(values.max(axis=2), 8 - exponent)) > 255
+    codes = np.rint(np.ldexp(values, (8 - exponent)[..., None]))
+    shown = (values.max(axis=2) > 0) & (exponent > -128)
+    texels = np.zeros((height, width, 4), np.uint8)
+    texels[..., :3] = np.where(shown[..., None], codes, 0)
+    texels[..., 3] = np.where(shown, exponent + 128, 0)
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
+    if not 8 <= width < 32768:  # too short or long for scanlines by channel
+        return head + texels.tobytes()
+    start, rows = bytes((2, 2, width >> 8, width & 255)), [head]
+    for row in texels:
+        rows.append(start)
+        for channel in row.T:
+            plain = channel.tobytes()  # in runs of up to 128 that do not repeat
+            rows += [bytes((len(part),)) + part for i in range(0, width, 128) if (part := plain[i : i + 128])]
+    return b"".join(rows)
+
+
+_LARGEST = 2.0**127 * (255 / 256)

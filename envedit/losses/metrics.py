@@ -90,7 +90,7 @@ def ssim(a, b, data_range: float = 1.0) -> float:
     return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
 
 
-def compare(a, b, tonemap: str = "gamma", lpips=None) -> dict:
+def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None) -> dict:
     """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.
 
     Parameters
@@ -101,6 +101,8 @@ def compare(a, b, tonemap: str = "gamma", lpips=None) -> dict:
         A name of `envedit.core.color.TONEMAPS`.
     lpips : distances.Lpips, optional
         What measures LPIPS of the display values.
+    seen : array of bool (H, W), optional
+        Pixels over which ``mse`` and ``psnr`` are taken; all by default, or where none is.
 
     Returns
     -------
@@ -117,8 +119,9 @@ def compare(a, b, tonemap: str = "gamma", lpips=None) -> dict:
     """
     a, b = (apply_tonemap(image, tonemap) for image in _pair(a, b))
     small = lpips is None or min(a.shape[:2]) < lpips.backbone.least_size("max")
-    seen = None if small else float(lpips(a.astype(np.float32), b.astype(np.float32)))
-    return {"psnr": psnr(a, b), "ssim": ssim(a, b), "mse": mse(a, b), "lpips": seen}
+    apart = None if small else float(lpips(a.astype(np.float32), b.astype(np.float32)))
+    some = (a, b) if seen is None or not np.any(seen) else (a[seen][None], b[seen][None])
+    return {"psnr": psnr(*some), "ssim": ssim(a, b), "mse": mse(*some), "lpips": apart}
 
 
 def painted(edited, wanted, initial, coverage, tonemap: str = "gamma") -> dict:

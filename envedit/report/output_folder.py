@@ -14,7 +14,8 @@ except ImportError:  # Windows
 from envedit.core.errors import InputError
 
 RESULTS = (
-    "metrics.json", "edited.exr", "edited_full.exr", "edited_layers.exr", "render_initial.exr",
+    "metrics.json", "edited.exr", "edited.hdr", "edited_full.exr", "edited_full.hdr", "edited_layers.exr",
+    "edited_sky.exr", "edited_lights.exr", "lights.json", "edited.xml", "render_initial.exr",
     "render_target.exr", "render_edited.exr", "influence.exr", "influence.png", "unreachable.png",
     "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "checkpoint.npz",
 )  # fmt: skip

@@ -11,11 +11,13 @@ from envedit import config, results
 from envedit.core import atomic_files
 from envedit.core.errors import InputError, NumericalError
 from envedit.images import images, layered_exr
-from envedit.report import html_report, manifest, output_folder, preview
+from envedit.report import html_report, manifest, map_files, output_folder, preview
 from envedit.solve import checkpoint, feasibility
 
 
-def write(settings: config.Config, folder: Path, result: results.Result, import_s: float) -> list[str]:
+def write(
+    settings: config.Config, folder: Path, result: results.Result, import_s: float, base: Path | None = None
+) -> list[str]:
     """Write a result; the checkpoint goes last of all.
 
     Parameters
@@ -28,6 +30,8 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
         What was found; the timing of its metrics is completed.
     import_s : float
         Seconds that imports took.
+    base : Path, optional
+        Folder that file names in scene parameters are relative to.
 
     Returns
     -------
@@ -37,6 +41,9 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
     start = time.perf_counter()
     timing = result.metrics["timing"]
     _maps(settings, folder, result)
+    map_files.write_lights(folder, result)
+    if settings.output.scene:
+        result.warnings += map_files.write_scene(settings, folder, base)
     timing["full_s"] = round(time.perf_counter() - start, 3)
     start = time.perf_counter()
     text = config.to_toml(settings)
@@ -45,7 +52,7 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
     weights = dataclasses.asdict(settings.perceptual)
     del weights["network"]  # the only one that is no file
     named = {
-        "envmap": settings.input.envmap,
+        "envmap": result.given.source,
         "scene": result.scene or "",
         "target": settings.target.file,
         "mask": settings.target.mask,
@@ -59,7 +66,7 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
         preview.preview(folder / "preview.png", result.renders, result.maps, settings.output.tonemap)
         html_report.write_report(
             folder / "report.html",
-            title=f"{Path(settings.input.envmap).stem}, {Path(settings.scene.file).stem}",
+            title=f"{Path(result.given.source).stem}, {Path(settings.scene.file).stem}",
             config_toml=text,
             metrics=result.metrics,
             manifest=facts,
@@ -85,13 +92,17 @@ def write(settings: config.Config, folder: Path, result: results.Result, import_
 
 def _maps(settings, folder, result):
     """Write maps and renderings."""
-    source = {"source": settings.input.envmap}
-    images.write_exr(folder / "edited.exr", result.envmap, source)
+    source = result.given.source
+    result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, source)
     for name, picture in result.renders.items():
         images.write_exr(
-            folder / f"render_{name}.exr", picture, {"source": settings.scene.file}, panorama=False
+            folder / f"render_{name}.exr",
+            picture,
+            {"source": settings.scene.file},
+            panorama=False,
+            alpha=result.alpha,
         )
-    initial = result.maps["initial"]
+    initial = result.given.stored
     layers = {"edited": result.envmap, "initial": initial, "difference": result.envmap - initial}
     if result.influence is not None:
         grey = result.influence[..., None].repeat(3, axis=2)
@@ -107,10 +118,11 @@ def _maps(settings, folder, result):
         try:
             full = results.at_full_resolution(settings.input, result)
             if full is not None:
-                layered_exr.write(folder / "edited_full.exr", {"edited": full})
+                asked = settings.output, folder / "edited_full", full, source
+                result.warnings += map_files.write_map(*asked)
         except MemoryError:
             result.warnings.append(
-                f"{settings.input.envmap}: not enough memory to carry the edit to its size; "
+                f"{result.given.source}: not enough memory to carry the edit to its size; "
                 "edited.exr has it at working resolution"
             )
         except (InputError, NumericalError) as error:  # the file may be gone by now

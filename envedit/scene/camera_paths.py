@@ -81,6 +81,9 @@ def trace(
     seed : int
         Seed of every random choice.
 
+    Where the scene's integrator hides emitters, camera rays pass shapes that are lamps, and those that leave
+    the scene are not active.
+
     Yields
     ------
     Escape, Vertex
@@ -100,10 +103,14 @@ def trace(
     throughput = mi.Color3f(mi.unpolarized_spectrum(weight))
     active = mi.Bool(dr.full(mi.Bool, True, n))
     pdf = dr.full(mi.Float, dr.inf, n)
+    hidden = getattr(scene.integrator(), "hide_emitters", False)
     for bounce in range(bounces + 1):
         si = scene.ray_intersect(ray, active)
+        if hidden and bounce == 0:
+            si = _behind_lamps(scene, ray, si, active)
         dr.eval(si, throughput, pdf, active, ray)
-        yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid())
+        seen = mi.Bool(bounce > 0 or not hidden)
+        yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid() & seen)
         active &= si.is_valid()
         if bounce == bounces:
             break
@@ -115,6 +122,15 @@ def trace(
         )
         active &= dr.max(dr.abs(throughput)) > 0
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
+
+
+def _behind_lamps(scene, ray, si, active):
+    """Return what camera rays meet behind shapes that are lamps."""
+    lamp = active & si.is_valid() & (si.shape.emitter() != None)  # noqa: E711 (an array)
+    onwards = si.spawn_ray(ray.d)
+    found = scene.integrator().skip_area_emitters(scene, onwards, False, lamp)
+    behind = found.compute_surface_interaction(onwards, mi.RayFlags.All, lamp)
+    return dr.select(lamp, behind, si)
 
 
 def _camera_rays(sensor, pixel, sample):

@@ -19,7 +19,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
     Parameters
     ----------
     scene : mi.Scene
-        Its film gives size, crop and filter; pixels are RGB without alpha.
+        Its film gives size, crop and filter.
     integrator : mi.Integrator
         A sampling integrator, such as ``path``.
     spp : int
@@ -31,8 +31,9 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
 
     Returns
     -------
-    array (height, width, 3) float64
-        sum f(p - s) L(s) / sum f(p - s), over the samples s near a pixel p, f the film's filter.
+    array (height, width, 4) float64
+        sum f(p - s) L(s) / sum f(p - s), over the samples s near a pixel p, f the film's filter; and alpha,
+        the same of samples whose path hits something that is not hidden.
     """
     sensor = scene.sensors()[0]
     film = sensor.film()
@@ -51,20 +52,20 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
     pixel = dr.arange(mi.UInt32, count) // spp
     corner = mi.Point2f(mi.Float(pixel % across), mi.Float(pixel // across)) - border
     inside = sampler.next_2d()
-    radiance = _radiance(scene, integrator, sampler, corner + inside, spp, medium)
-    dr.eval(radiance, inside)  # the sums below must not trace again
+    channels = _radiance(scene, integrator, sampler, corner + inside, spp, medium)
+    dr.eval(channels, inside)  # the sums below must not trace again
 
     def summed(weight):
-        """Sum weighted radiance and weights of a pixel's samples, (down, across, 4)."""
-        parts = [dr.block_sum(mi.Float64(weight * channel), spp).numpy() for channel in (*radiance, 1)]
-        return np.stack(parts, axis=-1).reshape(down, across, 4)
+        """Sum weighted radiance and weights of a pixel's samples, (down, across, 5)."""
+        parts = [dr.block_sum(mi.Float64(weight * channel), spp).numpy() for channel in (*channels, 1)]
+        return np.stack(parts, axis=-1).reshape(down, across, 5)
 
     if box:
         total = summed(dr.full(mi.Float, 1, count))
     else:
         reach = int(np.ceil(rfilter.radius() - 0.5))
         steps = range(-reach, reach + 1)
-        padded = np.zeros((down + 2 * reach, across + 2 * reach, 4))
+        padded = np.zeros((down + 2 * reach, across + 2 * reach, 5))
         for dy in steps:
             vertical = rfilter.eval(dy + 0.5 - inside.y)
             for dx in steps:
@@ -72,11 +73,11 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
                 padded[reach + dy : reach + dy + down, reach + dx : reach + dx + across] += part
         total = padded[reach : reach + down, reach : reach + across]
     total = total[border : border + height, border : border + width]
-    return total[..., :3] / np.where(total[..., 3:] == 0, 1, total[..., 3:])
+    return total[..., :4] / np.where(total[..., 4:] == 0, 1, total[..., 4:])
 
 
 def _radiance(scene, integrator, sampler, position, spp, medium):
-    """Trace one path a position, in pixels from the crop's corner."""
+    """Trace one path a position, in pixels from the crop's corner; returns red, green, blue and alpha."""
     sensor = scene.sensors()[0]
     lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = sensor.shutter_open()
@@ -86,5 +87,5 @@ def _radiance(scene, integrator, sampler, position, spp, medium):
         time, 0, position / mi.Vector2f(sensor.film().crop_size()), lens
     )
     ray.scale_differential(spp**-0.5)
-    radiance, _, _ = integrator.sample(scene, sampler, ray, medium)
-    return mi.Color3f(mi.unpolarized_spectrum(weight * radiance))
+    radiance, valid, _ = integrator.sample(scene, sampler, ray, medium)
+    return *mi.Color3f(mi.unpolarized_spectrum(weight * radiance)), dr.select(valid, mi.Float(1), 0)

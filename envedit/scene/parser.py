@@ -82,11 +82,13 @@ def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     if plugin != "constant" and "to_world" in node.props:
         matrix = _matrix(node.props["to_world"], place_of(state, node, where))
     rotation = matrix[:3, :3]
-    proper = np.isfinite(rotation).all() and np.linalg.det(rotation) > 0
-    if not proper or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
+    # A uniform scale has no meaning at infinity.
+    size = np.cbrt(np.linalg.det(rotation)) if np.isfinite(rotation).all() else 0.0
+    rotation = rotation / size if size > 0 else rotation
+    if not size > 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
         raise InputError(
-            f"{place_of(state, node, where)}: to_world of the environment emitter scales, shears or mirrors; "
-            "wanted a rotation (the axis of <rotate> has length 1)"
+            f"{place_of(state, node, where)}: to_world of the environment emitter stretches, shears or "
+            "mirrors; wanted a rotation (the axis of <rotate> has length 1)"
         )
     rotation = rotation @ _ENVIRONMENTS[plugin]
     matrix = np.eye(4)  # where an environment stands has no meaning: a translation is dropped

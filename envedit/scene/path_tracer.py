@@ -52,11 +52,13 @@ class PathTracer:
                 f"renderer.spp: {self.spp} samples of {scene.width}x{scene.height} pixels are more than one "
                 f"rendering can hold, {_MOST_SAMPLES}: lower [renderer] spp or [scene] width"
             )
-        self.depth = AUTO_DEPTH if max_depth == "auto" else max_depth
+        most = AUTO_DEPTH if scene.max_depth < 0 else min(AUTO_DEPTH, scene.max_depth)
+        self.depth = most if max_depth == "auto" else max_depth
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
         installed_plugins.come_first()
-        self._integrator = mi.load_dict({"type": "prb", "max_depth": self.depth, "rr_depth": self.depth + 1})
+        asked = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": scene.hide_emitters}
+        self._integrator = mi.load_dict({"type": "prb", **asked})
         self._index = None
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
@@ -69,7 +71,7 @@ class PathTracer:
         params[self.scene.envmap_key] = mi.TensorXf(data, (height, width + 2, 3))
         params.update()
         seed = mi.sample_tea_32(2 * step, self.seed)
-        return mi.render(
+        picture = mi.render(
             self.scene.mi,
             params,
             integrator=self._integrator,
@@ -77,6 +79,7 @@ class PathTracer:
             seed=int(seed[0]),
             seed_grad=int(seed[1]),
         )
+        return picture[..., :3] if self.scene.hide_emitters else picture
 
     def state(self) -> dict:
         """Return what a checkpoint must hold: nothing, the seeds follow from the step."""

@@ -1,24 +1,28 @@
 """Load a Mitsuba scene lit by one environment emitter, and render it under any map: the reference renderer.
 
 A scene comes from an XML file, a dict or the name of a shipped scene. Mitsuba's parser turns it into a list
-of nodes, and four things are changed there before anything is built, so that a broken reference in a part
+of nodes, and five things are changed there before anything is built, so that a broken reference in a part
 that is not used cannot get in the way:
 
 - the environment emitter, whatever its kind, becomes an ``envmap`` with the same orientation whose texels
   are set by :meth:`Scene.set_envmap`;
 - the film gets the asked size and float32 RGB; its reconstruction filter stays the author's;
+- the integrator gives way to ``path``, with the path depth and ``hide_emitters`` that it asks for;
 - a rough BSDF whose alpha is at most 1e-4, which Mitsuba would clamp, becomes its limit, the smooth one;
 - a shape with the properties ``fit_height`` (and ``fit_up``, one of x, y, z with or without a minus) is
   centred on the y axis, set on the plane y = 0 and scaled to that height, or to 1.5 times it in width.
 
-With scene and camera fixed a rendering is I = T E + I_0: linear in the map E, plus a constant I_0 where the
-scene has lamps besides its environment, which stay as they are.
+Maps are radiance as it reaches the scene: a ``scale`` of the environment emitter is in them, and not in what
+is built (:mod:`envedit.inputs` applies it to what a file holds). With scene and camera fixed a rendering is
+I = T E + I_0: linear in the map E, plus a constant I_0 where the scene has lamps besides its environment,
+which stay as they are.
 """
 
 from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import hashlib
 import os
 from dataclasses import dataclass
@@ -31,7 +35,7 @@ import numpy as np
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
-from envedit.scene import film, parser, scene_text
+from envedit.scene import film, parser, scene_text, supported
 
 __all__ = ["Scene", "load"]
 
@@ -42,6 +46,7 @@ QUIET_DECIBELS = 48.0
 QUIET_LEAST, QUIET_MOST = 256, 768
 """Samples a pixel between which a rendering of "auto" ends."""
 _QUIET_PASS = 64  # samples a pixel
+_ALPHA_SPP = 256
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -70,6 +75,14 @@ class Scene:
         Comments and the place of the files do not count.
     params : mitsuba.SceneParameters
         ``mi.traverse`` of the scene.
+    own : supported.OwnMap
+        File and scale of the map that the scene itself names.
+    max_depth : int
+        Longest path in segments that the scene's integrator asks for, as Mitsuba counts them; -1: any.
+    hide_emitters : bool
+        The camera sees neither the environment nor shapes that are lamps.
+    notes : tuple of str
+        What of the file is not used, or used otherwise.
     """
 
     mi: mi.Scene
@@ -80,6 +93,19 @@ class Scene:
     to_world: np.ndarray
     digest: str
     params: mi.SceneParameters
+    own: supported.OwnMap = supported.OwnMap(None, 1.0)
+    max_depth: int = -1
+    hide_emitters: bool = False
+    notes: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def alpha(self) -> np.ndarray | None:
+        """Share of each pixel that sees a surface, (h, w) float32; None unless emitters are hidden."""
+        if not self.hide_emitters:
+            return None
+        self.set_envmap(np.zeros((4, 8, 3), np.float32))
+        picture = self._traced(min(_ALPHA_SPP, self._pass_samples()), 0, 0, 2)
+        return np.clip(picture[..., 3], 0, 1).astype(np.float32)
 
     def set_envmap(self, image) -> None:
         """Light the scene by a map.
@@ -112,7 +138,7 @@ class Scene:
         self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
         self.params.update()
 
-    def render(self, image, spp: int = 64, seed: int = 0, max_depth: int = -1) -> np.ndarray:
+    def render(self, image, spp: int = 64, seed: int = 0, max_depth: int | None = None) -> np.ndarray:
         """Render the scene under a map by Mitsuba's ``path`` integrator, with fresh samples.
 
         The samples are split into passes of at most 2^22, each with its own seed derived from ``seed``, and
@@ -126,8 +152,9 @@ class Scene:
             Samples per pixel.
         seed : int
             The same seed gives the same samples.
-        max_depth : int
-            Longest path in segments, as Mitsuba counts them: 2 is direct light; -1 has no bound.
+        max_depth : int, optional
+            Longest path in segments, as Mitsuba counts them: 2 is direct light; -1 has no bound. None: the
+            scene's own.
 
         Returns
         -------
@@ -143,7 +170,7 @@ class Scene:
         """
         spp = _whole("spp", spp, 1)
         seed = _whole("seed", seed, 0)
-        max_depth = _whole("max_depth", max_depth, -1)
+        max_depth = self.max_depth if max_depth is None else _whole("max_depth", max_depth, -1)
         self.set_envmap(image)
         most = self._pass_samples()
         counts = [most] * (spp // most) + ([spp % most] if spp % most else [])
@@ -189,7 +216,7 @@ class Scene:
         count = min(self._pass_samples(), _QUIET_PASS)
         total, shown, power = 0.0, 0.0, 0.0
         for i in range(QUIET_MOST // count):
-            picture = self._pass(count, seed, i, -1)
+            picture = self._pass(count, seed, i, self.max_depth)
             display = tonemap(picture)
             total, shown, power = total + picture, shown + display, power + display**2
             n = i + 1
@@ -204,9 +231,14 @@ class Scene:
         return 4 ** (max(0, (_PASS_SAMPLES // (self.width * self.height)).bit_length() - 1) // 2)
 
     def _pass(self, count, seed, i, max_depth):
-        """Render one pass, float64."""
+        """Render one pass, (h, w, 3) float64."""
+        return self._traced(count, seed, i, max_depth)[..., :3]
+
+    def _traced(self, count, seed, i, max_depth):
+        """Render one pass with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
-        integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": False})
+        asked = {"type": "path", "max_depth": max_depth, "hide_emitters": self.hide_emitters}
+        integrator = mi.load_dict(asked)
         pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
         return film.render(self.mi, integrator, count, pass_seed)
 
@@ -270,6 +302,40 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: came {mi.variant()}, wanted one that ends in _rgb, such as llvm_ad_rgb")
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
+    config, state, path, where, folders = _parsed(file, parameters, base)
+    own = supported.own_map(state, where, folders)
+    asked = supported.take_integrator(state, where)
+    notes = (*own.notes, *asked.notes, *supported.check_sensors(state, where))
+    emitter, to_world = parser.replace_environment(state, where)
+    digest = hashlib.sha256(b"envedit scene 1")
+    parser.set_film(state, where, width, height)
+    parser.find_files(state, where, folders)
+    for node in state.nodes:
+        parser.smooth_limit(state, node)
+        parser.fit_to_stage(state, node)
+        parser.hash_node(digest, node)
+    emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
+    name = str(emitter.id())
+    parser.set_sampler(state, sampler)  # after the digest: light transport has its own samples
+    # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
+    for node in state.nodes:
+        for key in node.props.keys():  # noqa: SIM118 (no dict)
+            node.props.mark_queried(key, False)
+
+    with _two_threads():
+        built = parser.told(where, mi.parser.instantiate, config, state)
+    scene = built[0] if isinstance(built, list | tuple) else built
+    if scene.environment() is None or scene.environment().id() != name:
+        raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
+    params = mi.traverse(scene)
+    key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
+    columns, rows = (int(n) for n in scene.sensors()[0].film().crop_size())
+    told = own, asked.max_depth, asked.hide_emitters, notes
+    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told)
+
+
+def _parsed(file, parameters, base):
+    """Parse a scene; returns Mitsuba's configuration and state, the file, its name and where files lie."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = False  # shapes keep their names
     config.unused_parameters = mi.LogLevel.Debug  # checked here, with the nearest name
@@ -289,36 +355,44 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
             state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
     scene_text.check_references(state, where)
     parser.told(where, mi.parser.transform_all, config, state)
-
     parser.lower_names(state)
     installed_plugins.come_first()
     for node in state.nodes:
         installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
-    emitter, to_world = parser.replace_environment(state, where)
-    digest = hashlib.sha256(b"envedit scene 1")
-    parser.set_film(state, where, width, height)
+    return config, state, path, where, folders
+
+
+def relit(file, envmap: str, parameters=None, base=None) -> str:
+    """Return the XML of a scene that is lit by another map and otherwise as its author has it.
+
+    Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
+    and what plain Mitsuba does not know (``fit_height``, names in capitals) is written out. The environment
+    emitter becomes an ``envmap`` with the same rotation and ``scale``; a scene without an integrator gets
+    ``path``.
+
+    Parameters
+    ----------
+    file, parameters, base
+        As of :func:`load`.
+    envmap : str
+        Name of the map's file, as it shall stand in the XML.
+
+    Raises
+    ------
+    ConfigError, InputError
+        As of :func:`load`.
+    """
+    _, state, _, where, folders = _parsed(file, parameters, base)
+    own = supported.own_map(state, where, folders)
+    emitter, _ = parser.replace_environment(state, where)
     parser.find_files(state, where, folders)
     for node in state.nodes:
         parser.smooth_limit(state, node)
         parser.fit_to_stage(state, node)
-        parser.hash_node(digest, node)
-    emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
-    own = str(emitter.id())
-    parser.set_sampler(state, sampler)  # after the digest: light transport has its own samples
-    # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
-    for node in state.nodes:
-        for name in node.props.keys():  # noqa: SIM118 (no dict)
-            node.props.mark_queried(name, False)
-
-    with _two_threads():
-        built = parser.told(where, mi.parser.instantiate, config, state)
-    scene = built[0] if isinstance(built, list | tuple) else built
-    if scene.environment() is None or scene.environment().id() != own:
-        raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
-    params = mi.traverse(scene)
-    key = next(k for k, _ in params if k.split(".")[-2:] == [own, "data"])
-    columns, rows = (int(n) for n in scene.sensors()[0].film().crop_size())
-    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params)
+    emitter["filename"] = envmap
+    emitter["scale"] = own.scale
+    supported.ensure_integrator(state)
+    return mi.parser.write_string(state)
 
 
 # ----------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from envedit import config
+from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
@@ -103,9 +103,10 @@ def make(
         If a file cannot be read, a picture does not fit the film, or the other map is brighter than
         :data:`.radiance.BRIGHTEST`. A picture that is so bright is cut there, with a warning.
     """
-    chosen = settings.target
+    chosen, alpha = settings.target, scene.alpha
+    hidden = None if alpha is None else alpha == 0
     if picture is None and chosen.kind == "envmap":
-        return _rendered(settings, scene, envmap)
+        return _seen(_rendered(settings, scene, envmap), hidden)
     shape = scene.height, scene.width
     initial, asked = painted_image.initial(scene, envmap, settings), ()
     if picture is not None:
@@ -132,7 +133,19 @@ def make(
     source += (
         f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
     )
-    return Target(picture, weight, None, source, warnings, initial, found.coverage, asked)
+    return _seen(Target(picture, weight, None, source, warnings, initial, found.coverage, asked), hidden)
+
+
+def _seen(target, hidden):
+    """Take the pixels that see no surface, where the scene hides what lights it, out of the loss."""
+    if hidden is None or not hidden.any():
+        return target
+    weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight
+    weight = np.where(hidden[..., None], 0, weight).astype(np.float32)
+    if not weight.any():
+        raise InputError("target: no pixel counts: none that is asked for sees a surface (hide_emitters)")
+    share = f"{100 * hidden.mean():.3g} % of the pixels see no surface (hide_emitters) and do not count"
+    return replace(target, weight=weight, source=f"{target.source}; {share}")
 
 
 def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
@@ -160,6 +173,7 @@ def _rendered(settings, scene, envmap):
     if chosen.file:
         true, info = images.load_envmap(chosen.file, envmap.shape[1], settings.input.repair)
         require_radiance(true, str(chosen.file), brightest=BRIGHTEST)
+        true = inputs.scaled(true, scene.own.scale, str(chosen.file))
         source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
     else:
         true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()

@@ -172,7 +172,10 @@ class LightTransport:
             by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
             light = {"by_row": by_row, "by_bounce": by_bounce}
             cache.store(origin | {"part": "pilot"}, light)
-        bounces, choices = choose_bounces(scene, max_depth, light["by_bounce"])
+        by_bounce = np.array(light["by_bounce"])
+        if scene.max_depth > 0:
+            by_bounce[scene.max_depth :] = 0
+        bounces, choices = choose_bounces(scene, max_depth, by_bounce)
         mass = row_mass(sphere, light["by_row"])
         spp, capacity, choice = choose_samples(scene, spp, height * width, memory_gb)
         grid = Grid(height, width, scene.to_world, mass)
@@ -182,10 +185,11 @@ class LightTransport:
         )
         if few:
             transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
-        transport.depth_error = left_out(light["by_bounce"], bounces)
+        transport.depth_error = left_out(by_bounce, bounces)
         rows = hashlib.sha256(mass.tobytes()).hexdigest()
         # The light of other lamps is constant: it need not be cut where no path depth is asked for.
-        lamps = (-1 if max_depth == "auto" else bounces + 1) if len(scene.mi.emitters()) > 1 else 0
+        most = scene.max_depth if max_depth == "auto" else bounces + 1
+        lamps = most if len(scene.mi.emitters()) > 1 else 0
         key = origin | {
             "part": "recording", "samples": spp, "bounces": bounces, "lamps": lamps, "rows": rows
         }  # fmt: skip

@@ -39,8 +39,8 @@ def main():
             "target": {"rotate_degrees": given.angle},
         }
     )
-    original, _ = inputs.load_map(settings.input)
     lit = inputs.load_scene(settings.scene)
+    original, _ = inputs.load_map(settings.input, lit)
     wanted = target.make(settings, lit, original)
     transport = renderers.trace(settings, lit, original.shape[:2])
     first, last = inputs.active_rows(settings.input.rows, original.shape[0])

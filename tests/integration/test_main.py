@@ -36,7 +36,7 @@ def test_a_written_configuration_loads(scene, tmp_path, capsys):
     file = tmp_path / "edit.toml"
     assert init.main([scene, "--out", str(file)]) == 0 and str(file) in capsys.readouterr().out
     settings = config.load(file)
-    assert settings.scene.file == scene and settings.input.envmap == "sunsky"
+    assert settings.scene.file == scene and settings.input.envmap == "auto"
 
 
 def test_files_of_a_written_configuration_are_relative_to_it(tmp_path, monkeypatch, capsys):

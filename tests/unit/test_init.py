@@ -71,7 +71,7 @@ def test_nothing_is_overwritten(kind, here, capsys):
     [
         (["sphre"], ["SCENE: got sphre: no such file", "sphere, statue", "did you mean sphere?"]),
         (["my.xml"], ["SCENE: got my.xml: no such file", "sphere, statue", "check the path"]),
-        (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "or sunsky"]),
+        (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "scene, sunsky"]),
         (["--envmap", "sunski"], ["did you mean sunsky?"]),
         (["--out", "none/edit.toml"], ["none/edit.toml: cannot be written", "folder does not exist"]),
     ],

@@ -579,7 +579,7 @@ def test_exported_and_painted_on(ending, name, initial, tmp_path):
     pixels, info = images.read_stored(file)
     stored = info["metadata"]
     assert {k: str(stored[f"envedit.{k}"]) for k in ("scene", "envmap", "seed")} == {
-        "scene": "sphere", "envmap": "sunsky", "seed": "3"
+        "scene": "sphere", "envmap": "auto", "seed": "3"
     }  # fmt: skip
     assert stored["envedit.tonemap"] == ("linear" if ending == ".exr" else name)
     refused(["nothing of it is painted"], file, SIZE, name, initial)

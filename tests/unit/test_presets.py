@@ -179,7 +179,7 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
 
 def test_names_that_are_no_paths_stay():
     config = cfg.loads("[scene]\nfile = 'mirror'", base_dir="/d")
-    assert config.scene.file == "mirror" and config.input.envmap == "sunsky" and config.target.file == ""
+    assert config.scene.file == "mirror" and config.input.envmap == "auto" and config.target.file == ""
     config = cfg.loads("[scene]\nfile = './mirror'\n[input]\nenvmap = './sunsky'", base_dir="/d")
     assert config.scene.file == "/d/mirror" and config.input.envmap == "/d/sunsky"
 

@@ -26,7 +26,7 @@ def test_an_empty_file_gives_the_defaults():
     config = cfg.loads("")
     assert config.preset == "standard" and config.seed == 0 and config.variant == "llvm_ad_rgb"
     assert config == dataclasses.replace(cfg.Config(), output=config.output)
-    assert config.input == cfg.Input(envmap="sunsky", width=256, rows="all")
+    assert config.input == cfg.Input(envmap="auto", width=256, rows="all")
     assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
     assert config.representation.kind == "layers" and config.representation.cycles == "auto"
     assert config.loss.ssim == 0.1 and config.optimizer.iterations == 100

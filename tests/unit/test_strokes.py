@@ -512,7 +512,7 @@ def test_every_way_to_write_strokes_is_the_same():
 )
 def test_the_edits_that_come_ready_paint_something(name, rng):
     config = cfg.load(EDITS / f"{name}.toml")
-    assert config.target.kind == "strokes" and config.input.envmap == "sunsky" and config.preset == "standard"
+    assert config.target.kind == "strokes" and config.input.envmap == "auto" and config.preset == "standard"
     assert cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="b.toml") == config
     picture = (0.2 + 0.1 * rng.random((128, 128, 3))).astype(np.float32)
     found = strokes.paint(picture, config.target.strokes, config.target.tonemap)

@@ -1,0 +1,83 @@
+"""The edited map as files that other programs take: in their formats, as sky and lights, and as a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config, results
+from envedit.core import atomic_files
+from envedit.core.errors import InputError
+from envedit.core.radiance import HALF_MAX
+from envedit.export import light_list
+from envedit.images import images, layered_exr
+from envedit.report import manifest
+from envedit.scene import scene
+
+
+def write_map(settings: config.Output, path: Path, envmap: np.ndarray, source: str) -> list[str]:
+    """Write a map in the format asked for.
+
+    Parameters
+    ----------
+    settings : config.Output
+        Format, and whether half.
+    path : Path
+        File without its ending.
+    envmap : ndarray (H, W, 3)
+        Linear values.
+    source : str
+        The file that was edited.
+
+    Returns
+    -------
+    list of str
+        Warnings: what half could not hold.
+    """
+    if settings.format == "hdr":
+        images.write_hdr(path.with_suffix(".hdr"), envmap)
+        return []
+    name = path.with_suffix(".exr")
+    if not settings.half:
+        if path.name == "edited":
+            images.write_exr(name, envmap, {"source": source})
+        else:
+            layered_exr.write(name, {"edited": envmap})  # on all cores: it may be large
+        return []
+    images.write_exr(name, np.minimum(envmap, HALF_MAX), {"source": source}, half=True)
+    over = (envmap > HALF_MAX).any(axis=2)
+    if not over.any():
+        return []
+    lost = 100 * float(np.maximum(envmap - HALF_MAX, 0).sum(dtype=np.float64) / envmap.sum(dtype=np.float64))
+    return [
+        f"{name}: {over.sum()} texels are brighter than {HALF_MAX:g}, the largest half, and are cut there: "
+        f"{lost:.2g} % of the sum of all texels is lost; set output.half = false"
+    ]
+
+
+def write_lights(folder: Path, result: results.Result) -> None:
+    """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
+    source = {"source": result.given.source}
+    sky, lights = light_list.split(result.envmap)
+    images.write_exr(folder / "edited_sky.exr", sky, source)
+    images.write_exr(folder / "edited_lights.exr", lights, source)
+    before, after = (light_list.listed(result.maps[name], result.to_world) for name in ("initial", "edited"))
+    manifest.write_metrics(folder / "lights.json", {"before": before, "after": after})
+
+
+def write_scene(settings: config.Config, folder: Path, base: Path | None = None) -> list[str]:
+    """Write ``edited.xml``: the scene lit by the edited map, which lies beside it.
+
+    Returns
+    -------
+    list of str
+        A warning, if it cannot be written.
+    """
+    chosen = settings.scene
+    try:
+        text = scene.relit(chosen.file, f"edited.{settings.output.format}", dict(chosen.parameters), base)
+    except InputError as error:  # the scene's files may be gone by now
+        return [f"edited.xml is not written: {error}"]
+    atomic_files.write_atomically(folder / "edited.xml", text.encode())
+    return []

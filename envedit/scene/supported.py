@@ -1,0 +1,202 @@
+"""What of a parsed Mitsuba scene is used, what is left out, and what is refused by name.
+
+``docs/scenes.md`` lists every plugin, checked by ``tests/oracle/test_supported_scenes.py``. Each function
+takes the parser's ``state`` and ``where``, what errors call the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core.errors import InputError
+from envedit.scene.parser import place_of
+
+SENSORS = ("perspective", "thinlens", "orthographic")
+"""Sensors whose rays make a picture; others are refused."""
+PATHS = ("path", "prb", "prb_basic", "prb_projective", "ptracer")
+"""Integrators of surfaces, of any path depth."""
+DIRECT = ("direct", "direct_projective")
+"""Integrators of direct light alone, which are paths of two segments."""
+VOLUMES = ("volpath", "volpathmis", "prbvolpath")
+"""Integrators that would follow light through media."""
+WRAPPERS = ("aov", "moment", "stokes")
+"""Integrators that render by another one inside."""
+
+_ROUNDING = 1e-3  # of a rotation's columns that a file gives with few digits
+
+
+@dataclass(frozen=True)
+class OwnMap:
+    """The map that a scene's environment emitter names.
+
+    Attributes
+    ----------
+    file : Path or None
+        Its file, which need not exist; None where the emitter is no ``envmap`` or names none.
+    scale : float
+        What the emitter multiplies any map by, above 0.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    file: Path | None
+    scale: float
+    notes: tuple[str, ...] = ()
+
+
+def own_map(state, where: str, folders) -> OwnMap:
+    """Read the file and the ``scale`` of the scene's ``envmap`` emitter, before it is replaced.
+
+    Raises
+    ------
+    InputError
+        ``scale`` is not a finite number above 0.
+    """
+    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter and n.props.plugin_name() == "envmap"]
+    if len(nodes) != 1:
+        return OwnMap(None, 1.0)
+    props = nodes[0].props
+    scale = props.get("scale", 1.0)
+    number = isinstance(scale, int | float) and not isinstance(scale, bool)
+    if not number or not math.isfinite(scale) or not 0 < np.float32(scale) < np.inf:
+        raise InputError(
+            f"{place_of(state, nodes[0], where)}: scale of the environment map is {scale}, expected a number "
+            "above 0"
+        )
+    matrix = getattr(props.get("to_world", None), "matrix", None)
+    size = 1.0 if matrix is None else np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0])
+    notes = ()
+    if np.isfinite(size) and abs(size - 1) > _ROUNDING:
+        notes = (
+            f"to_world of the environment map scales by {size:.4g}: taken as the rotation in it, while "
+            "Mitsuba would look up wrong elevations",
+        )
+    name = props.get("filename", None)
+    if not isinstance(name, str) or not name:
+        return OwnMap(None, float(scale), notes)
+    found = [folder / name for folder in folders if (folder / name).is_file()]
+    return OwnMap(Path(found[0] if found else folders[0] / name), float(scale), notes)
+
+
+@dataclass(frozen=True)
+class Integrator:
+    """What the scene's integrator asks of a rendering.
+
+    Attributes
+    ----------
+    max_depth : int
+        Longest path in segments, as Mitsuba counts; -1: any.
+    hide_emitters : bool
+        The camera does not see the environment, nor shapes that are lamps.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    max_depth: int
+    hide_emitters: bool
+    notes: tuple[str, ...]
+
+
+def take_integrator(state, where: str) -> Integrator:
+    """Read what the integrator asks for and put ``path`` in its place, so that it is never built.
+
+    Raises
+    ------
+    InputError
+        The scene has a participating medium and an integrator that would render it, or ``max_depth`` gives
+        no picture.
+    """
+    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Integrator]
+    node = next(iter(nodes), None)
+    while node is not None and node.props.plugin_name() in WRAPPERS:
+        inside = [n for n in _references(state, node) if n.type == mi.ObjectType.Integrator]
+        if not inside:
+            break
+        node = inside[0]
+    name, depth, hide, notes = "path", -1, False, []
+    if node is not None:
+        props, name = node.props, node.props.plugin_name()
+        hide = props.get("hide_emitters", False) is True
+        if name in DIRECT:
+            depth = 2
+        elif name in PATHS + VOLUMES:
+            depth = props.get("max_depth", -1)
+        else:
+            notes.append(f"integrator {name} is not used: rendered by path, with paths of any length")
+        if isinstance(depth, bool) or not isinstance(depth, int) or depth < -1 or not depth:
+            raise InputError(
+                f"{place_of(state, node, where)}: max_depth is {depth}, expected -1 or a whole number above 0"
+            )
+    _check_media(state, where, name, notes)
+    for n in nodes:
+        identity = n.props.id()
+        n.props = mi.Properties("path")
+        n.props.set_id(identity)
+        n.props["max_depth"], n.props["hide_emitters"] = depth, hide
+    return Integrator(depth, hide, tuple(notes))
+
+
+def ensure_integrator(state) -> None:
+    """Give a scene without an integrator ``path``.
+
+    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+    """
+    if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
+        return
+    root = next(n for n in state.nodes if n.type == mi.ObjectType.Scene)
+    root.props["integrator"] = mi.Properties.ResolvedReference(len(state.nodes))
+    node = mi.parser.SceneNode()
+    node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
+    state.nodes.append(node)
+
+
+def _check_media(state, where, integrator, notes):
+    """Refuse media that the scene's integrator would render; say that another one leaves them out."""
+    media = [n for n in state.nodes if n.type == mi.ObjectType.Medium]
+    if not media:
+        return
+    kind = media[0].props.plugin_name()
+    if integrator in VOLUMES:
+        raise InputError(
+            f"{place_of(state, media[0], where)}: participating medium ({kind}): envedit renders "
+            "surfaces only; remove the medium from the scene"
+        )
+    notes.append(f"medium {kind} is not rendered, as the scene's integrator ({integrator}) has no media")
+
+
+def check_sensors(state, where: str) -> tuple[str, ...]:
+    """Refuse a first sensor that makes no picture; say which of several is used.
+
+    Raises
+    ------
+    InputError
+        The first sensor is of a kind that cannot be used.
+    """
+    sensors = [n for n in state.nodes if n.type == mi.ObjectType.Sensor]
+    if not sensors:
+        return ()
+    kind = sensors[0].props.plugin_name()
+    if kind not in SENSORS:
+        raise InputError(
+            f"{place_of(state, sensors[0], where)}: sensor {kind} makes no picture to edit by; "
+            f"expected {', '.join(SENSORS)}"
+        )
+    if len(sensors) == 1:
+        return ()
+    others = ", ".join(_name(n) for n in sensors[1:4]) + (", ..." if len(sensors) > 4 else "")
+    return (f"{len(sensors)} sensors: the first is used ({_name(sensors[0])}), not {others}",)
+
+
+def _name(node):
+    return f"{node.props.plugin_name()} {node.props.id()}".strip()
+
+
+def _references(state, node):
+    """List the nodes that a node refers to."""
+    values = [value for _, value in node.props.items()]
+    return [state.nodes[v.index()] for v in values if isinstance(v, mi.Properties.ResolvedReference)]

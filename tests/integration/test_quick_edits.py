@@ -1,0 +1,86 @@
+"""Edits of a scene without a configuration, and runs that programs read."""
+
+import json
+
+import numpy as np
+import pytest
+
+from envedit import config
+from envedit.images import images
+from tests.oracles import users_scenes
+from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
+from tests.oracles.runs import TINY, call, changed, no_constant, pixels, world
+from tests.oracles.users_scenes import PATH, light
+
+pytestmark = pytest.mark.usefixtures("isolated")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with a scene that has a map, and another map."""
+    users_scenes.write(tmp_path, (PATH, SENSOR, BALL, light(2)))
+    images.write_exr(tmp_path / "other.exr", sky(np.random.default_rng(1)) + 0.1)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def small():
+    """Return the options of a short run."""
+    keys = {f"{table}__{key}": value for table, keys in TINY.items() for key, value in keys.items()}
+    return changed(**keys | {"scene__width": 16, "optimizer__iterations": 1})
+
+
+@pytest.mark.parametrize("option", [["--rotate", "90"], ["--target", "other.exr"], ["--paint", "paint.exr"]])
+def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
+    if option[0] == "--paint":
+        assert call("scene.xml", *small(), "--export-initial", "paint.exr", "--quiet") == 0
+        picture = pixels(here / "paint.exr")
+        picture[:4] *= 0.5
+        images.write_exr(here / "paint.exr", picture, panorama=False)
+    assert call("scene.xml", *option, *small(), "--json", "--progress", "json") == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out, parse_constant=no_constant)
+    assert found["ok"] and found["exit_code"] == 0 and found["folder"] == str(here / "scene_out")
+    assert found["metrics"]["render"]["psnr"] > 0 and found["files"]["edited.exr"].endswith("edited.exr")
+    lines = [json.loads(line) for line in err.splitlines()]
+    assert {"stage", "progress"} <= {line["event"] for line in lines} <= {"stage", "progress", "warning"}
+    assert any(line["event"] == "stage" and line["stage"] == "rendering the result" for line in lines)
+    # The configuration that was run lies beside the results, and runs to the same end.
+    ran = config.load(here / "scene_out" / "config.toml")
+    assert ran.scene.file == str(here / "scene.xml") and ran.input.envmap == "auto"
+    kind = "image" if option[0] == "--paint" else "envmap"
+    assert ran.target.kind == kind and (option[0] != "--rotate" or ran.target.rotate_degrees == 90)
+    before = pixels(here / "scene_out" / "edited.exr")
+    assert call(here / "scene_out" / "config.toml", "--quiet", "--out", "again") == 0
+    assert pixels(here / "again" / "edited.exr").tobytes() == before.tobytes()
+
+
+def test_a_shipped_scene_by_its_name_and_another_map(here):
+    assert call("matte", "--envmap", "other.exr", "--rotate", "90", *small(), "--quiet") == 0
+    ran = config.load(here / "matte_out" / "config.toml")
+    assert ran.scene.file == "matte" and ran.input.envmap == str(here / "other.exr")
+
+
+@pytest.mark.parametrize(
+    "arguments, code, says",
+    [
+        (["scene.xml", "--envmap", "none.exr"], 3, "none.exr"),
+        (["gone.xml"], 3, "gone.xml: no such file"),
+        (
+            ["c.toml", "--rotate", "9"],
+            2,
+            "--rotate: got it beside a configuration, expected it beside a scene",
+        ),
+        (["nothing"], 2, "no such configuration file"),
+        (["dark.xml", "--envmap", "scene"], 2, 'got "scene", but'),
+    ],
+)
+def test_what_goes_wrong_is_an_object_too(arguments, code, says, here, rng, capsys):
+    world(here, rng)
+    write_scene(here, SENSOR, BALL, LIGHT, name="dark.xml")
+    assert call(*arguments, "--json", "--progress", "json", "--quiet") == code
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert not found["ok"] and found["exit_code"] == code and says in found["error"]
+    last = json.loads(err.splitlines()[-1])
+    assert last == {"event": "error", "text": found["error"]}

@@ -16,9 +16,12 @@ def curves_svg(rows: list[dict], width=860, height=340) -> str:
     Columns that are no losses (iteration, learning rates, times) are left out, and so is what a logarithm
     cannot show: a value that is missing, not finite, zero or negative interrupts its line. The axis ends
     twelve decades below the largest value. An empty string where there is nothing to draw.
+
+    Losses that are in units of a ``sigma`` which changes from row to row cannot be compared: ``residual`` is
+    drawn in their place.
     """
-    series = {}
-    for name in columns(rows):
+    series, names = {}, columns(rows)
+    for name in ["residual"] if {"sigma", "residual"} <= set(names) else names:
         if name in _NOT_LOSSES or name.startswith(("lr_", "weight")) or name.endswith(_TIMES):
             continue
         points = []
@@ -61,7 +64,7 @@ def curves_svg(rows: list[dict], width=860, height=340) -> str:
             if y is not None:  # h0 makes a lone point visible
                 pen.append(f"{'L' if drawing else 'M'}{across(x):.1f} {down(y):.1f}{'' if drawing else 'h0'}")
             drawing = y is not None
-        total = ' class="total"' if name in ("loss", "total") else ""
+        total = ' class="total"' if name in ("loss", "total", "residual") else ""
         out.append(f'<path{total} stroke="{colour}" d="{"".join(pen)}"/>')
         if i < 14:
             last = next((y for _, y in reversed(points) if y is not None), low)

@@ -46,7 +46,8 @@ class Run:
     finished : bool
         No further step is made.
     history : list of dict
-        A row a step: ``loss`` F, its parts ``data`` and ``prior``, ``sigma``, ``damping``, ``step_ms``.
+        A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
+        taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
     """
 
     state: dict
@@ -81,7 +82,8 @@ class Solution:
     params : dict
         Of the layers.
     history : list of dict
-        A row a step: ``loss`` F, its parts ``data`` and ``prior``, ``sigma``, ``damping``, ``step_ms``.
+        A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
+        taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
     loss : float
         Akaike's (1974) criterion, lower for what is likelier: F at the noise that the residual shows, twice
         that noise's logarithm for each independent residual, and two for every unknown that the picture
@@ -310,6 +312,7 @@ class _Search:
             if better is not None:
                 point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
                 row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}
+                row["residual"] = float(np.sqrt(np.square(point.residual).mean()))
                 row |= {"damping": run.damping, "step_ms": round(1000 * (time.perf_counter() - began), 3)}
                 run.history.append({"iteration": len(run.history), **row})
             if after_step and (better is not None or run.finished):

@@ -10,7 +10,7 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import SPARE
+from envedit.representations.layers.lights import LOBE_DEGREES, SPARE
 from envedit.representations.layers.separation import Light
 from envedit.solve.light_search import LEAST, MOST, PROBES, Question, rotations
 from envedit.solve.matching_pursuit import LEAST_FLUX, Given, Place, Pursuit, not_negative, relative
@@ -27,6 +27,8 @@ CHANGE_ORDER = 0
 """Order of the background's gains for a painted change: an extreme gain explains any small stroke."""
 BESIDE = 8.0
 """Degrees from all others that a light of a painted change is born at least."""
+SOFT = 2.0
+"""Radius in degrees of the lobes that take the place of lights where a shadow is to be softer."""
 
 
 def start(
@@ -98,7 +100,10 @@ def softened(layers: Layers, params: dict) -> tuple[dict, list[str]]:
         own, other = layers.lights.flux[i], layers.lights.flux[len(places) + i]
         places[i], spare[i] = Place(None, np.zeros(3)), Place(light.direction, own / np.maximum(other, 1e-30))
     turn, flux = rotations(layers.lights, places + spare)
-    found = {"turn": tensor(turn / layers.scales["turn"]), "flux": tensor(flux / layers.scales["flux"])}
+    size = np.zeros((len(turn), 1))
+    size[len(places) :] = np.log(SOFT / LOBE_DEGREES)
+    real = {"turn": turn, "flux": flux, "size": size}
+    found = {name: tensor(value / layers.scales[name]) for name, value in real.items()}
     return params | found, [f"{len(lights)} of the lights start as soft lobes"]
 
 

@@ -455,7 +455,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
     whole = pipeline.run(settings)
     steps = len(whole.history)
     assert steps >= 3 and set(whole.history[0]) == {
-        "iteration", "loss", "data", "prior", "sigma", "damping", "step_ms"
+        "iteration", "loss", "data", "prior", "sigma", "residual", "damping", "step_ms"
     }  # fmt: skip
 
     folder = tmp_path / "run"

@@ -621,7 +621,7 @@ def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, 
     assert names(out) == FILES | INFLUENCE and differing(out, tmp_path / "whole") == set()
 
     rows = rows_of(out)
-    assert list(rows[0]) == ["iteration", "loss", "data", "prior", "sigma", "damping", "step_ms"]
+    assert list(rows[0]) == ["iteration", "loss", "data", "prior", "sigma", "residual", "damping", "step_ms"]
     assert [int(row["iteration"]) for row in rows] == list(range(len(rows))) and 2 < len(rows) <= 5
     for row, other in zip(rows, rows_of(tmp_path / "whole"), strict=True):
         values = {name: float(value) for name, value in row.items()}

@@ -92,3 +92,12 @@ def test_log_axis_has_readable_ticks(low, high, labels):
 @pytest.mark.parametrize("value, rounded", [(0.01, 0.01), (0.011, 0.02), (3, 5), (5.1, 10), (1e-20, 1e-20)])
 def test_scales_are_round(value, rounded):
     assert curves.round_up(value) == pytest.approx(rounded, rel=1e-12)
+
+
+def test_losses_in_units_of_a_changing_noise_are_not_drawn():
+    rows = [
+        {"iteration": i, "loss": 9 + i, "data": 8 + i, "sigma": 1 / (1 + i), "residual": 0.1 / (1 + i)}
+        for i in range(3)
+    ]
+    svg = curves.curves_svg(rows)
+    assert "residual 0.0333" in svg and "loss 1" not in svg and "data" not in svg

@@ -222,7 +222,7 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     def solved(problem, params, *_, trial):
         if ends[params] is lost:
             raise NumericalError("it cannot begin")
-        return types.SimpleNamespace(loss=ends[params])
+        return types.SimpleNamespace(loss=ends[params], run=None)
 
     monkeypatch.setattr(edit_job.Job, "newton", True)
     monkeypatch.setattr(edit_job.Job, "_sigma", 0.01)

@@ -68,7 +68,7 @@ def behind_glow(
     low = _blurred(logs, BLUR, rows)
     texture = np.square((logs - low) @ LUMINANCE)[..., None]
     around = np.maximum(_blurred(texture, 2 * BLUR, rows), 0)  # a cut spectrum rings
-    weight = glow.mean(axis=2, keepdims=True) ** -2.0
+    weight = np.maximum(glow.mean(axis=2, keepdims=True) ** -2.0, 1e-30)
 
     def at_elevation(values):
         mean = (values * weight).sum(axis=1) / weight.sum(axis=1)

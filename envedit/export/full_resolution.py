@@ -19,7 +19,7 @@ from envedit.core.errors import NumericalError, place_of
 from envedit.export.ratio_transfer import Ratio
 from envedit.export.texel_maps import Places, as_image
 from envedit.representations.layers import lights
-from envedit.representations.layers.layers import Layers, brightened, unseen_kept
+from envedit.representations.layers.layers import Layers, brightened, gone_of, unseen_kept
 from envedit.representations.layers.separation import grown
 
 POINTS_AT_ONCE = 1 << 20
@@ -150,6 +150,11 @@ class _LayersAt:
         self.free = layers.free
         if self.edge is not None and self.free is not None:
             self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
+        if self.relit:
+            # Rows that follow have it in their factor.
+            none = np.zeros_like(self.gain[layers.shape[0] :])
+            self.behind = [np.concatenate([f, none]) for f in (layers.behind.offset, layers.behind.slope)]
+            self.faint = dr.opaque(mi.Float, layers.behind.faint)
         above = np.full(self.height, True) if self.edge is None else grid.place < self.edge - 0.5
         self.follows = dr.opaque(mi.UInt32, int(above.sum()))
         # Of lights that stay, what their cores are multiplied by; of those that move, nothing is left.
@@ -231,7 +236,12 @@ class _LayersAt:
             before = self.layers.lights.glow(still, still, d)
             ratio = self.layers.lights.glow(self.real["turn"], self.real["flux"], d) / before
             ratio = dr.select(self._follow(start, row), 1, ratio)
-            sky *= ratio
+            offset, slope = (
+                self.grid.across(mi.Color3f, flat(mi.Float, field), row, column)
+                for field in (self.grid.along_rows(f, start, size, self.edge) for f in self.behind)
+            )
+            change = offset + slope * dr.log(base / before + self.faint)
+            sky *= ratio * dr.exp(gone_of(ratio) * change)
             same &= ratio == 1
         if core is not None:
             # The last is 1, for texels of no light.

@@ -1,1 +1,1 @@
-"""The solver of layers: public scenes, course of the objective, cost of its parts."""
+"""The solver of layers: course of the objective, cost of its parts."""

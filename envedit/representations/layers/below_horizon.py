@@ -93,10 +93,11 @@ class Below:
         self._faint = float(max(1e-6 * sky.mean(), 1e-30))
         angle = np.degrees(np.pi * np.arange(up, total) / max(total - 1, 1)) - 90
         self.fade = np.ones(low) if kind == "mirror" else np.exp(-angle / FADE)
-        blend = np.clip(angle / BLENDED, 0, 1)
+        self._blend = blend = np.clip(angle / BLENDED, 0, 1)
         self._sharp, self._soft = (tensor((s * self.fade)[:, None]) for s in (1 - blend, blend))
         self.mirrored = np.arange(low)[::-1]
         texel = self.mirrored[:, None] * (3 * width) + np.arange(3 * width)
+        self._behind = None
         self._mirrored = dr.opaque(mi.UInt32(texel.ravel().astype(np.uint32)))
         self._blur = _Blur((up, width), total, COLUMNS)
         self._up = tensor(self._blur.down[self.mirrored])
@@ -123,13 +124,28 @@ class Below:
             errors.append(omega @ np.square(varying(soft) - shown).mean(axis=1))
         return WIDEST[int(np.argmin(errors))]
 
-    def log_factor(self, sky: mi.TensorXf) -> mi.TensorXf:
-        """Return log R^f (rows, W, 3) under a sky (sky_rows, W, 3) without cores."""
+    def reveal(self, log_change: np.ndarray) -> None:
+        """Say what changes, (rows, W, 3), where all of a texel's light was a glow's and is gone.
+
+        From nothing at the horizon, which follows the sky's own change, to all of it at :data:`BLENDED`.
+        """
+        self._behind = tensor(log_change * self._blend[:, None, None])
+
+    def log_factor(self, sky: mi.TensorXf, gone: mi.Float | None = None) -> mi.TensorXf:
+        """Return log R^f (rows, W, 3) under a sky (sky_rows, W, 3) without cores.
+
+        With what is to be revealed, ``gone`` (sky_rows * W) is the share of a texel's light above the horizon
+        that was a glow's and is gone.
+        """
         soft = dr.log((self._blur(sky) + self._faint) / (self._before_soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
         sharp = dr.log((sky.array + self._faint) / (self._before.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
-        return dr.reshape(sharp * self._sharp + soft * self._soft, (*self.shape, 3))
+        factor = dr.reshape(sharp * self._sharp + soft * self._soft, (*self.shape, 3))
+        if self._behind is None or gone is None:
+            return factor
+        gone = dr.gather(mi.Float, gone, self._mirrored // 3)
+        return factor + mi.TensorXf(gone, factor.shape) * self._behind
 
 
 class _Blur:

@@ -1,11 +1,12 @@
 """Layers: a representation of the edit instead of the map.
 
-    E = E_0' * prod((1 + G_l) / (1 + G_l^0)) * exp(g) + sum(C_l)
+    E = E_0' * prod((1 + G_l) / (1 + G_l^0)) * exp(w r) * exp(g) + sum(C_l)
 
 E_0' is the original without the cores of its lights, G_l and C_l are glow and core of light l
-(``separation.py``, ``lights.py``), with index 0 before they moved, and g is the smooth gain of the sky
-(``gain.py``); s_l, the factor of a light's flux, is in G_l. Rows below the horizon follow those above
-(``below_horizon.py``), or are edited like them. Where f = exp(g) is above 1, E f is read as
+(``separation.py``, ``lights.py``), with index 0 before they moved; w and r are what is seen where a glow has
+gone (``behind_glow.py``), g is the smooth gain of the sky (``gain.py``), and s_l, the factor of a light's
+flux, is in G_l. Rows below the horizon follow those above (``below_horizon.py``), or are edited like them.
+Where f = exp(g) is above 1, E f is read as
 E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`brightened`. Unmoved lights and no gain give the original
 back, bit for bit outside the cores: there is nothing to fit, the sky's own detail is kept, and the map has
 any resolution.
@@ -21,7 +22,9 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.representations.layers.behind_glow import BehindGlow, behind_glow
 from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave
 from envedit.representations.layers.lights import DARK, SPARE, Lights
@@ -46,6 +49,11 @@ def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:
     """Scale radiance; what is brightened is so in part by its luminance: a black channel stays in step."""
     grey = base * (1 - VEIL) + mi.luminance(base) * VEIL
     return dr.select(factor > 1, base + (factor - 1) * grey, base * factor)
+
+
+def gone_of(ratio: mi.Color3f) -> mi.Float:
+    """Return the share of radiance that was a glow's and is gone, where the glow changes by a ratio."""
+    return dr.maximum(mi.luminance(1 - ratio), 0)
 
 
 class Layers:
@@ -76,6 +84,8 @@ class Layers:
         Rows and columns of the image.
     below : Below or None
         The rows that follow.
+    behind : BehindGlow or None
+        What is seen where a glow has gone; None without glows.
     free : ndarray of bool (rows, W) or None
         As :meth:`keep` was told.
     scales : dict
@@ -113,7 +123,11 @@ class Layers:
         core = self.separation.core
         base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)
         self.base = np.maximum(base, 0).astype(np.float32)
-        self.below = Below(low, self.base, self._horizon) if low is not None and len(low) else None
+        self.behind = None
+        if self.lights.glowing:
+            told = self.separation.background, self.separation.glow, self._away()
+            self.behind = behind_glow(*told, self.rows)
+        self.below = self._below(low) if low is not None and len(low) else None
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1])
         self.scales = SCALES | self.gain.scales()
         self._prepared = {}
@@ -123,6 +137,27 @@ class Layers:
         params = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
         params |= self.gain.init()
         return {name: tensor(value) for name, value in params.items()}
+
+    def _away(self):
+        """Degrees from each texel to the nearest light that has a glow, (rows, W)."""
+        first, total = self.rows
+        toward = latlong.directions(total, self.shape[1])[first : first + self.shape[0]]
+        glowing = [light.direction for light in self.separation.lights if light.glow is not None]
+        return np.degrees(np.arccos(np.clip((toward @ np.transpose(glowing)).max(axis=2), -1, 1)))
+
+    def _below(self, low):
+        """Rows that follow, and what they show where the reflection of a glow has gone."""
+        below = Below(low, self.base, self._horizon)
+        if self.behind is None or self._horizon != "mirror":
+            return below
+        background, glow = self.separation.background, self.separation.glow
+        gone = 1 - 1 / (glow @ LUMINANCE)[..., None]
+        dark = background * np.exp(gone * self.behind.log_change(background))
+        unlit = low * np.exp(np.float64(below.log_factor(tensor(dark)).numpy()))
+        mirrored = glow[below.mirrored], self._away()[below.mirrored]
+        behind = behind_glow(unlit, *mirrored, (self.shape[0], self.rows[1]))
+        below.reveal(behind.log_change(unlit))
+        return below
 
     def refine(self, params: dict, octaves: list[Octave]) -> dict:
         """Give the gain finer grids and ``params``, of :meth:`encode`, what these start from: zero."""
@@ -150,30 +185,32 @@ class Layers:
             raise ValueError(f"rows below the horizon follow at {self.whole} texels only, asked for {shape}")
         rows = self._at(shape)[0]
         real = {name: value * self.scales[name] for name, value in params.items()}
-        sky = self._sky(real, shape)
+        sky, gone = self._sky(real, shape)
         if self.below is not None:
             shape = self.whole
-            factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky)).array)
+            factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky, gone)).array)
             low = dr.ravel(brightened(self.below.radiance, factor))
             sky = mi.TensorXf(dr.concat((sky.array, low)), (*shape, 3))
         return sky + self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
 
     def _sky(self, real, shape):
-        """Background and glow (rows, W, 3)."""
-        _, d, base, before, gain, free = self._at(shape)
+        """Background and glow (rows, W, 3); share of a texel's radiance that was a glow's and is gone."""
+        _, d, base, before, gain, free, behind = self._at(shape)
         factor = dr.exp(self.gain.evaluate(real, gain))
         factor = dr.select(free, factor, 1) if free is not None else factor
-        sky = brightened(base, factor)
+        sky, gone = brightened(base, factor), None
         if self.lights.glowing:
-            sky *= self.lights.glow(real["turn"], real["flux"], d) / before
-        return mi.TensorXf(dr.ravel(sky), (*shape, 3))
+            ratio = self.lights.glow(real["turn"], real["flux"], d) / before
+            gone = gone_of(ratio)
+            sky *= ratio * dr.exp(gone * behind)
+        return mi.TensorXf(dr.ravel(sky), (*shape, 3)), gone
 
     def log_below(self, params: dict) -> np.ndarray:
         """Return the log factor of the rows that follow, (rows, W, 3); without such rows, none."""
         if self.below is None:
             return np.zeros((0, self.shape[1], 3), np.float32)
         real = {name: value * self.scales[name] for name, value in params.items()}
-        return self.below.log_factor(self._sky(real, self.shape)).numpy()
+        return self.below.log_factor(*self._sky(real, self.shape)).numpy()
 
     @property
     def active(self) -> slice:
@@ -246,12 +283,12 @@ class Layers:
         if (first, total) != (0, height):
             rows = round(first * finer), round(total * finer)
         d = latlong.directions(rows[1], shape[1])[rows[0] : rows[0] + shape[0]]
-        base = self.base
-        if shape != self.shape:
-            whole = np.repeat(base[-1:], total, axis=0)
-            whole[first : first + height] = base
-            whole[:first] = base[:1]
-            base = latlong.lookup(whole, d).astype(np.float32)
+        base, behind = self._finer(self.base, shape, d), self.behind
+        if behind is not None:
+            glow = self._finer(self.separation.glow, shape, d)
+            smooth = (self._finer(field, shape, d) for field in (behind.offset, behind.slope))
+            behind = BehindGlow(*smooth, behind.faint).log_change(base / glow)
+            behind = dr.opaque(mi.Color3f(np.ascontiguousarray(behind.reshape(-1, 3).T, np.float32)))
         d = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)))
         n, before = self.lights.count, mi.Color3f(1)
         if self.lights.glowing:
@@ -263,4 +300,14 @@ class Layers:
             row = np.arange(shape[0]) * height // shape[0]
             column = np.arange(shape[1]) * width // shape[1]
             free = dr.opaque(mi.Bool(self.free[row][:, column].ravel()))
-        return rows, d, base, before, self.gain.prepare(shape, rows), free
+        return rows, d, base, before, self.gain.prepare(shape, rows), free, behind
+
+    def _finer(self, image, shape, d):
+        """Interpolate an image (rows, W, 3) at the directions of another resolution."""
+        if shape == self.shape:
+            return image
+        first, total = self.rows
+        whole = np.repeat(image[-1:], total, axis=0)
+        whole[first : first + len(image)] = image
+        whole[:first] = image[:1]
+        return latlong.lookup(whole, d).astype(np.float32)

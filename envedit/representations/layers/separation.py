@@ -32,6 +32,8 @@ RING_SHARE = (0.1, 0.5)
 """Part of a ring around a light, by luminance, that tells its glow: clouds and the horizon are brighter."""
 FARTHEST = 90.0
 """Largest radius of a glow, degrees."""
+SOFT = 1 / 12
+"""Standard deviation by which a glow is smoothed, over the angle: 5 degrees, a ring, at 60."""
 FLAT = 1.05
 """A glow ends where its ring is at most this many times as bright as the darkest ring farther out."""
 LEAST_EXPLAINED = 0.2
@@ -362,12 +364,22 @@ def _glow(image, small: _Small, cores, centre):
             continue
         factor = np.minimum.accumulate(np.maximum(colour[: last + 1] / far - 1, 0), axis=0)
         table = np.stack([np.interp(GLOW_DEGREES, middle[: last + 1], f) for f in factor.T], axis=1)
+        table = _without_kinks(table)
         inside = (angle < middle[last]) & ~cores & (lum > 0)
         before = np.log(lum[inside])
         after = before - np.log(1 + glow_at(table, np.cos(np.radians(angle[inside]))) @ LUMINANCE)
         if len(before) and after.var() < (1 - LEAST_EXPLAINED) * before.var():
             return table
     return None
+
+
+def _without_kinks(table):
+    """Smooth a table over the width of its rings, about :data:`SOFT` of the angle: kinks are seen as arcs."""
+    sd = np.maximum(SOFT * GLOW_DEGREES, 1e-3)
+    share = np.exp(-0.5 * np.square(np.subtract.outer(GLOW_DEGREES, GLOW_DEGREES) / sd[:, None]))
+    soft = np.minimum.accumulate(share @ table / share.sum(axis=1, keepdims=True), axis=0)
+    soft[-1] = 0
+    return soft
 
 
 def _end(middle, bright):

@@ -1,0 +1,103 @@
+"""What is seen where the glow of a light has gone: the sky of the same elevation.
+
+Dividing a map by a glow leaves what the glow was not: its own asymmetry, a tint, and clouds whose contrast
+was measured beside a light. With B the background, b = log B, K a Gaussian on the sphere and l = K b, what is
+seen there instead is
+
+    log R = m + c (b - l),    m = mean of l at the same elevation,
+    c = k min(1, sqrt(m(v) / K v)),    v = (b - l)^2
+
+the texture stays, at no more than the contrast that it has at this elevation, but for that within K of a
+light, where k is 0: it is bloom and no cloud. Level and colour are those of the elevation. Means are weighted
+by 1 / glow^2: they tell of the sky away from the lights. A texel goes from B to R by w, the share of its
+radiance that was the glow's and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a light
+that has not moved changes nothing, and there is no edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit.core.color import LUMINANCE
+
+BLUR = 4.0
+"""Standard deviation of K, degrees: what is finer is texture, what is coarser the sky's brightness."""
+_LEAST = 1e-12
+
+
+@dataclass(frozen=True)
+class BehindGlow:
+    """log R - b = offset + slope log(B + faint), which holds at any resolution of B.
+
+    Attributes
+    ----------
+    offset, slope : ndarray (rows, W, 3) float32
+        Smooth; slope is c - 1.
+    faint : float
+        Radiance that is nothing.
+    """
+
+    offset: np.ndarray
+    slope: np.ndarray
+    faint: float
+
+    def log_change(self, background: np.ndarray) -> np.ndarray:
+        """Return log R - b of a background (rows, W, 3)."""
+        return self.offset + self.slope * np.log(background + self.faint)
+
+
+def behind_glow(
+    background: np.ndarray, glow: np.ndarray, away: np.ndarray, rows: tuple[int, int]
+) -> BehindGlow:
+    """Tell what is seen where the glow has gone.
+
+    Parameters
+    ----------
+    background, glow : ndarray (rows, W, 3)
+        Linear radiance without lights; the factor by which they brightened it, at least 1.
+    away : ndarray (rows, W)
+        Degrees to the nearest light that has a glow.
+    rows : (int, int)
+        First row in the map, and the rows of the map.
+    """
+    faint = float(max(1e-6 * background.mean(), 1e-30))
+    shape = background.shape[:2]
+    logs = np.log(background + faint)
+    low = _blurred(logs, BLUR, rows)
+    texture = np.square((logs - low) @ LUMINANCE)[..., None]
+    around = np.maximum(_blurred(texture, 2 * BLUR, rows), 0)  # a cut spectrum rings
+    weight = np.maximum(glow.mean(axis=2, keepdims=True) ** -2.0, 1e-30)
+
+    def at_elevation(values):
+        mean = (values * weight).sum(axis=1) / weight.sum(axis=1)
+        return (_along_rows(shape[0], BLUR, rows[1]) @ mean)[:, None]
+
+    contrast = np.sqrt(np.minimum((at_elevation(texture) + _LEAST) / (around + _LEAST), 1))
+    contrast *= 1 - np.exp(-0.5 * np.square(away / BLUR))[..., None]
+    slope = np.broadcast_to(contrast - 1, background.shape)
+    offset = at_elevation(low) - contrast * low
+    return BehindGlow(offset.astype(np.float32), slope.astype(np.float32), faint)
+
+
+def _blurred(values, degrees, rows):
+    """Blur (rows, W, n) by a Gaussian on the sphere, along columns and then along rows."""
+    height, width, _ = values.shape
+    sine = np.sin(np.pi * (np.arange(height) + rows[0]) / max(rows[1] - 1, 1))
+    # At a pole columns meet: there the blur goes all around.
+    sd = np.radians(degrees) / np.maximum(sine, np.radians(degrees) / 2)
+    cycles = np.arange(width // 2 + 1)
+    passed = np.exp(-0.5 * np.square(sd[:, None] * cycles))
+    around = np.fft.irfft(np.fft.rfft(values, axis=1) * passed[..., None], width, axis=1)
+    # By solid angle: rows near a pole are small.
+    mean = _along_rows(height, degrees, rows[1]) * np.maximum(sine, 0.5 * np.pi / max(rows[1], 2))
+    mean /= mean.sum(axis=1, keepdims=True)
+    return (mean @ around.reshape(height, -1)).reshape(values.shape)
+
+
+def _along_rows(height, degrees, total):
+    """Return a Gaussian along rows, (rows, rows); each of its rows sums to 1."""
+    apart = np.subtract.outer(np.arange(height), np.arange(height)) * (180 / max(total - 1, 1))
+    mean = np.exp(-0.5 * np.square(apart / degrees))
+    return mean / mean.sum(axis=1, keepdims=True)

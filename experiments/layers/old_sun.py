@@ -1,0 +1,130 @@
+r"""Compare what may be shown where a sun was: a table, and a picture of the old place.
+
+    ENVEDIT_DATA=... python -m experiments.layers.old_sun [--to experiments/layers]      # a minute
+
+Every light of a map is turned about the vertical, nothing is rendered, and the map is compared with the map
+turned as a whole. ``envedit/representations/layers/behind_glow.py`` is "elevation, contrast"; the others take
+parts of it, or a membrane through what surrounds the brighter part of the glow.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.color import luminance
+from envedit.images import images
+from envedit.losses import metrics, naturalness
+from envedit.representations.layers import behind_glow as product
+from envedit.representations.layers import below_horizon, layers, separation
+from envedit.representations.layers.lights import rotation_vector
+from experiments import puresky
+
+TURNS = 71, 143
+"""Columns of 256."""
+HELD = "snow_field", "industrial_sunset", "kloofendal_48d_partly_cloudy"
+"""Nothing was chosen by these."""
+WAYS = "glow divided out", "contrast", "elevation", "elevation, contrast", "elevation, no texture", "membrane"
+OLD = 0.3
+"""The old place: where the glow was so much of the light, and is gone."""
+BRIGHT = 1.5
+"""Glow from which on the membrane fills in."""
+
+
+def under(made: layers.Layers, way: str) -> None:
+    """Let layers, just encoded, show what they do under one of the :data:`WAYS`."""
+    behind, background = made.behind, made.separation.background
+    logs = np.log(background + behind.faint)
+    low, none = product._blurred(logs, product.BLUR, made.rows), np.zeros_like(logs)
+    filled = separation.filled(background, made.separation.glow.max(axis=2) > BRIGHT)
+    offset, slope = {
+        "glow divided out": (none, none),
+        "contrast": (-behind.slope * low, behind.slope),
+        "elevation": (behind.offset + behind.slope * low, none),
+        "elevation, contrast": (behind.offset, behind.slope),
+        "elevation, no texture": (behind.offset + (behind.slope + 1) * low, none - 1),
+        "membrane": (np.log(filled + behind.faint) - logs, none),
+    }[way]
+    made.behind, made._prepared = replace(behind, offset=offset, slope=slope), {}
+    if made.mirrored and way in WAYS[:2]:
+        made.below.reveal(np.zeros((*made.below.shape, 3)))
+
+
+def turned(made: layers.Layers, params: dict, columns: int, width: int) -> dict:
+    """Return the parameters with every light of the map turned about the vertical."""
+    angle = 2 * np.pi * columns / width
+    about = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn = np.zeros(params["turn"].shape)
+    for i, light in enumerate(made.separation.lights):
+        turn[i] = rotation_vector(light.direction, about @ light.direction)
+    return params | {"turn": tensor(turn / layers.SCALES["turn"])}
+
+
+def measured(edited, original, true, old) -> list[float]:
+    """Map PSNR over the unedited one's; RMS of log radiance at the old place, up and low; seam; detail."""
+    errors = [metrics.compare(one, true)["psnr"] for one in (edited, original)]
+    off = np.square(np.log((edited + 1e-3) / (true + 1e-3)))
+    rows = old.shape[0]
+    low = old[: len(true) - rows][::-1]
+    natural = naturalness.natural(edited, original, true)
+    return [
+        errors[0] - errors[1],
+        float(np.sqrt(off[:rows][old].mean())),
+        float(np.sqrt(off[rows:][low].mean())),
+        natural["seam"],
+        natural["high_frequency"],
+    ]
+
+
+def main():
+    """Compute, print and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--to", type=Path, default=Path("experiments/layers"))
+    given = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    found = {(way, held): [] for way in WAYS for held in (False, True)}
+    pictures = []
+    for name, file in puresky.of_script().items():
+        original, _ = images.load_envmap(str(file), 256)
+        height, width, _ = original.shape
+        tiles = []
+        for way in WAYS:
+            made = layers.Layers((0, height), horizon=below_horizon.kind_of(original))
+            params = made.encode(original)
+            if made.behind is None:
+                break
+            under(made, way)
+            for columns in TURNS:
+                params = turned(made, params, columns, width)
+                edited = made.decode(params).numpy()
+                true = latlong.rotate(original, 360 * columns / width)
+                if metrics.sun_offset(edited, true) > width / 8:
+                    raise SystemExit(f"{name}: the light went elsewhere than the map")
+                glow = made.separation.glow @ [0.2126, 0.7152, 0.0722]
+                old = 1 - np.roll(glow, -columns, axis=1) / glow > OLD
+                found[way, name in HELD].append(measured(edited, original, true, old))
+            tiles.append(edited)
+        if tiles:
+            centre = latlong.texel_position(made.separation.lights[0].direction, height, width)[1]
+            shown = [true, original, *tiles]
+            white = 4 * float(np.median(luminance(true)))
+            shown = [np.roll(m, width // 2 - round(float(centre)), axis=1) for m in shown]
+            cut = slice(width // 4, 3 * width // 4)
+            pictures.append(np.concatenate([np.clip(m[:, cut] / white, 0, 1) ** (1 / 2.2) for m in shown], 1))
+    print("| where the sun was | maps | map, dB | log radiance, up | below | seam | high frequencies |")
+    print("|---" * 7 + "|")
+    for (way, held), rows in found.items():
+        if rows:
+            means = " | ".join(f"{v:.2f}" for v in np.mean(rows, axis=0))
+            print(f"| {way} | {'held out' if held else 'others'}, {len(rows)} | {means} |")
+    pixels = (np.concatenate(pictures) * 255 + 0.5).astype(np.uint8)
+    mi.Bitmap(pixels).write(str(given.to / "old_sun.jpg"), quality=88)
+    print(given.to / "old_sun.jpg")
+
+
+if __name__ == "__main__":
+    main()

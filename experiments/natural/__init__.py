@@ -1,0 +1,1 @@
+"""Many skies in many scenes: are edited maps still photographs of skies?"""

@@ -1,1 +1,1 @@
-"""Many skies in many scenes: are edited maps still photographs of skies?"""
+"""Every sky in five scenes: whether edited maps are still photographs of skies."""

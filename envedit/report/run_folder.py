@@ -116,7 +116,7 @@ def _maps(settings, folder, result):
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
     if settings.output.full:
         try:
-            full = results.at_full_resolution(settings.input, result)
+            full = results.at_full_resolution(settings, result)
             if full is not None:
                 asked = settings.output, folder / "edited_full", full, source
                 result.warnings += map_files.write_map(*asked)

@@ -112,7 +112,7 @@ def run(
         watch.stage("loading")
         lit = inputs.load_scene(settings.scene, base)
         given = inputs.read_map(settings.input, lit, settings.input.width)
-        original, said = given.radiance, inputs.notes(settings.input, lit)
+        original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
         height, width, _ = original.shape
         first, last = inputs.active_rows(settings.input.rows, height)
@@ -225,7 +225,12 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit.alpha)
         stored = given.as_stored(edited)
     said = "no target: the result is compared with the initial rendering"
-    notes = [*inputs.notes(settings.input, lit), said, *notes, f"rendered with {judged} samples a pixel"]
+    notes = [
+        *inputs.notes(settings.input, lit, given),
+        said,
+        *notes,
+        f"rendered with {judged} samples a pixel",
+    ]
     measured |= {
         "fit": None,
         "timing": clock.table([], time.perf_counter() - begun),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,7 +142,7 @@ def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
     if own is None:
         where = "no scene is given" if lit is None else f"{lit.path} names no file in an emitter envmap"
         raise ConfigError(f'input.envmap: got "scene", but {where}: name a map, or "sunsky"')
-    if not own.is_file():
+    if not os.path.isfile(own):  # no error for a name that no file can have
         raise InputError(f"{own}: the scene's own map is missing; name another with [input] envmap")
     return str(own)
 

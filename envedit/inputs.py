@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import functools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from envedit import config
-from envedit.core import latlong
+from envedit.core import latlong, primaries
 from envedit.core.errors import ConfigError, InputError, NumericalError
+from envedit.core.primaries import Chromaticities
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.images import analytic_sky, images
 from envedit.scene import scene
 
 SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
 """Words for ``[input] envmap``: Mitsuba's analytic sky; the scene's own map; that one if there is one."""
+_ROUNDING = 1e-6  # of a texel's largest channel
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class InputMap:
         Width and height of the file.
     warnings : list of str
         What was repaired, or is odd.
+    chromaticities : tuple, optional
+        Colour space of the file (:mod:`.primaries`); None: Rec. 709.
     """
 
     source: str
@@ -45,24 +50,41 @@ class InputMap:
     scale: float
     size: tuple[int, int]
     warnings: list[str]
+    chromaticities: Chromaticities | None = None
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
-        """Linear radiance (H, W, 3) float32 that reaches the scene.
+        """Linear radiance (H, W, 3) float32 that reaches the scene, in Rec. 709; no channel is negative.
 
         Raises
         ------
         InputError
             It is more than :data:`.radiance.BRIGHTEST` somewhere.
         """
-        return scaled(self.stored, self.scale, self.source)
+        return scaled(self._converted, self.scale, self.source)
+
+    @functools.cached_property
+    def _converted(self):
+        if self.chromaticities is None:
+            return self.stored
+        colours = primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))
+        colours = np.maximum(colours, 0)
+        require_radiance(colours, f"{self.source} in Rec. 709", brightest=BRIGHTEST)
+        return colours
+
+    @property
+    def outside(self) -> float:
+        """Share of the texels whose colour is outside Rec. 709: a channel of theirs is taken as 0."""
+        if self.chromaticities is None:
+            return 0.0
+        colours = primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))
+        return float((colours < -_ROUNDING * np.abs(colours).max(axis=2, keepdims=True)).any(axis=2).mean())
 
     def at_file_size(self, repair: bool) -> InputMap:
         """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
-        stored, info = images.load_envmap(self.source, None, repair)
-        return InputMap(self.source, stored, self.scale, info["size"], list(info["warnings"]))
+        return _read(self.source, None, repair, self.scale)
 
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
@@ -79,13 +101,16 @@ class InputMap:
         NumericalError
             A value is too large for the file: ``scale`` is too small.
         """
-        if self.scale == 1:
+        if self.scale == 1 and self.chromaticities is None:
             return edited
         with np.errstate(over="ignore"):
             found = (edited / np.float64(self.scale)).astype(np.float32)
+        if self.chromaticities is not None:
+            back = np.linalg.inv(primaries.to_rec709(self.chromaticities))
+            found = np.maximum(primaries.converted(found, back), 0)
         if not np.isfinite(found).all():
             raise NumericalError(f"the edited map over the scene's scale, {self.scale:g}, leaves float32")
-        same = edited == latlong.rotate(self.radiance, degrees)
+        same = (edited == latlong.rotate(self.radiance, degrees)).all(axis=2, keepdims=True)
         return np.where(same, latlong.rotate(self.stored, degrees), found)
 
 
@@ -117,7 +142,7 @@ def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
     if own is None:
         where = "no scene is given" if lit is None else f"{lit.path} names no file in an emitter envmap"
         raise ConfigError(f'input.envmap: got "scene", but {where}: name a map, or "sunsky"')
-    if not own.is_file():
+    if not os.path.isfile(own):  # no error for a name that no file can have
         raise InputError(f"{own}: the scene's own map is missing; name another with [input] envmap")
     return str(own)
 
@@ -144,8 +169,18 @@ def read_map(settings: config.Input, lit: scene.Scene | None, width: int | None 
         width = width or settings.width
         sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
         return InputMap(source, sky, scale, (width, width // 2), [])
-    stored, info = images.load_envmap(source, width, settings.repair)
-    return InputMap(source, stored, scale, info["size"], list(info["warnings"]))
+    return _read(source, width, settings.repair, scale)
+
+
+def _read(source, width, repair, scale):
+    stored, info = images.load_envmap(source, width, repair, convert=False)
+    given = scale, info["size"], list(info["warnings"]), info["chromaticities"]
+    found = InputMap(source, stored, *given)
+    if found.outside > 0:
+        space = primaries.name_of(found.chromaticities)
+        share = f"{100 * found.outside:.2g} % of its texels have colours of {space} outside Rec. 709"
+        found.warnings.append(f"{share}: a channel of theirs counts as 0; those not edited keep their colour")
+    return found
 
 
 def load_map(settings: config.Input, lit: scene.Scene | None = None) -> tuple[np.ndarray, list[str]]:
@@ -174,11 +209,14 @@ def load_map(settings: config.Input, lit: scene.Scene | None = None) -> tuple[np
     return found.radiance, found.warnings
 
 
-def notes(settings: config.Input, lit: scene.Scene) -> list[str]:
+def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = None) -> list[str]:
     """Say which map a run took and what the scene's file has that is used otherwise."""
     said, source, own = list(lit.notes), source_of(settings, lit), lit.own
     if settings.envmap == AUTO and source != SUNSKY:
         said.insert(0, f"map: the scene's own, {source}")
+    if given is not None and given.chromaticities is not None:
+        space = primaries.name_of(given.chromaticities)
+        said.append(f"map in {space}: edited in Rec. 709 (Bradford adaptation), written in {space}")
     if own.scale != 1:
         whose = "it" if source == str(own.file) else "the map (which is not the scene's own)"
         said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}")

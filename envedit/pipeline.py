@@ -15,6 +15,7 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
+from envedit.export import adjustments
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
@@ -110,10 +111,12 @@ def run(
         watch.stage("loading")
         lit = inputs.load_scene(settings.scene, base)
         given = inputs.read_map(settings.input, lit, settings.input.width)
-        original, said = given.radiance, inputs.notes(settings.input, lit)
+        original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
         height, width, _ = original.shape
         first, last = inputs.active_rows(settings.input.rows, height)
+        if settings.target.kind == "none" and picture is None:
+            return _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
         renderers.check(settings, lit, (height, width))
         watch.stage("rendering the target")
         wanted = target.make(settings, lit, original, picture, mask)
@@ -145,7 +148,8 @@ def run(
     with clock("edit_s"), _in_file_units(given):
         watch.stage("editing")
         params, state = job.optimise(edit.params, edit.crop, resume)
-        edited = job.decode(params)
+        found_map = job.decode(params)
+        edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
         wanted = job.wanted  # a resumed run has the picture that it began with
 
     with clock("judge_s"), _in_file_units(given), keeping(edited):
@@ -153,9 +157,9 @@ def run(
         final, judged, _ = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
     notes += [job.note] if job.note else []
     if representation.models_edit:
-        kept = 100 * float((edited == job.original)[rows].all(axis=2).mean())
+        kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels keep their bits")
-    notes = [*said, wanted.source, *renderer.choices, *notes]
+    notes = [*said, wanted.source, *renderer.choices, *notes, *adjusted]
     notes.append(f"result rendered with {judged} samples a pixel")
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
@@ -199,9 +203,44 @@ def run(
         separation=representation.separation,
         scene=lit.path,
         reach=within,
-        found=Found(representation, params, first, job.free, edit.degrees),
+        found=Found(representation, params, first, job.free, edit.degrees, found_map),
         posterior=job.posterior,
     )
+
+
+def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
+    """Adjust a map without a target; compared with the initial rendering."""
+    original = given.radiance
+    with clock("edit_s"), _in_file_units(given):
+        watch.stage("adjusting the map")
+        edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
+    with clock("judge_s"), _in_file_units(given), keeping(edited):
+        watch.stage("rendering the result")
+        seed, spp = settings.seed + JUDGE_SEED, settings.output.spp
+        initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache)
+        final, judged, _ = lit.sampled(edited, spp, seed + 1)
+        renders = {"initial": initial, "target": initial, "edited": final}
+        maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
+        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit.alpha)
+        stored = given.as_stored(edited)
+    said = "no target: the result is compared with the initial rendering"
+    notes = [
+        *inputs.notes(settings.input, lit, given),
+        said,
+        *notes,
+        f"rendered with {judged} samples a pixel",
+    ]
+    measured |= {
+        "fit": None,
+        "timing": clock.table([], time.perf_counter() - begun),
+        "iterations": 0,
+        "non_finite_steps": 0,
+        "transport": None,
+        "turn_degrees": 0.0,
+        "choices": notes,
+    }
+    more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
+    return Result(stored, renders, maps, measured, [], notes, warnings, **more)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
-from envedit.export import full_resolution
+from envedit.export import adjustments, full_resolution
 from envedit.representations import Representation
 from envedit.representations.layers.separation import Separation
 from envedit.solve.feasibility import Reach
@@ -85,7 +85,8 @@ class Result:
 class Found:
     """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`.
 
-    ``turn_degrees`` is by how much the map was turned before (:func:`.latlong.rotate`).
+    ``turn_degrees`` is by how much the map was turned before (:func:`.latlong.rotate`), ``edited`` the edited
+    map before its adjustments.
     """
 
     representation: Representation
@@ -93,9 +94,10 @@ class Found:
     first_row: int
     free: np.ndarray | None
     turn_degrees: float = 0.0
+    edited: np.ndarray | None = None
 
 
-def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | None:
+def at_full_resolution(settings: config.Config, result: Result) -> np.ndarray | None:
     """Carry a result to the resolution of its input's file, in its units; None where that has no more texels.
 
     Raises
@@ -103,15 +105,18 @@ def at_full_resolution(settings: config.Input, result: Result) -> np.ndarray | N
     InputError, NumericalError
         If the file cannot be read any more, or the carried map is not finite.
     """
-    if result.given.size[0] <= settings.width:
+    if result.given.size[0] <= settings.input.width:
         return None
-    full, found = result.given.at_file_size(settings.repair), result.found
+    full, found = result.given.at_file_size(settings.input.repair), result.found
+    adjusted = settings.lights, settings.output, full.scale
+    if found is None:
+        return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
     before = latlong.rotate(result.maps["initial"], found.turn_degrees)
     source = latlong.rotate(full.radiance, found.turn_degrees)
-    first, last = inputs.active_rows(settings.rows, before.shape[0])
+    first, last = inputs.active_rows(settings.input.rows, before.shape[0])
     rows = first, last - first + 1
-    edited = result.maps["edited"]
+    edited = found.edited
     carried = full_resolution.carry(
         found.representation, found.params, before, edited, source, rows, found.free
     )
-    return full.as_stored(carried, found.turn_degrees)
+    return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)

@@ -269,7 +269,7 @@ def calibrate(settings: config.Config, base: Path | None = None) -> tuple[Calibr
         quiet,
     )
     texels = texels if settings.output.full else 0
-    return found, Work(lit.height / lit.width, texels, settings.target.kind != "envmap")
+    return found, Work(lit.height / lit.width, texels, settings.target.kind in ("image", "strokes"))
 
 
 def _product_seconds():

@@ -406,6 +406,8 @@ def _verdict(measured):
         line += (
             f", changed elsewhere by {painted['elsewhere']:.3f}" if painted["elsewhere"] is not None else ""
         )
+    elif not measured["iterations"] and measured["initial"]["mse"] == 0:
+        line = f"no target, rendering changed: {measured['render']['psnr']:.1f} dB from the initial one"
     else:
         line = f"rendering {measured['initial']['psnr']:.1f} -> {measured['render']['psnr']:.1f} dB"
         if measured["envmap"]:

@@ -32,6 +32,7 @@ from envedit.config.validators import (
     checked,
     choice,
     integer,
+    kelvin,
     number,
     or_auto,
     parameter_table,
@@ -108,7 +109,9 @@ class Target(Table):
     """What the rendering should look like."""
 
     kind: str = _key(
-        "envmap", choice("envmap", "image", "strokes"), "given by: another map, a painted image, or strokes"
+        "envmap",
+        choice("envmap", "image", "strokes", "none"),
+        'given by: another map, a painted image, or strokes; "none": only [lights], exposure, white balance',
     )
     file: str = _key("", string, "kind envmap: the other map; kind image: the painted rendering")
     rotate_degrees: float = _key(
@@ -132,19 +135,31 @@ class Target(Table):
             raise ConfigError('target.file: came "", wanted the painted image, as target.kind is "image"')
         if self.kind == "strokes" and not self.strokes:
             raise ConfigError('target.strokes: came none, wanted at least one, as target.kind is "strokes"')
+        if self.kind == "none" and (self.file or self.mask):
+            raise ConfigError('target.file, target.mask: came one, wanted none, as target.kind is "none"')
         if self.kind == "strokes" and self.file:
             raise ConfigError(
                 f"target.file: came {show(self.file)}, wanted none: strokes go on the initial rendering"
             )
         if self.kind == "strokes" and self.mask:
             raise ConfigError(f"target.mask: came {show(self.mask)}, wanted none: strokes say where they are")
-        if self.kind != "envmap" and not self.paint + self.hold:
+        if self.kind in ("image", "strokes") and not self.paint + self.hold:
             raise ConfigError("target.paint, target.hold: came 0 for both, wanted one above 0")
         if self.kind != "strokes" and self.strokes:
             raise ConfigError(
                 f'target.strokes: came {len(self.strokes)}, wanted none, as target.kind is "{self.kind}": '
                 'set target.kind = "strokes"'
             )
+
+
+@dataclass(frozen=True)
+class Lights(Table):
+    """What is done to the lights of the edited map at last; their flux is kept."""
+
+    max_radiance: float = _key(
+        0.0, number(0), "spread lights until no texel of the map's file is above; 0: no bound"
+    )
+    soften_degrees: float = _key(0.0, number(0, 90), "radius over which each texel of a light is spread")
 
 
 @dataclass(frozen=True)
@@ -302,6 +317,12 @@ class Output(Table):
     format: str = _key(
         "exr", choice("exr", "hdr"), "file of the edited map: OpenEXR, or Radiance (.hdr), 8 bits a channel"
     )
+    exposure: float = _key(0.0, number(-100, 100), "stops by which the edited map is brightened at last")
+    white_balance: float = _key(
+        0.0,
+        kelvin,
+        "temperature of the light that becomes neutral in the edited map, kelvin; 0: as it is",
+    )
     half: bool = _key(
         False, boolean, "OpenEXR with 16 bits a channel; what is above 65504 is cut, with a warning"
     )
@@ -326,6 +347,7 @@ class Config(Table):
     input: Input = _table_key(Input)
     scene: Scene = _table_key(Scene)
     target: Target = _table_key(Target)
+    lights: Lights = _table_key(Lights)
     representation: Representation = _table_key(Representation)
     fit: Fit = _table_key(Fit)
     loss: Loss = _table_key(Loss)

@@ -97,6 +97,17 @@ def number(low: float, high: float = math.inf, positive: bool = False) -> Callab
     return check
 
 
+def kelvin(value: Any) -> float:
+    """Accept a colour temperature for which there are chromaticities, or 0."""
+    try:
+        found = number(0, 25000)(value)
+    except WantedError:
+        found = -1.0
+    if found and not 2000 <= found <= 25000:
+        raise WantedError("0, or kelvin from 2000 to 25000")
+    return found
+
+
 def or_auto(check: Callable) -> Callable:
     """Make a check that accepts "auto" beside what another check accepts."""
 

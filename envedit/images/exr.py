@@ -4,13 +4,12 @@ import re
 
 import numpy as np
 
+from envedit.core import primaries
 from envedit.core.errors import InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.images.headers import MAX_TEXELS, check_declared, damaged, shown
 
-REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""Chromaticities of red, green, blue and white (D65), as the OpenEXR attribute orders them."""
-
+_SPACE_NAMES = "colorInteropID", "oiio:ColorSpace"  # attributes that name a colour space
 _MOST_VALUES = 4 * MAX_TEXELS  # over all channels: colour and alpha of the largest
 _MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
 
@@ -79,7 +78,7 @@ def read(name, head, info, stored):
     if stored and len(planes) in (1, 3) and windows[index] != display:
         planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
     image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
-    _describe(header, info)
+    _describe(name, header, info)
     return _to_display(image, (left, top), display, name, info)
 
 
@@ -123,12 +122,15 @@ def _choose_channels(name, headers, info):
     raise InputError(f"{name}: no R, G, B channels (found: {found}); save it as RGB")
 
 
-def _describe(header, info):
-    """Take over the header's plain attributes, and warn of a colour space or projection we would misread."""
+def _describe(name, header, info):
+    """Take over the header's plain attributes and colour space; warn of a projection we would misread."""
     info["metadata"] = {k: v for k, v in header.items() if isinstance(v, str | int | float)}
-    primaries = header.get("chromaticities")
-    if primaries is not None and not np.allclose(primaries, REC709, atol=2e-3):
-        info["warnings"].append("its primaries are not Rec.709: values are used as they are, hues may be off")
+    given = header.get("chromaticities")
+    said = [v for k in _SPACE_NAMES if isinstance(v := header.get(k), str) and v]
+    if given is not None:
+        info["chromaticities"] = primaries.known(given, name)
+    elif said:
+        info["chromaticities"] = primaries.named(said[0], name)
     if "CUBE" in str(header.get("envmap", "")):
         info["warnings"].append("it is marked as a cube map: read as if it were lat-long")
 

@@ -11,12 +11,11 @@ import zlib
 
 import numpy as np
 
-from envedit.core import latlong, radiance
+from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import replacing, write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.images import exr, ldr, rgbe
-from envedit.images.exr import REC709
 from envedit.images.headers import MAX_SIDE, damaged, head_of
 
 FORMATS = (
@@ -53,7 +52,8 @@ def read(path) -> tuple[np.ndarray, dict]:
         Linear radiance.
     info : dict
         ``path`` (str), ``format`` ("exr", "hdr", "png" or "jpeg"), ``size`` (width, height), ``hdr`` (False
-        for 8- and 16-bit pictures), ``metadata`` (dict of str, int and float) and ``warnings`` (list of str).
+        for 8- and 16-bit pictures), ``metadata`` (dict of str, int and float), ``chromaticities`` (of the
+        file's colours; None: Rec. 709) and ``warnings`` (list of str).
 
     Raises
     ------
@@ -61,7 +61,8 @@ def read(path) -> tuple[np.ndarray, dict]:
         If the file is missing, empty, truncated, of another kind, or declares more than 32768 texels on a
         side or 2^27 in all.
     """
-    return _decode(path, stored=False)
+    image, info = _decode(path, stored=False)
+    return _in_rec709(image, info), info
 
 
 def read_stored(path) -> tuple[np.ndarray, dict]:
@@ -98,13 +99,23 @@ def read_stored(path) -> tuple[np.ndarray, dict]:
         info["warnings"].append(
             "its colour profile is not sRGB: values are used as they are, hues may be off"
         )
-    return pixels, info
+    return _in_rec709(pixels, info), info
+
+
+def _in_rec709(pixels, info):
+    """Convert the colours of (H, W, C) to Rec. 709, where the file has others."""
+    if info["chromaticities"] is None or pixels.shape[2] < 3:
+        return pixels
+    info["warnings"].append(f"converted from {primaries.name_of(info['chromaticities'])} to Rec. 709")
+    matrix = primaries.to_rec709(info["chromaticities"])
+    return np.concatenate([primaries.converted(pixels[..., :3], matrix), pixels[..., 3:]], axis=2)
 
 
 def _decode(path, stored):
     name = os.fsdecode(path)
     head = head_of(name)
     info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
+    info["chromaticities"] = None
     for kind, magic, reader in FORMATS:
         if head.startswith(magic):
             info["format"] = kind
@@ -124,7 +135,9 @@ def _decode(path, stored):
     raise InputError(f"{name}: not an image envedit can read; use OpenEXR or Radiance HDR (or PNG, JPEG)")
 
 
-def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[np.ndarray, dict]:
+def load_envmap(
+    path, width: int | None = None, repair: bool = False, convert: bool = True
+) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
     Parameters
@@ -135,6 +148,8 @@ def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[n
         Working width in texels, even and at least 6; the height is half of it. Without, the file's own size.
     repair : bool
         Replace NaN and infinite texels instead of refusing them.
+    convert : bool
+        To Rec. 709; otherwise colours are those of the file, ``info["chromaticities"]``.
 
     Returns
     -------
@@ -153,7 +168,7 @@ def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[n
     """
     if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
         raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
-    image, info = read(path)
+    image, info = read(path) if convert else _decode(path, stored=False)
     name, warnings = info["path"], info["warnings"]
     rows, columns = image.shape[:2]
     if columns != 2 * rows:
@@ -200,11 +215,17 @@ def load_envmap(path, width: int | None = None, repair: bool = False) -> tuple[n
 
 
 def write_exr(
-    path, image, metadata: dict | None = None, panorama: bool = True, alpha=None, half: bool = False
+    path,
+    image,
+    metadata: dict | None = None,
+    panorama: bool = True,
+    alpha=None,
+    half: bool = False,
+    chromaticities: primaries.Chromaticities | None = None,
 ) -> None:
     """Write an image as an OpenEXR file, of float32 unless asked for half, whole or not at all.
 
-    Marked as lat-long, unless it is no ``panorama``, with Rec.709 primaries.
+    Marked as lat-long, unless it is no ``panorama``.
     Written under another name in the same folder and then renamed.
 
     Parameters
@@ -221,6 +242,8 @@ def write_exr(
         Share of each pixel that is covered; the image is premultiplied by it.
     half : bool
         Write 16 bits a channel, 11 of them digits.
+    chromaticities : tuple, optional
+        Of the image's colours, which are written as they are; None: Rec. 709.
 
     Raises
     ------
@@ -236,7 +259,7 @@ def write_exr(
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "chromaticities": REC709,
+        "chromaticities": chromaticities or primaries.REC709,
         **({"envmap": OpenEXR.ENVMAP_LATLONG} if panorama else {}),
         "software": f"envedit {_version()}",
     }

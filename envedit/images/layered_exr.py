@@ -9,8 +9,8 @@ import numpy as np
 
 from envedit.core.atomic_files import replacing
 from envedit.core.errors import ConfigError, NumericalError, place_of
+from envedit.core.primaries import REC709, Chromaticities
 from envedit.core.quiet_libraries import quiet_libraries
-from envedit.images.exr import REC709
 
 DEFAULT = "edited"
 """The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
@@ -18,7 +18,13 @@ COMPRESSIONS = {"none": "NO", "rle": "RLE", "zips": "ZIPS", "zip": "ZIP", "piz":
 """Lossless ones that every reader of OpenEXR knows."""
 
 
-def write(path, layers: dict[str, np.ndarray], compression: str = "zip", threads: int | None = None) -> None:
+def write(
+    path,
+    layers: dict[str, np.ndarray],
+    compression: str = "zip",
+    threads: int | None = None,
+    chromaticities: Chromaticities | None = None,
+) -> None:
     """Write layers as one float32 OpenEXR file, whole or not at all.
 
     The layer ``edited``, or else the first, becomes the channels ``R``, ``G``, ``B``; any other NAME becomes
@@ -36,6 +42,8 @@ def write(path, layers: dict[str, np.ndarray], compression: str = "zip", threads
         One of :data:`COMPRESSIONS`.
     threads : int, optional
         Threads of the compression; None: one a core that this process may use.
+    chromaticities : tuple, optional
+        Of the colours; None: Rec. 709.
 
     Raises
     ------
@@ -71,7 +79,7 @@ def write(path, layers: dict[str, np.ndarray], compression: str = "zip", threads
     header = {
         "compression": getattr(OpenEXR, COMPRESSIONS[compression] + "_COMPRESSION"),
         "type": OpenEXR.scanlineimage,
-        "chromaticities": REC709,
+        "chromaticities": chromaticities or REC709,
         "envmap": OpenEXR.ENVMAP_LATLONG,
     }
     with replacing(name, ".exr") as temporary, quiet_libraries(), _threads(OpenEXR, threads):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import config, results
-from envedit.core import atomic_files
+from envedit import config, inputs, results
+from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
 from envedit.core.radiance import HALF_MAX
 from envedit.export import light_list
@@ -16,7 +16,7 @@ from envedit.report import manifest
 from envedit.scene import scene
 
 
-def write_map(settings: config.Output, path: Path, envmap: np.ndarray, source: str) -> list[str]:
+def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: inputs.InputMap) -> list[str]:
     """Write a map in the format asked for.
 
     Parameters
@@ -26,26 +26,29 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, source: s
     path : Path
         File without its ending.
     envmap : ndarray (H, W, 3)
-        Linear values.
-    source : str
-        The file that was edited.
+        Linear values, in the units and colours of the file that was edited.
+    given : inputs.InputMap
+        That file.
 
     Returns
     -------
     list of str
         Warnings: what half could not hold.
     """
-    if settings.format == "hdr":
-        images.write_hdr(path.with_suffix(".hdr"), envmap)
+    source, space = {"source": given.source}, given.chromaticities
+    if settings.format == "hdr":  # its colours are Rec. 709 to nearly every program
+        matrix = None if space is None else primaries.to_rec709(space)
+        shown = envmap if space is None else primaries.converted(envmap, matrix)
+        images.write_hdr(path.with_suffix(".hdr"), shown)
         return []
     name = path.with_suffix(".exr")
     if not settings.half:
         if path.name == "edited":
-            images.write_exr(name, envmap, {"source": source})
+            images.write_exr(name, envmap, source, chromaticities=space)
         else:
-            layered_exr.write(name, {"edited": envmap})  # on all cores: it may be large
+            layered_exr.write(name, {"edited": envmap}, chromaticities=space)  # on all cores
         return []
-    images.write_exr(name, np.minimum(envmap, HALF_MAX), {"source": source}, half=True)
+    images.write_exr(name, np.minimum(envmap, HALF_MAX), source, half=True, chromaticities=space)
     over = (envmap > HALF_MAX).any(axis=2)
     if not over.any():
         return []
@@ -58,10 +61,10 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, source: s
 
 def write_lights(folder: Path, result: results.Result) -> None:
     """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
-    source = {"source": result.given.source}
+    source, space = {"source": result.given.source}, result.given.chromaticities
     sky, lights = light_list.split(result.envmap)
-    images.write_exr(folder / "edited_sky.exr", sky, source)
-    images.write_exr(folder / "edited_lights.exr", lights, source)
+    images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
+    images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
     before, after = (light_list.listed(result.maps[name], result.to_world) for name in ("initial", "edited"))
     manifest.write_metrics(folder / "lights.json", {"before": before, "after": after})
 

@@ -92,8 +92,8 @@ def write(
 
 def _maps(settings, folder, result):
     """Write maps and renderings."""
-    source = result.given.source
-    result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, source)
+    given = result.given
+    result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, given)
     for name, picture in result.renders.items():
         images.write_exr(
             folder / f"render_{name}.exr",
@@ -111,14 +111,14 @@ def _maps(settings, folder, result):
         layers["influence"] = result.influence
     if result.posterior is not None:
         layers["deviation"] = result.posterior.deviation
-    layered_exr.write(folder / "edited_layers.exr", layers)
+    layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=given.chromaticities)
     if result.reach is not None:
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
     if settings.output.full:
         try:
-            full = results.at_full_resolution(settings.input, result)
+            full = results.at_full_resolution(settings, result)
             if full is not None:
-                asked = settings.output, folder / "edited_full", full, source
+                asked = settings.output, folder / "edited_full", full, given
                 result.warnings += map_files.write_map(*asked)
         except MemoryError:
             result.warnings.append(

@@ -7,6 +7,7 @@ takes the parser's ``state`` and ``where``, what errors call the scene.
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,7 +80,7 @@ def own_map(state, where: str, folders) -> OwnMap:
     name = props.get("filename", None)
     if not isinstance(name, str) or not name:
         return OwnMap(None, float(scale), notes)
-    found = [folder / name for folder in folders if (folder / name).is_file()]
+    found = [folder / name for folder in folders if os.path.isfile(folder / name)]
     return OwnMap(Path(found[0] if found else folders[0] / name), float(scale), notes)
 
 

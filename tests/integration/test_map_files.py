@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from envedit import config
+from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
 from envedit.export import light_list
@@ -131,7 +131,12 @@ def test_radiance_files_hold_every_exponent_to_a_256th(width, tmp_path, rng):
 def test_half_is_cut_at_its_largest_and_says_so(value, cut, tmp_path, rng):
     image = sky(rng)
     image[2, 3] = value
-    said = map_files.write_map(config.Output(half=True), tmp_path / "edited", image, "a.hdr")
+    said = map_files.write_map(
+        config.Output(half=True),
+        tmp_path / "edited",
+        image,
+        inputs.InputMap("a.hdr", image, 1.0, (16, 8), []),
+    )
     with OpenEXR.File(str(tmp_path / "edited.exr"), separate_channels=True) as file:
         assert file.channels()["R"].pixels.dtype == np.float16
     found = pixels(tmp_path / "edited.exr")

@@ -131,6 +131,9 @@ def test_a_map_that_its_scale_makes_too_bright_is_refused(tmp_path):
 
 
 def test_the_scene_s_own_map_must_be_there(tmp_path):
+    assert "own map is missing" in users_scenes.happened(
+        users_scenes.Kind("", (PATH, SENSOR, BALL, light(name="x" * 300)))
+    )
     path = write_scene(tmp_path, PATH, SENSOR, BALL, light(name="gone.exr"))
     lit = inputs.load_scene(config.Scene(file=str(path), width=16))
     for word in ("auto", "scene"):

@@ -75,7 +75,7 @@ def test_exr_window_and_primaries(tmp_path, rng):
     np.testing.assert_array_equal(found, expected)
     assert "cropped" in info["warnings"][0]
     _, info = images.read(exr(tmp_path / "aces.exr", header, **p))
-    assert "not Rec.709" in info["warnings"][0]
+    assert "converted from ACES2065-1 to Rec. 709" in info["warnings"][0]
 
 
 def test_exr_without_colour(tmp_path, rng):

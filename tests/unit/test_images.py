@@ -9,9 +9,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from envedit.core import latlong
+from envedit.core import latlong, primaries
 from envedit.core.errors import ConfigError, InputError, NumericalError
-from envedit.images import exr as exr_module
 from envedit.images import images
 from tests.oracles.builders import exr, planes, stacked
 
@@ -97,7 +96,7 @@ def test_write_exr_round_trip(tmp_path, rng):
     header = OpenEXR.File(str(path), header_only=True).header()
     assert header["envmap"] == OpenEXR.ENVMAP_LATLONG and not info["warnings"]
     assert header["software"].startswith("envedit ")
-    np.testing.assert_allclose(header["chromaticities"], exr_module.REC709, rtol=1e-6)
+    np.testing.assert_allclose(header["chromaticities"], primaries.REC709, rtol=1e-6)
     expected = {"source": "sky.hdr", "width": 12, "seed": str(2**40), "gamma": 0.5}
     assert {k: info["metadata"][k] for k in expected} == expected
     np.testing.assert_array_equal(np.array(mi.Bitmap(str(path))), values)  # another reader

@@ -250,9 +250,9 @@ class Job:
                     return
                 done = len(run.history)
                 if done:
-                    self.watch.progress(done, most, f"loss {run.history[-1]['loss']:.4g}")
+                    self.watch.progress(done, max(most, done), f"loss {run.history[-1]['loss']:.4g}")
                 due = time.perf_counter() - saved >= chosen.checkpoint_s
-                due |= run.finished or done == most  # what follows may be interrupted too
+                due |= run.finished or done >= most  # what follows may be interrupted too
                 if self.folder and (due or interrupt.is_set()):
                     state = adam_loop.State(step=done, history=run.history)
                     asked = self.folder, what, state, run.arrays(), self.renderer.state(), self.wanted.aim
@@ -263,7 +263,7 @@ class Job:
 
             rendered = self.wanted.coverage is None  # paint is no noisy picture, and asks for what it shows
             more = {"births": SPARE, "judge": self._display_error} if rendered else {"sparing": False}
-            asked = self._problem(), params, self._sigma, most, after_step, run
+            asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
             found = gauss_newton.solve(*asked, **more)
         self.posterior, self.note = found.posterior, found.note
         return found.params, adam_loop.State(step=len(found.history), history=found.history)

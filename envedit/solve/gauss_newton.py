@@ -19,7 +19,7 @@ from envedit.solve import added_light
 from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
-"""Most steps, and the relative decrease of F below which no further step is made."""
+"""Most steps without added lights, and the relative decrease of F below which no further step is made."""
 TRIES = 5
 """Dampings that are tried in one step."""
 NEAR, CLEARLY = 2.0, 0.95
@@ -108,7 +108,7 @@ def solve(
     problem: Problem,
     params: dict,
     sigma: float = SIGMA,
-    iterations: int = ITERATIONS,
+    iterations: int = 2 * ITERATIONS,
     after_step: Callable[[Run | None, Point], None] | None = None,
     run: Run | None = None,
     trial: bool = False,
@@ -258,7 +258,7 @@ class _Search:
         return len(self.problem.added(run.state)) < self.births
 
     def _most(self, run):
-        return self.iterations + min(ADDED_STEPS, self.iterations) * len(self.problem.added(run.state))
+        return min(self.iterations, ITERATIONS + ADDED_STEPS * len(self.problem.added(run.state)))
 
     def _better(self, run, point, state, new=None, margin=WORTH):
         """Return the better of a run and of one from a state with some lights new, after some steps.
@@ -274,7 +274,7 @@ class _Search:
         first = self.problem.evaluate(state)
         if first.residual is None:
             return run, point
-        most = len(run.history) + min(ADDED_STEPS, self.iterations)
+        most = min(self.iterations, len(run.history) + ADDED_STEPS)
         if not run.finished:
             run = replace(run, history=list(run.history))
             point = self._descended(run, point, most, self._tried)

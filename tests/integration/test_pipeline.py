@@ -172,9 +172,11 @@ PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels"])
 def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
+    picture = sky(rng, 32, 64) + 0.1
+    images.write_exr(tmp_path / "brighter.exr", 2 * picture)
     settings = settings_of(
-        tmp_path, sky(rng, 32, 64) + 0.1, input={"rows": "all", "horizon": "free", "width": 64},
-        representation={"kind": kind, "hidden": 16, "depth": 1},
+        tmp_path, picture, input={"rows": "all", "horizon": "free", "width": 64},
+        representation={"kind": kind, "hidden": 16, "depth": 1}, target={"file": "brighter.exr"},
         renderer={"spp": 256, "max_depth": 3}, optimizer={"kind": "adam", "iterations": 5, "lr": 1e-2},
     )  # fmt: skip
     write_scene(tmp_path, PLATE, LIGHT, name="scene.xml")

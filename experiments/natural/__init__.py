@@ -1,1 +1,1 @@
-"""Many skies in many scenes: are edited maps still photographs of skies?"""
+"""Many skies in many scenes: whether edited maps are still photographs of skies."""

@@ -1,1 +1,1 @@
-"""Every sky in five scenes: whether edited maps are still photographs of skies."""
+"""Many skies in many scenes: whether edited maps are still photographs of skies."""

@@ -7,7 +7,7 @@ import hashlib
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.array_cache import DiskCache, cache_folder
+from envedit.core.array_cache import DiskCache, cache_folder, holds
 from envedit.scene.scene import Scene
 
 MOST_BYTES = 500_000_000
@@ -40,7 +40,14 @@ def rendered(scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: 
         "map": [image.shape, hashlib.sha256(image.tobytes()).hexdigest()],
         "samples": [spp, seed],
     }
-    if (found := cache.load(key)) is not None:
+    size = scene.height, scene.width
+
+    def whole(arrays):
+        told = (0,) if arrays["noise"].size == 0 else size
+        kept = {"picture": ("f4", (*size, 3)), "spp": ("i8", ()), "noise": ("f8", told)}
+        return holds(arrays, kept) and arrays["spp"] > 0
+
+    if (found := cache.load(key, whole)) is not None:
         noise = np.array(found["noise"]) if found["noise"].size else None
         return np.array(found["picture"]), int(found["spp"]), noise
     picture, taken, noise = scene.sampled(envmap, spp, seed)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from envedit import config
-from envedit.core.atomic_files import replacing
+from envedit.core.atomic_files import opened, replacing
 from envedit.core.errors import InputError
 from envedit.solve.adam_loop import State
 
@@ -51,11 +52,11 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
         If it is damaged or belongs to another configuration or other input files.
     """
     path = folder / NAME
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     try:
         # Opened here: np.load leaves a file open that is no archive.
-        with open(path, "rb") as file, np.load(file) as stored:
+        with opened(path) as file, np.load(file) as stored:
             meta, picture = json.loads(stored["meta"].tobytes()), stored["target"]
             parts = {
                 part: {

@@ -171,6 +171,30 @@ def test_damaged_files_are_traced_again(lit, tmp_path, rng):
     assert build(tmp_path, lit).cached
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("forward/packed", lambda a: a.view(np.uint32)[3::4].__setitem__(5, 8 * 16)),  # a column too many
+        ("reverse/packed", lambda a: a.__setitem__(0, np.nan)),
+        ("reverse/packed", lambda a: a.__setitem__(1, -np.inf)),
+        ("forward/start", lambda a: a.__setitem__(0, a[0] + 1)),
+        ("forward/stop", lambda a: a.__setitem__(-1, 2**32 - 8)),
+        ("reverse/lane", lambda a: a.__setitem__(3, 2**31)),
+        ("forward/shape", lambda a: a.__setitem__(0, 2**40)),
+        ("influence", lambda a: a.__setitem__((2, 3), np.inf)),
+        ("lost", lambda a: a.__setitem__((), -1)),
+    ],
+)
+def test_a_recording_with_right_digests_and_wrong_numbers_is_traced_again(lit, tmp_path, name, change):
+    first = build(tmp_path, lit)
+    cache, key = first._stored[0], {k: v for k, v in first._stored[1].items()} | {"part": "recording"}
+    arrays = {k: np.array(v) for k, v in cache.load(key).items()}
+    change(arrays[name])
+    cache.store(key, arrays)
+    assert cache.load(key) is not None and not build(tmp_path, lit).cached
+    assert build(tmp_path, lit).cached
+
+
 @pytest.mark.slow
 def test_recordings_of_a_refresh_are_not_kept(lit, tmp_path, rng):
     image = mi.TensorXf(np.ones((8, 16, 3), np.float32))

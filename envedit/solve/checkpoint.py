@@ -70,6 +70,17 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
         ):
             raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
         state, found = State(**meta["state"]), meta["digest"]
+        whole = state.step, state.bad_steps, state.bad_in_a_row
+        if not (
+            all(type(n) is int and n >= 0 for n in whole)
+            and isinstance(state.slowdown, int | float)
+            and 0 < state.slowdown <= 1
+            and isinstance(state.history, list)
+            and all(isinstance(row, dict) for row in state.history)
+            and picture.dtype == np.float32
+            and all(np.isfinite(a).all() for a in (picture, *parts["optimiser"].values()))
+        ):
+            raise ValueError("what it holds is no state of a run")
     except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
         reason = " ".join(str(error).split())[:160]
         reason = reason if reason.isprintable() else ascii(reason)

@@ -27,7 +27,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.array_cache import DiskCache, holds
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_radiance
 from envedit.transport import block_transport as overviews
 from envedit.transport import bright_texels
@@ -401,7 +401,26 @@ class LightTransport:
         return {**self._exact.state(), "looks": self._looks, "epoch": np.int64(self.epoch)}
 
     def restore(self, state: dict) -> None:
-        """Trace the columns of an earlier :meth:`state`."""
+        """Trace the columns of an earlier :meth:`state`.
+
+        Raises
+        ------
+        InputError
+            If it is no state of such a transport.
+        """
+        columns, paths = state.get("columns"), state.get("paths")
+        own = {k: np.asarray(v) for k, v in state.items()}
+        kept = {name: (own[name].dtype, (None,)) for name in ("columns", "paths", "looks") if name in own}
+        if not (
+            holds(own, kept | {"epoch": ("i8", ())})
+            and all(a.dtype.kind in "iu" for a in own.values())
+            and len(columns) == len(paths) == len(np.unique(columns)) <= self.capacity
+            and len(own["looks"]) == self.grid.texels
+            and own["epoch"] >= 0
+            and (len(columns) == 0 or 0 <= columns.min() <= columns.max() < self.grid.texels)
+            and (len(paths) == 0 or 0 < paths.min() <= paths.max() <= max(*COLUMN_PATHS, *FEW_PATHS))
+        ):
+            raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
         if int(state["epoch"]) != self.epoch:
             self.epoch = int(state["epoch"])
             self._record()

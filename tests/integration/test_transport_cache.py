@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envedit.core.errors import InputError
 from envedit.scene import scene
 from envedit.transport import light_transport, recording
 from envedit.transport.light_transport import LightTransport
@@ -211,3 +212,25 @@ def test_without_a_folder_nothing_is_kept(lit, tmp_path):
     for _ in range(2):
         assert not LightTransport.build(lit, 8, 16, spp=4).cached
     assert set(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"columns": np.array([8 * 16])},
+        {"columns": np.array([-1])},
+        {"columns": np.array([3, 3]), "paths": np.array([8, 8])},
+        {"columns": np.array([3.0])},
+        {"paths": np.array([2**31])},
+        {"looks": np.zeros(5, np.uint8)},
+        {"epoch": np.int64(-1)},
+        {"more": np.zeros(1, int)},
+    ],
+)
+def test_columns_of_a_checkpoint_are_checked(lit, tmp_path, odd):
+    transport = build(tmp_path, lit)
+    good = {"columns": np.array([3]), "paths": np.array([8]), "looks": np.zeros(8 * 16, np.uint8)}
+    transport.restore(good | {"epoch": np.int64(0)})
+    assert transport.columns.tolist() == [3]
+    with pytest.raises(InputError, match="its columns are not of this light transport"):
+        transport.restore(good | {"epoch": np.int64(0)} | odd)

@@ -28,6 +28,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from envedit.cli.streams import steady
 from envedit.core.array_cache import cache_home
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
@@ -293,6 +294,7 @@ def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
 # The command line
 
 
+@steady
 def main(arguments=None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
     parser = argparse.ArgumentParser(

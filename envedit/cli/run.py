@@ -10,9 +10,11 @@ import sys
 import time
 from pathlib import Path
 
+from envedit.cli.streams import steady
 from envedit.core import shipped
 
 
+@steady
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     start = time.perf_counter()

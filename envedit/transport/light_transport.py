@@ -416,7 +416,7 @@ class LightTransport:
             and all(a.dtype.kind in "iu" for a in own.values())
             and len(columns) == len(paths) == len(np.unique(columns)) <= self.capacity
             and len(own["looks"]) == self.grid.texels
-            and own["epoch"] >= 0
+            and 0 <= own["epoch"] < 2**31
             and (len(columns) == 0 or 0 <= columns.min() <= columns.max() < self.grid.texels)
             and (len(paths) == 0 or 0 < paths.min() <= paths.max() <= max(*COLUMN_PATHS, *FEW_PATHS))
         ):

@@ -81,7 +81,7 @@ def mesh_files() -> dict[str, bytes]:
 
 @functools.cache
 def _world():
-    """A scene, a transport of it and the folder and key of its recording."""
+    """Return a scene, a transport of it, and the folder of its cache."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

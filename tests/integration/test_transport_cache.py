@@ -224,6 +224,7 @@ def test_without_a_folder_nothing_is_kept(lit, tmp_path):
         {"paths": np.array([2**31])},
         {"looks": np.zeros(5, np.uint8)},
         {"epoch": np.int64(-1)},
+        {"epoch": np.int64(2**40)},
         {"more": np.zeros(1, int)},
     ],
 )

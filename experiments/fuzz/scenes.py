@@ -137,7 +137,7 @@ def mutated_scene(data: bytes, rng: np.random.Generator) -> bytes:
                 quoted = re.sub(r'"[^"]*"', lambda _, w=word: f'"{w}"', tags[i], count=1)
                 tags[i] = quoted
             case 1:
-                tags[i] = re.sub(r"<\w+", f"<{word}", tags[i])
+                tags[i] = re.sub(r"<\w+", lambda _, w=word: f"<{w}", tags[i])
             case 2:
                 tags[i] = ""
             case 3:

@@ -408,11 +408,12 @@ class LightTransport:
         InputError
             If it is no state of such a transport.
         """
-        columns, paths = state.get("columns"), state.get("paths")
+        columns, paths = (np.asarray(state.get(name, 0)) for name in ("columns", "paths"))
         own = {k: np.asarray(v) for k, v in state.items()}
         kept = {name: (own[name].dtype, (None,)) for name in ("columns", "paths", "looks") if name in own}
         if not (
-            holds(own, kept | {"epoch": ("i8", ())})
+            own.keys() == {"columns", "paths", "looks", "epoch"}
+            and holds(own, kept | {"epoch": ("i8", ())})
             and all(a.dtype.kind in "iu" for a in own.values())
             and len(columns) == len(paths) == len(np.unique(columns)) <= self.capacity
             and len(own["looks"]) == self.grid.texels

@@ -123,7 +123,7 @@ def run(
         warnings += wanted.warnings
         few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
         initial = wanted.initial
-        if initial is None:
+        if initial is None and wanted.coverage is not None:
             initial, _, _ = rendered(lit, original, few, settings.seed + JUDGE_SEED, settings.renderer.cache)
     rows = slice(first, last + 1)
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock, initial)
@@ -154,7 +154,10 @@ def run(
 
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        final, judged, _ = lit.sampled(edited, settings.output.spp, settings.seed + JUDGE_SEED + 1)
+        spp, seed = settings.output.spp, settings.seed + JUDGE_SEED + 1
+        final, judged, _ = lit.sampled(edited, spp, seed)
+        if initial is None:  # the same samples: what differs is the map
+            initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
     notes += [job.note] if job.note else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
@@ -167,6 +170,12 @@ def run(
         stored = given.as_stored(edited, edit.degrees)
         measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit.alpha)
         predicted = traced.coarse_error(edited) if traced else None
+    before, after = (measured[name]["psnr"] for name in ("initial", "render"))
+    measured["worse"] = wanted.coverage is None and after < before
+    if measured["worse"]:
+        warnings.append(
+            f"the result is farther from the target than the input: {after:.2f} dB, {before:.2f} dB before"
+        )
     if state.bad_steps:
         warnings.append(
             f"{state.bad_steps} of {state.step} iterations were not finite: they were taken back, and the "

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
+from envedit.cli.streams import steady
+
 KINDS = {
     "transport": "light transports of scenes",
     "fits": "SIRENs fitted to maps",
@@ -12,6 +14,7 @@ KINDS = {
 }
 
 
+@steady
 def main(argv: list[str] | None = None) -> int:
     """Say what the cache holds, or empty it; returns the exit code."""
     parser = argparse.ArgumentParser(

@@ -28,7 +28,9 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from envedit.core.atomic_files import write_atomically
+from envedit.cli.streams import steady
+from envedit.core.array_cache import cache_home
+from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
 
 __all__ = ["Diagnosis", "check", "ensure", "main"]
@@ -123,15 +125,17 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
     cache that cannot be written costs a probe every time and nothing else.
     """
     memory = _memory(variant)
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        known = json.loads(memory.read_text())
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        with opened(memory) as file:
+            known = json.loads(file.read(1 << 16))
         if known["ok"] is True and known["library"] == _stamp(known["library"][0]):
             return
     diagnosis = check(variant)
     if not diagnosis.ok:
         raise MachineError("\n".join(diagnosis.lines))
     # A stamp of None (no library file is seen on this system) would never prove a change: then probe again.
-    if (stamp := _stamp(diagnosis.versions.get("llvm_path"))) or not variant.startswith("llvm"):
+    stamp = _stamp(diagnosis.versions.get("llvm_path"))
+    if memory is not None and (stamp or not variant.startswith("llvm")):
         with contextlib.suppress(OSError, RuntimeError, InputError):
             memory.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(memory, json.dumps({"ok": True, "library": stamp or [None]}).encode())
@@ -186,14 +190,14 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _memory(variant: str) -> Path:
+def _memory(variant: str) -> Path | None:
     """Return the file that remembers a success for this variant, these packages and these libraries."""
     libraries = sorted(name for pattern in _LIBRARIES for name in glob.glob(pattern))
     parts = [variant, sys.version, sys.executable, _version("mitsuba"), _version("drjit"), libraries]
     parts += [os.environ.get(name) for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")]
     key = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(home) / "envedit" / f"doctor-{key}.json"
+    home = cache_home()
+    return None if home is None else home / f"doctor-{key}.json"
 
 
 def _stamp(path: str | None) -> list | None:
@@ -290,6 +294,7 @@ def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
 # The command line
 
 
+@steady
 def main(arguments=None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
     parser = argparse.ArgumentParser(

@@ -11,6 +11,7 @@ import mitsuba as mi
 from envedit import config, inputs
 from envedit.cli import doctor
 from envedit.cli.progress import Progress
+from envedit.cli.streams import steady
 from envedit.core.errors import EnveditError, unwrapped
 from envedit.images import images
 from envedit.losses import metrics
@@ -18,6 +19,7 @@ from envedit.report import manifest, output_folder, preview
 from envedit.representations.siren import fit
 
 
+@steady
 def main(argv: list[str] | None = None) -> int:
     """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
     parser = argparse.ArgumentParser(

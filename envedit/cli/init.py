@@ -8,6 +8,7 @@ import os
 import sys
 from pathlib import Path
 
+from envedit.cli.streams import steady
 from envedit.core import shipped
 
 # Lines of "setting  # comment"; the comments are aligned when the settings are known.
@@ -43,6 +44,7 @@ WIDEST = 48
 """A setting that is wider than this, as with a long path, is not counted when comments are aligned."""
 
 
+@steady
 def main(argv: list[str] | None = None) -> int:
     """Write a configuration; returns the exit code."""
     scenes = ", ".join(shipped.scenes())

@@ -7,6 +7,8 @@ import difflib
 import importlib
 import sys
 
+from envedit.cli.streams import steady
+
 COMMANDS = {
     "run": "carry out the edit that a configuration describes",
     "fit": "fit a SIREN to a map, without an edit",
@@ -16,6 +18,7 @@ COMMANDS = {
 }
 
 
+@steady
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv

@@ -16,9 +16,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from envedit.cli.streams import steady
 from envedit.core import shipped
 
 
+@steady
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     start = time.perf_counter()

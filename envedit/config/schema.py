@@ -42,6 +42,7 @@ from envedit.config.validators import (
     weight,
 )
 from envedit.config.validators import key as _key
+from envedit.core.atomic_files import opened
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 
@@ -420,7 +421,7 @@ def load(path: str | PathLike, preset: str | None = None, overrides: Iterable[st
         The file cannot be read, is not TOML, or holds an unknown key or an unusable value.
     """
     try:
-        with open(path, "rb") as file:
+        with opened(path) as file:
             data = file.read(_MOST_BYTES + 1)
     except IsADirectoryError:
         raise ConfigError(f"{path}: a folder, wanted a TOML file") from None

@@ -1,8 +1,11 @@
 """Arrays kept on disk under a hash of what they were made from, in a folder of bounded size.
 
-An entry is one file: a header with the whole key and a checksum of every array, then the raw arrays, which
-are mapped into memory and not parsed. A file that is damaged, cut short or foreign is as good as none, and
-one that cannot be written costs nothing but the time to make its arrays again.
+An entry is one file: a header with the whole key and the SHA-256 of every array, then the raw arrays, which
+are mapped into memory and not parsed. A file that is damaged, cut short or foreign is as good as none, as is
+one in a folder that others may write to, and one that cannot be written costs nothing but the time to make
+its arrays again. A digest tells damage, not intent: callers check shapes and ranges too (``wanted``).
+
+SHA-256 reads 1.8 GB/s where the processor has instructions for it, BLAKE2b 0.9 GB/s.
 """
 
 from __future__ import annotations
@@ -13,20 +16,21 @@ import json
 import math
 import os
 import re
-import tempfile
+import stat
 import time
-import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from envedit.core.atomic_files import replacing
+from envedit.core.atomic_files import opened, replacing
 from envedit.core.errors import InputError
 
 MOST_BYTES = 4_000_000_000
 """Size above which a folder loses the entries that were not used for longest."""
-_MAGIC = b"envedit1"
-_ALIGNED, _PAGE = 64, 4096
+_MAGIC = b"envedit2"
+_ALIGNED = 64
+_START = len(_MAGIC) + 8 + 32  # magic, length and SHA-256 of the description
 _OURS = re.compile(r"[0-9a-f]{32}\.arrays|(?P<temporary>\.[0-9a-f]{32}\.arrays\.\d+)")
 _ABANDONED = 3600.0  # seconds after which a temporary file belongs to no writer that is still alive
 
@@ -45,25 +49,32 @@ class DiskCache:
     def __init__(self, folder: Path | None, most_bytes: int = MOST_BYTES):
         self.folder, self.most_bytes = folder, most_bytes
 
-    def load(self, key: dict) -> dict[str, np.ndarray] | None:
+    def load(
+        self, key: dict, wanted: Callable[[dict[str, np.ndarray]], bool] | None = None
+    ) -> dict[str, np.ndarray] | None:
         """Return the arrays that were stored under a key; None if there are none, or none that are whole.
 
         Parameters
         ----------
         key : dict
             What the arrays were made from, as JSON knows it.
+        wanted : callable, optional
+            Tells whether arrays are such as :meth:`store` was given: names, types, shapes and ranges. What it
+            raises is a no.
 
         Returns
         -------
         dict of str to ndarray
             Read-only, and mapped: to be copied if they are to outlive their use.
         """
-        if self.folder is None:
+        if self.folder is None or not _private(self.folder):
             return None
         path = self._path(key)
         try:
             arrays = _read(path, _text(key))
-        except (OSError, ValueError):
+            if wanted is not None and not wanted(arrays):
+                return None
+        except Exception:  # what a header that is believed can lead to has many names
             return None
         with contextlib.suppress(OSError):  # somebody else's folder is as good to read from
             os.utime(path)  # the time of last use, by which entries are dropped
@@ -80,7 +91,9 @@ class DiskCache:
             return
         path = self._path(key)
         with contextlib.suppress(OSError, InputError):
-            self.folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not _private(self.folder):
+                return
             self._make_room(size, path)
             with replacing(path) as temporary, open(temporary, "wb") as file:
                 file.write(head)
@@ -130,53 +143,86 @@ def _padded(size):
     return -(-size // _ALIGNED) * _ALIGNED
 
 
-def _checksum(array):
-    """CRC of the sums of an array's 4 kB pages: as quick as memory, which a CRC of all bytes is not."""
-    raw = array.reshape(-1).view(np.uint8)
-    whole = len(raw) // _PAGE * _PAGE
-    sums = raw[:whole].view(np.uint64).reshape(-1, _PAGE // 8).sum(axis=1)
-    return zlib.crc32(raw[whole:], zlib.crc32(sums))
+def _digest(array):
+    return hashlib.sha256(array.reshape(-1).view(np.uint8)).hexdigest()
 
 
 def _header(text, arrays):
-    """Magic number, length and CRC of the description, and the description in JSON, padded."""
-    listed = [[name, a.dtype.str, a.shape, _checksum(a)] for name, a in arrays.items()]
+    """Magic number, length and SHA-256 of the description, and the description in JSON, padded."""
+    listed = [[name, a.dtype.str, a.shape, _digest(a)] for name, a in arrays.items()]
     description = json.dumps({"key": text, "arrays": listed}).encode()
-    numbers = len(description), zlib.crc32(description)
-    head = _MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + description
+    length = len(description).to_bytes(8, "little")
+    head = _MAGIC + length + hashlib.sha256(description).digest() + description
     return head.ljust(_padded(len(head)), b"\0")
 
 
 def _read(path, text):
-    """Map the arrays of a file; ValueError if it is not whole or holds another key."""
-    raw = np.memmap(path, np.uint8, "r")
-    length, checksum = (int.from_bytes(raw[i : i + 4].tobytes(), "little") for i in (8, 12))
-    description = raw[16 : 16 + length].tobytes()
-    if raw[:8].tobytes() != _MAGIC or zlib.crc32(description) != checksum:
+    """Map the arrays of a file; raises if it is not whole or holds another key."""
+    with opened(path) as file:
+        raw = np.memmap(file, np.uint8, "r")
+    length = int.from_bytes(raw[8:16].tobytes(), "little")
+    description = raw[_START : _START + length].tobytes()
+    if raw[:8].tobytes() != _MAGIC or hashlib.sha256(description).digest() != raw[16:_START].tobytes():
         raise ValueError
     description = json.loads(description)
     if description["key"] != text:
         raise ValueError
-    place, arrays = _padded(16 + length), {}
-    for name, kind, shape, checksum in description["arrays"]:
+    place, arrays = _padded(_START + length), {}
+    for name, kind, shape, digest in description["arrays"]:
         dtype = np.dtype(kind)
+        if dtype.kind not in "biuf" or not all(isinstance(n, int) and n >= 0 for n in shape):
+            raise ValueError
         size = dtype.itemsize * math.prod(shape)
         array = raw[place : place + size].view(dtype).reshape(shape)
-        if _checksum(array) != checksum:
+        if _digest(array) != digest:
             raise ValueError
         arrays[name] = array
         place += _padded(size)
     return arrays
 
 
-def cache_folder(kind: str) -> Path:
-    """Folder in which one kind of file is kept between runs: $XDG_CACHE_HOME/envedit/KIND or in ~/.cache.
+def holds(arrays: dict[str, np.ndarray], wanted: dict[str, tuple]) -> bool:
+    """Tell whether arrays have these names, types and shapes, and hold finite numbers.
 
-    In the system's folder for temporary files where the user has no home.
+    Parameters
+    ----------
+    arrays : dict of str to ndarray
+        As of :meth:`DiskCache.load`.
+    wanted : dict of str to (dtype, shape)
+        A length of None in a shape is any.
     """
-    if not (base := os.environ.get("XDG_CACHE_HOME")):
-        try:
-            base = Path.home() / ".cache"
-        except RuntimeError:
-            base = tempfile.gettempdir()
-    return Path(base) / "envedit" / kind
+    return arrays.keys() == wanted.keys() and all(
+        array.dtype == np.dtype(dtype)
+        and len(array.shape) == len(shape)
+        and all(want in (None, got) for got, want in zip(array.shape, shape, strict=True))
+        and bool(np.isfinite(array).all())
+        for array, (dtype, shape) in ((arrays[name], wanted[name]) for name in wanted)
+    )
+
+
+def _private(folder):
+    """Tell whether only this user (and the system's) can have written into a folder; True of none."""
+    try:
+        about = os.stat(folder)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    ours = not hasattr(os, "geteuid") or about.st_uid in (os.geteuid(), 0)
+    return stat.S_ISDIR(about.st_mode) and ours and not about.st_mode & stat.S_IWOTH
+
+
+def cache_home() -> Path | None:
+    """Folder of all that is kept between runs: $XDG_CACHE_HOME/envedit, or ~/.cache/envedit.
+
+    None where the user has no home: in a folder for everybody, others could have put what they like.
+    """
+    if not os.path.isabs(base := os.environ.get("XDG_CACHE_HOME") or ""):  # as its specification has it
+        base = os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(base) / "envedit" if os.path.isabs(base) else None
+
+
+def cache_folder(kind: str) -> Path | None:
+    """Folder in which one kind of file is kept between runs, in :func:`cache_home`; None: nowhere."""
+    home = cache_home()
+    return None if home is None else home / kind

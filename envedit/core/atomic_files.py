@@ -1,8 +1,10 @@
 """Files that are written whole or not at all."""
 
 import contextlib
+import errno
 import os
 import re
+import stat
 from pathlib import Path
 
 from envedit.core.errors import EnveditError, InputError
@@ -61,3 +63,24 @@ def write_atomically(path, data: bytes) -> None:
     """
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+
+
+def opened(path):
+    """Open a regular file for reading bytes; a pipe or a device would wait or never end.
+
+    Raises
+    ------
+    OSError
+        As of ``open``, and for what is no regular file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "is no regular file", os.fspath(path))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise

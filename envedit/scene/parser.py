@@ -44,6 +44,11 @@ def told(where: str, call, /, *arguments, **filled):
         return call(*arguments, **filled)
     except (RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
         text = re.sub(r"\[[A-Za-z][\w.]*(:\d+)?\] ", "", str(error))
+        # What a mesh holds is not repeated: it may be another file.
+        text = re.sub(
+            r'(could not parse line|unknown token) ".*', r"\1", text, flags=re.DOTALL | re.IGNORECASE
+        )
+        text = "".join(c if c.isprintable() else " " for c in text)
         text = " ".join(text.split())
         for prefix in (f"At {where} ", f"Error while loading {where} ", f"While loading {where} ",
                        f"Parsing of XML file {where} failed: ", f'Parsing of XML file "{where}" failed: ',

@@ -7,7 +7,7 @@ import hashlib
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.array_cache import DiskCache, cache_folder
+from envedit.core.array_cache import DiskCache, cache_folder, holds
 from envedit.scene.scene import Scene
 
 MOST_BYTES = 500_000_000
@@ -15,14 +15,14 @@ MOST_BYTES = 500_000_000
 _RECIPE = 2  # raise when the same inputs give another rendering
 
 
-def rendered(scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: bool = True):
+def rendered(scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: bool = True, exactly=None):
     """Render as :meth:`.Scene.sampled`, or take what an earlier call rendered from disk.
 
     The judged rendering of a result is not taken from here: it is made with fresh samples every time.
 
     Parameters
     ----------
-    scene, envmap, spp, seed
+    scene, envmap, spp, seed, exactly
         As of :meth:`.Scene.sampled`.
     keep : bool
         Keep renderings on disk and take them from there.
@@ -38,12 +38,19 @@ def rendered(scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: 
         "version": [_RECIPE, mi.__version__, mi.variant()],
         "scene": [scene.digest, scene.width, scene.height, np.asarray(scene.to_world).tolist()],
         "map": [image.shape, hashlib.sha256(image.tobytes()).hexdigest()],
-        "samples": [spp, seed],
+        "samples": [spp, seed, exactly],
     }
-    if (found := cache.load(key)) is not None:
+    size = scene.height, scene.width
+
+    def whole(arrays):
+        told = (0,) if arrays["noise"].size == 0 else size
+        kept = {"picture": ("f4", (*size, 3)), "spp": ("i8", ()), "noise": ("f8", told)}
+        return holds(arrays, kept) and arrays["spp"] > 0
+
+    if (found := cache.load(key, whole)) is not None:
         noise = np.array(found["noise"]) if found["noise"].size else None
         return np.array(found["picture"]), int(found["spp"]), noise
-    picture, taken, noise = scene.sampled(envmap, spp, seed)
+    picture, taken, noise = scene.sampled(envmap, spp, seed, exactly)
     stored = np.zeros(0) if noise is None else noise
     cache.store(key, {"picture": picture, "spp": np.array(taken, np.int64), "noise": stored})
     return picture, taken, noise

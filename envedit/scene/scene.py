@@ -179,7 +179,7 @@ class Scene:
             total += count / spp * self._pass(count, seed, i, max_depth)
         return self._checked(total)
 
-    def sampled(self, image, spp: int | str = "auto", seed: int = 0):
+    def sampled(self, image, spp: int | str = "auto", seed: int = 0, exactly: int | None = None):
         """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
 
         Passes of 64 samples a pixel are added until the error of their mean, told by how much their display
@@ -194,6 +194,9 @@ class Scene:
             Samples a pixel.
         seed : int
             Of every random choice.
+        exactly : int, optional
+            With "auto": as many samples as another rendering took, to be judged beside it: with the same seed
+            they are the same samples.
 
         Returns
         -------
@@ -222,7 +225,8 @@ class Scene:
             n = i + 1
             if n * count >= QUIET_LEAST:
                 variance = np.maximum(power / n - (shown / n) ** 2, 0).mean(axis=2) / max(n - 1, 1)
-                if variance.mean() < 10 ** (-QUIET_DECIBELS / 10):
+                quiet = variance.mean() < 10 ** (-QUIET_DECIBELS / 10)
+                if quiet if exactly is None else n * count >= exactly:
                     break
         return self._checked(total / n), n * count, np.sqrt(variance)
 

@@ -192,7 +192,7 @@ def _serialized(path):
     if meshes * wide + 4 > len(data):
         raise damaged(path, f"{meshes} meshes are declared")
     table = np.frombuffer(data[len(data) - 4 - meshes * wide : -4], f"<u{wide}")
-    for offset in map(int, table):
+    for offset in {0, *map(int, table)}:  # Mitsuba reads the first mesh wherever the table has it
         if offset + 4 > len(data):
             raise damaged(path, "a mesh begins after the end of the file")
         unpacked = zlib.decompressobj()

@@ -17,6 +17,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from envedit.core.errors import InputError
+from envedit.images.headers import shown
 from envedit.scene import scene_files
 
 DEEPEST = 20
@@ -190,7 +191,7 @@ class _Reader:
         elif tag == "include" and "filename" in values:
             found = _resolved(values["filename"], folders)
             if not os.path.isfile(found):
-                raise _WrongError(f"includes a missing file: {values['filename'][:200]}")
+                raise _WrongError(f"includes a missing file: {shown(values['filename'], 200)}")
             self.file(Path(found), folders, above)
         elif tag == "spectrum" and values.get("filename"):
             scene_files.check_numbers(Path(_resolved(values["filename"], folders)))

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from envedit import config
-from envedit.core.atomic_files import replacing
+from envedit.core.atomic_files import opened, replacing
 from envedit.core.errors import InputError
 from envedit.solve.adam_loop import State
 
@@ -51,11 +52,11 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
         If it is damaged or belongs to another configuration or other input files.
     """
     path = folder / NAME
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     try:
         # Opened here: np.load leaves a file open that is no archive.
-        with open(path, "rb") as file, np.load(file) as stored:
+        with opened(path) as file, np.load(file) as stored:
             meta, picture = json.loads(stored["meta"].tobytes()), stored["target"]
             parts = {
                 part: {
@@ -69,6 +70,17 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
         ):
             raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
         state, found = State(**meta["state"]), meta["digest"]
+        whole = state.step, state.bad_steps, state.bad_in_a_row
+        if not (
+            all(type(n) is int and n >= 0 for n in whole)
+            and isinstance(state.slowdown, int | float)
+            and 0 < state.slowdown <= 1
+            and isinstance(state.history, list)
+            and all(isinstance(row, dict) for row in state.history)
+            and picture.dtype == np.float32
+            and all(np.isfinite(a).all() for a in (picture, *parts["optimiser"].values()))
+        ):
+            raise ValueError("what it holds is no state of a run")
     except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
         reason = " ".join(str(error).split())[:160]
         reason = reason if reason.isprintable() else ascii(reason)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.array_cache import holds
 
 CELLS = 64
 """Cells around the horizon: 5.6 degrees each."""
@@ -74,6 +75,21 @@ def make(matrix, shape: tuple[int, int], grid: tuple[int, int]) -> Overview:
     toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
     size = np.bincount(cell_of, omega, cells)
     return Overview(dense.astype(np.float32), block_of, cell_of, toward, size)
+
+
+def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int]) -> bool:
+    """Tell whether arrays from disk are an overview of such a picture and map: no index leaves it."""
+    block_of, blocks = _tiles(*shape, max(1, -(-max(shape) // BLOCKS)))
+    cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
+    wanted = {
+        "matrix": ("f4", (3, blocks, cells)),
+        "block_of": ("i8", block_of.shape),
+        "cell_of": ("i8", cell_of.shape),
+        "directions": ("f8", (cells, 3)),
+        "omega": ("f8", (cells,)),
+    }
+    same = holds(arrays, wanted) and (arrays["block_of"] == block_of).all()
+    return bool(same and (arrays["cell_of"] == cell_of).all())
 
 
 def _tiles(height, width, size):

@@ -26,14 +26,15 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.array_cache import DiskCache
-from envedit.core.errors import ConfigError
+from envedit.core.array_cache import DiskCache, holds
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_radiance
 from envedit.transport import block_transport as overviews
 from envedit.transport import bright_texels
 from envedit.transport.exact_columns import ExactColumns
 from envedit.transport.influence import determined
 from envedit.transport.recording import (
+    MAX_BOUNCES,
     allowed,
     choose_bounces,
     choose_samples,
@@ -167,7 +168,15 @@ class LightTransport:
             "seed": seed,
         }
         sphere = latlong.solid_angles(height, width)
-        light = cache.load(origin | {"part": "pilot"})
+        known = {"by_row": ("f8", (height,)), "by_bounce": ("f8", (None,))}
+        light = cache.load(
+            origin | {"part": "pilot"},
+            lambda found: (
+                holds(found, known)
+                and len(found["by_bounce"]) == MAX_BOUNCES + 1
+                and min(a.min() for a in found.values()) >= 0 < found["by_bounce"].sum()
+            ),
+        )
         if light is None:
             by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
             light = {"by_row": by_row, "by_bounce": by_bounce}
@@ -194,7 +203,7 @@ class LightTransport:
             "part": "recording", "samples": spp, "bounces": bounces, "lamps": lamps, "rows": rows
         }  # fmt: skip
         transport._stored = cache, key | {"part": "overview"}
-        found = cache.load(key)
+        found = cache.load(key, transport._whole)
         if found is None:
             transport._trace(lamps, progress)
             cache.store(key, transport._recording())
@@ -230,14 +239,26 @@ class LightTransport:
             **{f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()},
         }
 
+    def _whole(self, arrays):
+        """Tell whether :meth:`_take` can take arrays from disk."""
+        grid, pixels = (self.grid.height, self.grid.width), self.shape[0] * self.shape[1]
+        own = {k: a for k, a in arrays.items() if "/" not in k}
+        kept = {"influence": ("f4", grid), "lost": ("i8", ()), "offset": ("f4", (None,))}
+        shapes = {"forward": (pixels, self.grid.texels), "reverse": (self.grid.texels, pixels)}
+        return (
+            holds(own, kept)
+            and own["offset"].size in (1, 3 * pixels)
+            and own["lost"] >= 0 <= own["influence"].min()
+            and all(ColourMatrix.whole(_under(arrays, part), shape) for part, shape in shapes.items())
+        )
+
     def _take(self, arrays):
         """Take the first recording from arrays."""
         self.cached, self._lost = True, int(arrays["lost"])
         self.influence = np.array(arrays["influence"])
         self._offset = dr.opaque(mi.Float(arrays["offset"]))
         for part in ("forward", "reverse"):
-            own = {k.removeprefix(f"{part}/"): a for k, a in arrays.items() if k.startswith(f"{part}/")}
-            setattr(self, part, ColourMatrix.from_arrays(own))
+            setattr(self, part, ColourMatrix.from_arrays(_under(arrays, part)))
 
     # ------------------------------------------------------------------ what it is
 
@@ -290,9 +311,10 @@ class LightTransport:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
         if self._overview is None:
             cache, key = self._stored
-            stored = cache.load(key)
+            shapes = self.shape, (self.grid.height, self.grid.width)
+            stored = cache.load(key, lambda found: overviews.whole(found, *shapes))
             if stored is None:
-                made = overviews.make(self.forward, self.shape, (self.grid.height, self.grid.width))
+                made = overviews.make(self.forward, *shapes)
                 cache.store(key, vars(made))
                 stored = vars(made)
             self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
@@ -383,7 +405,27 @@ class LightTransport:
         return {**self._exact.state(), "looks": self._looks, "epoch": np.int64(self.epoch)}
 
     def restore(self, state: dict) -> None:
-        """Trace the columns of an earlier :meth:`state`."""
+        """Trace the columns of an earlier :meth:`state`.
+
+        Raises
+        ------
+        InputError
+            If it is no state of such a transport.
+        """
+        columns, paths = (np.asarray(state.get(name, 0)) for name in ("columns", "paths"))
+        own = {k: np.asarray(v) for k, v in state.items()}
+        kept = {name: (own[name].dtype, (None,)) for name in ("columns", "paths", "looks") if name in own}
+        if not (
+            own.keys() == {"columns", "paths", "looks", "epoch"}
+            and holds(own, kept | {"epoch": ("i8", ())})
+            and all(a.dtype.kind in "iu" for a in own.values())
+            and len(columns) == len(paths) == len(np.unique(columns)) <= self.capacity
+            and len(own["looks"]) == self.grid.texels
+            and 0 <= own["epoch"] < 2**31
+            and (len(columns) == 0 or 0 <= columns.min() <= columns.max() < self.grid.texels)
+            and (len(paths) == 0 or 0 < paths.min() <= paths.max() <= max(*COLUMN_PATHS, *FEW_PATHS))
+        ):
+            raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
         if int(state["epoch"]) != self.epoch:
             self.epoch = int(state["epoch"])
             self._record()
@@ -494,6 +536,11 @@ class LightTransport:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
         tolerance = self.tolerance if tolerance is None else tolerance
         return bright_texels.brightest(*self._radiance(envmap), self._samples, tolerance)
+
+
+def _under(arrays, part):
+    """Return the arrays whose names begin with a part's, under the rest of their names."""
+    return {k.removeprefix(f"{part}/"): a for k, a in arrays.items() if k.startswith(f"{part}/")}
 
 
 def _check(tensor, shape, what):

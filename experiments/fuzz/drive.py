@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import documents, headers, mutate, pictures, worker
+from . import documents, headers, mutate, pictures, scenes, worker
 
 ROOT = Path(__file__).parents[2]
 FAULTS = ("crashed", "hung", "traceback", "unclear", "wrong", "memory", "printed")
@@ -71,6 +71,10 @@ def seeds(what: str) -> list[tuple[str, bytes]]:
             "painted": lambda: pictures.painted_files(Path(folder)),
             "weights": pictures.weight_files,
             "checkpoint": lambda: pictures.checkpoint_files(Path(folder)),
+            "scene": scenes.scene_files,
+            "mesh": scenes.mesh_files,
+            "entry": scenes.entry_files,
+            "state": scenes.state_files,
         }[what]()
     return sorted(made.items())
 
@@ -79,7 +83,16 @@ def case(what: str, whole: list[tuple[str, bytes]], seed: int, index: int) -> tu
     """Return name and content of a damaged file: the same for the same seeds, kind, seed and index."""
     rng = np.random.default_rng([seed, zlib.crc32(what.encode()), index])
     name, data = whole[rng.integers(len(whole))]
-    return name, (documents.mutated if what == "toml" else mutate.mutated)(data, rng)
+    return name, _MUTATED.get(what, mutate.mutated)(data, rng)
+
+
+_MUTATED = {
+    "toml": documents.mutated,
+    "scene": scenes.mutated_scene,
+    "entry": scenes.mutated_entry,
+    "state": scenes.mutated_state,
+}
+"""Damage of kinds that bytes alone would not reach."""
 
 
 class Worker:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import pictures
+from . import pictures, scenes
 
 
 class WrongError(Exception):
@@ -99,5 +99,6 @@ def state(path: Path, index: int) -> None:
 
 READERS = {
     "exr": environment, "hdr": environment, "toml": configuration, "painted": picture, "weights": tensors,
-    "checkpoint": state,
+    "checkpoint": state, "scene": scenes.read_scene, "mesh": scenes.read_mesh, "entry": scenes.read_entry,
+    "state": scenes.read_state,
 }  # fmt: skip

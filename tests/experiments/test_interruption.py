@@ -271,10 +271,10 @@ def test_a_disk_that_is_full_at_any_file_is_told_and_costs_no_work(tmp_path, who
 def stopping(sampled):
     """Press Ctrl-C when the result is to be rendered."""
 
-    def stop(self, envmap, spp, seed):
+    def stop(self, envmap, spp, seed, *rest):
         if seed == pipeline.JUDGE_SEED + 1:
             raise KeyboardInterrupt
-        return sampled(self, envmap, spp, seed)
+        return sampled(self, envmap, spp, seed, *rest)
 
     return stop
 

@@ -346,8 +346,8 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
 
     sampled = scene.Scene.sampled
 
-    def judged_fails(self, envmap, spp, seed):
-        return fails() if seed == pipeline.JUDGE_SEED + 1 else sampled(self, envmap, spp, seed)
+    def judged_fails(self, envmap, spp, seed, *rest):
+        return fails() if seed == pipeline.JUDGE_SEED + 1 else sampled(self, envmap, spp, seed, *rest)
 
     if stage == "judged rendering":
         monkeypatch.setattr(scene.Scene, "sampled", judged_fails)

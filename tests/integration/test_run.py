@@ -22,7 +22,6 @@ import pytest
 from envedit import config, pipeline
 from envedit.cli import run
 from envedit.images import images
-from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, edit_job, map_problem
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
@@ -331,21 +330,31 @@ def one_sun(row, column):
     return picture
 
 
-@pytest.mark.slow
-def test_the_initial_rendering_has_few_samples(tmp_path, rng, monkeypatch):
-    seen, render = [], scene.Scene.render
+@pytest.mark.parametrize("spp", [16, "auto"])
+def test_initial_rendering_and_result_are_judged_with_the_same_samples(tmp_path, rng, spp):
+    """So that a map in which nothing changes has the same score."""
+    path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp})
+    out = tmp_path / "out"
+    assert call(path, "--quiet", "--out", out, *changed(representation__kind="pixels")) == 0
+    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
+    found = measured(out)
+    assert found["render"] == found["initial"] and found["worse"] is False
+    assert pixels(out / "render_initial.exr").tobytes() == pixels(out / "render_edited.exr").tobytes()
 
-    def noted(self, envmap, spp, *rest, **keys):
-        seen.append(spp)
-        return render(self, envmap, spp, *rest, **keys)
 
-    monkeypatch.setattr(scene.Scene, "render", noted)
-    monkeypatch.setattr(pipeline, "INITIAL_SPP", 8)
-    for spp, few in ((16, 8), (8, 8), (1, 1)):
-        seen.clear()
-        path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp})
-        assert call(path, "--quiet", *changed(representation__kind="pixels", renderer__cache=False)) == 0
-        assert seen == [16, few, spp]  # target, before, after
+def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, capsys):
+    """Also under --quiet."""
+    path = world(tmp_path, rng, optimizer={"iterations": 1})
+    compare, scores = pipeline.metrics.compare, iter((20.0, 21.5))
+
+    def worse(edited, wanted, *rest):
+        return compare(edited, wanted, *rest) | {"psnr": next(scores, 30.0)}
+
+    monkeypatch.setattr(pipeline.metrics, "compare", worse)
+    assert call(path, "--quiet", "--out", tmp_path / "out") == 0
+    says = "warning: the result is farther from the target than the input: 20.00 dB, 21.50 dB before"
+    assert says in capsys.readouterr().err
+    assert measured(tmp_path / "out")["worse"] is True
 
 
 # ---- what is said and set --------------------------------------------------------------------------------

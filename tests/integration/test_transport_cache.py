@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envedit.core.errors import InputError
 from envedit.scene import scene
 from envedit.transport import light_transport, recording
 from envedit.transport.light_transport import LightTransport
@@ -171,6 +172,30 @@ def test_damaged_files_are_traced_again(lit, tmp_path, rng):
     assert build(tmp_path, lit).cached
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("forward/packed", lambda a: a.view(np.uint32)[3::4].__setitem__(5, 8 * 16)),  # a column too many
+        ("reverse/packed", lambda a: a.__setitem__(0, np.nan)),
+        ("reverse/packed", lambda a: a.__setitem__(1, -np.inf)),
+        ("forward/start", lambda a: a.__setitem__(0, a[0] + 1)),
+        ("forward/stop", lambda a: a.__setitem__(-1, 2**32 - 8)),
+        ("reverse/lane", lambda a: a.__setitem__(3, 2**31)),
+        ("forward/shape", lambda a: a.__setitem__(0, 2**40)),
+        ("influence", lambda a: a.__setitem__((2, 3), np.inf)),
+        ("lost", lambda a: a.__setitem__((), -1)),
+    ],
+)
+def test_a_recording_with_right_digests_and_wrong_numbers_is_traced_again(lit, tmp_path, name, change):
+    first = build(tmp_path, lit)
+    cache, key = first._stored[0], {k: v for k, v in first._stored[1].items()} | {"part": "recording"}
+    arrays = {k: np.array(v) for k, v in cache.load(key).items()}
+    change(arrays[name])
+    cache.store(key, arrays)
+    assert cache.load(key) is not None and not build(tmp_path, lit).cached
+    assert build(tmp_path, lit).cached
+
+
 @pytest.mark.slow
 def test_recordings_of_a_refresh_are_not_kept(lit, tmp_path, rng):
     image = mi.TensorXf(np.ones((8, 16, 3), np.float32))
@@ -187,3 +212,27 @@ def test_without_a_folder_nothing_is_kept(lit, tmp_path):
     for _ in range(2):
         assert not LightTransport.build(lit, 8, 16, spp=4).cached
     assert set(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"columns": np.array([8 * 16])},
+        {"columns": np.array([-1])},
+        {"columns": np.array([3, 3]), "paths": np.array([8, 8])},
+        {"columns": np.array([3.0])},
+        {"paths": np.array([2**31])},
+        {"looks": np.zeros(5, np.uint8)},
+        {"epoch": np.int64(-1)},
+        {"epoch": np.int64(2**40)},
+        {"more": np.zeros(1, int)},
+    ],
+)
+def test_columns_of_a_checkpoint_are_checked(lit, tmp_path, odd):
+    transport = build(tmp_path, lit)
+    good = {"columns": np.array([3]), "paths": np.array([8]), "looks": np.zeros(8 * 16, np.uint8)}
+    transport.restore(good | {"epoch": np.int64(0)})
+    assert transport.columns.tolist() == [3]
+    for state in (good | {"epoch": np.int64(0)} | odd, good, {"epoch": np.int64(0)}):
+        with pytest.raises(InputError, match="its columns are not of this light transport"):
+            transport.restore(state)

@@ -1,5 +1,7 @@
 """Arrays on disk: what comes back, what does not, and what a full folder loses."""
 
+import hashlib
+import json
 import os
 import time
 
@@ -232,3 +234,116 @@ def test_what_a_killed_writer_left_is_deleted_but_not_what_is_being_written(tmp_
     cache.store({"i": 1}, {"a": np.full(2500, 1, np.float32)})
     assert not left.exists() and current.exists()
     assert cache.load({"i": 0}) is None and cache.load({"i": 1}) is not None  # both count
+
+
+# ---- entries and folders of others -------------------------------------------------------------------------
+
+
+def entry(text, arrays, description=None):
+    """An entry with right digests, made without the cache; another description where one is given."""
+    head = array_cache._header(text, arrays)
+    if description is not None:
+        told = json.dumps(description(json.loads(head[array_cache._START :].rstrip(b"\0")))).encode()
+        head = b"envedit2" + len(told).to_bytes(8, "little") + hashlib.sha256(told).digest() + told
+        head = head.ljust(-(-len(head) // 64) * 64, b"\0")
+    return head + b"".join(a.tobytes().ljust(-(-a.nbytes // 64) * 64, b"\0") for a in arrays.values())
+
+
+def test_exchanged_words_pages_and_bits_are_seen(tmp_path, rng):
+    cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(40_000)}
+    cache.store(KEY, arrays)
+    path = only_file(tmp_path)
+    good = path.read_bytes()
+    start = len(good) - 320_000
+    for first, second, size in ((0, 8, 8), (0, 4096, 512), (4096, 8192, 4096), (0, 100_000, 1)):
+        data = bytearray(good)
+        one, other = (slice(start + p, start + p + size) for p in (first, second))
+        data[one], data[other] = data[other], data[one]
+        path.write_bytes(data)
+        assert cache.load(KEY) is None
+    path.write_bytes(good)
+    assert same(cache.load(KEY), arrays)
+
+
+def test_a_header_is_not_believed(tmp_path, rng):
+    cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(8)}
+    path = cache._path(KEY)
+    text = json.dumps(KEY, sort_keys=True)
+
+    def listed(change):
+        return lambda told: told | {"arrays": [change(list(told["arrays"][0]))]}
+
+    path.write_bytes(entry(text, arrays))
+    assert same(cache.load(KEY), arrays)
+    for change in (
+        lambda told: [],
+        lambda told: {"key": text},
+        lambda told: told | {"arrays": 5},
+        lambda told: told | {"arrays": [[]]},
+        listed(lambda a: [a[0], "O", *a[2:]]),
+        listed(lambda a: [a[0], "V8", *a[2:]]),
+        listed(lambda a: [a[0], a[1], [-8], a[3]]),
+        listed(lambda a: [a[0], a[1], [2**62], a[3]]),
+        listed(lambda a: [a[0], a[1], ["8"], a[3]]),
+        listed(lambda a: [a[0], a[1], [4], a[3]]),
+        listed(lambda a: [{}, *a[1:]]),
+    ):
+        path.write_bytes(entry(text, arrays, change))
+        assert cache.load(KEY) is None
+    for length in (2**63, 2**64 - 1):
+        path.write_bytes(entry(text, arrays)[:8] + length.to_bytes(8, "little") + bytes(100))
+        assert cache.load(KEY) is None
+
+
+def test_arrays_that_are_not_what_is_wanted_are_none(tmp_path, rng):
+    cache, arrays = DiskCache(tmp_path), {"a": rng.random((3, 4)), "n": np.array(1)}
+    cache.store(KEY, arrays)
+
+    def load(**wanted):
+        return cache.load(KEY, lambda found: array_cache.holds(found, wanted))
+
+    right = {"a": ("f8", (3, None)), "n": ("i8", ())}
+    assert same(load(**right), arrays)
+    for odd in ({"a": ("f4", (3, 4))}, {"a": ("f8", (4, 3))}, {"a": ("f8", (12,))}, {"b": ("f8", (1,))}):
+        assert load(**right | odd) is None
+    assert load(n=right["n"]) is None
+    assert cache.load(KEY, lambda found: found["b"]) is None  # what it raises is a no
+    cache.store(KEY, {"a": np.full((3, 4), np.nan), "n": np.array(1)})
+    assert load(**right) is None
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_pipes_and_devices_do_not_wait(tmp_path):
+    cache = DiskCache(tmp_path)
+    os.mkfifo(cache._path(KEY))
+    assert cache.load(KEY) is None
+    os.unlink(cache._path(KEY))
+    os.symlink("/dev/zero", cache._path(KEY))
+    assert cache.load(KEY) is None
+    cache.store(KEY, {"a": np.ones(3)})  # in its place, and not into it
+    assert cache.load(KEY)["a"].tolist() == [1, 1, 1] and not cache._path(KEY).is_symlink()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners here")
+def test_a_folder_that_others_own_or_write_to_is_not_used(tmp_path, rng, monkeypatch):
+    cache, arrays = DiskCache(tmp_path / "kept"), some(rng)
+    cache.store(KEY, arrays)
+    assert (tmp_path / "kept").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "kept").chmod(0o777)
+    assert cache.load(KEY) is None
+    cache.store(KEY | {"seed": 4}, arrays)
+    assert len(cache.files()) == 1
+    (tmp_path / "kept").chmod(0o755)
+    assert same(cache.load(KEY), arrays)
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    if os.getuid() != 0:  # what the system's user made is trusted
+        assert cache.load(KEY) is None
+
+
+def test_without_a_home_nothing_is_kept(monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    assert array_cache.cache_home() is None and array_cache.cache_folder("fits") is None
+    cache = DiskCache(array_cache.cache_folder("fits"))
+    cache.store(KEY, {"a": np.ones(3)})
+    assert cache.load(KEY) is None and cache.files() == []

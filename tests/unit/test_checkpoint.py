@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 import zipfile
 
 import mitsuba as mi
@@ -202,3 +203,28 @@ def test_every_kind_of_damage_to_the_archive_is_told(tmp_path, offset, value):
     with pytest.raises(InputError, match="checkpoint.npz: the checkpoint cannot be read") as info:
         checkpoint.load(tmp_path, "what")
     assert len(str(info.value)) - len(str(path)) < 300
+
+
+@pytest.mark.parametrize(
+    ("state", "picture", "parameter"),
+    [
+        (State(step=-1), 0.0, 0.0),
+        (State(step="2"), 0.0, 0.0),
+        (State(slowdown=0), 0.0, 0.0),
+        (State(history=[5]), 0.0, 0.0),
+        (State(), np.nan, 0.0),
+        (State(), 0.0, np.inf),
+    ],
+)
+def test_a_right_digest_with_a_wrong_state_is_told(tmp_path, state, picture, parameter):
+    kept = np.full((2, 4, 3), picture, np.float32)
+    checkpoint.save(tmp_path, "what", state, {"a": np.array([parameter])}, {}, kept)
+    with pytest.raises(InputError, match="what it holds is no state of a run"):
+        checkpoint.load(tmp_path, "what")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_a_pipe_in_place_of_the_checkpoint_does_not_wait(tmp_path):
+    os.mkfifo(tmp_path / checkpoint.NAME)
+    with pytest.raises(InputError, match="the checkpoint cannot be read .*no regular file"):
+        checkpoint.load(tmp_path, "what")

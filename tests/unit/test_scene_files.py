@@ -88,6 +88,7 @@ def test_a_ply_that_is_cut_or_declares_too_much_is_refused(tmp_path, form):
     ("changes", "says"),
     [
         ({"index": 99_999_999}, "face 0 names vertex 99999999 of 3"),
+        ({"index": 99_999_999, "count": 0}, "face 0 names vertex 99999999 of 3"),
         ({"vertices": 10**12}, "the file ends before"),
         ({"faces": 10**12}, "the file ends before"),
         ({"count": 10**9}, "1000000000 meshes are declared"),
@@ -96,6 +97,7 @@ def test_a_ply_that_is_cut_or_declares_too_much_is_refused(tmp_path, form):
     ],
 )
 def test_a_serialized_mesh_is_walked_through(tmp_path, changes, says):
+    """Also the first mesh of a table that is empty."""
     path = serialized(tmp_path / "a.serialized")
     scene_files.check("serialized", str(path))
     assert mi.load_dict({"type": "serialized", "filename": str(path)}).face_count() == 1
@@ -156,3 +158,11 @@ def test_textures_state_sizes_that_can_be_read(tmp_path):
         scene_files.check("bitmap", str(tmp_path / "a.hdr"))
     mi.Bitmap(np.ones((4, 4, 3), np.float32)).write(str(tmp_path / "a.exr"))
     scene_files.check("bitmap", str(tmp_path / "a.exr"))
+
+
+def test_a_line_of_an_obj_that_cannot_be_read_is_not_repeated(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 secret\1 0\n")
+    shape = '<shape type="obj"><string name="filename" value="a.obj"/></shape>'
+    with pytest.raises(InputError, match="could not parse line$") as caught:
+        scene.load(write_scene(tmp_path, SENSOR, LIGHT, shape))
+    assert str(caught.value).isprintable()

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core.array_cache import DiskCache, cache_folder
+from envedit.core.array_cache import DiskCache, cache_folder, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError, NumericalError, place_of
 from envedit.losses import losses, metrics, optimizer, ssim
@@ -138,7 +138,7 @@ def fit(
     if not (good := np.isfinite(image) & (image >= 0)).all():
         raise InputError(f"fit: the texel at {place_of(~good)} is not finite or is negative: repair it")
     cache, key = DiskCache(folder if settings.cache else None), _key(image, network, settings, seed, rows)
-    if found := cache.load(key):
+    if found := cache.load(key, lambda arrays: _whole(arrays, network)):
         return _read(found)
     begun = _Begun(cache, key)
     normalisation = Normalisation.of(image, settings.headroom)
@@ -307,7 +307,11 @@ class _Begun:
 
     def restore(self, adam: optimizer.Adam) -> tuple[int, int]:
         """Bring the optimiser to where it was; returns epochs done and steps refused."""
-        if not (found := self._cache.load(self._key)):
+        expected = {k: (v.dtype, v.shape) for k, v in adam.state_dict().items()} | {_ABOUT: ("f8", (3,))}
+        found = self._cache.load(
+            self._key, lambda arrays: holds(arrays, expected) and arrays[_ABOUT].min() >= 0
+        )
+        if not found:
             return 0, 0
         found = dict(found)
         epoch, refused, self._earlier = found.pop(_ABOUT).tolist()
@@ -369,6 +373,23 @@ def _stored(fitted: Fitted) -> dict[str, np.ndarray]:
     """Put a fit into arrays; None becomes NaN."""
     about, range_ = [getattr(fitted, name) for name in _NUMBERS], fitted.normalisation
     return fitted.params | {_ABOUT: np.array([range_.low, range_.span, *about], np.float64)}
+
+
+def _whole(arrays, network):
+    """Tell whether arrays from disk are a fit of such a network."""
+    inputs = 2 if network.coordinates == "plane" else 3
+    made = siren.init(0, network.hidden, network.depth, network.omega, inputs)
+    shapes = {name: value.shape for name, value in made.items()}
+    about = arrays[_ABOUT]
+    params = {name: array for name, array in arrays.items() if name != _ABOUT}
+    return (
+        holds(params, {name: ("f4", shape) for name, shape in shapes.items()})
+        and about.dtype == np.float64
+        and about.shape == (2 + len(_NUMBERS),)
+        and bool(np.isfinite(about[:2]).all() and about[1] >= 0 and not np.isinf(about).any())
+        and about[2 + _NUMBERS.index("epochs")] >= 0
+        and about[2 + _NUMBERS.index("seconds")] >= 0
+    )
 
 
 def _read(arrays: dict[str, np.ndarray]) -> Fitted:

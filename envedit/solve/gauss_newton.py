@@ -48,6 +48,8 @@ class Run:
     history : list of dict
         A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
         taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
+    asked : int
+        How often it has been asked, where steps had ended, whether lights are to be added or moved.
     """
 
     state: dict
@@ -56,11 +58,12 @@ class Run:
     scale: float = np.inf
     finished: bool = False
     history: list[dict] = field(default_factory=list)
+    asked: int = 0
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
-        return both | {"numbers": np.array([self.damping, self.scale, self.finished])}
+        return both | {"numbers": np.array([self.damping, self.scale, self.finished, self.asked])}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -69,8 +72,8 @@ class Run:
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
         ]
-        damping, scale, finished = arrays["numbers"].tolist()
-        return cls(*parts, damping, scale, bool(finished), list(history))
+        damping, scale, finished, asked = arrays["numbers"].tolist()
+        return cls(*parts, damping, scale, bool(finished), list(history), int(asked))
 
 
 @dataclass
@@ -154,6 +157,8 @@ def solve(
         run, point = search.begun(start)
     else:  # it has the columns with which its last point was rendered
         point = problem.evaluate(run.state, resolve=False)
+        if after_step:
+            after_step(run, point)
     run, point = search.solved(run, point)
     normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     loss, note = _unlikeliness(problem, run, point, sigma), ""
@@ -220,21 +225,20 @@ class _Search:
         return run, point
 
     def solved(self, run, point):
-        """Descend, then put added lights where they lower F more, and add others while they lower it."""
+        """Descend, put added lights where they lower F more, and add others while they lower it."""
         while True:
             point = self._descended(run, point, self._most(run), self.after_step)
-            run, point = self._placed_again(run, point)
-            if not self._room(run) or not run.history:
+            if not self.births or run.asked > self.births or not run.history:
                 return run, point
+            run, point = self._placed_again(run, point)
+            run.asked += 1
+            if not self._room(run):
+                continue
             noise = self.problem.noise(point.residual, self.sigma)
             normal = self.problem.normal(point, run.start, noise)
             found = added_light.best(self.problem, point, normal)
-            if found is None or found[1] < WORTH:
-                return run, point
-            before = run
-            run, point = self._better(run, point, found[0])
-            if run is before:
-                return run, point
+            if found is not None and found[1] >= WORTH:
+                run, point = self._better(run, point, found[0])
 
     def _placed_again(self, run, point):
         """Ask of every added light where it would be added now: it goes there, or out, if F says so.

@@ -462,7 +462,8 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
 
     folder = tmp_path / "run"
     folder.mkdir()
-    for step in sorted({1, steps // 2, steps}):
+    tried = min(steps, edit_job.NEWTON_TRIAL) if name == "painted" else 1  # from where the best start goes on
+    for step in sorted({tried, max(tried, steps // 2), steps}):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
             pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))
         assert stop.value.step == step and np.isfinite(stop.value.envmap).all()

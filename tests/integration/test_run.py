@@ -187,7 +187,8 @@ def test_rows_that_are_not_active_come_back_bit_for_bit(done):
     "rows, active", slow_but([("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])], "all")
 )
 def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
-    path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows})
+    adam = {"kind": "adam", "iterations": 4}  # Gauss-Newton leaves a row be that changes nothing but noise
+    path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows}, optimizer=adam)
     assert call(path, "--quiet") == 0
     before, after = pixels(tmp_path / "map.exr"), pixels(tmp_path / "c_out" / "edited.exr")
     first, last = measured(tmp_path / "c_out")["active_rows"]
@@ -226,7 +227,9 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
     """
     apply = LightTransport.apply
     monkeypatch.setattr(LightTransport, "apply", lambda self, envmap: 3 * apply(self, envmap))
-    path = world(tmp_path, rng, output={"spp": 1024}, optimizer={"iterations": 12, "lr": 0.05})
+    path = world(
+        tmp_path, rng, output={"spp": 1024}, optimizer={"kind": "adam", "iterations": 12, "lr": 0.05}
+    )
     assert call(path, "--quiet") == 0
     out = tmp_path / "c_out"
     final = pixels(out / "render_edited.exr")
@@ -241,7 +244,7 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
 
 
 @pytest.mark.slow
-def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share_no_noise(tmp_path, rng):
+def test_without_iterations_the_map_is_the_original_and_its_two_renderings_are_the_same(tmp_path, rng):
     path = world(
         tmp_path, rng, representation={"kind": "pixels"}, optimizer={"iterations": 0}, output={"spp": 256}
     )
@@ -249,7 +252,7 @@ def test_without_iterations_the_map_is_the_original_and_its_two_renderings_share
     out = tmp_path / "c_out"
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
     a, b = pixels(out / "render_initial.exr"), pixels(out / "render_edited.exr")
-    assert (a != b).any() and a.mean() == pytest.approx(b.mean(), rel=0.05)
+    assert a.tobytes() == b.tobytes()  # judged with the same samples
     found = measured(out)
     assert found["iterations"] == 0 and found["timing"]["per_iteration_ms"] is None and rows_of(out) == []
 

@@ -530,14 +530,19 @@ def test_run_comes_back_from_a_checkpoint(tmp_path, rng):
          "size": rng.normal(size=(3, 1))} for _ in range(2)
     )  # fmt: skip
     history = [{"iteration": 0, "loss": 1 / 3, "data": 0.25, "prior": 1 / 12, "sigma": 0.1, "step_ms": 1.5}]
-    for run in (Run(state, start, 1e-4, 0.1, True, history), Run(state, start)):
-        arguments = State(step=len(run.history), history=run.history), run.arrays(), {}, np.zeros((2, 3, 3))
+    for run in (Run(state, start, 1e-4, 0.1, True, history, 2), Run(state, start, scale=0.5)):
+        arguments = (
+            State(step=len(run.history), history=run.history),
+            run.arrays(),
+            {},
+            np.zeros((2, 3, 3), np.float32),
+        )
         checkpoint.save(tmp_path, "what", *arguments)
         loaded, arrays, _, _ = checkpoint.load(tmp_path, "what")
         again = Run.of_arrays(arrays, loaded.history)
         assert same(again.state, state) and same(again.start, start) and not same(again.state, start)
-        numbers = again.damping, again.scale, again.finished, again.history
-        assert numbers == (run.damping, run.scale, run.finished, run.history)
+        numbers = again.damping, again.scale, again.finished, again.history, again.asked
+        assert numbers == (run.damping, run.scale, run.finished, run.history, run.asked)
 
 
 class Enough(Exception):

@@ -11,7 +11,7 @@ from envedit.images import images
 from envedit.representations import Pixels
 from envedit.representations.layers import layers
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, rotation_vector
 from envedit.scene import scene
 from tests.oracles.builders import grey
 
@@ -248,20 +248,20 @@ def test_a_light_that_stays_is_scaled_in_place(sunny):
     np.testing.assert_allclose(flux(result), flux(edited), rtol=0.03)
 
 
-@pytest.mark.parametrize("size", [0.5, 1.0, 3.0])
-def test_a_light_that_was_born_is_carried(size, sunny):
+@pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
+def test_a_light_that_was_added_is_carried(degrees, sunny):
     source, working, made, params = sunny
     new, born = toward(60, 60), made.lights.count - SPARE
     changed = sent(made, params, new, light=born)
     changed["flux"][born] = 0.0
-    changed["size"][born] = np.log(size) / layers.SCALES["size"]
+    changed["size"][born] = np.log(degrees / LOBE_DEGREES) / layers.SCALES["size"]
     result, edited = carried(made, changed, working, source)
     there = near(source.shape[:2], new, 24), near(WORKING, new, 24)
     np.testing.assert_allclose(flux(result, there[0]), flux(edited, there[1]), rtol=0.02)
     assert flux(result, there[0]).max() > 10 * flux(source, there[0]).max()
-    # A lobe of 2 degrees has 39 % within one standard deviation, 86 % within two.
-    inside = flux(result, near(source.shape[:2], new, 2 * max(size, 1))) / flux(result, there[0])
-    assert 0.3 < inside.max() < (0.95 if size < 1 else 0.6)
+    # A lobe has 39 % within one standard deviation, 86 % within two.
+    inside = flux(result, near(source.shape[:2], new, max(degrees, 2))) / flux(result, there[0])
+    assert 0.3 < inside.max() < (0.95 if degrees < 2 else 0.6)
 
 
 @pytest.mark.parametrize("shape", [(64, 128), (48, 96), (101, 202), (300, 512)])

@@ -55,25 +55,52 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
     channels = _radiance(scene, integrator, sampler, corner + inside, spp, medium)
     dr.eval(channels, inside)  # the sums below must not trace again
 
-    def summed(weight):
-        """Sum weighted radiance and weights of a pixel's samples, (down, across, 5)."""
-        parts = [dr.block_sum(mi.Float64(weight * channel), spp).numpy() for channel in (*channels, 1)]
-        return np.stack(parts, axis=-1).reshape(down, across, 5)
-
     if box:
-        total = summed(dr.full(mi.Float, 1, count))
+        sums = [
+            dr.block_sum(mi.Float64(channel), spp) for channel in (*channels, dr.full(mi.Float, 1, count))
+        ]
+        total = np.stack([one.numpy() for one in sums], axis=-1).reshape(down, across, 5)
+        total = total[border : border + height, border : border + width]
     else:
         reach = int(np.ceil(rfilter.radius() - 0.5))
-        steps = range(-reach, reach + 1)
-        padded = np.zeros((down + 2 * reach, across + 2 * reach, 5))
-        for dy in steps:
-            vertical = rfilter.eval(dy + 0.5 - inside.y)
-            for dx in steps:
-                part = summed(vertical * rfilter.eval(dx + 0.5 - inside.x))
-                padded[reach + dy : reach + dy + down, reach + dx : reach + dx + across] += part
-        total = padded[reach : reach + down, reach : reach + across]
-    total = total[border : border + height, border : border + width]
+        places = [dr.opaque(mi.Int32, n) for n in (width, across, down, border, reach, spp)]
+        pixels = dr.arange(mi.Int32, width * height)
+        sums = _filtered(pixels, rfilter, channels, inside.x - 0.5, inside.y - 0.5, *places)
+        total = np.stack([one.numpy() for one in sums], axis=-1).reshape(height, width, 5)
     return total[..., :4] / np.where(total[..., 4:] == 0, 1, total[..., 4:])
+
+
+@dr.syntax
+def _filtered(pixel, rfilter, channels, x, y, width, across, down, border, reach, spp):
+    """Sum the samples around each pixel by the filter: red, green, blue, alpha and weight, Float64.
+
+    ``x`` and ``y`` are the samples' places from the middle of their own pixel.
+    """
+    row, column = pixel // width + border, pixel % width + border
+    red, green, blue, alpha, total = (mi.Float64(0) for _ in range(5))
+    dy = mi.Int32(-reach)
+    while dy <= reach:
+        dx = mi.Int32(-reach)
+        while dx <= reach:
+            r, c = row + dy, column + dx
+            first = (r * across + c) * spp
+            k = mi.Int32(0)
+            stop = dr.select((r >= 0) & (r < down) & (c >= 0) & (c < across), spp, 0)
+            while k < stop:
+                i = mi.UInt32(first + k)
+                weight = rfilter.eval(dx + dr.gather(mi.Float, x, i)) * rfilter.eval(
+                    dy + dr.gather(mi.Float, y, i)
+                )
+                if weight != 0:
+                    red += mi.Float64(weight * dr.gather(mi.Float, channels[0], i))
+                    green += mi.Float64(weight * dr.gather(mi.Float, channels[1], i))
+                    blue += mi.Float64(weight * dr.gather(mi.Float, channels[2], i))
+                    alpha += mi.Float64(weight * dr.gather(mi.Float, channels[3], i))
+                    total += mi.Float64(weight)
+                k += 1
+            dx += 1
+        dy += 1
+    return red, green, blue, alpha, total
 
 
 def _radiance(scene, integrator, sampler, position, spp, medium):

@@ -237,6 +237,8 @@ class Job:
             self.renderer.restore(traced)
             self.wanted = self.wanted.aimed_at(picture)
             run = gauss_newton.Run.of_arrays(arrays, state.history)
+        elif run is not None:
+            self._problem().evaluate(run.state)  # another trial may have taken the columns of its lights
         saved, most = time.perf_counter(), min(chosen.iterations, gauss_newton.ITERATIONS)
 
         with ctrl_c() as interrupt:

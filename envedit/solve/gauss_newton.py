@@ -230,15 +230,16 @@ class _Search:
             point = self._descended(run, point, self._most(run), self.after_step)
             if not self.births or run.asked > self.births or not run.history:
                 return run, point
+            before, run.asked = run, run.asked + 1
             run, point = self._placed_again(run, point)
-            run.asked += 1
-            if not self._room(run):
-                continue
-            noise = self.problem.noise(point.residual, self.sigma)
-            normal = self.problem.normal(point, run.start, noise)
-            found = added_light.best(self.problem, point, normal)
-            if found is not None and found[1] >= WORTH:
-                run, point = self._better(run, point, found[0])
+            if len(self.problem.added(run.state)) < self.births:
+                noise = self.problem.noise(point.residual, self.sigma)
+                normal = self.problem.normal(point, run.start, noise)
+                found = added_light.best(self.problem, point, normal)
+                if found is not None and found[1] >= WORTH:
+                    run, point = self._better(run, point, found[0])
+            if run is before:
+                return run, point
 
     def _placed_again(self, run, point):
         """Ask of every added light where it would be added now: it goes there, or out, if F says so.
@@ -257,9 +258,6 @@ class _Search:
             elif problem.direction(found[0], i) @ problem.direction(run.state, i) < SAME_PLACE:
                 run, point = self._better(run, point, found[0], [i])
         return run, point
-
-    def _room(self, run):
-        return len(self.problem.added(run.state)) < self.births
 
     def _most(self, run):
         return min(self.iterations, ITERATIONS + ADDED_STEPS * len(self.problem.added(run.state)))

@@ -29,8 +29,9 @@ TO_NOISE, DOUBTFUL = 1.25, 4.0
 """Residual of a map over that of T against Mitsuba's rendering of the same map up to which nothing is left to
 explain (renderings of one map differ by 0.5 to 1.1 of it on four scenes, under a light 5 % brighter by 1.7
 and more); and up to which the turned map is rendered to ask, as T's errors depend on where the sun stands."""
-NOISIEST = 0.03
-"""Display residual of T beyond which noise would hide what is asked for; four scenes have at most 0.016."""
+NOISIEST, QUIET = 0.03, 0.008
+"""Display residual of T beyond which noise would hide what is asked for (four scenes have at most 0.016), and
+what is taken for T's error then."""
 TURNED_SPP, TURNED_SEED = 256, 800_011
 """Samples a pixel of that rendering, and what is added to the run's seed."""
 PREFERRED = 0.05
@@ -160,15 +161,14 @@ class Preparation:
     def _noise(self, wanted):
         """Return the residual of T against Mitsuba's rendering of the map; 0 where an edit is made anyway.
 
-        That is where the target is painted, where nothing is left as it is (a network is no exact copy), and
-        where renderings are too noisy to tell.
+        That is where the target is painted, or nothing is left as it is: a network is no exact copy.
         """
         transport = self.renderer.transport
         if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
             return 0.0
         with self.clock("start_s"):
             found = turning.residual(transport, self.original, self.initial, wanted.weight)
-        return found if found <= NOISIEST else 0.0
+        return found if found <= NOISIEST else QUIET
 
     def _still(self, turn, wanted):
         """Return the residual of the map as it is."""

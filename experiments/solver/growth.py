@@ -42,7 +42,7 @@ def main(arguments=None):
             path = Path(folder) / "growth.toml"
             path.write_text(text)
             for _ in range(2):
-                found = pipeline.run(config.load(path, given.set)).metrics
+                found = pipeline.run(config.load(path, overrides=given.set)).metrics
         timing = found["timing"]
         seconds = " | ".join(f"{timing[name]:.2f}" for name in names)
         row = f"| {pixels}², {columns}x{columns // 2} | {found['iterations']} "

@@ -126,7 +126,7 @@ def run(
         if initial is None and wanted.coverage is not None:
             initial, _, _ = rendered(lit, original, few, settings.seed + JUDGE_SEED, settings.renderer.cache)
     rows = slice(first, last + 1)
-    start = Preparation(settings, lit, original, rows, folder, watch, dists, clock, initial)
+    start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
     start.trace()
     traced, within, notes = start.renderer.transport, None, []
     if traced and wanted.coverage is not None:

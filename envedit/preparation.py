@@ -18,6 +18,7 @@ from envedit.representations import Representation
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
 from envedit.scene import scene
+from envedit.scene.renderings import rendered
 from envedit.solve import initialization, map_problem, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
@@ -32,8 +33,8 @@ and more); and up to which the turned map is rendered to ask, as T's errors depe
 NOISIEST, QUIET = 0.03, 0.008
 """Display residual of T beyond which noise would hide what is asked for (four scenes have at most 0.016), and
 what is taken for T's error then."""
-TURNED_SPP, TURNED_SEED = 256, 800_011
-"""Samples a pixel of that rendering, and what is added to the run's seed."""
+CHECKED_SPP, CHECKED_SEED = 256, 800_011
+"""Samples a pixel of these renderings, and what is added to the run's seed."""
 PREFERRED = 0.05
 """By this share the residual of the sky as it is must be smaller: where it turns, nothing is made up."""
 
@@ -88,8 +89,6 @@ class Preparation:
         As for :class:`.edit_job.Job`.
     clock : callable
         ``with clock(name):`` adds up seconds.
-    initial : ndarray (h, w, 3)
-        The map as it is, rendered by Mitsuba.
     """
 
     settings: config.Config
@@ -100,7 +99,6 @@ class Preparation:
     watch: Watch
     dists: object
     clock: object
-    initial: np.ndarray
     renderer: renderers.Renderer | None = None
     _recordings: initialization.Recordings | None = None
 
@@ -129,6 +127,7 @@ class Preparation:
         if not worth:
             if noise > 0 and self._still(turn, wanted) <= TO_NOISE * noise:
                 said = "the target shows what is there already, to its noise: nothing is changed"
+                said += f" (T's own display residual {noise:.4f})"
                 return idle._prepared(wanted, 0.0, [said], search=False)
             return self._prepared(wanted, 0.0, [])
         said = f"the sky is turned by {turn.degrees:.2f} degrees"
@@ -167,7 +166,9 @@ class Preparation:
         if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
             return 0.0
         with self.clock("start_s"):
-            found = turning.residual(transport, self.original, self.initial, wanted.weight)
+            cache, seed = self.settings.renderer.cache, (self.settings.seed + CHECKED_SEED) % 2**32
+            shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
+            found = turning.residual(transport, self.original, shown, wanted.weight)
         return found if found <= NOISIEST else QUIET
 
     def _still(self, turn, wanted):
@@ -183,7 +184,7 @@ class Preparation:
             return turn.error <= TO_NOISE * noise
         with self.clock("start_s"):
             turned = latlong.rotate(self.original, turn.degrees)
-            shown = self.lit.render(turned, TURNED_SPP, (self.settings.seed + TURNED_SEED) % 2**32)
+            shown = self.lit.render(turned, CHECKED_SPP, (self.settings.seed + CHECKED_SEED) % 2**32)
             return turn.error <= TO_NOISE * turning.residual(self.renderer.transport, turned, shown)
 
     def _prepared(self, wanted, degrees, notes, search=True):

@@ -66,3 +66,18 @@ def every_step(monkeypatch):
     from envedit.solve import adam_loop
 
     monkeypatch.setattr(adam_loop, "READ_EVERY", 1)
+
+
+@pytest.fixture
+def threads():
+    """Set the number of threads; it is as before at the end."""
+    import drjit as dr
+
+    before = dr.thread_count()
+
+    def use(count):
+        dr.sync_thread()
+        dr.set_thread_count(count)
+
+    yield use
+    use(before)

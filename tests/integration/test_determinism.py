@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -22,19 +21,6 @@ pytestmark = pytest.mark.usefixtures("isolated")
 BOUND = 1e-4
 """Largest relative difference of a texel. At this size 3e-6 was seen at most, after 12 steps as after 200."""
 KINDS = ("layers", "siren", "pixels", "log-pixels")
-
-
-@pytest.fixture
-def threads():
-    """Set the number of threads; it is as before at the end."""
-    before = dr.thread_count()
-
-    def use(count):
-        dr.sync_thread()
-        dr.set_thread_count(count)
-
-    yield use
-    use(before)
 
 
 @pytest.fixture

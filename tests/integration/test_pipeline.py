@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from envedit import api, config, inputs, pipeline, representations
+from envedit import api, config, inputs, pipeline, preparation, representations
 from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.images import images
@@ -717,11 +717,23 @@ def test_a_sky_that_must_not_turn_does_not(tmp_path, rng):
     assert found.metrics["turn_degrees"] == 0 and not any("turned by 90.00" in line for line in found.notes)
 
 
-def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng):
-    settings, picture = turned_world(tmp_path, rng, target={"rotate_degrees": 0.0, "spp": 256})
+def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng, monkeypatch):
+    """By the error of T that is measured against a rendering, however few samples the result is judged by."""
+    told, measured = [], preparation.Preparation._noise
+    monkeypatch.setattr(
+        preparation.Preparation, "_noise", lambda *given: told.append(measured(*given)) or told[-1]
+    )
+    asked = {"renderer": {"spp": 256, "max_depth": 3}}
+    settings, picture = turned_world(tmp_path, rng, target={"rotate_degrees": 0.0, "spp": 256}, **asked)
     found = pipeline.run(settings)
     assert found.metrics["turn_degrees"] == 0
     assert found.envmap.tobytes() == picture.tobytes()
+    assert len(told) == 1 and 0 < told[0] < preparation.NOISIEST and told[0] != preparation.QUIET
+
+    images.write_exr(tmp_path / "brighter.exr", 1.2 * picture)
+    brighter = {"file": "brighter.exr", "rotate_degrees": 0.0, "spp": 256}
+    settings, _ = turned_world(tmp_path, rng, target=brighter, **asked)
+    assert pipeline.run(settings).history
 
 
 def test_keys_that_gauss_newton_does_not_use_are_named(tmp_path, rng):

@@ -1,6 +1,5 @@
 """Renderings: Mitsuba's own values, and the same bits with any number of threads."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -15,19 +14,6 @@ CROP = "".join(
     for key, value in {"offset_x": 3, "offset_y": 2, "width": 9, "height": 7}.items()
 )
 SIGNED = f'<rfilter type="lanczos"/>{CROP}'
-
-
-@pytest.fixture
-def threads():
-    """Set the number of threads; it is as before at the end."""
-    before = dr.thread_count()
-
-    def use(count):
-        dr.sync_thread()
-        dr.set_thread_count(count)
-
-    yield use
-    use(before)
 
 
 def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):

@@ -114,7 +114,7 @@ class Preparation:
         """Prepare the edit; the sky is turned where that explains the target better."""
         turn, settings = self._turn(wanted), self.settings
         idle = replace(self, settings=replace(settings, optimizer=replace(settings.optimizer, iterations=0)))
-        noise = self._noise(wanted)
+        noise = self._noise(wanted, turn)
         worth = (
             turn is not None
             and turn.degrees != 0
@@ -157,10 +157,11 @@ class Preparation:
             self.watch.stage("turning the sky")
             return turning.find(transport, self.original, wanted.picture, wanted.weight)
 
-    def _noise(self, wanted):
+    def _noise(self, wanted, turn):
         """Return the residual of T against Mitsuba's rendering of the map; 0 where an edit is made anyway.
 
-        That is where the target is painted, or nothing is left as it is: a network is no exact copy.
+        That is where the target is painted, where nothing is left as it is (a network is no exact copy), and
+        where neither the map nor its turn come near the target.
         """
         transport = self.renderer.transport
         if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
@@ -168,6 +169,9 @@ class Preparation:
         with self.clock("start_s"):
             cache, seed = self.settings.renderer.cache, (self.settings.seed + CHECKED_SEED) % 2**32
             shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
+            near = turning.apart(shown, wanted.picture, wanted.weight) < 2 * TO_NOISE * NOISIEST
+            if not near and (turn is None or turn.error > DOUBTFUL * NOISIEST):
+                return 0.0
             found = turning.residual(transport, self.original, shown, wanted.weight)
         return found if found <= NOISIEST else QUIET
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import envedit.cli  # noqa: F401 -- as many threads of numpy as the command line has
+
 pytest.register_assert_rewrite("tests.oracles")
 
 

@@ -80,8 +80,9 @@ class _Model:
 
     def __init__(self, problem, normal):
         self.problem, self.normal = problem, normal
-        self._lower = np.linalg.cholesky(normal.hessian)
-        self._gradient = np.linalg.solve(self._lower, normal.gradient)
+        # numpy has no substitution: the inverse of the factor is what serves two models of candidates.
+        self._inverse = np.linalg.inv(np.linalg.cholesky(normal.hessian))
+        self._gradient = self._inverse @ normal.gradient
 
     def of_cells(self, atoms):
         """Return strength and fall of F for pictures in blocks, (blocks, n) per channel."""
@@ -108,7 +109,7 @@ class _Model:
         return self._best(mixed, pull, (pictures * weighted).sum(axis=(1, 2)))
 
     def _best(self, mixed, pull, power):
-        half = np.linalg.solve(self._lower, mixed)
+        half = self._inverse @ mixed
         along = half.T @ self._gradient - pull
         rest = power - np.square(half).sum(axis=0)
         strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > 1e-6 * power)

@@ -34,7 +34,8 @@ class BlockJacobian:
         used = np.bincount(self._cell, minlength=cells) > 0
         self._used = np.flatnonzero(used)
         self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)
-        self._matrix = [tensor(np.ascontiguousarray(m[:, used])) for m in overview.matrix]
+        self._matrix = [np.ascontiguousarray(m[:, used]) for m in overview.matrix]
+        self._tensors = [tensor(m) for m in self._matrix]
 
     def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
         """Return the change of a block's radiance by each node, (blocks, n), per channel."""
@@ -44,17 +45,19 @@ class BlockJacobian:
                 self._total, 1e-30
             )
             hats = tensor(sky[self._used, None].astype(np.float32) * self._hats)
-            found.append(dr.matmul(self._matrix[c], hats).numpy())
+            found.append(dr.matmul(self._tensors[c], hats).numpy())
         return found
 
-    def picture(self, change: np.ndarray) -> np.ndarray:
-        """Return what a change of the active rows, (rows, W, 3), does to every pixel: (pixels, 3)."""
-        found = []
+    def pictures(self, changes: np.ndarray) -> np.ndarray:
+        """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
+        found = np.empty((len(changes), len(self.block_of), 3), np.float32)
         for c, matrix in enumerate(self._matrix):
-            cells = np.bincount(self._cell, self._omega * change[..., c].ravel(), self._cells)
-            cells = (cells / np.maximum(self._total, 1e-30))[self._used]
-            found.append(dr.matmul(matrix, tensor(cells[:, None].astype(np.float32))).numpy()[:, 0])
-        return np.stack(found, axis=1)[self.block_of]
+            cells = np.stack(
+                [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
+            )
+            cells = (cells / np.maximum(self._total, 1e-30))[:, self._used]
+            found[..., c] = (cells.astype(np.float32) @ matrix.T)[:, self.block_of]
+        return found
 
     def sky_cells(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """List the cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""
@@ -67,7 +70,7 @@ class BlockJacobian:
     def lit(self, cells: np.ndarray) -> list[np.ndarray]:
         """Return pictures of unit flux in each of some cells, (blocks, n), per channel."""
         size = self._total[self._used[cells]]
-        return [m.numpy()[:, cells] / np.maximum(size, 1e-30) for m in self._matrix]
+        return [m[:, cells] / np.float32(np.maximum(size, 1e-30)) for m in self._matrix]
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""

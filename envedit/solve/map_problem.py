@@ -203,6 +203,7 @@ class Problem:
         self.nodes = sum(rows * columns for rows, columns in self.sizes)
         self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
         self._precisions = self.prior.gain_precisions(self.sizes)
+        self._linear: tuple | None = None
 
     # ---- unknowns ------------------------------------------------------------------------------------------
 
@@ -336,8 +337,7 @@ class Problem:
         size = _sizes(point.residual)
         robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
         slope = display_curve.slope(point.rendering)
-        blocks, lights = self.blocks, self._lights(point)
-        jacobian = blocks.jacobian(self._slopes(point))
+        blocks, (lights, jacobian) = self.blocks, self._linearised(point)
         unknowns = 3 * n + len(lights.pictures)
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         squared, pulled = blocks.summed(slope**2 * robust), blocks.summed(slope * robust * point.residual)
@@ -362,6 +362,12 @@ class Problem:
         gradient += precision @ back
         parts = Blocks(jacobian, squared, pulled, lit), robust, slope, point.residual, lights.pictures
         return Normal(hessian, gradient, precision, lights.unknowns, *parts)
+
+    def _linearised(self, point):
+        """Pictures of lights and Jacobian of the gain, which no weight changes: kept of the last point."""
+        if self._linear is None or self._linear[0] is not point:
+            self._linear = point, self._lights(point), self.blocks.jacobian(self._slopes(point))
+        return self._linear[1:]
 
     def _precision(self, unknowns):
         """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
@@ -481,10 +487,10 @@ class Problem:
                 unknowns.append(("turn", i, axis))
             larger = {**state, "size": state["size"] + 0.1}
             cores.append((self._core(larger, alone) - now) / 0.1)
-            flux, *others = self.transport.pictures(np.stack(cores), self.rows).reshape(4, -1, 3)
+            seen = self.transport.pictures(np.stack(cores), self.rows).reshape(4, -1, 3)
             if glow is not None:
-                flux = flux + self.blocks.picture(shone[0])
-                others[:2] = [one + self.blocks.picture(s) for one, s in zip(others, shone[1:], strict=False)]
+                seen[:3] += self.blocks.pictures(np.stack(shone))
+            flux, *others = seen
             pictures += others
             unknowns.append(("size", i, 0))
             for c in range(3):

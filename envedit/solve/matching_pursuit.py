@@ -217,7 +217,7 @@ class Pursuit:
         share = overview.to_cells(given.active[:, None].astype(float), omega)[:, 0]
         self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
         self.directions = d = given.directions
-        self.cosine = d @ d[self.candidates].T
+        self.cosine = np.float32(d @ d[self.candidates].T)
         self.wanted = [w * self.weight for w in wanted]
         self.residual = list(self.wanted)
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]

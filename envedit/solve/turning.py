@@ -86,7 +86,12 @@ def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
     Parameters are those of :func:`find`.
     """
     transport.resolve(envmap, limit=COLUMNS)
-    off = np.float64(display_curve.to_display(transport.apply(tensor(envmap))).numpy())
+    return apart(transport.apply(tensor(envmap)).numpy(), picture, weight)
+
+
+def apart(rendering, picture, weight=None) -> float:
+    """Return the display residual of a rendering (h, w, 3), likewise."""
+    off = np.float64(display_curve.to_display(tensor(rendering)).numpy())
     off -= display_curve.to_display(tensor(picture)).numpy()
     size = np.sqrt(np.square(off).mean(axis=2, keepdims=True))
     mean = (size * (1 if weight is None else weight)).mean()

@@ -107,14 +107,11 @@ class ExactColumns:
         self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
         self.paths_of[texels] = count
 
-        traced = np.full(self.grid.texels, -1, np.int32)
-        traced[texels] = self.slot_of[texels]
-        traced = dr.opaque(mi.Int32(traced))
         for block in itertools.islice(self._paths(count, seed), blocks):
             for some in _split(texels, max(1, MOST_VALUES // max(block.vertices, 1))):
                 self._add_vertices(block, some, count, seed)
             if block.escapes:
-                self._add_escapes(block, traced)
+                self._add_escapes(block, texels)
         self._publish()
 
     def _paths(self, count, seed):
@@ -179,32 +176,27 @@ class ExactColumns:
         self.mask = dr.opaque(mi.Float(mask))
         self._count = dr.opaque(mi.UInt32, len(self.texels))
 
-    def _add_escapes(self, block, slot_of):
-        """Add paths that left the scene towards the traced texels.
+    def _add_escapes(self, block, texels):
+        """Add paths that left the scene towards some texels.
 
         Few do; they are summed on the host, in a fixed order.
         """
-        place = _first_place(block.at + dr.opaque(mi.UInt32, block.first), self.capacity)
-        targets, values = [], []
-        for texel, share in block.taps:
-            wanted = (dr.gather(mi.Int32, slot_of, texel) >= 0) & (share > 0)
-            keep = np.flatnonzero(wanted.numpy()).astype(np.uint32)
-            if len(keep):
-                index = path_vertices.on_device(mi.UInt32, keep)
-                slot = dr.gather(mi.UInt32, mi.UInt32(slot_of), dr.gather(mi.UInt32, texel, index))
-                target = dr.gather(mi.UInt32, place, index) + slot * SLICE
-                value = dr.gather(mi.Color3f, block.light, index) * dr.gather(mi.Float, share, index)
-                dr.eval(target, value)
-                # Channel by channel: a Color3f is interleaved by a kernel that has its length in it.
-                rgb = np.stack([value[c].numpy()[: len(keep)] for c in range(3)], axis=1)
-                finite = np.isfinite(rgb).all(axis=1)
-                self._lost += int((~finite).sum())
-                targets.append(target.numpy()[: len(keep)][finite])
-                values.append(rgb[finite])
-        if not targets:
+        traced = np.zeros(self.grid.texels, bool)
+        traced[texels] = True
+        taps = np.flatnonzero(traced[block.texel])
+        if not len(taps):
             return
-        rows = np.zeros(sum(map(len, targets)), np.uint32)
-        _, target, value = merge(rows, np.concatenate(targets), np.concatenate(values), len(self._store) // 4)
+        escape = block.escape[taps]
+        value = block.light[escape] * block.share[taps, None]
+        pixel = block.first + block.at[escape].astype(np.int64)
+        slot = self.slot_of[block.texel[taps]]
+        target = (pixel // SLICE * self.capacity + slot) * SLICE + pixel % SLICE
+        finite = np.isfinite(value).all(axis=1)
+        self._lost += int((~finite).sum())
+        target, value = target[finite], value[finite]
+        if not len(target):
+            return
+        _, target, value = merge(np.zeros(len(target), np.uint32), target, value, len(self._store) // 4)
         place = path_vertices.on_device(mi.UInt32, target) * 4
         real = dr.arange(mi.UInt32, len(place)) < dr.opaque(mi.UInt32, len(target))
         for c in range(3):

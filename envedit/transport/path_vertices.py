@@ -19,14 +19,14 @@ from envedit.transport.recording import LANES, bsdf_weight, connect
 from envedit.transport.sparse_matrix import SLICE
 from envedit.transport.texel_sampling import Grid
 
-VERTEX_BYTES, ESCAPE_BYTES = 216, 48
+VERTEX_BYTES, ESCAPE_BYTES = 216, 64
 """Memory of a kept vertex and of a path that leaves the scene."""
 _SHADING = mi.BSDFFlags.Smooth
 
 
 @dataclass
 class Block:
-    """The paths of some pixels: vertices sorted by pixel, then bounce, then path; and escapes.
+    """The paths of some pixels: vertices sorted by pixel, then bounce, then path; and escapes, on the host.
 
     Attributes
     ----------
@@ -38,9 +38,10 @@ class Block:
         As of :class:`.camera_paths.Vertex`; ``pixel`` counts from the picture's first.
     start : UInt32 (pixels + 1,)
         First vertex of each pixel.
-    taps : list of (UInt32, Float)
-        Four texels around the direction of each escape, and their shares.
-    light, at : Color3f, UInt32 (escapes,)
+    texel, share, escape : ndarrays (n,)
+        Texels around the directions of escapes, four or fewer of each: the texel, its share, and the escape
+        that it belongs to.
+    light, at : ndarrays (escapes, 3), (escapes,)
         What an escape adds for a radiance of 1, and its pixel, from the block's first.
     """
 
@@ -54,9 +55,11 @@ class Block:
     path: mi.UInt32 | None = None
     pixel: mi.UInt32 | None = None
     start: mi.UInt32 | None = None
-    taps: list | None = None
-    light: mi.Color3f | None = None
-    at: mi.UInt32 | None = None
+    texel: np.ndarray | None = None
+    share: np.ndarray | None = None
+    escape: np.ndarray | None = None
+    light: np.ndarray | None = None
+    at: np.ndarray | None = None
 
     @property
     def bytes(self) -> int:
@@ -92,7 +95,7 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
             else:
                 vertices.append(_vertices(event, count, first))
         _sort(block, [part for part in vertices if part is not None])
-        _join(block, [part for part in escapes if part is not None])
+        _join(block, escapes)
         yield block
 
 
@@ -131,34 +134,29 @@ def _sort(block, parts):
 
 
 def _escapes(event, grid, count):
-    """Take the paths that left the scene, with the texels around them; None if there are none."""
+    """Take the paths that left the scene: texels around them and their shares (4, n), light, pixel."""
     taps, _, jacobian = grid.locate(event.direction)
     uniform = grid.width * max(grid.height - 1, 1)
     light = event.throughput * (bsdf_weight(event.pdf, uniform / jacobian) / dr.opaque(mi.Float, count))
     # NaN is kept: what uses it counts what it leaves out.
     active = event.active & ~dr.all(light == 0)
     dr.eval(taps, light, active)
-    keep = np.flatnonzero(active.numpy()).astype(np.uint32)
-    if not len(keep):
-        return None
-    index = on_device(mi.UInt32, keep)
-    taps = [(dr.gather(mi.UInt32, texel, index), dr.gather(mi.Float, share, index)) for texel, share in taps]
-    light = dr.gather(mi.Color3f, light, index)
-    light = dr.select(dr.arange(mi.UInt32, len(index)) < dr.opaque(mi.UInt32, len(keep)), light, 0)
-    dr.eval(taps, light)
-    return taps, light, np.resize(keep // count, len(index))
+    active = active.numpy()
+    keep = np.flatnonzero(active)
+    texels, shares = (np.stack([tap[k].numpy()[keep] for tap in taps]) for k in (0, 1))
+    # By channel: a Color3f is interleaved by a kernel that has its length in it. Literals have one value.
+    light = [np.broadcast_to(light[c].numpy(), active.shape)[keep] for c in range(3)]
+    return texels, shares, np.stack(light, axis=1), keep // count
 
 
 def _join(block, parts):
-    if not parts:
-        return
-    sizes = [len(part[2]) for part in parts]
-    block.taps = [
-        tuple(_concatenated([part[0][i][k] for part in parts], sizes) for k in (0, 1)) for i in range(4)
-    ]
-    block.light = _concatenated([part[1] for part in parts], sizes)
-    at = np.concatenate([part[2] for part in parts]).astype(np.uint32)
-    block.at, block.escapes = on_device(mi.UInt32, at), len(at)
+    texels, shares, light, at = zip(*parts, strict=True)
+    block.light, block.at = np.concatenate(light), np.concatenate(at).astype(np.uint32)
+    block.escapes = len(block.at)
+    texel, share = (np.concatenate(both, axis=1).ravel() for both in (texels, shares))
+    some = np.flatnonzero(share > 0)
+    block.texel, block.share = texel[some], share[some]
+    block.escape = (some % max(block.escapes, 1)).astype(np.uint32)
 
 
 def _concatenated(parts, sizes):

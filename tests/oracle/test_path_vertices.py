@@ -81,8 +81,8 @@ def test_few_paths(size, count):
     assert slow.any()
 
 
-def test_a_block_with_a_single_vertex_and_a_single_escape(monkeypatch):
-    """Half of two pixels sees the sky and half the ground: one of each in a picture of 2 x 1."""
+def test_a_single_escape():
+    """Half of two pixels sees the sky and half the ground: one escape in a picture of 2 x 1."""
     s = load("in the air")
     grid = columns_of(s).grid
     for pixel in range(0, s.width * s.height):
@@ -90,11 +90,10 @@ def test_a_block_with_a_single_vertex_and_a_single_escape(monkeypatch):
         if dr.any(events[0].active)[0]:
             break
     assert dr.count(events[0].active)[0] == 1
-    taps, light, at = path_vertices._escapes(events[0], grid, 1)
-    assert len(at) == 2 and not at.any()
-    np.testing.assert_array_equal(np.array(light)[:, 1], 0)  # the repeated one counts for nothing
-    np.testing.assert_allclose(np.array(light)[:, 0], 1, rtol=1e-6)
-    assert sum(np.array(share)[0] for _, share in taps) == pytest.approx(1, rel=1e-6)
+    texels, shares, light, at = path_vertices._escapes(events[0], grid, 1)
+    assert texels.shape == shares.shape == (4, 1) and at.tolist() == [0]
+    np.testing.assert_allclose(light, [[1, 1, 1]], rtol=1e-6)
+    assert shares.sum() == pytest.approx(1, rel=1e-6)
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------
@@ -165,9 +164,8 @@ def test_memory_of_kept_paths_is_what_is_stated(name):
     columns = columns_of(load(name))
     traced(columns)
     blocks = columns._kept[COUNT, SEED]
-    real = sum(
-        size_of([b.si, b.throughput, b.bounce, b.path, b.pixel, b.taps, b.light, b.at]) for b in blocks
-    )
+    real = sum(size_of([b.si, b.throughput, b.bounce, b.path, b.pixel]) for b in blocks)
+    real += sum(v.nbytes for b in blocks for v in (b.texel, b.share, b.escape, b.light, b.at))
     assert real <= sum(b.bytes for b in blocks) <= 1.25 * real
     assert columns.kept_bytes == sum(b.bytes for b in blocks)
 
@@ -245,7 +243,7 @@ def test_escapes_that_are_not_finite_are_left_out_and_counted(monkeypatch):
     columns = columns_of(s)
     got = traced(columns)
     (block,) = columns._kept[COUNT, SEED]
-    bad = ~np.isfinite(np.array(block.light)).all(axis=0)
-    hits = sum((np.isin(np.array(t), TEXELS) & (np.array(share) > 0) & bad).sum() for t, share in block.taps)
+    bad = ~np.isfinite(block.light).all(axis=1)
+    hits = (np.isin(block.texel, TEXELS) & bad[block.escape]).sum()
     assert columns.lost == hits > 0
     assert np.isfinite(got).all() and got.sum() < clean.sum()

@@ -391,12 +391,22 @@ def _end(middle, bright):
 
 
 def glow_at(table: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Interpolate a :attr:`Light.glow` at angles given by their cosines; returns (..., 3)."""
-    place = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / GLOW_DEGREES[1]  # nodes are evenly apart
-    node = np.minimum(place.astype(np.intp), len(GLOW_DEGREES) - 2)
-    share = (place - node)[..., None]
-    inside = place[..., None] <= len(GLOW_DEGREES) - 1
-    return np.where(inside, table[node] + (table[node + 1] - table[node]) * share, 0.0)
+    """Interpolate a :attr:`Light.glow` at angles given by their cosines; returns (..., 3) of their type."""
+    table = np.asarray(table, cosine.dtype)
+    found = np.zeros((cosine.size, 3), cosine.dtype)
+    reach = int(np.flatnonzero(table.any(axis=1)).max(initial=-1)) + 1  # most of a sphere is beyond it
+    if reach == 0:
+        return found.reshape(*cosine.shape, 3)
+    farthest = np.cos(np.radians(min(GLOW_DEGREES[-1], reach * GLOW_DEGREES[1])) + 1e-9)
+    some = np.flatnonzero(cosine >= farthest)
+    place = np.degrees(np.arccos(np.clip(cosine.ravel()[some], -1, 1))) / GLOW_DEGREES[1]  # evenly apart
+    inside = place <= len(GLOW_DEGREES) - 1
+    some, place = some[inside], place[inside]
+    node = np.minimum(place.astype(np.int32), len(GLOW_DEGREES) - 2)
+    share, steps = place - node.astype(place.dtype), np.diff(table, axis=0)
+    for c in range(3):
+        found[some, c] = table[node, c] + steps[node, c] * share
+    return found.reshape(*cosine.shape, 3)
 
 
 def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -131,7 +131,7 @@ def run(
     traced, within, notes = start.renderer.transport, None, []
     if traced and wanted.coverage is not None:
         with clock("reach_s"):
-            watch.stage("asking what any light could do")
+            watch.stage("estimating how much of the target is feasible")
             within = reaches.reachable(
                 traced, original, wanted.picture, wanted.weight, rows, None, wanted.coverage[..., 0], initial
             )
@@ -161,7 +161,7 @@ def run(
     notes += [job.note] if job.note else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
-        notes.append(f"{kept:.3g} % of the active texels keep their bits")
+        notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
     notes = [*said, wanted.source, *renderer.choices, *notes, *adjusted]
     notes.append(f"result rendered with {judged} samples a pixel")
     renders = {"initial": initial, "target": wanted.picture, "edited": final}

@@ -161,7 +161,7 @@ def _separation_figures(separation, tonemap):
 
 
 def _unreachable_figure(pixels, share):
-    within = "" if share is None else f"; {100 * share:.0f} % of the request is within reach"
+    within = "" if share is None else f"; {100 * share:.0f} % of the request is feasible"
     ends = '<div class="ends"><span>red: stays darker than asked</span><span>blue: brighter</span></div>'
     return _figure(
         np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), f"what no light can do{within}", ends

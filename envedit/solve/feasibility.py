@@ -94,7 +94,7 @@ class Reach:
     @property
     def note(self) -> str:
         """One sentence for the report."""
-        return f"{_percent(self.share)} % of the request is within reach of some map"
+        return f"{_percent(self.share)} % of the request is feasible: some map gives it"
 
     @property
     def warning(self) -> str | None:
@@ -106,7 +106,7 @@ class Reach:
         else:
             left = "is asked to be darker than any light leaves it without darkening what is to stay"
         return (
-            f"only {_percent(self.share)} % of the request is within reach of any map: "
+            f"only {_percent(self.share)} % of the request is feasible under any map: "
             f"most of the rest {left}; see unreachable.png"
         )
 

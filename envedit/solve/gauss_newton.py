@@ -171,11 +171,9 @@ def solve(
         least = _unlikeliness(problem, before, first, sigma)
         near = problem.noise(first.residual, sigma) < NEAR * problem.noise(point.residual, sigma)
         if least <= loss:
-            note = (
-                f"the start as it is: steps take {normal.determined:.0f} unknowns and gain no more than noise"
-            )
+            note = f"kept the initialisation: {normal.determined:.0f} parameters would only fit noise"
         elif judge is not None and near and CLEARLY * judge(first.edited) <= judge(point.edited):
-            note = "the start as it is: path traced it is as close to the target"
+            note = "kept the initialisation: path traced, it is as close to the target"
         if note:
             run, point, loss = before, first, least
             normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))

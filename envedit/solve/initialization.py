@@ -124,13 +124,16 @@ def recordings(
     asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
     told = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
     shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
-    notes = [f"detail that the picture tells beyond {CYCLES} cycles: {shares or 'not enough'}"]
+    notes = [f"share of the sky whose detail beyond {CYCLES} cycles is identifiable: {shares or 'none'}"]
     if told and told[0].share < MIRRORED:
-        told, notes = [], [f"{notes[0]}: not enough, {100 * MIRRORED:.0f} % of the sky"]
+        told = []
+        notes[0] += f"; gain limited to {CYCLES} cycles, as less than {100 * MIRRORED:.0f} % is"
     if told and traced and settings.renderer.spp == "auto":
         most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:
-            notes.append(f"{most} paths a pixel in place of {transport.spp}: detail would follow their noise")
+            notes.append(
+                f"{most} paths a pixel instead of {transport.spp}, for less noise in the identifiable detail"
+            )
             transport.release()
             transport = trace(settings.seed, spp=most)
     # Columns of both are compared: their paths are in the ratio of the samples.
@@ -186,7 +189,7 @@ def _trusted(envmap, recordings, wanted):
     if weight is None:
         return None, ""
     noisy = 100 * float((weight < 0.5).mean())
-    said = f"{noisy:.3g} % of the pixels are mostly noise of caustics or of a light's images: they count less"
+    said = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
     weight = weight if wanted.weight is None else weight * wanted.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
         return None, ""

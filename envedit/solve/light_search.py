@@ -25,7 +25,7 @@ from envedit.solve.matching_pursuit import GAIN_ORDER, Given, Place, place, prod
 from envedit.transport.light_transport import LightTransport
 
 KEPT_FLUX = 3.0
-"""A light that moves starts with its own flux unless the picture wants this many times more or less."""
+"""A light that moves starts with its own flux unless the estimate is this many times more or less."""
 LEAST, MOST = 0.05, 20.0
 """Bounds of every factor that a start may have."""
 UPDATES = 30
@@ -80,18 +80,18 @@ def start(
     for i, (light, found) in enumerate(zip(lights, places, strict=False)):
         name = f"light {i + 1} of {len(lights)} ({100 * light.share:.3g} % of the map's)"
         if not found.flux.max() > 0:
-            notes.append(f"{name}: the picture does not want it")
+            notes.append(f"{name}: removed, its estimated flux is zero")
             continue
         direction, flux = light.direction, 1.0
         if found.direction is not None and transport.capacity < PROBES:
             direction = found.direction
-            notes.append(f"{name}: placed to a few degrees: memory_gb leaves no exact columns to refine")
+            notes.append(f"{name}: placed to a few degrees; renderer.memory_gb is too small to refine it")
         elif found.direction is not None:
             direction, flux = scene.refine(found.direction, layers.lights.flux[i], light.glow)
             angle = np.degrees(np.arccos(np.clip(direction @ light.direction, -1, 1)))
-            notes.append(f"{name}: starts {angle:.1f} degrees from where it was")
+            notes.append(f"{name}: initialised {angle:.1f} degrees from its place in the map")
         else:
-            notes.append(f"{name}: starts where it was")
+            notes.append(f"{name}: initialised at its place in the map")
         places[i] = Place(direction if found.direction is not None else None, np.full(3, flux))
         if only_own:
             continue
@@ -100,7 +100,7 @@ def start(
             factor *= 1 + glow_at(light.glow, scene.cells @ direction)
     for i in range(len(lights), len(places)):
         if places[i].flux.max() > 0:
-            notes.append("a light is born: the picture wants one where the map has none")
+            notes.append("added a light: the target needs one where the map has none")
             pictures.append((i, scene.light(i, places[i])))
 
     found = dict(params)

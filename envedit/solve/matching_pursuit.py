@@ -22,18 +22,18 @@ LEAST_FLUX = 1e-3
 GAIN_ORDER = 2
 """Order of the gains, as polynomials of the direction, that the background may take on meanwhile."""
 APART = 20.0
-"""Degrees from all others that a light is born at least."""
+"""Degrees from all others that an added light has at least."""
 BIRTH_ORDER = 4
 """Order of the background's gains that must fail to explain what a new light explains."""
 BIRTH = 0.6
-"""A light is born where it explains this share of what all others leave unexplained."""
+"""A light is added where it explains this share of what all others leave unexplained."""
 BIRTH_LIGHT = 0.03
 """And adds this share to the light of the picture."""
 SEEN, UNWANTED = 1e-3, 1e-2
 """A light that adds less than the first share to the picture, and would explain less than the second of its
 square anywhere, stays as it is."""
 UNEXPLAINED = 0.003
-"""Share of the squared picture that must be left unexplained before a light can be born."""
+"""Share of the squared picture that must be left unexplained before a light is added."""
 FAINT = 0.2
 """Pixels count by 1 / (brightness + this share of the mean brightness)."""
 NEAR, NEARLY = 1.6, 0.8
@@ -105,7 +105,7 @@ def place(
     lights : list of Light
         The map's lights.
     spare : int
-        Lights that may be born.
+        Lights that may be added.
     spare_flux : ndarray (3,)
         Flux of a spare light.
 
@@ -122,7 +122,7 @@ def place(
         stay = search.atom_of(given.cells(light), flux, light.direction, light.glow)
         score = search.scores(atom)
         unseen = np.abs(stay).sum() < SEEN * search.light and score.max() < UNWANTED * search.asked()
-        if unseen:  # nothing is known of it, and nothing else wants it
+        if unseen:  # nothing is known of it, and no other place explains more
             directions.append(None)
             atoms.append(None)
             continue

@@ -17,16 +17,16 @@ from envedit.solve.matching_pursuit import LEAST_FLUX, Given, Place, Pursuit, no
 from envedit.transport.light_transport import LightTransport
 
 BIRTH_BESIDE, BIRTH_ASKED = 0.3, 0.1
-"""For a painted change a light is born where it explains the first share of what is left unexplained, and the
-second of the squared change."""
+"""For a painted change a light is added where it explains the first share of what is left unexplained, and
+the second of the squared change."""
 BOLD = 0.01
 """The first of these shares where it will be tried out which start is better."""
 TAKEN = 0.3
-"""A light that loses this share of its strength where another is born has moved there."""
+"""A light that loses this share of its strength where another is added has moved there."""
 CHANGE_ORDER = 0
 """Order of the background's gains for a painted change: an extreme gain explains any small stroke."""
 BESIDE = 8.0
-"""Degrees from all others that a light of a painted change is born at least."""
+"""Degrees from all others that an added light has at least."""
 SOFT = 2.0
 """Radius in degrees of the lobes that take the place of lights where a shadow is to be softer."""
 
@@ -50,7 +50,7 @@ def start(
     initial : ndarray (h, w, 3)
         What was painted on. What is looked for explains the change, ``picture - initial``.
     bold : bool
-        Bear a light that explains little as well: a shadow takes a light elsewhere and a darker sky together,
+        Also add lights with a low score: a shadow takes a light elsewhere and a darker sky together,
         and either alone explains next to nothing.
 
     Returns
@@ -60,7 +60,7 @@ def start(
     notes : list of str
         What was found.
     """
-    # Paint does not weigh more than the rest here: what is born must leave the rest as it is.
+    # Paint does not weigh more than the rest here: what is added must leave the rest as it is.
     weight = None if weight is None or (weight > 0).all() else (weight > 0).astype(np.float32)
     scene = Question(layers, transport, initial, weight, envmap, wanted=picture - initial)
     lights = layers.separation.lights
@@ -77,9 +77,11 @@ def start(
         new[i] = scene.light(i, places[i])
         if i < len(lights):
             angle = np.degrees(np.arccos(np.clip(direction @ lights[i].direction, -1, 1)))
-            notes.append(f"light {i + 1} of {len(lights)}: starts {angle:.1f} degrees from where it was")
+            notes.append(
+                f"light {i + 1} of {len(lights)}: initialised {angle:.1f} degrees from its place in the map"
+            )
         else:
-            notes.append("a light is born: the paint wants one where the map has none")
+            notes.append("added a light: the paint needs one where the map has none")
     if moved:
         for i, factor in _strengths(scene, there, new).items():
             places[i] = Place(places[i].direction, places[i].flux * factor if i in new else factor)
@@ -89,7 +91,7 @@ def start(
 
 
 def softened(layers: Layers, params: dict) -> tuple[dict, list[str]]:
-    """Return a start with lobes in place of the strongest lights, as softer shadows want them.
+    """Return a start with lobes in place of the strongest lights, as softer shadows need them.
 
     A light of few texels cannot grow: its texels would part. A lobe can.
     """
@@ -104,7 +106,7 @@ def softened(layers: Layers, params: dict) -> tuple[dict, list[str]]:
     size[len(places) :] = np.log(SOFT / LOBE_DEGREES)
     real = {"turn": turn, "flux": flux, "size": size}
     found = {name: tensor(value / layers.scales[name]) for name, value in real.items()}
-    return params | found, [f"{len(lights)} of the lights start as soft lobes"]
+    return params | found, [f"{len(lights)} lights initialised as soft lobes"]
 
 
 def place(
@@ -118,7 +120,7 @@ def place(
     """Find which lights a painted change asks for; parameters as for :func:`.matching_pursuit.place`.
 
     ``difference`` (h, w, 3) is what was painted less what was there, 0 beside the paint. Beside a gain of the
-    background, lights that are there may become stronger or weaker, and lights are born. If one is born
+    background, lights that are there may become stronger or weaker, and lights are added. If one is added
     while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``: be
     content with :data:`BOLD` of what is left unexplained.
     """
@@ -129,23 +131,23 @@ def place(
         stays.append(atom[..., 0])
         search.explain(stays[-1])
     own = [given.flux(light).sum(axis=0) for light in lights]
-    born, added, atom = [], [], search.atoms(spare_flux, None)
+    new_places, added, atom = [], [], search.atoms(spare_flux, None)
     for _ in range(spare + len(lights)):
         score = search.scores(atom)
-        for there in [*(light.direction for light in lights), *born]:
+        for there in [*(light.direction for light in lights), *new_places]:
             score[overview.directions[search.candidates] @ there > np.cos(np.radians(BESIDE))] = 0
         best = int(score.argmax())
         enough = BOLD * search.left() if bold else BIRTH_BESIDE * search.left()
-        if not score[best] > max(enough, 0 if bold and not born else BIRTH_ASKED * search.asked()):
+        if not score[best] > max(enough, 0 if bold and not new_places else BIRTH_ASKED * search.asked()):
             break
-        born.append(search.between(score, best))
+        new_places.append(search.between(score, best))
         added.append(atom[..., best])
         search.explain(added[-1])
     factors = search.solve([a * sign for a in stays for sign in (1, -1)] + added, signed=True)
     grown = factors[: 2 * len(stays)].reshape(len(stays), 2, 3)
     factor = np.clip(1 + grown[:, 0] - grown[:, 1], 0, None)
-    places, moved = [Place(None, f if born else np.ones(3)) for f in factor], []
-    for direction, strength in zip(born, factors[2 * len(stays) :], strict=True):
+    places, moved = [Place(None, f if new_places else np.ones(3)) for f in factor], []
+    for direction, strength in zip(new_places, factors[2 * len(stays) :], strict=True):
         flux = strength * spare_flux
         left = [1.0 if i in moved else factor[i].mean() for i in range(len(lights))]
         if left and min(left) < 1 - TAKEN:

@@ -162,23 +162,23 @@ def test_a_sun_that_the_picture_does_not_show_disappears(transport):
 
 
 @pytest.mark.slow
-def test_a_light_that_the_map_does_not_have_is_born(transport):
+def test_a_light_that_the_map_does_not_have_is_added(transport):
     """A mirror sees where a light is; a matte ground leaves too much to the sky."""
     place, mirror = (8, 50), transport("mirror")
     image = blob(place, 10, degrees=3)
     found = Start(mirror, sky(), picture(transport("mirror"), image))
-    assert found.count == 0 and any("born" in note for note in found.notes)
+    assert found.count == 0 and any("added a light" in note for note in found.notes)
     lit = found.flux.max(axis=1) > 1e-3
     assert lit.any()
     for direction in np.array(found.direction)[lit]:
         assert degrees_apart(direction, DIRECTIONS[place]) < NEAR
-    # What was born has the light that was wanted.
+    # What was added has the light that was wanted.
     extra = ((found.decoded - sky()[:ROWS]) * OMEGA[:ROWS, None, None]).sum(axis=(0, 1))
     np.testing.assert_allclose(extra, 10, rtol=0.3)
 
 
 @pytest.mark.slow
-def test_nothing_is_born_in_a_sky_that_is_right(transport):
+def test_nothing_is_added_to_a_sky_that_is_right(transport):
     found = Start(transport("mirror"), sky(), picture(transport("mirror"), sky()))
     assert found.notes == [] and (found.flux < 1e-9).all()
     np.testing.assert_allclose(found.decoded, sky()[:ROWS], rtol=0.1)
@@ -361,12 +361,12 @@ def test_a_painted_shadow_elsewhere_moves_the_sun(place, transport):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suns", [(), (SUN,)])
-def test_a_painted_light_is_born_beside_those_that_stay(suns, transport):
+def test_a_painted_light_is_added_beside_those_that_stay(suns, transport):
     place = (7, 44)
     found = painted(transport(), sky(*suns), sky(*suns, place))
-    born = found.count
-    assert degrees_apart(found.direction[born], DIRECTIONS[place]) < NEAR
-    assert found.flux[born].max() > 0.1 and "born" in found.notes[-1]
+    new = found.count
+    assert degrees_apart(found.direction[new], DIRECTIONS[place]) < NEAR
+    assert found.flux[new].max() > 0.1 and "added a light" in found.notes[-1]
     for i in range(found.count):
         assert degrees_apart(found.direction[i], DIRECTIONS[suns[i]]) < 0.5 * TEXEL
         np.testing.assert_allclose(found.flux[i], 1, atol=0.25)

@@ -123,7 +123,7 @@ def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, c
     painted = found["painted"]
     assert set(painted) == {"towards", "elsewhere", "reachable"} and 0 <= painted["reachable"] <= 1
     assert found["envmap"] is None and found["timing"]["reach_s"] > 0
-    assert any("within reach" in line for line in found["choices"])
+    assert any("is feasible" in line for line in found["choices"])
     assert images.read(out / "unreachable.png")[0].shape == (18, 24, 3)
     assert "What was painted" in (out / "report.html").read_text()
     wanted, initial = (images.read(out / f"render_{name}.exr")[0] for name in ("target", "initial"))
@@ -139,4 +139,4 @@ def test_less_than_half_within_reach_is_a_warning(tmp_path, rng, capsys):
     ]  # fmt: skip
     out = carried_out(tmp_path, source(rng), target={"kind": "strokes", "strokes": strokes})
     assert json.loads((out / "metrics.json").read_text())["painted"]["reachable"] < 0.5
-    assert "within reach of any map" in capsys.readouterr().err
+    assert "is feasible under any map" in capsys.readouterr().err

@@ -45,7 +45,7 @@ def test_weights_have_a_mean_of_one_and_are_told(rng):
     recordings, base = seen(rng)
     weight, said = initialization._trusted(MAP, recordings, target(base))
     assert weight.shape == (24, 32, 1) and float(weight.mean()) == pytest.approx(1, abs=1e-5)
-    assert weight[11, 21] == 0 and "% of the pixels are mostly noise" in said
+    assert weight[11, 21] == 0 and "% of the pixels are dominated by Monte Carlo noise" in said
 
 
 def test_a_mask_counts_too(rng):

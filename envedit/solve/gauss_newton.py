@@ -14,12 +14,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from envedit.core.errors import NumericalError
-from envedit.representations.layers.lights import DARK
+from envedit.representations.layers.lights import DARK, rotation_vector
 from envedit.solve import added_light
 from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
-"""Most steps without added lights, and the relative decrease of F below which no further step is made."""
+"""Most steps where no light is added or moved, and the relative decrease of F below which no further step is
+made."""
 TRIES = 5
 """Dampings that are tried in one step."""
 NEAR, CLEARLY = 2.0, 0.95
@@ -50,6 +51,8 @@ class Run:
         taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
     asked : int
         How often it has been asked, where steps had ended, whether lights are to be added or moved.
+    most : int
+        Steps after which it ends; more once a light was added or moved.
     """
 
     state: dict
@@ -59,11 +62,12 @@ class Run:
     finished: bool = False
     history: list[dict] = field(default_factory=list)
     asked: int = 0
+    most: int = ITERATIONS
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
-        return both | {"numbers": np.array([self.damping, self.scale, self.finished, self.asked])}
+        return both | {"numbers": np.array([self.damping, self.scale, self.finished, self.asked, self.most])}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -72,8 +76,8 @@ class Run:
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
         ]
-        damping, scale, finished, asked = arrays["numbers"].tolist()
-        return cls(*parts, damping, scale, bool(finished), list(history), int(asked))
+        damping, scale, finished, asked, most = arrays["numbers"].tolist()
+        return cls(*parts, damping, scale, bool(finished), list(history), int(asked), int(most))
 
 
 @dataclass
@@ -207,7 +211,7 @@ class _Search:
         if not self.iterations:
             return run, point
         if more is not None:
-            run, point = self._better(run, point, more)
+            run, point = self._better(run, point, self._new(run, more))
         for _ in range(self.births):
             began = point
             if run.state["gain"].any():
@@ -217,7 +221,7 @@ class _Search:
             if found is None or found[1] < WORTH:
                 break
             before = run
-            run, point = self._better(run, point, found[0])
+            run, point = self._better(run, point, self._new(run, found[0]), self._moved(run, found[0]))
             if run is before:
                 break
         return run, point
@@ -225,7 +229,7 @@ class _Search:
     def solved(self, run, point):
         """Descend, put added lights where they lower F more, and add others while they lower it."""
         while True:
-            point = self._descended(run, point, self._most(run), self.after_step)
+            point = self._descended(run, point, min(self.iterations, run.most), self.after_step)
             if not self.births or run.asked > self.births or not run.history:
                 return run, point
             before, run.asked = run, run.asked + 1
@@ -235,7 +239,9 @@ class _Search:
                 normal = self.problem.normal(point, run.start, noise)
                 found = added_light.best(self.problem, point, normal)
                 if found is not None and found[1] >= WORTH:
-                    run, point = self._better(run, point, found[0])
+                    run, point = self._better(
+                        run, point, self._new(run, found[0]), self._moved(run, found[0])
+                    )
             if run is before:
                 return run, point
 
@@ -252,36 +258,60 @@ class _Search:
             noise = problem.noise(point.residual, self.sigma)
             found = added_light.best(problem, dark, problem.normal(dark, run.start, noise), i)
             if found is None or found[1] < WORTH:
-                run, point = self._better(run, point, without, [], -WORTH)
+                run, point = self._better(run, point, (without, []))
             elif problem.direction(found[0], i) @ problem.direction(run.state, i) < SAME_PLACE:
-                run, point = self._better(run, point, found[0], [i])
+                run, point = self._better(run, point, (found[0], [i]))
         return run, point
 
-    def _most(self, run):
-        return min(self.iterations, ITERATIONS + ADDED_STEPS * len(self.problem.added(run.state)))
+    def _new(self, run, state):
+        """Return a state with more added lights, and which are new."""
+        return state, [i for i in self.problem.added(state) if i not in self.problem.added(run.state)]
 
-    def _better(self, run, point, state, new=None, margin=WORTH):
-        """Return the better of a run and of one from a state with some lights new, after some steps.
+    def _moved(self, run, state):
+        """Return the state in which the map's strongest light is where a state has added one, and its number.
 
-        ``margin`` is by how much F must be lower; below zero, may be higher.
+        What looks like a new light may be the one that the map has. None where the map has no light.
         """
-        start = {name: value.copy() for name, value in run.start.items()}
-        if new is None:
-            new = [i for i in self.problem.added(state) if i not in self.problem.added(run.state)]
-        for name in ("turn", "flux", "size"):
-            start[name][new] = state[name][new]
-        rival = replace(run, state=state, start=start, history=list(run.history), finished=False)
-        first = self.problem.evaluate(state)
-        if first.residual is None:
-            return run, point
+        problem, (_, new) = self.problem, self._new(run, state)
+        lights = problem.layers.lights
+        own = [i for i in problem.lit(run.state) if i not in problem.added(run.state)]
+        if not own or not new:
+            return None
+        flux = [float((lights.flux[i] * np.exp(run.state["flux"][i])).sum()) for i in own]
+        i, moved = own[int(np.argmax(flux))], {name: value.copy() for name, value in run.state.items()}
+        moved["turn"][i] = rotation_vector(lights.centres[i], problem.direction(state, new[0]))
+        moved["flux"][i], moved["gain"][:] = 0, 0  # what has made up for the light is in the gain
+        return moved, [i]
+
+    def _better(self, run, point, *rivals):
+        """Return the best of a run and of those from other states, after some steps.
+
+        ``rivals`` are states and which lights they have placed anew; None: there is none. One with no fewer
+        added lights than the best so far must have F lower by :data:`WORTH`, one with fewer may have it
+        higher by that.
+        """
+        problem, ends = self.problem, []
         most = min(self.iterations, len(run.history) + ADDED_STEPS)
+        for state, new in filter(None, rivals):
+            start = {name: value.copy() for name, value in run.start.items()}
+            for name in ("turn", "flux", "size"):
+                start[name][new] = state[name][new]
+            rival = replace(run, state=state, start=start, history=list(run.history), finished=False)
+            first = problem.evaluate(state)
+            if first.residual is not None:
+                ends.append((rival, self._descended(rival, first, most, self._tried)))
+        if not ends:
+            return run, point
         if not run.finished:
             run = replace(run, history=list(run.history))
             point = self._descended(run, point, most, self._tried)
-        end = self._descended(rival, first, most, self._tried)
-        scale = max(run.scale, rival.scale)
-        loss, other = (self.problem.loss(p, r.start, scale) for p, r in ((point, run), (end, rival)))
-        return (rival, end) if other + margin < loss else (run, point)
+        scale = max(one.scale for one, _ in [(run, point), *ends])
+        for rival, end in ends:
+            fewer = len(problem.added(rival.state)) < len(problem.added(run.state))
+            loss, other = (problem.loss(p, r.start, scale) for p, r in ((point, run), (end, rival)))
+            if other + (-WORTH if fewer else WORTH) < loss:
+                run, point = replace(rival, most=len(rival.history) + ITERATIONS - ADDED_STEPS), end
+        return run, point
 
     def _tried(self, _, point):
         if self.after_step:

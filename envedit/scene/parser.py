@@ -82,7 +82,8 @@ def check_required(state, where: str) -> None:
         name = node.props.plugin_name()
         needed = _REQUIRED.get(name, ())
         if needed and not any(key in node.props for key in needed):
-            raise InputError(f"{place_of(state, node, where)}: {name} has no {' or '.join(needed)}; give it one")
+            place = place_of(state, node, where)
+            raise InputError(f"{place}: {name} has no {' or '.join(needed)}; give it one")
 
 
 def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:

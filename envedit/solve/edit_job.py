@@ -315,8 +315,8 @@ class Job:
             return ""
         return (
             f"optimizer.lr = {chosen.lr:g} is too high: the loss went from {before:.3g} to {after:.3g}, "
-            f"{bad} of {chosen.iterations} steps were not finite; the map that the edit began with is kept; lower "
-            f"optimizer.lr, {usual:g} is usual"
+            f"{bad} of {chosen.iterations} steps were not finite; the map that the edit began with is kept; "
+            f"lower optimizer.lr, {usual:g} is usual"
         )
 
     def _loss(self, objective, params, rows, step):

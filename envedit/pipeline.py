@@ -170,16 +170,18 @@ def run(
         stored = given.as_stored(edited, edit.degrees)
         measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit.alpha)
         predicted = traced.coarse_error(edited) if traced else None
-    before, after = (measured[name]["psnr"] for name in ("initial", "render"))
-    measured["worse"] = wanted.coverage is None and after < before
+    rate = "; lower optimizer.lr" if job.raised_rate else ""
+    judged = [measured[name] for name in ("render", "initial")]
+    measured["worse"] = wanted.coverage is None and metrics.worse(*judged)
     if measured["worse"]:
+        after, before = (metrics.score(one, judged, 2) for one in judged)
         warnings.append(
-            f"the result is farther from the target than the input: {after:.2f} dB, {before:.2f} dB before"
+            f"the result is farther from the target than the input: {after}, {before} before{rate}"
         )
     if state.bad_steps:
         warnings.append(
             f"{state.bad_steps} of {state.step} iterations were not finite: they were taken back, and the "
-            "learning rate was lowered for a while"
+            f"learning rate was lowered for a while{rate}"
         )
     measured |= {
         "fit": _of_fit(representation.fitted),

@@ -400,6 +400,14 @@ def _note_results(arguments, folder):
 
 
 def _verdict(measured):
+    from envedit.losses import metrics
+
+    def change(before, after):
+        pair = measured[before], measured[after]
+        first, last = (metrics.score(one, pair) for one in pair)
+        what = ", of which a display shows little" if metrics.saturated(pair) else ""
+        return f"{first.rpartition(' ')[0]} -> {last}{what}"
+
     painted = measured["painted"]
     if painted and painted["towards"] is not None:
         line = f"{100 * painted['towards']:.0f} % of the way to the paint"
@@ -408,12 +416,12 @@ def _verdict(measured):
         line += (
             f", changed elsewhere by {painted['elsewhere']:.3f}" if painted["elsewhere"] is not None else ""
         )
-    elif not measured["iterations"] and measured["initial"]["mse"] == 0:
-        line = f"no target, rendering changed: {measured['render']['psnr']:.1f} dB from the initial one"
+    elif not measured["iterations"] and measured["initial"]["log_rmse"] == 0:
+        line = f"no target, rendering changed: {metrics.score(measured['render'], [])} from the initial one"
     else:
-        line = f"rendering {measured['initial']['psnr']:.1f} -> {measured['render']['psnr']:.1f} dB"
+        line = f"rendering {change('initial', 'render')}"
         if measured["envmap"]:
-            line += f", map {measured['initial_envmap']['psnr']:.1f} -> {measured['envmap']['psnr']:.1f} dB"
+            line += f", map {change('initial_envmap', 'envmap')}"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 

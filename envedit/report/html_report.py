@@ -13,6 +13,7 @@ from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.latlong import solid_angles
 from envedit.images.images import png
+from envedit.losses.metrics import saturated, score, worse
 from envedit.report.curves import curves_svg, escape, number
 from envedit.report.manifest import plain
 from envedit.report.preview import (
@@ -182,17 +183,20 @@ def _map_statistics(image):
 
 
 def _verdict(metrics):
-    def psnr(table):
-        return number((metrics.get(table) or {}).get("psnr"))
+    def table(name):
+        found = metrics.get(name) or {}
+        return found if number(found.get("psnr")) is not None else None
 
-    before, after, true_map = psnr("initial"), psnr("render"), psnr("envmap")
+    before, after, true_map = table("initial"), table("render"), table("envmap")
+    known = [one for one in (before, after) if one]
     total = number((metrics.get("timing") or {}).get("total_s"))
 
-    def decibel(value):
-        return "unknown" if value is None else f"{value:.1f} dB"
+    def told(one):
+        return "unknown" if one is None else score(one, known)
 
-    parts = [f"Rendering against the target: {decibel(before)} → <strong>{decibel(after)}</strong> PSNR"]
-    parts += [f"map against the true one: {decibel(true_map)}"] if true_map is not None else []
+    kind = "log RMSE: a display shows little of what differs" if saturated(known) else "PSNR"
+    parts = [f"Rendering against the target: {told(before)} → <strong>{told(after)}</strong> {kind}"]
+    parts += [f"map against the true one: {score(true_map, [])}"] if true_map else []
     painted = metrics.get("painted") or {}
     towards, elsewhere = number(painted.get("towards")), number(painted.get("elsewhere"))
     if towards is not None:
@@ -202,7 +206,7 @@ def _verdict(metrics):
     line = f'<p class="verdict">{" · ".join(parts)}</p>'
     if towards is not None and towards < 0:
         line += '<p class="alarm">The edited rendering is further from the paint than the unedited one.</p>'
-    if towards is None and before is not None and after is not None and after < before:
+    if towards is None and before and after and worse(after, before):
         line += '<p class="alarm">The edited rendering is further from the target than the unedited one.</p>'
     return line
 
@@ -296,6 +300,7 @@ def write_report(
     # Tables
     quality = [metrics.get(table) or {} for table in ("initial", "render", "envmap")]
     measures = {"psnr": "PSNR (dB)", "ssim": "SSIM", "mse": "MSE", "lpips": "LPIPS"}
+    measures |= {"log_rmse": "log RMSE (stops)", "beyond_display": "share that a display does not show"}
     quality_rows = [[name, *(_show(table.get(key)) for table in quality)] for key, name in measures.items()]
     others = [(key, value) for key, value in metrics.items() if not isinstance(value, (dict, type(None)))]
     others = [(key, value) for key, value in others if key != "choices"]  # a chapter of their own

@@ -30,6 +30,8 @@ _ENVIRONMENTS = {
 _SMOOTH = {"roughconductor": "conductor", "roughplastic": "plastic", "roughdielectric": "dielectric"}
 _SMALLEST_ALPHA = 1e-4  # Mitsuba's own clamp
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+_REQUIRED = {"bitmap": ("filename", "bitmap", "data"), "blendbsdf": ("weight",), "normalmap": ("normalmap",)}
+"""Of which one must be given: Mitsuba 3.9 reads beyond the properties of such a plugin that has none."""
 _MESHES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}
 _MOST_WIDTH_PER_HEIGHT = 1.5
 
@@ -72,6 +74,16 @@ def lower_names(state) -> None:
         name = node.props.plugin_name()
         if name != name.lower():
             node.props.set_plugin_name(name.lower())
+
+
+def check_required(state, where: str) -> None:
+    """Refuse plugins that lack a property without which Mitsuba stops with a signal."""
+    for node in state.nodes:
+        name = node.props.plugin_name()
+        needed = _REQUIRED.get(name, ())
+        if needed and not any(key in node.props for key in needed):
+            place = place_of(state, node, where)
+            raise InputError(f"{place}: {name} has no {' or '.join(needed)}; give it one")
 
 
 def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
@@ -160,8 +172,10 @@ def set_sampler(state, plugin: str) -> None:
 def find_files(state, where: str, folders) -> None:
     """Make every file name absolute; the environment's own bitmap is already gone and need not exist."""
     for node in state.nodes:
-        if "filename" not in node.props or not isinstance(name := node.props["filename"], str):
+        if "filename" not in node.props:
             continue
+        if not isinstance(name := node.props["filename"], str):
+            raise InputError(f"{place_of(state, node, where)}: filename is {name}, expected a text")
         found = [f / name for f in folders if os.path.isfile(f / name)]
         if not found:
             kind = str(node.type).rpartition(".")[2].lower()

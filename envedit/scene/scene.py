@@ -363,6 +363,7 @@ def _parsed(file, parameters, base):
     installed_plugins.come_first()
     for node in state.nodes:
         installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
+    parser.check_required(state, where)
     return config, state, path, where, folders
 
 

@@ -118,11 +118,11 @@ class _Reader:
                 f"scene {name}: more than {MOST_INCLUDED} files are included, or more than "
                 f"{_INCLUDES_DEEP} inside one another"
             )
-        text = self._text(path)
+        text = self._text(path, above)
         folders = [os.path.dirname(name), *folders] if os.path.dirname(name) else list(folders)
         self._tags(text, name, folders, [*above, real])
 
-    def _text(self, path):
+    def _text(self, path, above):
         size = scene_files.size_of(path, "an XML file")
         self.bytes += size
         if self.bytes > MOST_BYTES:
@@ -133,7 +133,8 @@ class _Reader:
             raise InputError(f"scene {path}: {error.strerror or error}") from None
         text = text.decode("utf-8-sig", "replace")
         if "\0" in text or not text.lstrip().startswith("<"):
-            raise InputError(f"scene {path}: is no XML file in UTF-8")
+            which = f"{above[-1]}: includes {path}, which" if above else f"{path}:"
+            raise InputError(f"scene {which} is no XML file in UTF-8")
         return text
 
     def _tags(self, text, name, folders, above):

@@ -167,7 +167,7 @@ def _odd(array, rng):
     if kind == 1:
         return array.reshape(-1)[: rng.integers(array.size + 1)]
     if kind == 2:
-        return array.reshape(-1, *array.shape) if rng.random() < 0.5 else array.ravel()
+        return array[None] if rng.random() < 0.5 else array.ravel()
     raw = np.atleast_1d(array).copy()
     words = raw.reshape(-1).view(np.uint32) if raw.nbytes % 4 == 0 else raw.reshape(-1).view(np.uint8)
     for _ in range(int(rng.integers(1, 4)) if words.size else 0):

@@ -335,6 +335,22 @@ def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch,
     assert names(out) == {"edited.exr"}
 
 
+@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
+@pytest.mark.parametrize("iterations", [1, 30])
+def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
+    kind, iterations, tmp_path, rng, capsys, recorded
+):
+    path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
+    asked = {"optimizer__iterations": iterations, "optimizer__kind": "adam"}
+    assert call(path, "--quiet", *changed(**asked, optimizer__lr=1e38)) == 5
+    said = capsys.readouterr().err
+    assert "optimizer.lr = 1e+38 is too high" in said and "material" not in said
+    assert len(said.splitlines()) == 1
+    if kind == "pixels":  # whose start is the input
+        assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
+    assert call(path, "--quiet", *changed(**asked)) == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["judged rendering", "metrics", "transport's error"])
 def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):

@@ -729,6 +729,13 @@ def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng, monkeypatch
     assert found.metrics["turn_degrees"] == 0
     assert found.envmap.tobytes() == picture.tobytes()
     assert len(told) == 1 and 0 < told[0] < preparation.NOISIEST and told[0] != preparation.QUIET
+    itself = {"file": "map.exr", "rotate_degrees": 0.0, "spp": 256}
+    settings, drawn = turned_world(tmp_path, rng, target=itself, input={"rows": "upper"}, **asked)
+    again = pipeline.run(settings)
+    assert again.envmap.tobytes() == drawn.tobytes()
+    for one in (found, again):
+        assert any("what is there already, to its noise: nothing is changed" in line for line in one.notes)
+        assert one.metrics["render"] == one.metrics["initial"] and one.metrics["worse"] is False
 
     images.write_exr(tmp_path / "brighter.exr", 1.2 * picture)
     brighter = {"file": "brighter.exr", "rotate_degrees": 0.0, "spp": 256}

@@ -83,7 +83,7 @@ def test_images_are_float32_of_the_right_size_and_finite(done):
 
 def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
     found = measured(done[1])
-    image_keys = {"psnr", "ssim", "mse", "lpips"}
+    image_keys = {"psnr", "ssim", "mse", "lpips", "log_rmse", "beyond_display"}
     assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
     assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached", "seconds"}
     timing = {
@@ -358,6 +358,20 @@ def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, 
     says = "warning: the result is farther from the target than the input: 20.00 dB, 21.50 dB before"
     assert says in capsys.readouterr().err
     assert measured(tmp_path / "out")["worse"] is True
+
+
+def test_what_a_display_does_not_show_is_judged_in_stops(tmp_path, rng, capsys):
+    """A map a million times brighter than white: both renderings are white, and 200 dB from the target."""
+    path = world(tmp_path, rng)
+    images.write_exr(tmp_path / "map.exr", 1e6 * (sky(rng) + 0.1))
+    assert call(path, *changed(representation__kind="pixels", optimizer__iterations=0)) == 0
+    found, out = measured(tmp_path / "c_out"), capsys.readouterr().out
+    first, last = (found[key]["log_rmse"] for key in ("initial", "render"))
+    assert found["initial"]["psnr"] > 60 and found["initial"]["beyond_display"] > 0.9 and 0.1 < first == last
+    shown = f"{first:.2f} -> {last:.2f} stops, of which a display shows little"
+    assert f"rendering {shown}, map" in out
+    page = (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
+    assert f"{first:.2f} stops" in page and "log RMSE (stops)" in page
 
 
 # ---- what is said and set --------------------------------------------------------------------------------

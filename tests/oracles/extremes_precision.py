@@ -17,7 +17,7 @@ from envedit.representations.layers import lights
 from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
 from tests.oracles.extremes_stages import LUMINANCE, dense, loss_and_gradient, plain, single, sky, transport
-from tests.oracles.plain import plain_ssim
+from tests.oracles.plain import IDENTICAL, plain_ssim
 
 SCALES = [10.0**k for k in range(-5, 6)]
 RANGE = "1e-5 to 1e5"
@@ -275,6 +275,11 @@ def _log_psnr(a, b):
     return 10 * math.log10((b.max() - b.min()) ** 2 / _mse(a, b))
 
 
+def _log_rmse(a, b):
+    offset = 0.01 * np.median(b)
+    return math.sqrt(math.fsum((np.log2((a + offset) / (b + offset)) ** 2).ravel()) / a.size)
+
+
 def _ssim(a, b):
     return plain_ssim(a, b).mean()
 
@@ -291,7 +296,7 @@ def _high_pass(a):
 
 def _same():
     for a, _ in _cases(""):
-        assert metrics.compare(a, a) == {"psnr": 200.0, "ssim": 1.0, "mse": 0.0, "lpips": None}
+        assert metrics.compare(a, a) == IDENTICAL
         assert metrics.psnr(a, a) == metrics.log_psnr(a, a) == 200 and metrics.ssim(a, a) == 1
     return 0.0
 
@@ -359,6 +364,7 @@ CHECKS |= {
     "metric `psnr`": Check(_judged(metrics.psnr, lambda a, b: -10 * math.log10(_mse(a, b))), 1e-12, _WIDE),
     "metric `ssim`": Check(_judged(metrics.ssim, _ssim), 1e-12, _WIDE),
     "metric `log_psnr`": Check(_judged(metrics.log_psnr, _log_psnr), 1e-12, _WIDE),
+    "metric `log_rmse`": Check(_judged(metrics.log_rmse, _log_rmse), 1e-12, _WIDE),
     "metric `peak_ratio`": Check(
         _judged(metrics.peak_ratio, lambda a, b: (a @ LUMINANCE).max() / (b @ LUMINANCE).max()), 1e-12, _WIDE
     ),

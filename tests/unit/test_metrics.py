@@ -8,6 +8,12 @@ import pytest
 
 from envedit.core.errors import ConfigError, InputError
 from envedit.losses import metrics
+from tests.oracles.plain import IDENTICAL
+
+PAIRS = [
+    "mse", "psnr", "ssim", "compare",
+    "log_psnr", "log_rmse", "sun_offset", "peak_ratio", "mean_luminance_ratio",
+]  # fmt: skip
 
 
 def waves(height=40, width=56):
@@ -44,7 +50,7 @@ def test_compare_states_its_tonemap():
     result = metrics.compare(a, b)
     error = (1 - 0.25 ** (1 / 2.2)) ** 2
     assert result["mse"] == pytest.approx(error) and result["psnr"] == pytest.approx(-10 * math.log10(error))
-    assert result["lpips"] is None and list(result) == ["psnr", "ssim", "mse", "lpips"]
+    assert result["lpips"] is None and list(result) == list(IDENTICAL)
     assert metrics.compare(a, b, tonemap="linear")["mse"] == pytest.approx(0.75**2)
     with pytest.raises(ConfigError, match="tonemap"):
         metrics.compare(a, b, tonemap="gama")
@@ -55,10 +61,9 @@ def test_compare_states_its_tonemap():
 def test_everything_is_finite_or_null(level, shape, rng):
     a, b = np.full(shape, level, np.float32), rng.random(shape).astype(np.float32)
     for x, y in ((a, b), (b, a), (a, a)):
-        numbers = [f(x, y) for f in (metrics.log_psnr, metrics.peak_ratio, metrics.mean_luminance_ratio,
-                                     metrics.sun_offset)]  # fmt: skip
+        numbers = [getattr(metrics, name)(x, y) for name in PAIRS[4:]]
         json.dumps([metrics.compare(x, y), numbers, metrics.high_frequency_energy(x)], allow_nan=False)
-    assert metrics.compare(a, a) == {"psnr": metrics.PSNR_CAP, "ssim": 1.0, "mse": 0.0, "lpips": None}
+    assert metrics.compare(a, a) == IDENTICAL
 
 
 def test_log_psnr_is_normalised_by_the_reference(rng):
@@ -69,6 +74,41 @@ def test_log_psnr_is_normalised_by_the_reference(rng):
     assert metrics.log_psnr(b, b) == metrics.PSNR_CAP
     flat = np.ones((2, 2, 3))
     assert metrics.log_psnr(flat, flat) == metrics.PSNR_CAP and metrics.log_psnr(2 * flat, flat) is None
+
+
+def test_log_rmse_is_the_same_at_every_exposure(rng):
+    b = sky(rng).astype(np.float64)
+    offset = metrics.RELATIVE_EPS * np.median(b)
+    a = (b + offset) * 2**0.5 - offset  # half a stop brighter everywhere
+    for exposure in (1e-30, 1.0, 1e30):
+        assert metrics.log_rmse(exposure * a, exposure * b) == pytest.approx(0.5, abs=1e-9)
+    black = np.zeros((2, 2, 3))
+    assert metrics.log_rmse(black, black) == 0 and metrics.log_rmse(black + 1, black) is None
+
+
+@pytest.mark.parametrize("exposure, beyond", [(1e-12, 1), (0.1, 0), (1e3, 1), (1e30, 1)])
+@pytest.mark.parametrize("tonemap", ["gamma", "linear", "srgb", "log"])
+def test_where_a_display_shows_nothing_the_logarithm_judges(rng, tonemap, exposure, beyond):
+    """Even where the PSNR of both is 200 dB, and where the farther one has the better PSNR."""
+    wanted = exposure * sky(rng).astype(np.float64)
+    near, far = (metrics.compare(wanted * factor, wanted, tonemap) for factor in (1.1, 2.0))
+    assert near["beyond_display"] == beyond
+    assert metrics.saturated([near, far]) == bool(beyond)
+    assert metrics.worse(far, near) and not metrics.worse(near, far) and not metrics.worse(near, near)
+    assert metrics.score(far, [near]).endswith(" stops" if beyond else " dB")
+
+
+def test_the_share_beyond_the_display_is_of_what_differs(rng):
+    """A black ground that is equal in both does not hide that the rest is clipped."""
+    a = np.zeros((10, 10, 3))
+    a[:4] = 50 + rng.random((4, 10, 3))
+    b = a.copy()
+    b[:4] *= 2
+    b[0] = 0.5
+    assert metrics.compare(b, a)["beyond_display"] == pytest.approx(0.75)
+    seen = np.zeros((10, 10), bool)
+    seen[:1] = True
+    assert metrics.compare(b, a, seen=seen)["beyond_display"] == 0
 
 
 def test_sun_offset_goes_through_the_seam(rng):
@@ -102,9 +142,6 @@ def test_high_frequency_energy_sees_speckle_and_not_gradients(rng):
     assert metrics.high_frequency_energy(wave) < 1e-6
     assert metrics.high_frequency_energy(np.roll(speckle, 100, axis=1)) == pytest.approx(
         metrics.high_frequency_energy(speckle), rel=1e-12)  # fmt: skip
-
-
-PAIRS = ["mse", "psnr", "ssim", "compare", "log_psnr", "sun_offset", "peak_ratio", "mean_luminance_ratio"]
 
 
 @pytest.mark.parametrize("name", PAIRS)

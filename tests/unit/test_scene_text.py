@@ -46,6 +46,26 @@ def test_references_in_a_circle_are_refused(tmp_path):
     refused(write_scene(tmp_path, SENSOR, LIGHT, *parts), "circular reference")
 
 
+@pytest.mark.parametrize(
+    "part, says",
+    [
+        ('<bsdf type="blendbsdf"/>', "blendbsdf has no weight"),
+        ('<bsdf type="BlendBSDF" id="b"><bsdf type="diffuse"/></bsdf>', "blendbsdf has no weight"),
+        ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap has no normalmap"),
+        ('<emitter type="spot"><texture name="texture" type="bitmap"/></emitter>', "bitmap has no filename"),
+        ('<texture type="bitmap"><float name="filename" value="2"/></texture>', "filename is 2"),
+    ],
+)
+def test_what_mitsuba_reads_without_looking_must_be_there(tmp_path, part, says):
+    refused(write_scene(tmp_path, SENSOR, LIGHT, part), says)
+
+
+def test_what_is_included_and_no_xml_is_told_with_the_scene(tmp_path):
+    (tmp_path / "passwd").write_text("root:x:0:0")
+    message = refused(write_scene(tmp_path, SENSOR, LIGHT, '<include filename="passwd"/>'), "is no XML file")
+    assert str(tmp_path / "test.xml") in message and str(tmp_path / "passwd") in message
+
+
 @pytest.mark.parametrize("name", ["test.xml", "x/../test.xml", "./x/.././x/../test.xml"])
 def test_an_include_of_itself_is_refused(tmp_path, name):
     (tmp_path / "x").mkdir()

@@ -168,7 +168,7 @@ def run(
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
     with _in_file_units(given), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit.alpha)
+        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit)
         predicted = traced.coarse_error(edited) if traced else None
     before, after = (measured[name]["psnr"] for name in ("initial", "render"))
     measured["worse"] = wanted.coverage is None and after < before
@@ -207,6 +207,7 @@ def run(
         history=state.history,
         notes=notes,
         warnings=warnings,
+        views=lit.views,
         influence=traced.influence if traced else None,
         frozen=frozen,
         separation=representation.separation,
@@ -230,7 +231,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         final, judged, _ = lit.sampled(edited, spp, seed + 1)
         renders = {"initial": initial, "target": initial, "edited": final}
         maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
-        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit.alpha)
+        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
     said = "no target: the result is compared with the initial rendering"
     notes = [
@@ -249,7 +250,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         "choices": notes,
     }
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
-    return Result(stored, renders, maps, measured, [], notes, warnings, **more)
+    return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, **more)
 
 
 @contextlib.contextmanager
@@ -295,20 +296,22 @@ def _perceptual(settings):
     return dists, lpips
 
 
-def _measure(settings, renders, maps, rows, coverage, within, lpips, alpha):
+def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
     tonemap = settings.output.tonemap
     before, wanted, after = (renders[name] for name in ("initial", "target", "edited"))
-    seen = None if alpha is None else alpha > 0
+    seen = None if lit.alpha is None else lit.alpha > 0
     measured = {
-        "render": metrics.compare(after, wanted, tonemap, lpips, seen),
-        "initial": metrics.compare(before, wanted, tonemap, lpips, seen),
+        "render": metrics.compare(after, wanted, tonemap, lpips, seen, lit.rows),
+        "initial": metrics.compare(before, wanted, tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.start, rows.stop - 1],
         "natural": naturalness.natural(maps["edited"], maps["initial"], maps["target"]),
         "painted": None,
     }
+    if len(lit.views) > 1:
+        measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap)
     if coverage is not None:
         measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
         measured["painted"]["reachable"] = None if within is None else within.share
@@ -318,6 +321,21 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, alpha):
         measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
         measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)
     return measured
+
+
+def _of_views(views, renders, coverage, lpips, seen, tonemap):
+    """Compare the renderings of each view."""
+    found = []
+    for view in views:
+        before, wanted, after = (renders[name][view.rows] for name in ("initial", "target", "edited"))
+        some = tonemap, lpips, None if seen is None else seen[view.rows]
+        of_view = {"name": view.name}
+        of_view |= {"render": metrics.compare(after, wanted, *some)}
+        of_view |= {"initial": metrics.compare(before, wanted, *some), "painted": None}
+        if coverage is not None:
+            of_view["painted"] = metrics.painted(after, wanted, before, coverage[view.rows], tonemap)
+        found.append(of_view)
+    return found
 
 
 def _of_fit(fitted):

@@ -15,10 +15,11 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
-from envedit.export import adjustments
+from envedit.export import adjustments, light_list
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
+from envedit.representations.layers.separation import separate
 from envedit.results import Found, Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
@@ -158,7 +159,9 @@ def run(
         final, judged, _ = lit.sampled(edited, spp, seed)
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
+        lights, core = _lights(original, edited, lit.to_world, edit.degrees)
     notes += [job.note] if job.note else []
+    notes += [said_of] if (said_of := light_list.told(lights, height)) else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels keep their bits")
@@ -208,6 +211,8 @@ def run(
         notes=notes,
         warnings=warnings,
         views=lit.views,
+        lights=lights,
+        core=core,
         influence=traced.influence if traced else None,
         frozen=frozen,
         separation=representation.separation,
@@ -233,11 +238,13 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
+        lights, core = _lights(original, edited, lit.to_world)
     said = "no target: the result is compared with the initial rendering"
     notes = [
         *inputs.notes(settings.input, lit, given),
         said,
         *notes,
+        *filter(None, [light_list.told(lights, len(original))]),
         f"rendered with {judged} samples a pixel",
     ]
     measured |= {
@@ -250,7 +257,14 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         "choices": notes,
     }
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
-    return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, **more)
+    return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
+
+
+def _lights(original, edited, to_world, degrees=0.0):
+    """Match the lights of both maps, and return the edited one's alone as well."""
+    found = [separate(envmap) for envmap in (original, edited)]
+    lists = [light_list.listed(one, to_world) for one in found]
+    return light_list.matched(*lists, degrees), np.minimum(found[1].core, edited).astype(np.float32)
 
 
 @contextlib.contextmanager

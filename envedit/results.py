@@ -39,6 +39,10 @@ class Result:
         What was chosen automatically; what the user should know.
     views : tuple of View
         Name of each view, and its rows in a rendering.
+    lights : dict
+        Lights ``before`` and ``after``, of :func:`.light_list.matched`.
+    core : ndarray (H, W, 3) float32
+        The lights alone in the edited map, radiance that reaches the scene.
     influence : ndarray (H, W), optional
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
@@ -69,6 +73,8 @@ class Result:
     notes: list[str]
     warnings: list[str]
     views: tuple[View, ...]
+    lights: dict[str, list[dict]]
+    core: np.ndarray
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
     separation: Separation | None = None

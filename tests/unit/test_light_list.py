@@ -21,10 +21,10 @@ def numbers(lights):
     return [(one["id"], one["added"], one["moved_degrees"]) for one in lights["after"]]
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (4, 4), (2, 5), (5, 3), (0, 3), (3, 0)])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 3), (2, 4), (4, 2), (0, 3), (3, 0)])
 def test_pairs_are_the_cheapest_of_all(shape, rng):
     """Against all ways there are."""
-    for _ in range(20):
+    for _ in range(10):
         cost = rng.random(shape) * 1.5 * light_list.FARTHEST
         found = light_list._paired(cost)
         taken = [j for j in found if j is not None]

@@ -157,7 +157,7 @@ def _named(light):
 
 
 def _place(light):
-    return f"azimuth {light['azimuth']:.0f}, elevation {light['elevation']:.0f}"
+    return f"azimuth {round(light['azimuth']) % 360}, elevation {round(light['elevation'])}"
 
 
 def _toward(light):

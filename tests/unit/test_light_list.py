@@ -76,5 +76,7 @@ def test_lights_that_come_go_and_stay_are_told():
     many = light_list.matched([light(30 * k, 0) for k in range(12)], [])
     assert light_list.told(many, HEIGHT).endswith("; and 4 more in lights.json")
     assert light_list.told(light_list.matched([], []), HEIGHT) is None
+    level = light_list.matched([], [light(359.9, -0.2)])
+    assert light_list.told(level, HEIGHT) == "light 1 at azimuth 0, elevation 0 is new"
     dark = light_list.matched([light(0, 0, 0.0)], [light(0, 0, 0.0)])
     assert numbers(dark) == [(1, False, 0.0)]

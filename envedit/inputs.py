@@ -232,4 +232,5 @@ def active_rows(rows, height: int) -> tuple[int, int]:
 
 def load_scene(settings: config.Scene, base: Path | None = None) -> scene.Scene:
     """Load the scene of a configuration; ``base`` and errors as of :func:`.scene.load`."""
-    return scene.load(settings.file, settings.width, settings.height, dict(settings.parameters), base)
+    size, filled = (settings.width, settings.height), dict(settings.parameters)
+    return scene.load(settings.file, *size, filled, base, sensors=settings.sensors)

@@ -15,10 +15,11 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
-from envedit.export import adjustments
+from envedit.export import adjustments, light_list
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
+from envedit.representations.layers.separation import separate
 from envedit.results import Found, Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
@@ -158,7 +159,9 @@ def run(
         final, judged, _ = lit.sampled(edited, spp, seed)
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
+        lights, core = _lights(original, edited, lit.to_world, edit.degrees)
     notes += [job.note] if job.note else []
+    notes += [said_of] if (said_of := light_list.told(lights, height)) else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
@@ -168,7 +171,7 @@ def run(
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
     with _in_file_units(given), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit.alpha)
+        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit)
         predicted = traced.coarse_error(edited) if traced else None
     rate = "; lower optimizer.lr" if job.raised_rate else ""
     judged = [measured[name] for name in ("render", "initial")]
@@ -209,6 +212,9 @@ def run(
         history=state.history,
         notes=notes,
         warnings=warnings,
+        views=lit.views,
+        lights=lights,
+        core=core,
         influence=traced.influence if traced else None,
         frozen=frozen,
         separation=representation.separation,
@@ -232,13 +238,15 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         final, judged, _ = lit.sampled(edited, spp, seed + 1)
         renders = {"initial": initial, "target": initial, "edited": final}
         maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
-        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit.alpha)
+        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
+        lights, core = _lights(original, edited, lit.to_world)
     said = "no target: the result is compared with the initial rendering"
     notes = [
         *inputs.notes(settings.input, lit, given),
         said,
         *notes,
+        *filter(None, [light_list.told(lights, len(original))]),
         f"rendered with {judged} samples a pixel",
     ]
     measured |= {
@@ -251,7 +259,14 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         "choices": notes,
     }
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
-    return Result(stored, renders, maps, measured, [], notes, warnings, **more)
+    return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
+
+
+def _lights(original, edited, to_world, degrees=0.0):
+    """Match the lights of both maps, and return the edited one's alone as well."""
+    found = [separate(envmap) for envmap in (original, edited)]
+    lists = [light_list.listed(one, to_world) for one in found]
+    return light_list.matched(*lists, degrees), np.minimum(found[1].core, edited).astype(np.float32)
 
 
 @contextlib.contextmanager
@@ -297,20 +312,22 @@ def _perceptual(settings):
     return dists, lpips
 
 
-def _measure(settings, renders, maps, rows, coverage, within, lpips, alpha):
+def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
     tonemap = settings.output.tonemap
     before, wanted, after = (renders[name] for name in ("initial", "target", "edited"))
-    seen = None if alpha is None else alpha > 0
+    seen = None if lit.alpha is None else lit.alpha > 0
     measured = {
-        "render": metrics.compare(after, wanted, tonemap, lpips, seen),
-        "initial": metrics.compare(before, wanted, tonemap, lpips, seen),
+        "render": metrics.compare(after, wanted, tonemap, lpips, seen, lit.rows),
+        "initial": metrics.compare(before, wanted, tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.start, rows.stop - 1],
         "natural": naturalness.natural(maps["edited"], maps["initial"], maps["target"]),
         "painted": None,
     }
+    if len(lit.views) > 1:
+        measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap)
     if coverage is not None:
         measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
         measured["painted"]["reachable"] = None if within is None else within.share
@@ -320,6 +337,21 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, alpha):
         measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
         measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)
     return measured
+
+
+def _of_views(views, renders, coverage, lpips, seen, tonemap):
+    """Compare the renderings of each view."""
+    found = []
+    for view in views:
+        before, wanted, after = (renders[name][view.rows] for name in ("initial", "target", "edited"))
+        some = tonemap, lpips, None if seen is None else seen[view.rows]
+        of_view = {"name": view.name}
+        of_view |= {"render": metrics.compare(after, wanted, *some)}
+        of_view |= {"initial": metrics.compare(before, wanted, *some), "painted": None}
+        if coverage is not None:
+            of_view["painted"] = metrics.painted(after, wanted, before, coverage[view.rows], tonemap)
+        found.append(of_view)
+    return found
 
 
 def _of_fit(fitted):

@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from envedit import config
 from envedit.core import array_cache
+from envedit.core.errors import ConfigError
 from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
 from envedit.transport import recording
@@ -59,8 +60,21 @@ def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Ren
 
 
 def check(settings: config.Config, lit: scene.Scene, shape) -> None:
-    """Refuse, before anything is rendered, what :func:`make` will refuse: T that does not fit into memory."""
+    """Refuse, before anything is rendered, what :func:`make` will refuse.
+
+    Raises
+    ------
+    ConfigError
+        A path tracer is asked for several views.
+    InputError
+        T does not fit into memory.
+    """
     chosen = settings.renderer
+    if chosen.kind == "path" and len(lit.views) > 1:
+        raise ConfigError(
+            f'renderer.kind: got "path" with {len(lit.views)} views, which only "transport" renders: '
+            "set it, or [scene] sensors to one of them"
+        )
     if chosen.kind == "transport":
         recording.choose_samples(lit, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
 

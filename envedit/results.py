@@ -12,6 +12,7 @@ from envedit.core import latlong
 from envedit.export import adjustments, full_resolution
 from envedit.representations import Representation
 from envedit.representations.layers.separation import Separation
+from envedit.scene.scene import View
 from envedit.solve.feasibility import Reach
 from envedit.solve.map_problem import Posterior
 
@@ -27,7 +28,8 @@ class Result:
         active ones are the original's, bit for bit, and so are frozen texels but where layers move a light or
         its glow across them.
     renders, maps : dict
-        ``initial``, ``target``, ``edited``; linear radiance, of maps as it reaches the scene.
+        ``initial``, ``target``, ``edited``; linear radiance, of maps as it reaches the scene. Renderings of
+        several views stand below each other.
         ``maps["target"]`` is None where it is unknown.
     metrics : dict
         As in metrics.json.
@@ -35,6 +37,12 @@ class Result:
         A row an iteration.
     notes, warnings : list of str
         What was chosen automatically; what the user should know.
+    views : tuple of View
+        Name of each view, and its rows in a rendering.
+    lights : dict
+        Lights ``before`` and ``after``, of :func:`.light_list.matched`.
+    core : ndarray (H, W, 3) float32
+        The lights alone in the edited map, radiance that reaches the scene.
     influence : ndarray (H, W), optional
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
@@ -64,6 +72,9 @@ class Result:
     history: list
     notes: list[str]
     warnings: list[str]
+    views: tuple[View, ...]
+    lights: dict[str, list[dict]]
+    core: np.ndarray
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
     separation: Separation | None = None

@@ -251,10 +251,11 @@ def _edit(settings, arguments, folder, allowed, start):
     from envedit.cli import doctor
     from envedit.report import output_folder
 
-    named = (settings.input.envmap, settings.scene.file, settings.target.file, settings.target.mask)
+    target = settings.target
+    named = (settings.input.envmap, settings.scene.file, *target.files, *target.masks)
     inputs = [path for path in named if path]
     spare = [] if arguments.config is None else [arguments.config]
-    output_folder.prepare_folder(folder, output_folder.RESULTS, inputs, arguments.resume, spare)
+    output_folder.prepare_folder(folder, output_folder.names(folder), inputs, arguments.resume, spare)
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
         _check_same(settings, folder)
         _say(arguments, f"{folder}: this run is complete, there is nothing to resume")
@@ -336,25 +337,37 @@ def _export_initial(settings, arguments):
     mi.set_variant(settings.variant)
     mi.set_log_level(mi.LogLevel.Error)
     from envedit import inputs
+    from envedit.report import output_folder
     from envedit.targets import painted_image
 
     painted_image.check_export(file)
     with _progress(arguments) as progress:
         progress.stage("rendering the picture to paint on")
         lit = inputs.load_scene(settings.scene, arguments.base)
+        files = output_folder.of_views(file.name, lit.rows)
+        files = files[1:] or files
+        files = [(file.with_name(name), rows) for name, rows in files]
+        for one, _ in files:
+            painted_image.check_export(one)
         envmap, warnings = inputs.load_map(settings.input, lit)
         notes = inputs.notes(settings.input, lit)
         source = inputs.source_of(settings.input, lit)  # what the picture says that it was made from
         settings = replace(settings, input=replace(settings.input, envmap=source))
-        warnings += painted_image.export(file, painted_image.initial(lit, envmap, settings), settings)
+        picture = painted_image.initial(lit, envmap, settings)
+        for one, rows in files:
+            warnings += painted_image.export(one, picture[rows], settings)
     for line in warnings:
         _tell(arguments, "warning", line)
     for line in notes:
         _say(arguments, line)
     under = "linear" if file.suffix.lower() == ".exr" else f"under the '{settings.target.tonemap}' tonemap"
-    ask = f'[target] kind = "image", file = "{file.absolute()}"'
-    _say(arguments, f"{file}: {lit.width}x{lit.height}, {under}; paint on it, then set {ask}")
-    arguments.facts["files"] = {file.name: str(file.absolute())}
+    for k, (one, rows) in enumerate(files):
+        ask = f'[target] kind = "image", file = "{one.absolute()}"' + (
+            f", view = {k}" if len(files) > 1 else ""
+        )
+        size = f"{lit.width}x{rows.stop - rows.start}"
+        _say(arguments, f"{one}: {size}, {under}; paint on it, then set {ask}")
+    arguments.facts["files"] = {one.name: str(one.absolute()) for one, _ in files}
     return 0
 
 
@@ -392,9 +405,8 @@ def _note_results(arguments, folder):
     """Note a finished run for the object of ``--json``: its folder, files and metrics.json."""
     from envedit.report import output_folder
 
-    here = {
-        name: str((folder / name).resolve()) for name in output_folder.RESULTS if (folder / name).exists()
-    }
+    names = output_folder.names(folder)
+    here = {name: str((folder / name).resolve()) for name in names if (folder / name).exists()}
     measured = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     arguments.facts |= {"folder": str(folder.resolve()), "files": here, "metrics": measured}
 

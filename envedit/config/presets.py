@@ -154,6 +154,8 @@ def resolve_paths(merged: dict[str, Any], base: Path, stem: str) -> None:
     merged["output"] = output
     for table, key in _PATHS:
         value = merged.get(table, {}).get(key, "")
-        shipped = key == "file" and table == "scene" and Path(value).name == value and not Path(value).suffix
+        shipped = table == "scene" and Path(value).name == value and not Path(value).suffix
         if value and not shipped and not (key == "envmap" and value in _MAPS):
-            merged[table] = merged[table] | {key: str(base / value)}
+            several = isinstance(value, tuple)
+            found = tuple(str(base / v) for v in value) if several else str(base / value)
+            merged[table] = merged[table] | {key: found}

@@ -34,11 +34,14 @@ from envedit.config.validators import (
     integer,
     kelvin,
     number,
+    one_or_more,
     or_auto,
     parameter_table,
     row_range,
     show,
     string,
+    view,
+    view_list,
     weight,
 )
 from envedit.config.validators import key as _key
@@ -98,6 +101,9 @@ class Scene(Table):
     )
     width: int = _key(128, integer(4, MOST_DIM), "width of the rendering while editing, pixels")
     height: int = _key(0, integer(0, MOST_DIM), "height of the rendering, pixels; 0: by the scene's aspect")
+    sensors: str | tuple[int | str, ...] = _key(
+        (0,), view_list, 'views that one map explains: a list of sensors, by id or index from 0, or "all"'
+    )
     parameters: dict[str, str | float | bool] = _key({}, parameter_table, "values for the scene's <default>s")
 
     def _check_together(self) -> None:
@@ -114,12 +120,23 @@ class Target(Table):
         choice("envmap", "image", "strokes", "none"),
         'given by: another map, a painted image, or strokes; "none": only [lights], exposure, white balance',
     )
-    file: str = _key("", string, "kind envmap: the other map; kind image: the painted rendering")
+    file: str | tuple[str, ...] = _key(
+        "",
+        one_or_more(string),
+        "kind envmap: the other map; kind image: the painted rendering, or a list of them",
+    )
     rotate_degrees: float = _key(
         60.0, number(-360, 360), "kind envmap: turn of the input about the vertical, degrees; 0 with a file"
     )
-    mask: str = _key(
-        "", string, "image that is white where the target counts; kind image: where it was painted"
+    mask: str | tuple[str, ...] = _key(
+        "",
+        one_or_more(string),
+        "image that is white where the target counts, or a list; kind image: where it was painted",
+    )
+    view: int | str | tuple[int | str, ...] = _key(
+        (),
+        one_or_more(view),
+        "view that each file, or mask, belongs to: index or id; []: the first, the second, ...",
     )
     tonemap: str = _key("gamma", choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted")
     strokes: tuple[dict, ...] = _key((), stroke_list, "kind strokes: list of tables, see docs/painting.md")
@@ -129,7 +146,35 @@ class Target(Table):
         "auto", or_auto(integer(1, 1 << 20)), "samples a pixel of the target's rendering; auto: until quiet"
     )
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files of :attr:`file`."""
+        return _each(self.file)
+
+    @property
+    def masks(self) -> tuple[str, ...]:
+        """The files of :attr:`mask`."""
+        return _each(self.mask)
+
+    @property
+    def views(self) -> tuple[int | str, ...]:
+        """The view of each painted file, or of each mask."""
+        given = self.view if isinstance(self.view, tuple) else (self.view,)
+        count = len(self.files) if self.kind == "image" else len(self.masks)
+        return given or tuple(range(count))
+
     def _check_together(self) -> None:
+        if self.kind == "envmap" and isinstance(self.file, tuple):
+            raise ConfigError('target.file: came a list, wanted one map, as target.kind is "envmap"')
+        if self.view != () and self.kind == "strokes":
+            raise ConfigError("target.view: came one, wanted none: each stroke has a view of its own")
+        named = len(self.files) if self.kind == "image" else len(self.masks)
+        if self.view != () and len(self.views) != named:
+            raise ConfigError(f"target.view: came {len(self.views)} views, wanted {named}, one for each file")
+        if len({*self.views}) != len(self.views):
+            raise ConfigError("target.view: came a view twice, wanted each once")
+        if self.kind == "image" and self.mask and len(self.masks) != named:
+            raise ConfigError(f"target.mask: came {len(self.masks)} masks, wanted {named}, one for each file")
         if self.kind == "envmap" and self.file:
             object.__setattr__(self, "rotate_degrees", 0.0)
         if self.kind == "image" and not self.file:
@@ -151,6 +196,11 @@ class Target(Table):
                 f'target.strokes: came {len(self.strokes)}, wanted none, as target.kind is "{self.kind}": '
                 'set target.kind = "strokes"'
             )
+
+
+def _each(files):
+    """List the files of a key that takes one or several."""
+    return files if isinstance(files, tuple) else (files,) if files else ()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import difflib
 from collections.abc import Callable
 from typing import Any
 
-from envedit.config.validators import WantedError, choice, named, number, show
+from envedit.config.validators import WantedError, choice, named, number, show, view
 from envedit.core.errors import ConfigError
 
 
@@ -91,7 +91,7 @@ def _stroke(name: str, stroke: dict) -> dict:
         raise ConfigError(f"{name}.type: came none, wanted one of {', '.join(STROKES)}")
     kind = named(f"{name}.type", choice(*STROKES), stroke["type"])
     keys = STROKES[kind] | _ANY_STROKE
-    known = ["type", *SHAPES, "width", *keys]
+    known = ["type", *SHAPES, "width", "view", *keys]
     for unknown in (k for k in stroke if k not in known):
         text = unknown[:60] if isinstance(unknown, str) else ""
         close = difflib.get_close_matches(text, known, 1)
@@ -116,6 +116,8 @@ def _stroke(name: str, stroke: dict) -> dict:
         found["width"] = named(f"{name}.width", _length, stroke["width"])
     elif "width" in stroke:
         raise ConfigError(f"{name}.width: came {show(stroke['width'])}, wanted none without points")
+    if "view" in stroke:
+        found["view"] = named(f"{name}.view", view, stroke["view"])
     for key, (default, check) in keys.items():
         if key not in stroke and default is None:
             raise ConfigError(f"{name}.{key}: came none, wanted a number, as type is {kind}")

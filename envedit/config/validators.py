@@ -146,6 +146,40 @@ def row_range(value: Any) -> str | tuple[int, int]:
     raise WantedError('"upper", "all" or [first, last], rows from 0 at the zenith, last included')
 
 
+def view_list(value: Any) -> str | tuple[int | str, ...]:
+    """Accept sensors of a scene: "all", or a list of ids and of indices from 0, none of them twice."""
+    if isinstance(value, str) and value == "all":
+        return value
+    try:
+        if isinstance(value, list | tuple) and value and len({*value}) == len(value):
+            return tuple(view(v) for v in value)
+    except (TypeError, WantedError):
+        pass
+    raise WantedError('"all", or a list of ids of sensors or of indices from 0, each once')
+
+
+def view(value: Any) -> int | str:
+    """Accept a view: the id of its sensor, or its index."""
+    try:
+        if (found := string(value) if isinstance(value, str) else integer(0, MOST_DIM)(value)) != "":
+            return found
+    except WantedError:
+        pass
+    raise WantedError("the id of a sensor, or the index of a view from 0")
+
+
+def one_or_more(check: Callable) -> Callable:
+    """Make a check that accepts a value, or a list of values, as a tuple."""
+
+    def check_each(value: Any) -> Any:
+        try:
+            return tuple(check(v) for v in value) if isinstance(value, list | tuple) else check(value)
+        except WantedError as error:
+            raise WantedError(f"{error}, or a list of them") from None
+
+    return check_each
+
+
 def plain(value: Any, depth: int = 8) -> Any:
     """Accept what :func:`.schema.quote` can write: strings, numbers, booleans, lists and tables of them."""
     if isinstance(value, bool):

@@ -1,7 +1,8 @@
 """The lights of a map as a list, for programs that take the sun as a lamp and the sky as a map.
 
 The lights are those that :mod:`.separation` tells from the background, of any map, however it was edited.
-Radiance is what reaches the scene, ``scale`` included.
+Radiance is what reaches the scene, ``scale`` included. Lights of a map before and after an edit are matched
+by where they are and how much flux they have, whatever moved them.
 """
 
 from __future__ import annotations
@@ -11,29 +12,40 @@ import math
 import numpy as np
 
 from envedit.core import latlong
-from envedit.representations.layers.separation import Separation, separate
+from envedit.representations.layers.separation import Separation
+
+FARTHEST = math.pi**2 + 1
+"""Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
+MOST_TOLD = 8
+"""Lights that :func:`told` names."""
 
 
-def split(envmap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split a map (H, W, 3) into its sky, without lights but with their glow, and its lights.
+
+    Parameters
+    ----------
+    envmap : ndarray (H, W, 3)
+        Of the map.
+    core : ndarray (H, W, 3)
+        :attr:`.Separation.core` of the map, in its units.
 
     Returns
     -------
     sky, lights : ndarray (H, W, 3) float32
         Not negative; their sum is the map, to rounding. Where there is no light the sky has the map's bits.
     """
-    core = separate(envmap).core
     lights = np.minimum(core, envmap).astype(np.float32)
     return np.where(lights > 0, envmap - lights, envmap).astype(np.float32), lights
 
 
-def listed(envmap: np.ndarray, to_world: np.ndarray) -> list[dict]:
+def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
     """List the lights of a map, those with most flux first.
 
     Parameters
     ----------
-    envmap : ndarray (H, W, 3)
-        Linear radiance that reaches the scene.
+    found : separation.Separation
+        Of the map, linear radiance that reaches the scene.
     to_world : ndarray (3, 3)
         Rotation from the map's frame (+y up) to the scene's.
 
@@ -46,8 +58,7 @@ def listed(envmap: np.ndarray, to_world: np.ndarray) -> list[dict]:
         ``flux``: integral of its radiance over its solid angle, RGB; this is its irradiance on a surface
         that faces it. ``irradiance``: on the horizontal plane of the map, flux max(sin(elevation), 0).
     """
-    found: Separation = separate(envmap)
-    height, width, _ = envmap.shape
+    height, width, _ = found.core.shape
     omega = latlong.lookup_solid_angles(height, width)
     lights = []
     for light in found.lights:
@@ -68,3 +79,125 @@ def listed(envmap: np.ndarray, to_world: np.ndarray) -> list[dict]:
             }
         )
     return sorted(lights, key=lambda light: -sum(light["flux"]))
+
+
+def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict[str, list[dict]]:
+    """Find which light of a map has become which light of the edited map.
+
+    Of all ways to pair them, the one with the least sum of angle^2 + ln(flux ratio)^2 (radians; fluxes are
+    means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`.
+
+    Parameters
+    ----------
+    before, after : list of dict
+        Of :func:`listed`.
+    degrees : float
+        By how much the whole map was turned (:func:`.latlong.rotate`): angles are to where that brings a
+        light.
+
+    Returns
+    -------
+    dict
+        The lists ``before`` and ``after``. A light has the same ``id`` in both, from 1; ``before`` has
+        ``removed``, whether it is gone, and ``after`` has ``added``, whether it is new, and ``moved_degrees``
+        from where it was before any turn, None if it is new.
+    """
+    start, end = (np.array([_toward(light) for light in lights]).reshape(-1, 3) for lights in (before, after))
+    flux = [np.log([max(np.mean(light["flux"]), 1e-30) for light in lights]) for lights in (before, after)]
+    apart = np.arccos(np.clip(_turned(start, degrees) @ end.T, -1, 1))
+    partner = _paired(apart**2 + (flux[0][:, None] - flux[1]) ** 2)
+    moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))
+    removed = [j is None for j in partner]
+    numbered = [{"id": i + 1, "removed": removed[i], **light} for i, light in enumerate(before)]
+    owner = {j: i for i, j in enumerate(partner) if j is not None}
+    others = [j for j in range(len(after)) if j not in owner]
+    ids = {j: i + 1 for j, i in owner.items()} | {j: len(before) + 1 + k for k, j in enumerate(others)}
+    return {
+        "before": numbered,
+        "after": [
+            {
+                "id": ids[j],
+                "added": j not in owner,
+                "moved_degrees": float(moved[owner[j], j]) if j in owner else None,
+                **light,
+            }
+            for j, light in enumerate(after)
+        ],
+    }
+
+
+def told(lights: dict[str, list[dict]], height: int) -> str | None:
+    """Say which lights moved, stayed, came and went, those with most flux first; None without any.
+
+    Parameters
+    ----------
+    lights : dict
+        Of :func:`matched`.
+    height : int
+        Rows of the map: what has moved by less than one has stayed.
+    """
+    after = {light["id"]: light for light in lights["after"]}
+    parts = []
+    for light in lights["before"]:
+        if light["removed"]:
+            parts.append(f"{_named(light)} is gone")
+            continue
+        end = after.pop(light["id"])
+        stayed = end["moved_degrees"] < 180 / height
+        how = "stayed" if stayed else f"moved by {end['moved_degrees']:.1f} degrees to {_place(end)}"
+        ratio = sum(end["flux"]) / max(sum(light["flux"]), 1e-30)
+        parts.append(f"{_named(light)} {how}" + (f", flux x {ratio:.2g}" if abs(ratio - 1) > 0.1 else ""))
+    parts += [f"{_named(light)} is new" for light in after.values()]
+    more = f"; and {len(parts) - MOST_TOLD} more in lights.json" if len(parts) > MOST_TOLD else ""
+    return "; ".join(parts[:MOST_TOLD]) + more if parts else None
+
+
+def _named(light):
+    return f"light {light['id']} at {_place(light)}"
+
+
+def _place(light):
+    return f"azimuth {round(light['azimuth']) % 360}, elevation {round(light['elevation'])}"
+
+
+def _toward(light):
+    """Return the unit vector towards a light in the map's frame."""
+    azimuth, elevation = math.radians(light["azimuth"]), math.radians(light["elevation"])
+    flat = math.cos(elevation)
+    return flat * math.sin(azimuth), math.sin(elevation), -flat * math.cos(azimuth)
+
+
+def _turned(directions, degrees):
+    """Turn directions (n, 3) as :func:`.latlong.rotate` turns a map."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return directions @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+
+
+def _paired(cost):
+    """Return for each row the column that it is paired with, or None, by the least sum of costs.
+
+    The Hungarian method with potentials (Kuhn 1955; Jonker and Volgenant 1987), with a column for every row
+    that stands for none.
+    """
+    rows, columns = cost.shape
+    table = np.hstack([np.minimum(cost, 1e6), np.full((rows, rows), FARTHEST)])
+    u, v = np.zeros(rows + 1), np.zeros(columns + rows + 1)
+    row_of = np.zeros(columns + rows + 1, int)  # 0: none; column 0 is where a search begins
+    for i in range(1, rows + 1):
+        row_of[0], column = i, 0
+        least, back = np.full(len(v), np.inf), np.zeros(len(v), int)
+        done = np.zeros(len(v), bool)
+        while row_of[column]:
+            done[column] = True
+            here = row_of[column]
+            reduced = np.append(np.inf, table[here - 1]) - u[here] - v
+            closer = ~done & (reduced < least)
+            least[closer], back[closer] = reduced[closer], column
+            column = int(np.argmin(np.where(done, np.inf, least)))
+            step = least[column]
+            u[row_of[done]] += step
+            v[done] -= step
+            least[~done] -= step
+        while column:
+            row_of[column], column = row_of[back[column]], back[column]
+    return [next((j for j in range(columns) if row_of[j + 1] == i + 1), None) for i in range(rows)]

@@ -101,7 +101,7 @@ def ssim(a, b, data_range: float = 1.0) -> float:
     return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
 
 
-def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None) -> dict:
+def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None, views=()) -> dict:
     """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.
 
     Parameters
@@ -114,6 +114,9 @@ def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None) -> dict:
         What measures LPIPS of the display values.
     seen : array of bool (H, W), optional
         Pixels over which ``mse`` and ``psnr`` are taken; all by default, or where none is.
+    views : sequence of slice
+        Rows of each view, where the images are of several: ``ssim`` and ``lpips`` are means over views,
+        weighted by their pixels.
 
     Returns
     -------
@@ -131,11 +134,15 @@ def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None) -> dict:
     """
     radiance = _pair(a, b)
     a, b = (apply_tonemap(image, tonemap) for image in radiance)
-    small = lpips is None or min(a.shape[:2]) < lpips.backbone.least_size("max")
-    apart = None if small else float(lpips(a.astype(np.float32), b.astype(np.float32)))
+    views = views or (slice(0, len(a)),)
+    shares = [len(a[rows]) / len(a) for rows in views]
+    alike = sum(share * ssim(a[rows], b[rows]) for share, rows in zip(shares, views, strict=True))
+    apart, pairs = None, [(a[rows].astype(np.float32), b[rows].astype(np.float32)) for rows in views]
+    if lpips is not None and min(min(x.shape[:2]) for x, _ in pairs) >= lpips.backbone.least_size("max"):
+        apart = sum(share * float(lpips(*pair)) for share, pair in zip(shares, pairs, strict=True))
     here = np.ones(a.shape[:2], bool) if seen is None or not np.any(seen) else seen
     some, radiance = (a[here][None], b[here][None]), [image[here][None] for image in radiance]
-    shown = {"psnr": psnr(*some), "ssim": ssim(a, b), "mse": mse(*some), "lpips": apart}
+    shown = {"psnr": psnr(*some), "ssim": alike, "mse": mse(*some), "lpips": apart}
     return shown | {"log_rmse": log_rmse(*radiance), "beyond_display": _beyond_display(*some, *radiance)}
 
 

@@ -200,6 +200,61 @@ class Ssim:
         return _scatter_filter(self._rows, fields, index, 0, step, height * step)
 
 
+class StackedSsim:
+    r"""Structural similarity of pictures below each other: no window crosses from one to the next.
+
+    ``sum_k s_k (1 - SSIM_k)``, where s_k is picture k's share of the weight, or of the pixels.
+
+    Parameters
+    ----------
+    reference, weight
+        As of :class:`Ssim`.
+    rows : sequence of slice
+        Of each picture, from the top, without gaps.
+    """
+
+    def __init__(self, reference, weight, rows):
+        check_image(reference, "reference")
+        width, channels = reference.shape[1:]
+        self.shape, F = tuple(reference.shape), type(reference.array)
+        self._parts, shares = [], []
+        for some in rows:
+            cut = slice(some.start * width * channels, some.stop * width * channels)
+            height = some.stop - some.start
+            own = type(reference)(_cut(reference.array, cut), (height, width, channels))
+            counts = None
+            if weight is not None:
+                depth = weight.shape[2]
+                part = slice(some.start * width * depth, some.stop * width * depth)
+                counts = type(weight)(_cut(weight.array, part), (height, width, depth))
+            self._parts.append((cut, Ssim(own, counts)))
+            shares.append(height if counts is None else float(total(counts.array)[0]) / depth / width)
+        self._shares = [dr.opaque(F, share / max(sum(shares), 1e-30)) for share in shares]
+
+    def __call__(self, x):
+        """Return the loss of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
+        if tuple(x.shape) != self.shape:
+            raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
+        return dr.custom(KnownGradient, x.array, self)
+
+    def _evaluate(self, x, with_gradient):
+        """As of :class:`Ssim`."""
+        loss, gradients = type(x)(0), []
+        for share, (cut, part) in zip(self._shares, self._parts, strict=True):
+            value, gradient = part._evaluate(_cut(x, cut), with_gradient)
+            loss += share * value
+            gradients.append(share * gradient)
+        gradient = dr.concat(gradients)
+        dr.eval(loss, gradient)
+        return loss, gradient
+
+
+def _cut(values, part):
+    """Take a slice of a flat array."""
+    index = dr.arange(dr.uint32_array_t(type(values)), part.stop - part.start)
+    return dr.gather(type(values), dr.detach(values), index + part.start)
+
+
 class KnownGradient(dr.CustomOp):
     """A measure of a flat array as one node of the AD graph: its gradient is known as soon as its value is.
 

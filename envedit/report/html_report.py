@@ -229,6 +229,7 @@ def write_report(
     warnings=(),
     notes=(),
     tonemap="gamma",
+    views=(),
 ) -> None:
     """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
 
@@ -258,6 +259,8 @@ def write_report(
         What the user should know, and the choices made for settings left at "auto".
     tonemap : str
         A name of `envedit.core.color.TONEMAPS`, for the pictures.
+    views : sequence of `scene.View`
+        Name and rows of each view, where the renderings are of several.
 
     Raises
     ------
@@ -282,13 +285,21 @@ def write_report(
                 warnings.append(f"{kind} {name}: {bad} pixels are not finite, drawn in magenta.")
 
     # Pictures
-    figures = [_figure_of(renders, name, "rendering", tonemap) for name in names]
+    shown = [(f"rendering of view {k} ({v.name})", f"view {k}: ", v.rows) for k, v in enumerate(views)]
+    if len(views) < 2:
+        shown = [("rendering", "", slice(None))]
+    of_views = [{name: image[rows] for name, image in renders.items()} for _, _, rows in shown]
+    figures = [
+        _grid([_figure_of(pictures, name, what, tonemap) for name in names])
+        for pictures, (what, _, _) in zip(of_views, shown, strict=True)
+    ]
     map_figures = [_figure_of(maps, name, "environment map", tonemap) for name in names]
     differences = []
-    for pictures, other in ((renders, "target"), (maps, "initial"), (maps, "target")):
+    pairs = [(one, "target", part) for one, (_, part, _) in zip(of_views, shown, strict=True)]
+    for pictures, other, part in (*pairs, (maps, "initial", ""), (maps, "target", "")):
         if "edited" not in pictures or other not in pictures:
             continue
-        kind, what = ("stops", "maps") if pictures is maps else ("tonemapped", "renderings")
+        kind, what = ("stops", "maps") if pictures is maps else ("tonemapped", f"{part}renderings")
         a, b = pictures["edited"], pictures[other]
         if a.shape != b.shape:
             sizes = f"{a.shape[:2]} and {b.shape[:2]}"
@@ -303,7 +314,15 @@ def write_report(
     measures |= {"log_rmse": "log RMSE (stops)", "beyond_display": "share that a display does not show"}
     quality_rows = [[name, *(_show(table.get(key)) for table in quality)] for key, name in measures.items()]
     others = [(key, value) for key, value in metrics.items() if not isinstance(value, (dict, type(None)))]
-    others = [(key, value) for key, value in others if key != "choices"]  # a chapter of their own
+    others = [(key, value) for key, value in others if key not in ("choices", "views")]  # they have their own
+    view_rows = [
+        [
+            f"{k} ({view['name']})",
+            *(_show(view[when][key]) for key in measures for when in ("initial", "render")),
+        ]
+        for k, view in enumerate(metrics.get("views") or [])
+    ]
+    view_head = ["view", *(f"{what}, {name}" for name in measures.values() for what in ("initial", "edited"))]
     for part in ("fit", "transport", "painted"):
         others += [(f"{part} {key}", value) for key, value in (metrics.get(part) or {}).items()]
     timing = {key: number(value) for key, value in (metrics.get("timing") or {}).items()}
@@ -320,7 +339,9 @@ def write_report(
 
     parts = _separation_figures(separation, tonemap)
     painted = metrics.get("painted") or {}
-    asked = [] if unreachable is None else [_unreachable_figure(unreachable, painted.get("reachable"))]
+    asked = [] if unreachable is None else [
+        _unreachable_figure(unreachable[rows], painted.get("reachable")) for _, _, rows in shown
+    ]  # fmt: skip
 
     # The page
     seen = []
@@ -334,7 +355,7 @@ def write_report(
         f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body>",
         f"<h1>{escape(title)}</h1>{_verdict(metrics)}",
         f'<div class="warnings"><strong>Warnings</strong>{_list(warnings)}</div>' if warnings else "",
-        f"<h2>Renderings and maps</h2>{_grid(figures)}<p></p>{_grid(map_figures)}" if names else "",
+        f"<h2>Renderings and maps</h2>{'<p></p>'.join(figures)}<p></p>{_grid(map_figures)}" if names else "",
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>' if names else "",
         f"<h2>Differences</h2>{_grid(differences)}" if differences else "",
         f"<h2>Lights and background</h2>{_grid(parts)}" if parts else "",
@@ -343,6 +364,7 @@ def write_report(
         f"<h2>Losses</h2>{curves}",
         "<h2>Quality</h2>",
         _table(["", "initial rendering", "edited rendering", "edited map"], quality_rows),
+        f"<h2>Views</h2>{_table(view_head, view_rows)}" if view_rows else "",
         _table(["", ""], [[k.replace("_", " "), _show_list(v)] for k, v in others]) if others else "",
         f"<h2>Environment maps</h2>{_table(map_head, map_rows)}" if map_rows else "",
         '<p class="soft">Luminances are linear; the mean is over the sphere.</p>' if map_rows else "",

@@ -62,11 +62,10 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: in
 def write_lights(folder: Path, result: results.Result) -> None:
     """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
     source, space = {"source": result.given.source}, result.given.chromaticities
-    sky, lights = light_list.split(result.envmap)
+    sky, lights = light_list.split(result.envmap, result.given.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
-    before, after = (light_list.listed(result.maps[name], result.to_world) for name in ("initial", "edited"))
-    manifest.write_metrics(folder / "lights.json", {"before": before, "after": after})
+    manifest.write_metrics(folder / "lights.json", result.lights)
 
 
 def write_scene(settings: config.Config, folder: Path, base: Path | None = None) -> list[str]:

@@ -3,6 +3,7 @@
 import contextlib
 import filecmp
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -23,18 +24,38 @@ RESULTS = (
 
 The first says that a run is complete: whoever moves them away moves it first of all.
 """
+_NUMBERED = re.compile(r"render_(initial|target|edited)_\d+\.exr")  # of one view among several
 EARLIER = "earlier"
 """With a number, the folder that what an earlier run left is moved to."""
 
 
+def of_views(name: str, views) -> list[tuple[str, slice]]:
+    """List the files of a rendering and the rows in each: of several views one more for each, numbered.
+
+    >>> of_views("render_edited.exr", [slice(0, 4), slice(4, 9)])[1:]
+    [('render_edited_0.exr', slice(0, 4, None)), ('render_edited_1.exr', slice(4, 9, None))]
+    """
+    stem, dot, ending = name.rpartition(".")
+    numbered = [(f"{stem}_{k}{dot}{ending}", rows) for k, rows in enumerate(views)]
+    return [(name, views[0]), *(numbered if len(views) > 1 else [])]
+
+
+def names(folder: Path) -> tuple[str, ...]:
+    """Return :data:`RESULTS`, with the numbered renderings that are in a folder before the last."""
+    found = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
+    return (*RESULTS[:-1], *found, RESULTS[-1])
+
+
 def tidy(folder: Path) -> None:
-    """Remove what killed processes were writing in a folder: temporary names of :data:`RESULTS`."""
-    for name in RESULTS:
-        for path in folder.glob(f".{name}.*"):
-            writer = path.name.removeprefix(f".{name}.").partition(".")[0]
-            if writer.isdecimal() and not _runs(int(writer)):
-                with contextlib.suppress(OSError):
-                    path.unlink()
+    """Remove what killed processes were writing in a folder: temporary names of what a run may leave."""
+    for path in folder.glob(".*.*.*"):
+        stem, ending, writer = path.name[1:].split(".")[:3]
+        name = f"{stem}.{ending}"
+        if not (name in RESULTS or _NUMBERED.fullmatch(name)):
+            continue
+        if writer.isdecimal() and not _runs(int(writer)):
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 def _runs(process):

@@ -105,7 +105,7 @@ def _text(label, width, scale):
 # The preview
 
 
-def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0) -> None:
+def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -> None:
     """Draw ``preview.png``: a row of renderings and under each its environment map.
 
     Parameters
@@ -122,6 +122,8 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0) -> 
         Write the names above the columns.
     exposure : float
         Exposure of the maps in stops, on top of the tonemap; renderings are never exposed.
+    views : sequence of slice
+        Rows of each view, where renderings are of several: they are drawn below each other.
 
     Raises
     ------
@@ -139,12 +141,10 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0) -> 
     # Columns of 214 to 768 pixels whatever the run's size; small pictures are enlarged by a whole factor.
     widest = max((image.shape[1] for image in renders.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
-    heights = {
-        name: min(max(round(width * image.shape[0] / image.shape[1]), 1), 4 * width)
-        for name, image in renders.items()
-    }
+    pictures = {name: [image[rows] for rows in views or (slice(None),)] for name, image in renders.items()}
+    heights = {name: [_height(image, width) for image in images] for name, images in pictures.items()}
     top = 7 * scale + GAP if labels else 0
-    render_height = max(heights.values(), default=0)
+    render_height = max((sum(each) + GAP * (len(each) - 1) for each in heights.values()), default=0)
     map_top = GAP + top + render_height + GAP
     canvas = np.empty((map_top + width // 2 + GAP, GAP + len(names) * (width + GAP), 3), np.uint8)
     canvas[:] = BACKGROUND
@@ -153,8 +153,10 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0) -> 
         if labels:
             canvas[GAP : GAP + 7 * scale, column][_text(str(name), width, scale)] = INK
         if name in renders:
-            rows = slice(GAP + top, GAP + top + heights[name])
-            canvas[rows, column] = display(renders[name], heights[name], width, tonemap)
+            first = GAP + top
+            for image, height in zip(pictures[name], heights[name], strict=True):
+                canvas[first : first + height, column] = display(image, height, width, tonemap)
+                first += height + GAP
         else:
             canvas[GAP + top : map_top - GAP, column] = PLACEHOLDER
         rows = slice(map_top, map_top + width // 2)
@@ -162,6 +164,11 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0) -> 
         if name in maps:
             canvas[rows, column] = display(maps[name], width // 2, width, tonemap, exposure)
     write_atomically(path, png(canvas))
+
+
+def _height(image, width):
+    """Height at which a rendering is drawn, of at most four times its width."""
+    return min(max(round(width * image.shape[0] / image.shape[1]), 1), 4 * width)
 
 
 # ----------------------------------------------------------------------------------------------------------

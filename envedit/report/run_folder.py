@@ -54,8 +54,8 @@ def write(
     named = {
         "envmap": result.given.source,
         "scene": result.scene or "",
-        "target": settings.target.file,
-        "mask": settings.target.mask,
+        **_roles("target", settings.target.files),
+        **_roles("mask", settings.target.masks),
         **weights,
     }
     inputs = {role: path for role, path in named.items() if os.path.isfile(path)}
@@ -63,7 +63,9 @@ def write(
     manifest.write_manifest(folder / "manifest.json", facts)
     timing["import_s"] = round(import_s, 3)
     if settings.output.report:
-        preview.preview(folder / "preview.png", result.renders, result.maps, settings.output.tonemap)
+        views = [view.rows for view in result.views]
+        drawn = result.renders, result.maps, settings.output.tonemap
+        preview.preview(folder / "preview.png", *drawn, views=views)
         html_report.write_report(
             folder / "report.html",
             title=f"{Path(result.given.source).stem}, {Path(settings.scene.file).stem}",
@@ -72,6 +74,7 @@ def write(
             manifest=facts,
             history=result.history,
             renders=result.renders,
+            views=result.views,
             maps=result.maps,
             influence=result.influence,
             frozen=result.frozen,
@@ -90,18 +93,24 @@ def write(
     return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
 
 
+def _roles(name, files):
+    """Name files by what they are to a run, numbered where there are several."""
+    return {name if len(files) == 1 else f"{name} {i}": file for i, file in enumerate(files)}
+
+
 def _maps(settings, folder, result):
     """Write maps and renderings."""
     given = result.given
     result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, given)
     for name, picture in result.renders.items():
-        images.write_exr(
-            folder / f"render_{name}.exr",
-            picture,
-            {"source": settings.scene.file},
-            panorama=False,
-            alpha=result.alpha,
-        )
+        for file, rows in output_folder.of_views(f"render_{name}.exr", [v.rows for v in result.views]):
+            images.write_exr(
+                folder / file,
+                picture[rows],
+                {"source": settings.scene.file},
+                panorama=False,
+                alpha=None if result.alpha is None else result.alpha[rows],
+            )
     initial = result.given.stored
     layers = {"edited": result.envmap, "initial": initial, "difference": result.envmap - initial}
     if result.influence is not None:

@@ -71,9 +71,9 @@ def trace(
     Parameters
     ----------
     scene : mi.Scene
-        Its first sensor is used.
+        Its sensors are the views.
     pixels : ndarray of uint32
-        Indices row * width + column of the pixels to trace.
+        Indices row * width + column of the pixels to trace, the views' pictures below each other.
     paths : int
         Camera paths a pixel.
     bounces : int
@@ -99,7 +99,7 @@ def trace(
         scramble = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, (seed * 1009 + dimension) & 0xFFFFFFFF))[0]
         return lattice(mi.permute_kensler(path, paths, scramble), scramble ^ mi.UInt32(0x5BD1E995))
 
-    ray, weight = _camera_rays(scene.sensors()[0], pixel, sample)
+    ray, weight = _camera_rays(scene, pixels, pixel, sample)
     throughput = mi.Color3f(mi.unpolarized_spectrum(weight))
     active = mi.Bool(dr.full(mi.Bool, True, n))
     pdf = dr.full(mi.Float, dr.inf, n)
@@ -133,8 +133,23 @@ def _behind_lamps(scene, ray, si, active):
     return dr.select(lamp, behind, si)
 
 
-def _camera_rays(sensor, pixel, sample):
-    """Rays through the pixels' footprints, distributed as the film's reconstruction filter."""
+def _camera_rays(scene, pixels, pixel, sample):
+    """Rays through the footprints of ``pixel``, one a lane, of the views that ``pixels`` lie in."""
+    first, found = 0, None
+    for sensor in scene.sensors():
+        count = int(dr.prod(sensor.film().crop_size()))
+        if ((pixels >= first) & (pixels < first + count)).any():
+            start = dr.opaque(mi.UInt32, first)
+            own = pixel - start if first else pixel
+            rays = _rays_of_view(sensor, own, sample)
+            # Views come in the order of their pixels: a lane of an earlier one keeps its ray.
+            found = rays if found is None else dr.select(pixel >= start, rays, found)
+        first += count
+    return found
+
+
+def _rays_of_view(sensor, pixel, sample):
+    """Rays of one sensor, distributed as its film's reconstruction filter, and their weights."""
     film = sensor.film()
     size = film.crop_size()
     column, row = pixel % size.x, pixel // size.x

@@ -13,13 +13,15 @@ import mitsuba as mi
 import numpy as np
 
 
-def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medium=None) -> np.ndarray:
-    """Render the first sensor of a scene as ``mi.render`` does, with sums in a fixed order.
+def render(
+    scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medium=None, view=0
+) -> np.ndarray:
+    """Render one sensor of a scene as ``mi.render`` does, with sums in a fixed order.
 
     Parameters
     ----------
     scene : mi.Scene
-        Its film gives size, crop and filter.
+        Whose sensor; its film gives size, crop and filter.
     integrator : mi.Integrator
         A sampling integrator, such as ``path``.
     spp : int
@@ -28,6 +30,8 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
         Of the sampler.
     medium : mi.Medium, optional
         Around the camera; only volumetric integrators look at it.
+    view : int
+        Index of the sensor.
 
     Returns
     -------
@@ -35,7 +39,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
         sum f(p - s) L(s) / sum f(p - s), over the samples s near a pixel p, f the film's filter; and alpha,
         the same of samples whose path hits something that is not hidden.
     """
-    sensor = scene.sensors()[0]
+    sensor = scene.sensors()[view]
     film = sensor.film()
     rfilter = film.rfilter()
     box = rfilter.is_box_filter()
@@ -52,7 +56,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medi
     pixel = dr.arange(mi.UInt32, count) // spp
     corner = mi.Point2f(mi.Float(pixel % across), mi.Float(pixel // across)) - border
     inside = sampler.next_2d()
-    channels = _radiance(scene, integrator, sampler, corner + inside, spp, medium)
+    channels = _radiance(scene, sensor, integrator, sampler, corner + inside, spp, medium)
     dr.eval(channels, inside)  # the sums below must not trace again
 
     if box:
@@ -103,9 +107,8 @@ def _filtered(pixel, rfilter, channels, x, y, width, across, down, border, reach
     return red, green, blue, alpha, total
 
 
-def _radiance(scene, integrator, sampler, position, spp, medium):
+def _radiance(scene, sensor, integrator, sampler, position, spp, medium):
     """Trace one path a position, in pixels from the crop's corner; returns red, green, blue and alpha."""
-    sensor = scene.sensors()[0]
     lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:

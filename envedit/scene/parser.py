@@ -118,19 +118,17 @@ def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     return node.props, rotation
 
 
-def set_film(state, where: str, width: int, height: int) -> None:
-    """Give the first sensor's film the asked size and float32 RGB pixels."""
-    sensors = [n for n in state.nodes if n.type == mi.ObjectType.Sensor]
-    if not sensors:
-        raise InputError(f'{where}: the scene has no sensor; add <sensor type="perspective">')
+def set_film(state, where: str, sensor: int, width: int, height: int) -> None:
+    """Give the film of a sensor, a node's index, the asked size and float32 RGB pixels."""
+    node = state.nodes[sensor]
     inside = [
         state.nodes[v.index()]
-        for _, v in sensors[0].props.items()
+        for _, v in node.props.items()
         if isinstance(v, mi.Properties.ResolvedReference)
     ]
     films = [n for n in inside if n.type == mi.ObjectType.Film]
     if not films or films[0].props.plugin_name() != "hdrfilm":
-        raise InputError(f'{place_of(state, sensors[0], where)}: the sensor needs a <film type="hdrfilm">')
+        raise InputError(f'{place_of(state, node, where)}: the sensor needs a <film type="hdrfilm">')
     film = films[0].props
     own = [film.get("width", 768), film.get("height", 576)]  # Mitsuba's defaults
     if not all(isinstance(n, int) and n > 0 for n in own):
@@ -149,21 +147,21 @@ def set_film(state, where: str, width: int, height: int) -> None:
     film["pixel_format"], film["component_format"] = "rgb", "float32"
 
 
-def set_sampler(state, plugin: str) -> None:
-    """Give the first sensor a sampler of the asked kind, unless it has another than ``independent``.
+def set_sampler(state, sensor: int, plugin: str) -> None:
+    """Give a sensor, a node's index, a sampler of the asked kind, unless it has another than ``independent``.
 
     May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
     """
-    sensor = next(n for n in state.nodes if n.type == mi.ObjectType.Sensor)
-    for _, value in sensor.props.items():
+    props = state.nodes[sensor].props
+    for _, value in props.items():
         if isinstance(value, mi.Properties.ResolvedReference):
             node = state.nodes[value.index()]
             if node.type == mi.ObjectType.Sampler:
                 if node.props.plugin_name() == "independent":
                     node.props.set_plugin_name(plugin)
                 return
-    # Before the append, which moves the nodes: references to them, ``sensor`` too, are void after it.
-    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes))
+    # Before the append, which moves the nodes: references to them, ``props`` too, are void after it.
+    props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes))
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Sampler, mi.Properties(plugin)
     state.nodes.append(node)

@@ -54,6 +54,14 @@ _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and
 # The scene
 
 
+@dataclass(frozen=True)
+class View:
+    """One of the pictures that a scene's rendering consists of: the name of its sensor, and its rows."""
+
+    name: str
+    rows: slice
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A scene under one replaceable environment map; made by :func:`load`.
@@ -65,7 +73,9 @@ class Scene:
     path : Path or None
         The XML file, None for a dict.
     width, height : int
-        Size of a rendering in pixels.
+        Size of a rendering in pixels, the pictures of all views below each other.
+    views : tuple of View
+        Name and rows of each view, in the order of ``mi.sensors()``; usually one.
     envmap_key : str
         Name of the texels in ``params``; their layout is :func:`envedit.core.latlong.to_envmap_data`'s.
     to_world : array (3, 3) float64
@@ -93,6 +103,7 @@ class Scene:
     to_world: np.ndarray
     digest: str
     params: mi.SceneParameters
+    views: tuple[View, ...]
     own: supported.OwnMap = supported.OwnMap(None, 1.0)
     max_depth: int = -1
     hide_emitters: bool = False
@@ -106,6 +117,27 @@ class Scene:
         self.set_envmap(np.zeros((4, 8, 3), np.float32))
         picture = self._traced(min(_ALPHA_SPP, self._pass_samples()), 0, 0, 2)
         return np.clip(picture[..., 3], 0, 1).astype(np.float32)
+
+    @property
+    def rows(self) -> tuple[slice, ...]:
+        """Rows of each view."""
+        return tuple(view.rows for view in self.views)
+
+    def view(self, asked: int | str, key: str) -> int:
+        """Return the index of a view by index or name.
+
+        Raises
+        ------
+        ConfigError
+            There is none; ``key`` is what asked for it.
+        """
+        names = [view.name for view in self.views]
+        if asked in names:
+            return names.index(asked)
+        if isinstance(asked, int) and 0 <= asked < len(names):
+            return asked
+        known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
+        raise ConfigError(f"{key}: got view {asked!r}, expected one of {known}; see [scene] sensors")
 
     def set_envmap(self, image) -> None:
         """Light the scene by a map.
@@ -239,12 +271,15 @@ class Scene:
         return self._traced(count, seed, i, max_depth)[..., :3]
 
     def _traced(self, count, seed, i, max_depth):
-        """Render one pass with alpha, (h, w, 4) float64."""
+        """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
         asked = {"type": "path", "max_depth": max_depth, "hide_emitters": self.hide_emitters}
         integrator = mi.load_dict(asked)
-        pass_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-        return film.render(self.mi, integrator, count, pass_seed)
+        pictures = []
+        for k in range(len(self.views)):
+            pass_seed = int(np.random.SeedSequence([seed, i, k]).generate_state(1)[0])
+            pictures.append(film.render(self.mi, integrator, count, pass_seed, view=k))
+        return np.concatenate(pictures)
 
     def _checked(self, total):
         """Round to float32, refusing what is not finite."""
@@ -271,7 +306,9 @@ def _two_threads():
             dr.set_thread_count(threads)
 
 
-def load(file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter") -> Scene:
+def load(
+    file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter", sensors=(0,)
+) -> Scene:
     """Load a scene and make its environment emitter replaceable.
 
     Parameters
@@ -289,17 +326,18 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
     sampler : str
         Sampler of Mitsuba's renderings, where the scene asks for none or for ``independent``. Stratified
         samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
+    sensors : "all" or sequence of int and str
+        Indices or ids of the sensors whose pictures a rendering consists of; all of one width.
 
     Returns
     -------
     Scene
-        Lit by a grey map until :meth:`Scene.set_envmap` or :meth:`Scene.render` sets another. If the scene
-        has several sensors its first one is used, as Mitsuba does.
+        Lit by a grey map until :meth:`Scene.set_envmap` or :meth:`Scene.render` sets another.
 
     Raises
     ------
     ConfigError
-        If a parameter is unknown, missing or unusable, or the size is.
+        If a parameter or sensor is unknown, missing or unusable, or the size is.
     InputError
         If a file is missing or damaged, or the scene is not lit by exactly one environment emitter.
     """
@@ -309,10 +347,12 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
     config, state, path, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders)
     asked = supported.take_integrator(state, where)
-    notes = (*own.notes, *asked.notes, *supported.check_sensors(state, where))
+    nodes, names, said = supported.take_sensors(state, where, sensors)
+    notes = (*own.notes, *asked.notes, *said)
     emitter, to_world = parser.replace_environment(state, where)
     digest = hashlib.sha256(b"envedit scene 1")
-    parser.set_film(state, where, width, height)
+    for node in nodes:
+        parser.set_film(state, where, node, width, height)
     parser.find_files(state, where, folders)
     for node in state.nodes:
         parser.smooth_limit(state, node)
@@ -320,7 +360,8 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         parser.hash_node(digest, node)
     emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
     name = str(emitter.id())
-    parser.set_sampler(state, sampler)  # after the digest: light transport has its own samples
+    for node in nodes:  # after the digest: light transport has its own samples
+        parser.set_sampler(state, node, sampler)
     # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
     for node in state.nodes:
         for key in node.props.keys():  # noqa: SIM118 (no dict)
@@ -333,9 +374,24 @@ def load(file, width=None, height=None, parameters=None, base=None, sampler: str
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
-    columns, rows = (int(n) for n in scene.sensors()[0].film().crop_size())
-    told = own, asked.max_depth, asked.hide_emitters, notes
+    columns, views = _views(scene, names)
+    rows = views[-1].rows.stop
+    told = views, own, asked.max_depth, asked.hide_emitters, notes
     return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told)
+
+
+def _views(scene, names):
+    """Return the width that all views have, and the rows of each."""
+    views, sizes, first = [], [[int(n) for n in s.film().crop_size()] for s in scene.sensors()], 0
+    for name, (width, height) in zip(names, sizes, strict=True):
+        if width != sizes[0][0]:
+            raise ConfigError(
+                f"scene.sensors: {names[0]} is {sizes[0][0]} pixels wide and {name} is {width}: views need "
+                "the same width; set [scene] width, or choose other sensors"
+            )
+        views.append(View(name, slice(first, first + height)))
+        first += height
+    return sizes[0][0], tuple(views)
 
 
 def _parsed(file, parameters, base):

@@ -14,7 +14,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.errors import InputError
+from envedit.core.errors import ConfigError, InputError
 from envedit.scene.parser import place_of
 
 SENSORS = ("perspective", "thinlens", "orthographic")
@@ -170,27 +170,82 @@ def _check_media(state, where, integrator, notes):
     notes.append(f"medium {kind} is not rendered, as the scene's integrator ({integrator}) has no media")
 
 
-def check_sensors(state, where: str) -> tuple[str, ...]:
-    """Refuse a first sensor that makes no picture; say which of several is used.
+def take_sensors(state, where: str, asked="all") -> tuple[list[int], list[str], tuple[str, ...]]:
+    """Choose the sensors whose pictures are edited, in the order asked for; the scene has no others then.
+
+    Parameters
+    ----------
+    asked : "all" or sequence of int and str
+        Indices and ids.
+
+    Returns
+    -------
+    nodes : list of int
+        Indices of their nodes.
+    names : list of str
+        Their ids, or ``sensor N`` where one has none.
+    notes : tuple of str
+        Which of several are used, and which not.
 
     Raises
     ------
+    ConfigError
+        There is no such sensor, or one is asked for twice.
     InputError
-        The first sensor is of a kind that cannot be used.
+        One is of a kind that makes no picture.
     """
-    sensors = [n for n in state.nodes if n.type == mi.ObjectType.Sensor]
-    if not sensors:
-        return ()
-    kind = sensors[0].props.plugin_name()
-    if kind not in SENSORS:
-        raise InputError(
-            f"{place_of(state, sensors[0], where)}: sensor {kind} makes no picture to edit by; "
-            f"expected {', '.join(SENSORS)}"
-        )
-    if len(sensors) == 1:
-        return ()
-    others = ", ".join(_name(n) for n in sensors[1:4]) + (", ..." if len(sensors) > 4 else "")
-    return (f"{len(sensors)} sensors: the first is used ({_name(sensors[0])}), not {others}",)
+    found = [i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Sensor]
+    if not found:
+        raise InputError(f'{where}: the scene has no sensor; add <sensor type="perspective">')
+    ids = [state.nodes[i].props.id() for i in found]
+    chosen = list(range(len(found))) if asked == "all" else [_sensor(one, ids, state, found) for one in asked]
+    if len({*chosen}) != len(chosen):
+        raise ConfigError(f"scene.sensors: got {list(asked)}, expected each sensor once")
+    nodes = [found[k] for k in chosen]
+    for i in nodes:
+        kind = state.nodes[i].props.plugin_name()
+        if kind not in SENSORS:
+            raise InputError(
+                f"{place_of(state, state.nodes[i], where)}: sensor {kind} makes no picture to edit by; "
+                f"expected {', '.join(SENSORS)}"
+            )
+    names = [ids[k] or f"sensor {k}" for k in chosen]
+    if len(found) == 1:
+        return nodes, names, ()
+    _keep_only(state, nodes)
+    used = ", ".join(_name(state.nodes[i]) for i in nodes[:4]) + (", ..." if len(nodes) > 4 else "")
+    others = [_name(state.nodes[i]) for i in found if i not in nodes]
+    more = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
+    if len(nodes) > 1:
+        count = f"{len(nodes)} of {len(found)}" if more else f"{len(nodes)}"
+        said = f"{count} sensors are views: {used}" + (f"; not {more}" if more else "")
+        return nodes, names, (said,)
+    which = "the first" if chosen == [0] else "one"
+    return nodes, names, (f"{len(found)} sensors: {which} is used ({used}), not {more}",)
+
+
+def _sensor(asked, ids, state, found):
+    """Return the place of a sensor among all."""
+    if asked in ids:
+        return ids.index(asked)
+    if isinstance(asked, int) and 0 <= asked < len(ids):
+        return asked
+    known = ", ".join(f"{k} ({_name(state.nodes[i])})" for k, i in enumerate(found))
+    raise ConfigError(f"scene.sensors: got {asked!r}, expected one of {known}")
+
+
+def _keep_only(state, nodes):
+    """Let the scene refer to these sensors only, in this order."""
+    references = {}
+    for node in state.nodes:
+        for name, value in list(node.props.items()):
+            if not isinstance(value, mi.Properties.ResolvedReference):
+                continue
+            if state.nodes[value.index()].type == mi.ObjectType.Sensor:
+                references[value.index()] = value
+                del node.props[name]
+    for k, i in enumerate(nodes):
+        state.root.props[f"view_{k}_of_{len(nodes)}"] = references[i]
 
 
 def _name(node):

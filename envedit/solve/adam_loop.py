@@ -21,7 +21,7 @@ from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError
 from envedit.losses import losses, optimizer
 from envedit.losses.display_curve import to_display
-from envedit.losses.ssim import Ssim
+from envedit.losses.ssim import Ssim, StackedSsim
 
 MOST_BAD_STEPS = 20
 """Non-finite steps in a row after which the loop gives up."""
@@ -48,9 +48,13 @@ class Objective:
         Length of the run, over which ramps are walked.
     dists : distances.Dists, optional
         The term of that name, between display values of the map and the original; None: it is off.
+    views : sequence of slice
+        Rows of each view, where the picture is of several.
     """
 
-    def __init__(self, weights: config.Loss, picture, pixel_weight, original, iterations: int, dists=None):
+    def __init__(
+        self, weights: config.Loss, picture, pixel_weight, original, iterations: int, dists=None, views=()
+    ):
         self.iterations = iterations
         self.ramps = {
             name: value if isinstance(value, tuple) else (value, value)
@@ -60,7 +64,8 @@ class Objective:
         self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
         self._weight = None if pixel_weight is None else tensor(pixel_weight)
         self._original = tensor(original)
-        self._ssim = Ssim(self._target, self._weight)
+        shown = self._target, self._weight
+        self._ssim = StackedSsim(*shown, views) if len(views) > 1 else Ssim(*shown)
         self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
 
     def __call__(self, rendering, crop, step: int):

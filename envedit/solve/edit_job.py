@@ -188,7 +188,7 @@ class Job:
             return found.loss
         few = replace(self.settings.optimizer, iterations=steps)
         wanted = self.wanted.aim, self.wanted.weight
-        objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists)
+        objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists, self.lit.rows)
         return self._loop(params, objective, few)[1].history[-1]["loss"]
 
     def optimise(self, params, crop, resume):
@@ -204,7 +204,7 @@ class Job:
             self.renderer.restore(traced)
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
             wanted = self.wanted = wanted.aimed_at(picture)
-        asked = wanted.aim, wanted.weight, crop, chosen.iterations, self.dists
+        asked = wanted.aim, wanted.weight, crop, chosen.iterations, self.dists, self.lit.rows
         objective = adam_loop.Objective(self.settings.loss, *asked)
         saved = time.perf_counter()
 

@@ -43,12 +43,15 @@ class Recordings:
         Detail that the picture tells; see :func:`.gain_bandwidth.octaves`.
     notes : list of str
         What was found and chosen.
+    views : tuple of slice
+        Rows of each view.
     """
 
     transport: LightTransport
     second: LightTransport | None = None
     octaves: list[Octave] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    views: tuple[slice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def recordings(
             transport = trace(settings.seed, spp=most)
     # Columns of both are compared: their paths are in the ratio of the samples.
     second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
-    return Recordings(transport, second, told, notes)
+    return Recordings(transport, second, told, notes, lit.rows)
 
 
 def find(
@@ -185,7 +188,8 @@ def _trusted(envmap, recordings, wanted):
         one.resolve(envmap)
         pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
-    weight = pixel_confidence.weights(*pictures, share, wanted.picture, wanted.noise)
+    asked = wanted.picture, wanted.noise, recordings.views
+    weight = pixel_confidence.weights(*pictures, share, *asked)
     if weight is None:
         return None, ""
     noisy = 100 * float((weight < 0.5).mean())

@@ -24,7 +24,7 @@ LIT = 0.01
 """Multiples of the target's mean brightness from which on a pixel counts in medians: not a black backdrop."""
 
 
-def weights(first, second, share: float, picture, noise=None) -> np.ndarray | None:
+def weights(first, second, share: float, picture, noise=None, views=()) -> np.ndarray | None:
     """Weigh pixels by what is known of them.
 
     Parameters
@@ -38,6 +38,8 @@ def weights(first, second, share: float, picture, noise=None) -> np.ndarray | No
         The target, linear radiance.
     noise : ndarray (h, w), optional
         Standard error of the target's display values.
+    views : sequence of slice
+        Rows of each view, where the pictures are of several: no window crosses from one to the next.
 
     Returns
     -------
@@ -50,7 +52,8 @@ def weights(first, second, share: float, picture, noise=None) -> np.ndarray | No
     variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
     if noise is not None:
         variance += np.square(noise)
-    around = _windows(variance, AROUND).mean(axis=(2, 3))
+    views = views or (slice(None),)
+    around = np.concatenate([_windows(variance[rows], AROUND).mean(axis=(2, 3)) for rows in views])
     brightness = picture.max(axis=2)
     lit = brightness > LIT * brightness.mean(dtype=np.float64)
     if not lit.any():
@@ -59,7 +62,7 @@ def weights(first, second, share: float, picture, noise=None) -> np.ndarray | No
     trust = TRUSTED**2 / (TRUSTED**2 + beyond)
     if trust.min() >= 0.5:
         return None
-    brightest = _windows(brightness, 1).max(axis=(2, 3))
+    brightest = np.concatenate([_windows(brightness[rows], 1).max(axis=(2, 3)) for rows in views])
     shows_light = (brightest >= SHOWS_LIGHT * np.median(picture[lit])) & (beyond > 0)
     trust = np.where(shows_light, 0, trust)
     return trust[..., None].astype(np.float32) if trust[lit].any() else None

@@ -3,17 +3,21 @@
 A picture that was painted asks two things: that the pixels under the paint become as painted, and that all
 others stay as they are. Each of the two has a weight of its own, shared among its pixels, so that a small
 stroke is not outvoted by the many pixels around it.
+
+Where the scene has several views, what is painted belongs to one of them, and views on which nothing was
+painted stay as they are: their target is their initial rendering.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
-from envedit.core.errors import InputError
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.images import images
 from envedit.scene.renderings import rendered
@@ -113,14 +117,11 @@ def make(
         found = painted_image.given(picture, shape, initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
     elif chosen.kind == "image":
-        found = painted_image.read(chosen.file, shape, chosen.tonemap, initial, chosen.mask)
-        files = [chosen.file, *([chosen.mask] if chosen.mask else [])]
-        source, asked = f"painted: {chosen.file}", tuple(np.fromfile(file, np.uint8) for file in files)
+        found = _painted_files(scene, initial, chosen)
+        asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks))
+        source = f"painted: {', '.join(chosen.files)}"
     else:
-        made = strokes.paint(initial, chosen.strokes, chosen.tonemap)
-        if not made.coverage.any():
-            raise InputError(f"target.strokes: {'; '.join(made.warnings) or 'none of them paints anything'}")
-        found = painted_image.Painted(made.picture, made.coverage, np.zeros(shape, bool), made.warnings)
+        found = _painted_strokes(scene, initial, chosen)
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
     picture, warnings = found.picture, tuple(found.warnings)
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
@@ -134,6 +135,65 @@ def make(
         f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
     )
     return _seen(Target(picture, weight, None, source, warnings, initial, found.coverage, asked), hidden)
+
+
+def _painted_files(scene, initial, chosen):
+    """Read what was painted on views, each from its file."""
+    masks = chosen.masks or ("",) * len(chosen.files)
+    painted = {
+        scene.view(view, "target.view"): (file, mask)
+        for view, file, mask in zip(chosen.views, chosen.files, masks, strict=True)
+    }
+    if len(painted) < len(chosen.files):
+        raise ConfigError("target.view: got a view by index and by name, expected each once")
+
+    def of_view(k, before):
+        file, mask = painted[k]
+        return painted_image.read(file, before.shape[:2], chosen.tonemap, before, mask)
+
+    return _of_views(scene, initial, painted, of_view)
+
+
+def _painted_strokes(scene, initial, chosen):
+    """Paint strokes, each on its view."""
+    numbers = [
+        scene.view(s.get("view", 0), f"target.strokes[{i}].view") for i, s in enumerate(chosen.strokes)
+    ]
+    warnings = []
+
+    def of_view(k, before):
+        own = [i for i, number in enumerate(numbers) if number == k]
+        made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.tonemap)
+        warnings.extend(_renumbered(line, own) for line in made.warnings)
+        return painted_image.Painted(made.picture, made.coverage, np.zeros(before.shape[:2], bool), ())
+
+    found = _of_views(scene, initial, numbers, of_view)
+    if not found.coverage.any():
+        raise InputError(f"target.strokes: {'; '.join(warnings) or 'none of them paints anything'}")
+    return replace(found, warnings=tuple(warnings))
+
+
+def _renumbered(line, own):
+    """Give a stroke that a warning begins with its place in the configuration's list."""
+    return re.sub(r"^target\.strokes\[(\d+)\]", lambda m: f"target.strokes[{own[int(m[1])]}]", line)
+
+
+def _of_views(scene, initial, painted, of_view):
+    """Put together what was painted on each view; those that are not ``painted`` hold."""
+    parts = []
+    for k, rows in enumerate(scene.rows):
+        before = initial[rows]
+        if k in painted:
+            parts.append(of_view(k, before))
+        else:
+            shape = before.shape[:2]
+            parts.append(painted_image.Painted(
+                before, np.zeros((*shape, 1), np.float32), np.zeros(shape, bool), ()
+            ))  # fmt: skip
+    joined = (
+        np.concatenate([getattr(p, name) for p in parts]) for name in ("picture", "coverage", "excluded")
+    )
+    return painted_image.Painted(*joined, tuple(line for part in parts for line in part.warnings))
 
 
 def _seen(target, hidden):
@@ -180,7 +240,10 @@ def _rendered(settings, scene, envmap):
         source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
     picture, spp, noise = rendered(scene, true, chosen.spp, settings.seed + SEED, settings.renderer.cache)
-    weight = painted_image.read_mask(chosen.mask, picture.shape[:2]) if chosen.mask else None
+    weight = np.ones((*picture.shape[:2], 1), np.float32) if chosen.masks else None
+    for view, mask in zip(chosen.views, chosen.masks, strict=True):
+        rows = scene.rows[scene.view(view, "target.view")]
+        weight[rows] = painted_image.read_mask(mask, weight[rows].shape[:2])
     asked = (true,) if weight is None else (true, weight)
     source += f", {spp} samples a pixel"
     return Target(picture, weight, true, source, warnings, asked=asked, noise=noise)

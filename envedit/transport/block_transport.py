@@ -16,7 +16,7 @@ from envedit.core.array_cache import holds
 CELLS = 64
 """Cells around the horizon: 5.6 degrees each."""
 BLOCKS = 32
-"""Blocks along the longer side of the picture."""
+"""Blocks along the longer side of a view."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Overview:
         return _means(values, self.cell_of, weight)
 
 
-def make(matrix, shape: tuple[int, int], grid: tuple[int, int]) -> Overview:
+def make(matrix, shape: tuple[int, int], grid: tuple[int, int], views=()) -> Overview:
     """Sum up the entries of a transport.
 
     Parameters
@@ -61,8 +61,10 @@ def make(matrix, shape: tuple[int, int], grid: tuple[int, int]) -> Overview:
         T, pixels by texels.
     shape, grid : (int, int)
         Height and width of the picture and of the map.
+    views : sequence of slice
+        Rows of each view, where the picture is of several: no block is of two.
     """
-    block_of, blocks = _tiles(*shape, max(1, -(-max(shape) // BLOCKS)))
+    block_of, blocks = _blocks(shape, views)
     cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
     rows, columns, weights = matrix.coordinates()
     key = block_of[rows] * cells + cell_of[columns]
@@ -77,9 +79,9 @@ def make(matrix, shape: tuple[int, int], grid: tuple[int, int]) -> Overview:
     return Overview(dense.astype(np.float32), block_of, cell_of, toward, size)
 
 
-def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int]) -> bool:
+def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int], views=()) -> bool:
     """Tell whether arrays from disk are an overview of such a picture and map: no index leaves it."""
-    block_of, blocks = _tiles(*shape, max(1, -(-max(shape) // BLOCKS)))
+    block_of, blocks = _blocks(shape, views)
     cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
     wanted = {
         "matrix": ("f4", (3, blocks, cells)),
@@ -90,6 +92,17 @@ def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int
     }
     same = holds(arrays, wanted) and (arrays["block_of"] == block_of).all()
     return bool(same and (arrays["cell_of"] == cell_of).all())
+
+
+def _blocks(shape, views):
+    """Return the block of every pixel, and their number; the longest side of a view has BLOCKS of them."""
+    heights = [rows.stop - rows.start for rows in views] or [shape[0]]
+    size, parts, count = max(1, -(-max(*heights, shape[1]) // BLOCKS)), [], 0
+    for height in heights:
+        block_of, blocks = _tiles(height, shape[1], size)
+        parts.append(block_of + count)
+        count += blocks
+    return np.concatenate(parts), count
 
 
 def _tiles(height, width, size):

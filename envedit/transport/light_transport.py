@@ -312,9 +312,10 @@ class LightTransport:
         if self._overview is None:
             cache, key = self._stored
             shapes = self.shape, (self.grid.height, self.grid.width)
-            stored = cache.load(key, lambda found: overviews.whole(found, *shapes))
+            views = self.scene.rows
+            stored = cache.load(key, lambda found: overviews.whole(found, *shapes, views))
             if stored is None:
-                made = overviews.make(self.forward, *shapes)
+                made = overviews.make(self.forward, *shapes, views)
                 cache.store(key, vars(made))
                 stored = vars(made)
             self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})

@@ -73,7 +73,7 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
     Parameters
     ----------
     scene : mi.Scene
-        Its first sensor is used.
+        Its sensors are the views.
     grid : Grid
         Texels that escapes are told by.
     pixels : int

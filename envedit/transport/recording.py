@@ -98,7 +98,7 @@ def contributions(
     Parameters
     ----------
     scene : mi.Scene
-        Its first sensor is used.
+        Its sensors are the views.
     grid : Grid
         Where the rays go.
     pixels : ndarray of uint32

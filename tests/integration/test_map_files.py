@@ -13,6 +13,7 @@ from envedit.core.errors import NumericalError
 from envedit.export import light_list
 from envedit.images import images
 from envedit.report import map_files
+from envedit.representations.layers.separation import separate
 from tests.oracles import users_scenes
 from tests.oracles.builders import BALL, sky
 from tests.oracles.runs import TINY, call, changed, content, measured, pixels
@@ -72,6 +73,8 @@ def test_sky_and_lights_add_up_to_the_map(own, rng):
     np.testing.assert_allclose(sum(parts), pixels(out / "edited.exr"), rtol=3e-7)
     lights = json.loads((out / "lights.json").read_text())
     assert set(lights) == {"before", "after"}
+    assert {"id", "removed"} <= set(lights["before"][0])
+    assert any("light 1 at azimuth" in line for line in measured(out)["choices"])
 
 
 def test_lights_are_where_and_as_strong_as_in_the_map():
@@ -80,7 +83,7 @@ def test_lights_are_where_and_as_strong_as_in_the_map():
     envmap = np.full((height, width, 3), 0.2, np.float32)
     envmap[row, column] = [900, 600, 300]
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
-    (found,) = light_list.listed(envmap, turn)
+    (found,) = light_list.listed(separate(envmap), turn)
     d = latlong.directions(height, width)[row, column]
     np.testing.assert_allclose(found["direction"], turn @ d, atol=1e-6)
     assert found["azimuth"] == pytest.approx(360 * (column + 0.5) / width, abs=1e-3)
@@ -90,7 +93,7 @@ def test_lights_are_where_and_as_strong_as_in_the_map():
     assert found["angle"] == pytest.approx(2 * np.degrees(np.sqrt(omega / np.pi)), rel=1e-3)
     np.testing.assert_allclose(found["flux"], np.array([900, 600, 300]) * omega, rtol=2e-3)
     np.testing.assert_allclose(found["irradiance"], np.array(found["flux"]) * d[1], rtol=1e-6)
-    emitter = {"type": "envmap", "bitmap": mi.Bitmap(light_list.split(envmap)[1])}
+    emitter = {"type": "envmap", "bitmap": mi.Bitmap(light_list.split(envmap, separate(envmap).core)[1])}
     eye = mi.ScalarTransform4d().look_at(origin=[0, 5, 0.01], target=[0, 0, 0], up=[0, 0, 1])
     film = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "rgb", "rf": {"type": "box"}}
     sensor = {"type": "perspective", "fov": 1, "to_world": eye, "film": film}
@@ -103,11 +106,16 @@ def test_lights_are_where_and_as_strong_as_in_the_map():
 
 def test_a_map_without_lights_is_all_sky(rng):
     even = (1 + 0.1 * rng.random((16, 32, 3))).astype(np.float32)
-    whole, none = light_list.split(even)
-    assert whole.tobytes() == even.tobytes() and not none.any() and light_list.listed(even, np.eye(3)) == []
+    whole, none = light_list.split(even, separate(even).core)
+    assert (
+        whole.tobytes() == even.tobytes()
+        and not none.any()
+        and light_list.listed(separate(even), np.eye(3)) == []
+    )
     black = np.zeros((16, 32, 3), np.float32)
     assert (
-        not any(part.any() for part in light_list.split(black)) and light_list.listed(black, np.eye(3)) == []
+        not any(part.any() for part in light_list.split(black, separate(black).core))
+        and light_list.listed(separate(black), np.eye(3)) == []
     )
 
 

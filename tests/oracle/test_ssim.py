@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit.core.errors import ConfigError, InputError
-from envedit.losses.ssim import Ssim, ssim_index, ssim_loss, ssim_map
+from envedit.losses.ssim import Ssim, StackedSsim, ssim_index, ssim_loss, ssim_map
 from tests.oracles.plain import double, gradient, plain_ssim, single, waves
 
 
@@ -60,6 +60,26 @@ def test_ssim_class_agrees_with_the_function_and_can_be_reused(rng):
         (a, g), (b, h) = gradient(ssim, single(image)), gradient(ssim_loss, single(image), single(y), w)
         assert a == b and np.array_equal(g, h)
         assert ssim(single(image))[0] == a  # without gradients asked for
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_ssim_of_pictures_below_each_other_is_that_of_each(weighted, rng):
+    """Value and gradient; each counts by its pixels, or by its weight."""
+    x, y, w = rng.random((30, 14, 3)), rng.random((30, 14, 3)), rng.random((30, 14, 1)) + 0.1
+    rows = slice(0, 12), slice(12, 30)
+    w[rows[1]] *= 3
+    shares = [w[some].sum() / w.sum() if weighted else len(x[some]) / 30 for some in rows]
+    stacked = StackedSsim(double(y), double(w) if weighted else None, rows)
+    value, found = gradient(stacked, double(x))
+    each = [
+        gradient(ssim_loss, double(x[some]), double(y[some]), double(w[some]) if weighted else None)
+        for some in rows
+    ]
+    assert value == pytest.approx(sum(s * v for s, (v, _) in zip(shares, each, strict=True)), rel=1e-12)
+    expected = np.concatenate([s * g for s, (_, g) in zip(shares, each, strict=True)])
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    with pytest.raises(InputError, match="SSIM: image"):
+        stacked(double(x[:20]))
 
 
 def test_ssim_forward_mode(rng):

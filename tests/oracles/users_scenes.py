@@ -213,6 +213,9 @@ that are refused or replaced are tried one by one, the others are Mitsuba's own 
   of the file: `scale` is not in it.
 - **The picture** is the one that Mitsuba makes of the file, to its noise: camera, crop, path depth and hidden
   emitters are the file's, `[scene] width` is its size. Light of other lamps stays as it is.
+- **Several views.** `[scene] sensors = "all"`, or a list of sensors by `id` or by index from 0, makes every
+  one of them a picture, and one map explains all; without it the first sensor is used. Views need the same
+  width, which `[scene] width` gives to all; `renderer.kind = "path"` is refused with more than one.
 - **Variants.** Everything runs in `llvm_ad_rgb` or `cuda_ad_rgb`. Spectra are converted to RGB when a scene
   is loaded, as Mitsuba does. Spectral and polarised rendering are not supported: polarising materials act on
   unpolarised light.

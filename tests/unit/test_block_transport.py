@@ -91,3 +91,20 @@ def test_a_cell_without_weight_is_zero(rng):
     weight[7] = 0
     means = result.to_cells(np.ones((30, 3)), weight)
     assert not means[7].any() and (np.delete(means, 7, axis=0) == 1).all()
+
+
+def test_no_block_is_of_two_views(rng):
+    """Two views of one size have the blocks that each has alone."""
+    views, grid = (slice(0, 33), slice(33, 66)), (4, 65)
+    matrix, full = transport(rng, (66, 20), grid)
+    result = block_transport.make(matrix, (66, 20), grid, views)
+    assert block_transport.whole(vars(result), (66, 20), grid, views)
+    assert not block_transport.whole(vars(result), (66, 20), grid)
+    half = np.split(result.matrix, 2, axis=1)
+    for rows, one in zip(views, half, strict=True):
+        part = full[rows].reshape(33 * 20, -1, 3)
+        pixels, texels = np.nonzero(part.any(axis=2))
+        weights = part[pixels, texels].astype(np.float32)
+        indices = pixels.astype(np.uint32), texels.astype(np.uint32)
+        alone = block_transport.make(ColourMatrix(*indices, weights, part.shape[:2]), (33, 20), grid)
+        np.testing.assert_array_equal(one, alone.matrix)

@@ -153,5 +153,5 @@ def recorded(tables, traced, coverage=None, size=24, width=48):
     settings = config.from_dict({**tables, "seed": 2**32 - 1})
     layers = SimpleNamespace(separation=SimpleNamespace(background=MAP), rows=(0, 8))
     wished = Target(np.zeros(SHAPE, np.float32), None, None, "", coverage=coverage)
-    lit = SimpleNamespace(width=size, height=size)
+    lit = SimpleNamespace(width=size, height=size, rows=())
     return initialization.recordings(settings, lit, (24, width), layers, wished, traced)

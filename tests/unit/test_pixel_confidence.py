@@ -89,3 +89,11 @@ def test_a_picture_of_noise_alone_is_trusted_as_a_whole(rng):
     base = np.full(SHAPE, 0.5)
     both = [base + rng.random(SHAPE) for _ in range(2)]
     assert pixel_confidence.weights(*both, 1 / 8, base) is None
+
+
+def test_noise_at_the_edge_of_a_view_says_nothing_of_the_next(rng):
+    (first, second), base = pictures(rng)
+    first[10:12, 20:23] += 3
+    views = slice(0, 12), slice(12, 24)
+    apart, joined = (pixel_confidence.weights(first, second, 1 / 8, base, None, v) for v in (views, ()))
+    assert apart[11, 21] < 0.01 and apart[12:].min() > 0.99 and joined[12, 21] < 0.05

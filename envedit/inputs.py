@@ -184,8 +184,8 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
     if settings.lights:
         placed = PlacedLights(given.radiance, settings.horizon)
         if lacking := missing(settings.lights, len(placed.lights)):
-            had = len(placed.lights)
-            warnings.append(f"input.lights: the map has {had} lights, none with number {lacking[0]}: not moved")
+            had = f"the map has {len(placed.lights)} lights"
+            warnings.append(f"input.lights: {had}, none with number {lacking[0]}: nothing is done to it")
         found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
     turned = latlong.rotate(found.stored, settings.rotate_degrees)
     return replace(given, stored=turned, warnings=warnings, placed=placed)

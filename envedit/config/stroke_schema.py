@@ -12,7 +12,6 @@ from typing import Any
 from envedit.config.validators import WantedError, choice, named, number, numbers, show
 from envedit.core.errors import ConfigError
 
-
 _FURTHEST = 1e6
 _coordinate = number(-_FURTHEST, _FURTHEST)
 _length = number(0, _FURTHEST, positive=True)

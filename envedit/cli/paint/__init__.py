@@ -42,8 +42,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         reason = error.strerror or error
         print(
-            f"envedit: port {arguments.port} on {HOST}: cannot be used ({reason}): another `envedit paint` may "
-            "run there; end it, or give another with --port",
+            f"envedit: port {arguments.port} on {HOST}: cannot be used ({reason}): another `envedit paint` "
+            "may run there; end it, or give another with --port",
             file=sys.stderr,
         )
         return 2
@@ -100,7 +100,7 @@ def _parser():
     )
     parser.add_argument("--envmap", metavar="MAP", help="map to edit: a file, scene or sunsky")
     parser.add_argument("--preset", choices=("draft", "standard"), help="named set of defaults")
-    parser.add_argument("--port", type=int, default=PORT, help=f"port on this machine (default: {PORT}; 0: any)")
+    parser.add_argument("--port", type=int, default=PORT, help=f"port (default: {PORT}; 0: any)")
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     return parser
 

@@ -165,7 +165,7 @@ def _without(table, *names, **more):
 
 
 def _continued(project):
-    """Go on from ``painted.toml`` where its folder has one of the same scene and map, else in a folder beside."""
+    """Go on from a ``painted.toml`` of the same scene and map; of another, in a folder beside it."""
     folder, tried = project.folder, 1
     while (folder / NAME).exists():
         try:

@@ -36,8 +36,8 @@ MAPS = "maps"
 """Folder, in the working folder of the project, that dropped maps are put in."""
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|pfm|png|jpg|jpeg)", re.IGNORECASE)
 _SAFE = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
@@ -187,7 +187,8 @@ class Server:
         if file is None or name not in output_folder.RESULTS or not file.is_file() or file.is_symlink():
             return PlainTextResponse("no such result", 404, _SAFE)
         # The report has its pictures and its style in itself.
-        safe = {**_SAFE, "Content-Security-Policy": "default-src 'none'; img-src data:; style-src 'unsafe-inline'"}
+        policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+        safe = {**_SAFE, "Content-Security-Policy": policy}
         return FileResponse(file, headers=safe)
 
     async def _map(self, request: Request) -> Response:
@@ -195,7 +196,8 @@ class Server:
             return PlainTextResponse("not from the page", 403, _SAFE)
         name = request.path_params["name"]
         if not _MAP_NAME.fullmatch(name):
-            return PlainTextResponse("a map is an .exr, .hdr, .pfm, .png or .jpg with a plain name", 400, _SAFE)
+            wanted = "expected a plain name that ends in .exr, .hdr, .pfm, .png or .jpg"
+            return PlainTextResponse(wanted, 400, _SAFE)
         folder = Path.cwd() / MAPS
         folder.mkdir(exist_ok=True)
         part, size = folder / f".{name}.{secrets.token_hex(8)}", 0

@@ -22,12 +22,15 @@ from envedit.cli.paint.project import Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.errors import NumericalError
 from envedit.export import adjustments
 from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
+from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers, unseen_kept
 from envedit.representations.layers.placed_lights import PlacedLights, angles
-from envedit.solve import feasibility, gauss_newton, map_problem
+from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
+from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.targets import strokes
 from envedit.targets.target import pixel_weight
 
@@ -35,8 +38,8 @@ DRAGGED_COLUMNS, COLUMNS = 12, 32
 """Most exact columns of T traced in one frame while a light is dragged, and otherwise."""
 SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
-PASS, PASSES = 16, 16
-"""Samples a pixel of one pass of that rendering, and passes."""
+PASS, FIRST_PASSES, PASSES = 16, 4, 16
+"""Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
 RENDER_SEED = 9_000_021
 """Added to the run's seed."""
 PATCH = 1
@@ -124,22 +127,21 @@ class Session:
         params = layers.encode(self.origin[self.rows])
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
-        before = getattr(self, "run", None)
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
-        self.start = self.problem.state(params)
+        self.still = self.start = self.problem.state(params)
         self.run = gauss_newton.Run(self.start, self.start)
-        if before is not None and before.state["gain"].shape == self.start["gain"].shape and document.strokes:
-            self.run.state = {**self.start, "gain": before.state["gain"]}
         self.point = self.problem.evaluate(self.run.state, resolve=False)
         self._painted: tuple[list, strokes.Painted] | None = None
         self.status = {"reachable": None, "iterations": 0, "number": 0, "client": ""}
-        self._rendered, self.reach = None, None
+        self._rendered = None
         self._paint()
         self._tell_lights()
 
     def _horizon(self):
         chosen, rows = self.project.settings.input.horizon, self.project.settings.input.rows
-        return "free" if rows != "all" else self.placed.layers._horizon if chosen == "auto" else chosen
+        if rows != "all":
+            return "free"
+        return below_horizon.kind_of(self.origin) if chosen == "auto" else chosen
 
     def _by_hand(self, document):
         return latlong.rotate(self.placed.place(document.lights), document.rotate_degrees)
@@ -154,10 +156,11 @@ class Session:
 
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
-        chosen, self.reach = self.project.settings.target, None
+        chosen, self.reach, self.searched = self.project.settings.target, None, False
         painted = self._after(list(self.document.strokes), chosen.tonemap)
         self.solving = bool(painted is not None and painted.coverage.any())
         if not self.solving:
+            self.start = self.still
             self.run = gauss_newton.Run(self.start, self.start)
             self.point = self.problem.evaluate(self.start, resolve=False)
             self.target, self.weight, self.coverage = self.base, None, None
@@ -191,13 +194,16 @@ class Session:
         """Do the next piece of work; False where there is none left."""
         if self._dragged:
             return False
-        if self.solving and not self.run.finished and len(self.run.history) < gauss_newton.ITERATIONS:
+        if not self.converged:
             self._step()
             return True
         if self.phase != "done":
             return False
         try:
-            if self._render(4):
+            if self._render(FIRST_PASSES):
+                return True
+            if self.solving and not self.searched:
+                self._search()
                 return True
             if self.solving and self.reach is None:
                 self._reach()
@@ -206,6 +212,11 @@ class Session:
         except SupersededError:
             return True
 
+    @property
+    def converged(self) -> bool:
+        """Whether no further step is made towards what is painted."""
+        return not self.solving or self.run.finished or len(self.run.history) >= gauss_newton.ITERATIONS
+
     def _step(self):
         began = time.perf_counter()
         self.point = gauss_newton.descended(self.problem, self.run, self.point)
@@ -213,8 +224,46 @@ class Session:
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._show("transport")
         self.tell_state()
-        if self.run.finished or len(self.run.history) >= gauss_newton.ITERATIONS:
+        if self.converged:
             self._tell_lights()
+
+    def _search(self):
+        """Ask whether another start leads further, as the pipeline does; a newer edit ends it.
+
+        A light that jumps, or that is added, is where no small step leads.
+        """
+        self._tell_doing("looking for other lights")
+        layers, params = self.problem.layers, self.problem.params(self.still)
+        asked = layers, params, self._watched, self.base, self.target, self.weight, self.origin
+        starts = [painted_change.start(*asked, bold=bold)[0] for bold in (False, True)]
+        if layers.separation.lights:
+            starts.append(painted_change.softened(layers, params)[0])
+        best = gauss_newton.solve(self.problem, {}, iterations=0, run=self.run, trial=True, sparing=False)
+        least, found = best.loss - LIKELIER, None
+        for start in [params, *starts]:
+            tried = self._tried(start)
+            if tried is not None and tried.loss < least:
+                least, found = tried.loss, tried.run
+        self.searched = True
+        if found is not None:
+            self.run, self.start = found, found.start
+            self._rendered = None
+        self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns
+        self._show("transport")
+        self._tell_lights()
+        self.tell_state()
+
+    def _tried(self, start):
+        """Return the solution after a few steps from a start; None where it cannot begin."""
+        more = {"iterations": NEWTON_TRIAL, "after_step": self._unless_newer, "trial": True, "sparing": False}
+        try:
+            return gauss_newton.solve(self.problem, start, **more)
+        except NumericalError:
+            return None
+
+    def _unless_newer(self, *_):
+        if self.newer():
+            raise SupersededError
 
     def _render(self, passes):
         """Add a pass to Mitsuba's rendering of the map that is shown; False where it has so many."""
@@ -238,6 +287,7 @@ class Session:
 
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
+        self._tell_doing("asking what any light could do")
         asked = self.problem.envmap, self.target, self.weight, self.rows, None
         self.reach = feasibility.reachable(self._watched, *asked, self.coverage[..., 0], self.base)
         self.status["reachable"] = self.reach.share
@@ -265,8 +315,9 @@ class Session:
         self.tell.frame("render", source, rendering)
         self.tell.frame("map", source, shown)
         if not self._dragged:
-            off = [display_curve.to_display(tensor(one)).numpy() for one in (self.target, self.point.rendering)]
-            self.tell.frame("difference", source, off[0] - off[1])
+            both = self.target, self.point.rendering
+            target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
+            self.tell.frame("difference", source, target - solution)
 
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
@@ -290,13 +341,16 @@ class Session:
             found.append({"azimuth": azimuth, "elevation": elevation, "flux": flux.tolist()})
         self.tell.say({"type": "lights", "own": own, "found": found})
 
-    def tell_state(self):
-        busy = self.solving and not self._dragged and not self.run.finished
-        busy = busy and len(self.run.history) < gauss_newton.ITERATIONS
+    def tell_state(self) -> None:
+        """Say whether there is a solution yet, and how good it is."""
+        busy = not self._dragged and not self.converged
         rendered = self._rendered[0] * PASS if self._rendered else 0
         self.tell.say(
             {"type": "status", "state": "solving" if busy else "done", "samples": rendered, **self.status}
         )
+
+    def _tell_doing(self, text):
+        self.tell.say({"type": "doing", "text": text})
 
     def _stage(self, text):
         self.tell.say({"type": "status", "state": "loading", "text": text})
@@ -307,7 +361,7 @@ class Session:
     # ---- lights by the rendering ---------------------------------------------------------------------------
 
     def pick(self, asked: Pick) -> None:
-        """Tell which light a pixel is lit by most, or where a light must go for its highlight to lie there."""
+        """Tell which light a pixel is lit by most, or where one must go for its highlight to lie there."""
         height, width = self.base.shape[:2]
         row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
         patch = np.zeros((height, width, 3), np.float32)

@@ -58,9 +58,10 @@ const connection = new Connection({
     if (frame.kind === "before") { displays.render.compare(frame); return; }
     if (frame.kind === "render") {
       const box = $("render-stack");
-      box.style.aspectRatio = `${frame.width} / ${frame.height}`;
+      box.parentElement.style.setProperty("--aspect", frame.width / frame.height);
       $("badge").textContent = NAMES[frame.source];
     }
+    if (frame.kind !== "map") displays[frame.kind].canvas.style.setProperty("aspect-ratio", frame.width / frame.height);
     displays[frame.kind].show(frame);
   },
   message(message) { RECEIVED[message.type]?.(message); },
@@ -103,6 +104,7 @@ const RECEIVED = {
     if (message.client === client && message.number) note({ status: message.number, state: message.state });
     state(message.state, message.text ?? told(message));
   },
+  doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },
   progress(message) {
     $("progress").hidden = false;
     $("progress").max = Math.max(1, message.total);

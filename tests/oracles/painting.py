@@ -50,6 +50,7 @@ def served(name, **more):
         server.worker.join(120)
         server.socket.close()
         assert not thread.is_alive() and not server.worker.is_alive()
+        assert not server.worker.faults, server.worker.faults
 
 
 def until(true, seconds=120):

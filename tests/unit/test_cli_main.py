@@ -79,7 +79,8 @@ def test_an_unknown_command(wrong, says, capsys):
         cli.main([wrong])
     out, err = capsys.readouterr()
     assert stop.value.code == 2 and out == ""
-    assert f"got command '{wrong}', expected one of run, fit, init, doctor, cache; " in err and says in err
+    known = "run, paint, fit, init, doctor, cache"
+    assert f"got command '{wrong}', expected one of {known}; " in err and says in err
 
 
 def test_no_command_shows_the_help(capsys):

@@ -33,7 +33,7 @@ MOST_CLIENTS = 8
 LARGEST_MAP = 1 << 30
 """Bytes of a map that is dropped on the page."""
 MAPS = "maps"
-"""Folder, in the working folder of the project, that dropped maps are put in."""
+"""Folder, in the working folder, that maps are put in which are dropped on the start page."""
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|pfm|png|jpg|jpeg)", re.IGNORECASE)
 _SAFE = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -194,6 +194,8 @@ class Server:
     async def _map(self, request: Request) -> Response:
         if not self._known(request) or request.headers.get("origin") not in self.origins:
             return PlainTextResponse("not from the page", 403, _SAFE)
+        if self.worker.session is not None:
+            return PlainTextResponse("a painting is open: maps are taken before that", 409, _SAFE)
         name = request.path_params["name"]
         if not _MAP_NAME.fullmatch(name):
             wanted = "expected a plain name that ends in .exr, .hdr, .pfm, .png or .jpg"

@@ -75,7 +75,7 @@ class Session:
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
         self.project, self.tell, self.newer = project, tell, newer
-        self.document, self.saved_as = Document(), None
+        self.document, self.resting = Document(), False
         settings = project.settings
         self._stage("loading the scene")
         self.lit = inputs.load_scene(settings.scene, project.base)
@@ -104,7 +104,7 @@ class Session:
         began = time.perf_counter()
         before, self.document = self.document, edit.document
         moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
-        self.phase, self._rendered = edit.phase, None
+        self.phase, self._rendered, self.resting = edit.phase, None, False
         self.status = {"reachable": None, "iterations": 0, "number": edit.number, "client": edit.client}
         if edit.phase == "dragging":
             self._drag()
@@ -114,7 +114,6 @@ class Session:
             self._paint()
         if edit.phase == "done":
             self.project.keep(self.document)
-            self.saved_as = None
         self._show("transport")
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self.tell_state()
@@ -192,7 +191,7 @@ class Session:
 
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
-        if self._dragged:
+        if self._dragged or self.resting:
             return False
         if not self.converged:
             self._step()
@@ -238,7 +237,8 @@ class Session:
         starts = [painted_change.start(*asked, bold=bold)[0] for bold in (False, True)]
         if layers.separation.lights:
             starts.append(painted_change.softened(layers, params)[0])
-        best = gauss_newton.solve(self.problem, {}, iterations=0, run=self.run, trial=True, sparing=False)
+        more = {"iterations": 0, "run": self.run, "trial": True, "sparing": False}
+        best = gauss_newton.solve(self.problem, params, **more)
         least, found = best.loss - LIKELIER, None
         for start in [params, *starts]:
             tried = self._tried(start)
@@ -321,6 +321,7 @@ class Session:
 
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
+        self.resting = False
         self.tell.frame("before", "transport", self.before)
         self._show("transport")
         self._rendered = None
@@ -423,7 +424,7 @@ class Session:
             warnings = run_folder.write(settings, folder, result, import_s, project.base)
         self.tell.frame("render", "saved", result.renders["edited"])
         self.tell.frame("map", "saved", result.maps["edited"])
-        self.saved_as, self._rendered = folder, (PASSES, 0.0)
+        self.resting = True  # what is shown is what was saved
         files = [name for name in output_folder.RESULTS if (folder / name).exists()]
         self.tell.say({"type": "saved", "folder": str(folder), "files": files, "warnings": warnings})
         return warnings

@@ -36,6 +36,7 @@ class Worker(threading.Thread):
         self._waiting: dict[type, object] = {}
         self._lock = threading.Condition()
         self._over = False
+        self.faults: list[Exception] = []  # of ours, no user's mistakes
 
     def post(self, request) -> None:
         """Let a request wait, in the place of an earlier one of its kind."""
@@ -128,5 +129,6 @@ class Worker(threading.Thread):
             self.tell.say({"type": "error", "text": str(error)})
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
+            self.faults.append(error)
             self.tell.say({"type": "error", "text": f"{type(error).__name__}: {error}"})
         return None

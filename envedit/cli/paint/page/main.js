@@ -18,7 +18,7 @@ const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
 window.envedit = { log };
 
-let client = "", sent = 0, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush", dirty = false;
+let client = "", sent = 0, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
 
@@ -41,7 +41,6 @@ function flush() {
   const message = { type: "document", number: ++sent, ...waiting };
   if (!connection.send(message)) return; // sent again when the server is back
   note({ edit: sent, phase: waiting.phase });
-  if (waiting.phase === "done") dirty = true;
   waiting = null;
 }
 
@@ -93,13 +92,14 @@ const RECEIVED = {
     }
     opened = true;
     if (mine) flush();
-    say(message.again && !message.notes.length ? `Goes on from ${message.folder}/painted.toml` : message.notes.join("; "));
+    say(message.again && !message.notes.length ? `Goes on from ${message.folder}/painted.toml` : message.notes.join("; "), true);
     refresh();
   },
   document(message) { history.follow({ ...EMPTY, ...message.document }); refresh(); },
   lights(message) { lights.set(message); },
   status(message) {
     last = message;
+    $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
     if (message.client === client && message.number) note({ status: message.number, state: message.state });
     state(message.state, message.text ?? told(message));
@@ -112,7 +112,7 @@ const RECEIVED = {
   },
   saving(message) { state("saving", `Saving: ${message.text}`); },
   saved(message) {
-    dirty = false;
+    say("", true);
     $("progress").hidden = true;
     const links = message.files.filter((name) => ["report.html", "edited.exr", "lights.json"].includes(name));
     $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...message.warnings.map((line) => `${line}. `));
@@ -138,7 +138,10 @@ function state(name, text) {
   document.querySelector(".group").toggleAttribute("inert", name === "saving");
 }
 
-function say(text) { $("message").textContent = text ?? ""; }
+function say(text, good = false) {
+  $("message").textContent = text ?? "";
+  $("message").classList.toggle("good", good);
+}
 
 function list(holder, entries) {
   holder.replaceChildren(...entries.map(([name, text]) => {
@@ -221,7 +224,7 @@ function choose(name, value) {
     label.hidden = wanted[0] === "size" ? shape !== "brush" && shape !== "line" : !wanted.includes(tool);
   }
   $("shapes").hidden = $("options").hidden = tool === "move";
-  strokes.cancelled?.();
+  strokes.reset();
   strokes.draw();
 }
 

@@ -82,8 +82,10 @@ class Hub(Tell):
         self._send(f"frame {kind}", protocol.frame(kind, source, self.count, image))
 
     def say(self, message):
-        """Send a message; of each type the latest."""
+        """Send a message, of each type the latest; a status says which frame it is about."""
         kind = message["type"]
+        if kind == "status":
+            message = {**message, "frame": self.count}
         if kind in _KEPT:
             self.last[kind] = message
         if kind in ("opened", "status"):  # what went wrong before is over

@@ -16,9 +16,9 @@ const displays = {
 };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
-window.envedit = { log };
+window.envedit = { log, displays };
 
-let client = "", sent = 0, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
+let client = "", sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
 
@@ -29,6 +29,7 @@ const history = new History((phase, document) => {
 
 function send(document, phase) {
   waiting = { document, phase };
+  since ??= performance.now();
   if (phase === "done") flush();
   else if (!send.due) {
     send.due = true;
@@ -40,7 +41,8 @@ function flush() {
   if (!waiting || !opened) return;
   const message = { type: "document", number: ++sent, ...waiting };
   if (!connection.send(message)) return; // sent again when the server is back
-  note({ edit: sent, phase: waiting.phase });
+  note({ edit: sent, phase: waiting.phase, since });
+  since = null;
   waiting = null;
 }
 
@@ -101,7 +103,7 @@ const RECEIVED = {
     last = message;
     $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
-    if (message.client === client && message.number) note({ status: message.number, state: message.state });
+    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations });
     state(message.state, message.text ?? told(message));
   },
   doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },

@@ -4,12 +4,14 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.oracles.painting import SMALL, served, until
@@ -42,11 +44,20 @@ def connected(server, **more):
 def heard(socket, kind, wanted=lambda message: True):
     """Return the next message of a kind."""
     while True:
-        received = socket.recv(timeout=120)
+        received = socket.recv(timeout=60)
         if isinstance(received, str):
             message = json.loads(received)
             if message["type"] == kind and wanted(message):
                 return message
+
+
+def shown(socket):
+    """Return the next picture of T E, (h, w, 3)."""
+    while True:
+        received = socket.recv(timeout=60)
+        if isinstance(received, bytes) and received[4:6] == b"\0\0":
+            width, height = struct.unpack("<HH", received[6:10])
+            return np.frombuffer(received[16:], "<f2").reshape(height, width, 3).astype(np.float32)
 
 
 def asked(address, **more):
@@ -140,6 +151,28 @@ def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):
             found.append(heard(page, "picked")["azimuth"])
         turned = (found[1] - found[0] + 180) % 360 - 180
         assert abs(turned) > 10, found
+
+
+def test_a_shadow_that_is_dragged_falls_where_the_pointer_is(server):
+    def at(picture, x, y):
+        return picture[round(y * 48) - 1 : round(y * 48) + 2, round(x * 48) - 1 : round(x * 48) + 2].mean()
+
+    with connected(server) as page:
+        bare = shown(page)
+        page.send(json.dumps({"type": "pick", "x": 0.25, "y": 0.78, "number": 1}))
+        picked = heard(page, "picked")
+        assert (picked["light"], picked["shadow"]) == (0, True)
+        page.send(json.dumps({"type": "pick", "x": 0.8, "y": 0.7, "light": 0, "shadow": True, "number": 2}))
+        to = heard(page, "picked")
+        light = {"light": 1, "azimuth": to["azimuth"], "elevation": to["elevation"]}
+        page.send(json.dumps({"type": "document", "number": 9, "document": {"lights": [light]}}))
+        heard(page, "status", lambda m: m.get("number") == 9)
+        page.send(json.dumps({"type": "document", "number": 10, "document": {"lights": [light]}}))
+        moved = shown(page)
+        page.send(json.dumps({"type": "document", "number": 11, "document": {}}))
+        heard(page, "status", lambda m: m.get("number") == 11)
+    assert at(moved, 0.8, 0.7) < 0.6 * at(bare, 0.8, 0.7)
+    assert at(moved, 0.25, 0.78) > 1.5 * at(bare, 0.25, 0.78)
 
 
 def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, monkeypatch):

@@ -28,20 +28,25 @@ from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers, unseen_kept
-from envedit.representations.layers.placed_lights import PlacedLights, angles
+from envedit.representations.layers.placed_lights import PlacedLights, angles, direction
 from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.targets import strokes
 from envedit.targets.target import pixel_weight
 
-DRAGGED_COLUMNS, COLUMNS = 12, 32
+DRAGGED_COLUMNS, COLUMNS = 8, 32
 """Most exact columns of T traced in one frame while a light is dragged, and otherwise."""
+QUICK_SPP = 32
+"""Paths a pixel of the transport by which it is told what a dragged light changes: an eighth of the texels'
+weights to read in every frame, and its errors cancel where nothing changes."""
 SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
 RENDER_SEED = 9_000_021
 """Added to the run's seed."""
+BLOCKED = 0.1
+"""Share of the sky's median, of a pixel's row of T per solid angle, below which a direction is blocked."""
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
@@ -91,7 +96,10 @@ class Session:
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
-        self._watched = _Watched(self.transport, newer)
+        self._watched, self._quick = _Watched(self.transport, newer), self.transport
+        if self.transport.spp > QUICK_SPP:
+            fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
+            self._quick = renderers.trace(fewer, self.lit, self.map.shape[:2], self._progress)
         self._sharp = None
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
@@ -147,11 +155,15 @@ class Session:
 
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
+        if not self._dragged:
+            self._quick.resolve(self.point.edited, limit=COLUMNS)
+            self._still_quick = self._quick.apply(tensor(self.point.edited)).numpy()
         self._dragged, self.solving = True, False
         origin = self._by_hand(self.document)
         found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
-        self.transport.resolve(found, limit=DRAGGED_COLUMNS)
-        self._preview = found, self.transport.apply(tensor(found)).numpy()
+        self._quick.resolve(found, limit=DRAGGED_COLUMNS)
+        changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
+        self._preview = found, np.maximum(self.point.rendering + changed, 0)
 
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
@@ -311,7 +323,8 @@ class Session:
         shown = self._adjusted(edited)
         rendering = self._preview[1] if self._dragged else self.point.rendering
         if shown is not edited:
-            rendering = self.transport.apply(tensor(shown)).numpy()
+            by = self._quick if self._dragged else self.transport
+            rendering = by.apply(tensor(shown)).numpy()
         self.tell.frame("render", source, rendering)
         self.tell.frame("map", source, shown)
         if not self._dragged:
@@ -362,25 +375,47 @@ class Session:
     # ---- lights by the rendering ---------------------------------------------------------------------------
 
     def pick(self, asked: Pick) -> None:
-        """Tell which light a pixel is lit by most, or where one must go for its highlight to lie there."""
+        """Tell which light's shadow or highlight a pixel is in, or where that light must go for it to be.
+
+        By the pixel's row of T, per solid angle: a highlight is where it is largest. A shadow is in every
+        direction of the sky from which next to nothing comes; the one nearest to the light is taken.
+        """
         height, width = self.base.shape[:2]
         row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
         patch = np.zeros((height, width, 3), np.float32)
         patch[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
         seen = self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
-        answer = {"type": "picked", "number": asked.number, "client": asked.client}
+        omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
+        toward = latlong.directions(*seen.shape)
+        density = _smooth(seen / np.maximum(omega, 1e-12))
+        sky = toward[..., 1] > 0
+        dark = sky & (density < BLOCKED * np.median(density[sky]))
+        lights, degrees = self._directions(), self.document.rotate_degrees
+        answer = {"type": "picked", "number": asked.number, "client": asked.client, "shadow": asked.shadow}
         if asked.light < 0:
-            answer["light"] = self._lit_by(seen)
-        else:
-            omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
-            toward = latlong.directions(*seen.shape)
-            best = _smooth(seen / np.maximum(omega, 1e-12))
-            best[self.rows.stop :] = 0
-            i = int(best.argmax())
-            azimuth, elevation = angles(toward.reshape(-1, 3)[i])
-            answer |= {"light": asked.light, "azimuth": (azimuth + self.document.rotate_degrees) % 360}
-            answer["elevation"] = elevation
-        self.tell.say(answer)
+            if lights:  # the first has most flux
+                at = latlong.texel_position(lights[0], *seen.shape)
+                answer["shadow"] = bool(dark[round(float(at[0])), round(float(at[1])) % seen.shape[1]])
+            answer["light"] = 0 if answer["shadow"] else self._lit_by(seen)
+            self.tell.say(answer)
+            return
+        if asked.light >= len(lights) or (asked.shadow and not dark.any()):
+            self.tell.say(answer | {"light": -1, "nowhere": True})
+            return
+        score = np.where(dark, toward @ lights[asked.light], -2) if asked.shadow else density
+        azimuth, elevation = angles(toward.reshape(-1, 3)[int(score[: self.rows.stop].argmax())])
+        place = {"azimuth": (azimuth + degrees) % 360, "elevation": elevation}
+        self.tell.say(answer | {"light": asked.light} | place)
+
+    def _directions(self):
+        """List where the document's lights are on the turned map, (3,) each, the map's own first."""
+        own, degrees = [], self.document.rotate_degrees
+        for i, light in enumerate(self.placed.lights):
+            entry = next((one for one in self.document.lights if one.get("light") == i + 1), {})
+            moved = "azimuth" in entry
+            own.append((entry["azimuth"], entry["elevation"]) if moved else angles(light.direction))
+        own += [(one["azimuth"], one["elevation"]) for one in self.document.lights if "light" not in one]
+        return [direction(azimuth - degrees, elevation) for azimuth, elevation in own]
 
     def _lit_by(self, seen):
         """Return the index of the light of the document that adds most at a pixel; -1 without lights."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import traceback
+from pathlib import Path
 
 from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Open, Pick, Save
@@ -107,7 +108,7 @@ class Worker(threading.Thread):
         self.tell.say(
             {
                 "type": "opened",
-                "title": f"{self.session.lit.path.stem}, {opened.settings.input.envmap}",
+                "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
                 "folder": str(opened.folder),
                 "again": opened.again,
                 "document": opened.document.plain(),

@@ -110,8 +110,7 @@ class Edit:
 class Pick:
     """A place on the rendering (shares of width and height) that a light is dragged from, or to.
 
-    ``light`` is the index of the light that follows, the map's own first, then those added; -1: tell which.
-    ``shadow``: its shadow is dragged, and no highlight.
+    ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: tell which.
     """
 
     x: float
@@ -119,7 +118,6 @@ class Pick:
     light: int = -1
     number: int = 0
     client: str = ""
-    shadow: bool = False
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,7 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
         if kind == "pick":
             at = (number(0, 1)(found.get(name)) for name in "xy")
             light = int(number(-1, 100)(found.get("light", -1)))
-            return Pick(*at, light, _count(found.get("number", 0)), client, found.get("shadow") is True)
+            return Pick(*at, light, _count(found.get("number", 0)), client)
         if kind == "open":
             name, envmap = string(found.get("name")), string(found.get("envmap", ""))
             if not name:

@@ -28,7 +28,7 @@ from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers, unseen_kept
-from envedit.representations.layers.placed_lights import PlacedLights, angles, direction
+from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.targets import strokes
@@ -45,8 +45,6 @@ PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
 RENDER_SEED = 9_000_021
 """Added to the run's seed."""
-BLOCKED = 0.1
-"""Share of the sky's median, of a pixel's row of T per solid angle, below which a direction is blocked."""
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
@@ -80,7 +78,8 @@ class Session:
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
         self.project, self.tell, self.newer = project, tell, newer
-        self.document, self.resting = Document(), False
+        self.document, self.resting, self.phase = Document(), False, "done"
+        self.status = {"reachable": None, "iterations": 0, "number": 0, "client": ""}
         settings = project.settings
         self._stage("loading the scene")
         self.lit = inputs.load_scene(settings.scene, project.base)
@@ -128,7 +127,7 @@ class Session:
 
     def _aim(self, document):
         """Take lights and turn of a document for the map that is painted on."""
-        self.document, self._dragged, self.phase = document, False, "done"
+        self.document, self._dragged = document, False
         self.origin = self._by_hand(document)
         layers = Layers((self.rows.start, len(self.origin)), horizon=self._horizon())
         params = layers.encode(self.origin[self.rows])
@@ -139,7 +138,6 @@ class Session:
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)
         self._painted: tuple[list, strokes.Painted] | None = None
-        self.status = {"reachable": None, "iterations": 0, "number": 0, "client": ""}
         self._rendered = None
         self._paint()
         self._tell_lights()
@@ -375,47 +373,25 @@ class Session:
     # ---- lights by the rendering ---------------------------------------------------------------------------
 
     def pick(self, asked: Pick) -> None:
-        """Tell which light's shadow or highlight a pixel is in, or where that light must go for it to be.
-
-        By the pixel's row of T, per solid angle: a highlight is where it is largest. A shadow is in every
-        direction of the sky from which next to nothing comes; the one nearest to the light is taken.
-        """
+        """Tell which light a pixel is lit by most, or where one must go for its highlight to lie there."""
         height, width = self.base.shape[:2]
         row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
         patch = np.zeros((height, width, 3), np.float32)
         patch[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
         seen = self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
-        omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
-        toward = latlong.directions(*seen.shape)
-        density = _smooth(seen / np.maximum(omega, 1e-12))
-        sky = toward[..., 1] > 0
-        dark = sky & (density < BLOCKED * np.median(density[sky]))
-        lights, degrees = self._directions(), self.document.rotate_degrees
-        answer = {"type": "picked", "number": asked.number, "client": asked.client, "shadow": asked.shadow}
+        answer = {"type": "picked", "number": asked.number, "client": asked.client}
         if asked.light < 0:
-            if lights:  # the first has most flux
-                at = latlong.texel_position(lights[0], *seen.shape)
-                answer["shadow"] = bool(dark[round(float(at[0])), round(float(at[1])) % seen.shape[1]])
-            answer["light"] = 0 if answer["shadow"] else self._lit_by(seen)
-            self.tell.say(answer)
-            return
-        if asked.light >= len(lights) or (asked.shadow and not dark.any()):
-            self.tell.say(answer | {"light": -1, "nowhere": True})
-            return
-        score = np.where(dark, toward @ lights[asked.light], -2) if asked.shadow else density
-        azimuth, elevation = angles(toward.reshape(-1, 3)[int(score[: self.rows.stop].argmax())])
-        place = {"azimuth": (azimuth + degrees) % 360, "elevation": elevation}
-        self.tell.say(answer | {"light": asked.light} | place)
-
-    def _directions(self):
-        """List where the document's lights are on the turned map, (3,) each, the map's own first."""
-        own, degrees = [], self.document.rotate_degrees
-        for i, light in enumerate(self.placed.lights):
-            entry = next((one for one in self.document.lights if one.get("light") == i + 1), {})
-            moved = "azimuth" in entry
-            own.append((entry["azimuth"], entry["elevation"]) if moved else angles(light.direction))
-        own += [(one["azimuth"], one["elevation"]) for one in self.document.lights if "light" not in one]
-        return [direction(azimuth - degrees, elevation) for azimuth, elevation in own]
+            answer["light"] = self._lit_by(seen)
+        else:
+            omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
+            toward = latlong.directions(*seen.shape)
+            best = _smooth(seen / np.maximum(omega, 1e-12))
+            best[self.rows.stop :] = 0
+            i = int(best.argmax())
+            azimuth, elevation = angles(toward.reshape(-1, 3)[i])
+            answer |= {"light": asked.light, "azimuth": (azimuth + self.document.rotate_degrees) % 360}
+            answer["elevation"] = elevation
+        self.tell.say(answer)
 
     def _lit_by(self, seen):
         """Return the index of the light of the document that adds most at a pixel; -1 without lights."""

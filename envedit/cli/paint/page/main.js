@@ -174,19 +174,18 @@ const strokes = new Strokes($("overlay"), () => ({
   drag(phase, x, y) { pick(phase, x, y); },
 });
 
-// A highlight or a shadow is dragged: first ask whose it is, then where that light must go.
-let picked = -1, shadow = false, asked = 0, ended = false;
+// A highlight is dragged: first ask whose it is, then where that light must go.
+let picked = -1, asked = 0, ended = false;
 function pick(phase, x, y) {
   if (phase === "start") { picked = -1; ended = false; }
   if (phase === "end") { ended = true; setTimeout(() => { if (ended) lights.commit(); }, 300); return; }
   if (phase === "move" && picked < 0) return;
-  connection.send({ type: "pick", x, y, light: picked, shadow: picked >= 0 && shadow, number: ++asked });
+  connection.send({ type: "pick", x, y, light: picked, number: ++asked });
 }
 RECEIVED.picked = (message) => {
-  if (message.client !== client || message.nowhere) return;
+  if (message.client !== client) return;
   if (message.azimuth === undefined) {
     picked = message.light;
-    shadow = message.shadow;
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
     else lights.choose(picked);
   } else if (!ended || message.number === asked) {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.core.primaries import Chromaticities
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.images import analytic_sky, images
+from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene
 
 SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
@@ -43,6 +44,8 @@ class InputMap:
         What was repaired, or is odd.
     chromaticities : tuple, optional
         Colour space of the file (:mod:`.primaries`); None: Rec. 709.
+    placed : PlacedLights, optional
+        The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed.
     """
 
     source: str
@@ -51,6 +54,7 @@ class InputMap:
     size: tuple[int, int]
     warnings: list[str]
     chromaticities: Chromaticities | None = None
+    placed: PlacedLights | None = None
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -168,8 +172,23 @@ def read_map(settings: config.Input, lit: scene.Scene | None, width: int | None 
     if source == SUNSKY:
         width = width or settings.width
         sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
-        return InputMap(source, sky, scale, (width, width // 2), [])
-    return _read(source, width, settings.repair, scale)
+        return by_hand(settings, InputMap(source, sky, scale, (width, width // 2), []))
+    return by_hand(settings, _read(source, width, settings.repair, scale))
+
+
+def by_hand(settings: config.Input, given: InputMap) -> InputMap:
+    """Return a map with its lights placed and turned as ``lights`` and ``rotate_degrees`` ask."""
+    if not settings.lights and not settings.rotate_degrees:
+        return given
+    placed, found, warnings = None, given, list(given.warnings)
+    if settings.lights:
+        placed = PlacedLights(given.radiance, settings.horizon)
+        if lacking := missing(settings.lights, len(placed.lights)):
+            had = f"the map has {len(placed.lights)} lights"
+            warnings.append(f"input.lights: {had}, none with number {lacking[0]}: nothing is done to it")
+        found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
+    turned = latlong.rotate(found.stored, settings.rotate_degrees)
+    return replace(given, stored=turned, warnings=warnings, placed=placed)
 
 
 def _read(source, width, repair, scale):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.export import adjustments, full_resolution
 from envedit.representations import Representation
+from envedit.representations.layers import placed_lights
 from envedit.representations.layers.separation import Separation
 from envedit.scene.scene import View
 from envedit.solve.feasibility import Reach
@@ -118,7 +119,7 @@ def at_full_resolution(settings: config.Config, result: Result) -> np.ndarray | 
     """
     if result.given.size[0] <= settings.input.width:
         return None
-    full, found = result.given.at_file_size(settings.input.repair), result.found
+    full, found = _by_hand(settings.input, result.given), result.found
     adjusted = settings.lights, settings.output, full.scale
     if found is None:
         return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
@@ -131,3 +132,19 @@ def at_full_resolution(settings: config.Config, result: Result) -> np.ndarray | 
         found.representation, found.params, before, edited, source, rows, found.free
     )
     return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)
+
+
+def _by_hand(settings, given):
+    """Read a map at its file's size, and place and turn its lights as it was done at working size."""
+    full = given.at_file_size(settings.repair)
+    if given.placed is not None:
+        own = given.placed
+        before, rows = own.envmap, (0, len(own.envmap))
+        moved = full.radiance
+        if any("light" in light for light in settings.lights):
+            moved = full_resolution.carry(
+                own.layers, own.params(settings.lights), before, before, moved, rows
+            )
+        moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
+        full = replace(full, stored=full.as_stored(moved))
+    return replace(full, stored=latlong.rotate(full.stored, settings.rotate_degrees))

@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, fit, init, doctor, cache."""
+"""The command ``envedit``: run, paint, fit, init, doctor, cache."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from envedit.cli.streams import steady
 
 COMMANDS = {
     "run": "carry out the edit that a configuration describes",
+    "paint": "paint on the rendering in the browser, while the map follows",
     "fit": "fit a SIREN to a map, without an edit",
     "init": "write a commented configuration to start from",
     "doctor": "check whether this machine can run envedit",

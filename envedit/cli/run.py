@@ -69,7 +69,7 @@ def _progress(arguments):
     return JsonProgress() if wanted else Progress(quiet=arguments.quiet)
 
 
-def _load(name, preset, overrides):
+def load(name, preset, overrides):
     """Read a configuration, given as a path or as the name of a shipped one.
 
     Returns
@@ -237,7 +237,7 @@ def _run(arguments, start):
     overrides = [*_quick(arguments), *arguments.overrides]
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
-    settings, arguments.config, arguments.base = _load(arguments.config, arguments.preset, overrides)
+    settings, arguments.config, arguments.base = load(arguments.config, arguments.preset, overrides)
     allowed = None if arguments.budget is None else _seconds(arguments.budget)
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from envedit.config import presets
+from envedit.config.light_schema import light_list
 from envedit.config.stroke_schema import stroke_list
 from envedit.config.validators import (
     MOST_DIM,
@@ -80,6 +81,12 @@ class Input(Table):
     azimuth: float = _key(90.0, number(-360, 360), "sunsky: azimuth of the sun, degrees")
     elevation: float = _key(35.0, number(0, 90), "sunsky: elevation of the sun above the horizon, degrees")
     turbidity: float = _key(3.0, number(1, 10), "sunsky: haziness of the air, 1 (pure) to 10")
+    rotate_degrees: float = _key(
+        0.0, number(-360, 360), "turn of the map about the vertical before the edit, as target.rotate_degrees"
+    )
+    lights: tuple[dict, ...] = _key(
+        (), light_list, "lights moved, changed or added by hand, before turn and edit: list of tables"
+    )
     repair: bool = _key(False, boolean, "replace NaN and Inf by their neighbours instead of refusing the map")
 
     def _check_together(self) -> None:

@@ -9,40 +9,28 @@ import difflib
 from collections.abc import Callable
 from typing import Any
 
-from envedit.config.validators import WantedError, choice, named, number, show, view
+from envedit.config.validators import WantedError, choice, named, number, numbers, show, view
 from envedit.core.errors import ConfigError
-
-
-def _numbers(*checks: Callable) -> Callable:
-    """Make a check that accepts a list with one value for each of some checks."""
-
-    def check(value: Any) -> list[float]:
-        if not isinstance(value, list | tuple) or len(value) != len(checks):
-            raise WantedError(f"a list of {len(checks)} numbers")
-        return [check(v) for check, v in zip(checks, value, strict=True)]
-
-    return check
-
 
 _FURTHEST = 1e6
 _coordinate = number(-_FURTHEST, _FURTHEST)
 _length = number(0, _FURTHEST, positive=True)
-_point = _numbers(_coordinate, _coordinate)
-_color = _numbers(*3 * [number(0, 1e6)])
+_point = numbers(_coordinate, _coordinate)
+_color = numbers(*3 * [number(0, 1e6)])
 
 
 def _ellipse(value: Any) -> list[float]:
     fields = (_coordinate, _coordinate, _length, _length, number(-360, 360))
     if not isinstance(value, list | tuple) or len(value) not in (4, 5):
         raise WantedError("[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]")
-    return _numbers(*fields[: len(value)])(value)
+    return numbers(*fields[: len(value)])(value)
 
 
 def _rectangle(value: Any) -> list[float]:
     wanted = "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
     if not isinstance(value, list | tuple) or len(value) != 4:
         raise WantedError(wanted)
-    x0, y0, x1, y1 = _numbers(*4 * [_coordinate])(value)
+    x0, y0, x1, y1 = numbers(*4 * [_coordinate])(value)
     if x1 <= x0 or y1 <= y0:
         raise WantedError(wanted)
     return [x0, y0, x1, y1]
@@ -58,6 +46,7 @@ STROKES: dict[str, dict[str, tuple[Any, Callable]]] = {
     "temperature": {"kelvin": (None, number(2000, 25000))},
     "contrast": {"amount": (1.5, number(0, 100))},
     "blur": {"radius": (None, _length)},
+    "hold": {},
 }
 """What a stroke does, and the keys that belong to it: default (None: it must be given) and check."""
 

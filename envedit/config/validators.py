@@ -97,6 +97,17 @@ def number(low: float, high: float = math.inf, positive: bool = False) -> Callab
     return check
 
 
+def numbers(*checks: Callable) -> Callable:
+    """Make a check that accepts a list with one value for each of some checks."""
+
+    def check(value: Any) -> list[float]:
+        if not isinstance(value, list | tuple) or len(value) != len(checks):
+            raise WantedError(f"a list of {len(checks)} numbers")
+        return [check(v) for check, v in zip(checks, value, strict=True)]
+
+    return check
+
+
 def kelvin(value: Any) -> float:
     """Accept a colour temperature for which there are chromaticities, or 0."""
     try:

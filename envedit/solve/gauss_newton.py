@@ -185,6 +185,21 @@ def solve(
     return Solution(problem.params(run.state), run.history, loss, whole, posterior, note)
 
 
+def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, steps: int = 1) -> Point:
+    """Make a few steps from where a run is, without lights that are added; the run goes along.
+
+    Parameters
+    ----------
+    problem, run, sigma
+        As of :func:`solve`.
+    point : Point
+        Of the run's state.
+    steps : int
+        Most steps; the run may be finished before.
+    """
+    return _Search(problem, sigma, steps, 0, None)._descended(run, point, len(run.history) + steps, None)
+
+
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
     noise = problem.noise(point.residual, sigma)

@@ -205,6 +205,19 @@ class Problem:
         self._precisions = self.prior.gain_precisions(self.sizes)
         self._linear: tuple | None = None
 
+    def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:
+        """Take another target, with its weights; returns a point with its residual from that target.
+
+        What was linearised at the point stays: it does not depend on the target.
+        """
+        self.target = display_curve.to_display(tensor(picture)).numpy()
+        self.weight = np.ones((*picture.shape[:2], 1), np.float32) if weight is None else np.float32(weight)
+        shown = display_curve.to_display(tensor(point.rendering)).numpy()
+        found = Point(point.state, point.edited, point.rendering, np.float64(shown) - self.target)
+        if self._linear is not None and self._linear[0] is point:
+            self._linear = found, *self._linear[1:]
+        return found
+
     # ---- unknowns ------------------------------------------------------------------------------------------
 
     def state(self, params: dict) -> dict[str, np.ndarray]:

@@ -24,6 +24,7 @@ With E linear radiance, c coverage times opacity, t = D(E) display values:
   does this, so a map can. k keeps the summed luminance of what is covered.
 - contrast: t + c (u - t), u = m + amount (t - m), with m the mean of t over what is covered, a channel at a
   time; u ends at black, and above display white nothing is made brighter than it was.
+- hold: nothing is changed; what is covered is asked to stay as it is, with the weight of what is painted.
 - blur: t + c (b - t), with b = t under a Gaussian of standard deviation ``radius`` that sees all of the
   picture.
 
@@ -318,6 +319,10 @@ def _blur(values, covered, stroke):
     return _blurred(_blurred(values, sigma, 0), sigma, 1)
 
 
+def _hold(values, covered, stroke):
+    return values
+
+
 _OPERATIONS: dict[str, tuple[Callable, bool]] = {
     "shadow": (_shadow, False),
     "light": (_light, False),
@@ -325,6 +330,7 @@ _OPERATIONS: dict[str, tuple[Callable, bool]] = {
     "temperature": (_temperature, False),
     "contrast": (_contrast, True),
     "blur": (_blur, True),
+    "hold": (_hold, False),
 }
 """What each type of stroke does, and whether it does it to display values."""
 

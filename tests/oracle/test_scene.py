@@ -84,8 +84,8 @@ def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, mon
     calls = []
     render = film.render
 
-    def record(built, integrator, spp, seed):
-        calls.append((spp, seed, result := render(built, integrator, spp, seed)))
+    def record(built, integrator, spp, seed, view=0):
+        calls.append((spp, seed, result := render(built, integrator, spp, seed, view=view)))
         return result
 
     monkeypatch.setattr(scene, "_PASS_SAMPLES", 4 * 16 * 12)

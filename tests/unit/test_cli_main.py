@@ -79,7 +79,8 @@ def test_an_unknown_command(wrong, says, capsys):
         cli.main([wrong])
     out, err = capsys.readouterr()
     assert stop.value.code == 2 and out == ""
-    assert f"got command '{wrong}', expected one of run, fit, init, doctor, cache; " in err and says in err
+    known = "run, paint, fit, init, doctor, cache"
+    assert f"got command '{wrong}', expected one of {known}; " in err and says in err
 
 
 def test_no_command_shows_the_help(capsys):
@@ -124,7 +125,7 @@ def here(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", shipped.configurations())
 def test_a_shipped_configuration_by_name(name, here):
-    settings, file, base = run._load(name, None, [])
+    settings, file, base = run.load(name, None, [])
     assert file == shipped.folder() / f"{name}.toml" and base == here
     stem = name.split("/")[-1]
     assert settings.output.dir == str(here / "runs" / stem)
@@ -133,7 +134,7 @@ def test_a_shipped_configuration_by_name(name, here):
 
 def test_paths_given_beside_a_name_start_from_the_working_folder(here):
     overrides = ["input.envmap=sky.hdr", "scene.file=my/scene.xml", "output.dir=elsewhere"]
-    settings, _, _ = run._load("quickstart", "paper", overrides)
+    settings, _, _ = run.load("quickstart", "paper", overrides)
     assert settings.input.envmap == str(here / "sky.hdr") and settings.scene.file == str(
         here / "my/scene.xml"
     )
@@ -142,16 +143,16 @@ def test_paths_given_beside_a_name_start_from_the_working_folder(here):
 
 def test_a_shipped_configuration_by_its_path_keeps_the_results_out_of_its_folder(here):
     file = shipped.folder() / "edits" / "warmer.toml"
-    settings, _, base = run._load(str(file), None, [])
+    settings, _, base = run.load(str(file), None, [])
     assert settings.output.dir == str(here / "runs" / "warmer") and base == file.parent
 
 
 def test_a_file_goes_before_a_shipped_name_and_a_folder_does_not(here):
     (here / "quickstart").mkdir()
-    assert run._load("quickstart", None, [])[1] == shipped.folder() / "quickstart.toml"
+    assert run.load("quickstart", None, [])[1] == shipped.folder() / "quickstart.toml"
     (here / "quickstart").rmdir()
     (here / "quickstart").write_text("seed = 7")
-    settings, file, base = run._load("quickstart", None, [])
+    settings, file, base = run.load("quickstart", None, [])
     assert settings.seed == 7 and file == Path("quickstart") and base == here
     assert settings.output.dir == str(here / "quickstart_out")
 

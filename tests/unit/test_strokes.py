@@ -22,6 +22,7 @@ ALL = [
     {"type": "temperature", "kelvin": 4000, "rectangle": BOX, "opacity": 0.7},
     {"type": "contrast", "rectangle": [0.1, 0.1, 0.9, 0.9]},
     {"type": "blur", "radius": 0.02, "ellipse": [0.5, 0.5, 0.3, 0.3, 30]},
+    {"type": "hold", "ellipse": [0.2, 0.8, 0.1, 0.1]},
 ]
 
 
@@ -159,7 +160,7 @@ def test_what_no_stroke_covers_is_the_same_bit_for_bit(stroke, name, rng):
     assert 0.1 < bare.mean() < 0.99
     assert found.picture[bare].tobytes() == picture[bare].tobytes()
     changed = found.picture[found.coverage[..., 0] == 1] != picture[found.coverage[..., 0] == 1]
-    assert changed.mean() > 0.2
+    assert changed.mean() > 0.2 or stroke["type"] == "hold"
 
 
 def test_a_shadow_is_a_factor_on_radiance_by_coverage_and_opacity():
@@ -495,6 +496,13 @@ def test_strokes_come_back_from_toml_equal_and_paint_the_same(rng):
         strokes.paint(picture, ALL, "srgb").picture,
         strokes.paint(picture, again.target.strokes, "srgb").picture,
     )
+
+
+def test_what_is_held_still_counts_as_painted_and_keeps_its_bits(rng):
+    picture = rng.random((16, 16, 3)).astype(np.float32)
+    done = strokes.paint(picture, [{"type": "hold", "rectangle": [0.25, 0.25, 0.75, 0.5]}])
+    np.testing.assert_array_equal(done.picture, picture)
+    assert done.coverage[4:8, 4:12].min() == 1 and done.coverage.sum() == 32
 
 
 def test_every_way_to_write_strokes_is_the_same():

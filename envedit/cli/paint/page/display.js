@@ -1,0 +1,152 @@
+// Half floats on a canvas: WebGL2, or a 2D canvas where there is none. Exposure and tone mapping happen here.
+
+const VERTEX = `#version 300 es
+out vec2 at;
+void main() {
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0;
+  at = vec2(corner.x, 1.0 - corner.y);
+  gl_Position = vec4(corner * 2.0 - 1.0, 0, 1);
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+uniform sampler2D now, before;
+uniform float scale, split;
+uniform int curve, mode;
+in vec2 at;
+out vec4 color;
+vec3 shown(vec3 e) {
+  e = max(e * scale, 0.0);
+  if (curve == 1) e = clip(e * (2.51 * e + 0.03) / (e * (2.43 * e + 0.59) + 0.14));
+  else if (curve == 2) return log(1.0 + 100.0 * min(e, 1e4)) / log(10001.0) * 1.6;
+  return pow(e, vec3(1.0 / 2.2));
+}`.replace("e = clip(", "e = (") + `
+void main() {
+  vec3 e = texture(now, at).rgb;
+  if (mode == 1) { color = vec4(0.5 + e * 2.0, 1); return; }
+  if (mode == 2) { color = vec4(e, 1); return; }
+  if (at.x < split) e = texture(before, at).rgb;
+  color = vec4(shown(e), 1);
+  if (split > 0.0 && split < 1.0 && abs(at.x - split) < 0.002) color = vec4(1);
+}`;
+
+export class Display {
+  // mode: "radiance", "signed" differences of display values, or "values" of a display.
+  constructor(canvas, mode = "radiance", plain = false) {
+    this.canvas = canvas;
+    this.mode = ["radiance", "signed", "values"].indexOf(mode);
+    this.settings = { stops: 0, curve: 0, split: 0 };
+    this.gl = plain ? null : canvas.getContext("webgl2", { alpha: false, antialias: false });
+    if (this.gl) this.prepare();
+    else this.flat = canvas.getContext("2d");
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => { this.prepare(); this.upload(); });
+  }
+
+  prepare() {
+    const gl = this.gl;
+    const program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) console.error(gl.getShaderInfoLog(shader));
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    gl.useProgram(program);
+    this.at = (name) => gl.getUniformLocation(program, name);
+    gl.uniform1i(this.at("now"), 0);
+    gl.uniform1i(this.at("before"), 1);
+    gl.uniform1i(this.at("mode"), this.mode);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    this.textures = [0, 1].map((unit) => {
+      const texture = gl.createTexture();
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+      return texture;
+    });
+  }
+
+  upload() {
+    for (const [unit, frame] of [[0, this.now], [1, this.before]]) this.fill(unit, frame);
+    this.draw();
+  }
+
+  fill(unit, frame) {
+    if (!this.gl || !frame) return;
+    const gl = this.gl;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB16F, frame.width, frame.height, 0, gl.RGB, gl.HALF_FLOAT, frame.pixels);
+  }
+
+  show(frame) {
+    this.now = frame;
+    this.fill(0, frame);
+    this.draw();
+  }
+
+  compare(frame) {
+    this.before = frame;
+    this.fill(1, frame);
+    this.draw();
+  }
+
+  set(changed) {
+    Object.assign(this.settings, changed);
+    this.draw();
+  }
+
+  draw() {
+    if (!this.now || this.due) return;
+    this.due = true;
+    requestAnimationFrame(() => {
+      this.due = false;
+      if (this.gl) this.drawGl();
+      else this.drawFlat();
+      this.drawn?.(this.now);
+    });
+  }
+
+  drawGl() {
+    const gl = this.gl, box = this.canvas.getBoundingClientRect();
+    const width = Math.max(1, Math.round(box.width * devicePixelRatio)), height = Math.max(1, Math.round(box.height * devicePixelRatio));
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    gl.viewport(0, 0, width, height);
+    gl.uniform1f(this.at("scale"), 2 ** this.settings.stops);
+    gl.uniform1f(this.at("split"), this.before ? this.settings.split : 0);
+    gl.uniform1i(this.at("curve"), this.settings.curve);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  drawFlat() {
+    const { width, height, pixels } = this.now, scale = 2 ** this.settings.stops;
+    Object.assign(this.canvas, { width, height });
+    const image = this.flat.createImageData(width, height);
+    const earlier = this.before && this.before.width === width ? this.before.pixels : null;
+    const edge = earlier ? this.settings.split * width : 0;
+    for (let i = 0; i < width * height; i++) {
+      const from = i % width < edge ? earlier : pixels;
+      for (let c = 0; c < 3; c++) image.data[4 * i + c] = 255 * this.value(HALF[from[3 * i + c]], scale);
+      image.data[4 * i + 3] = 255;
+    }
+    this.flat.putImageData(image, 0, 0);
+  }
+
+  value(e, scale) {
+    if (this.mode === 1) return 0.5 + 2 * e;
+    if (this.mode === 2) return e;
+    e = Math.max(e * scale, 0);
+    if (this.settings.curve === 1) e = (e * (2.51 * e + 0.03)) / (e * (2.43 * e + 0.59) + 0.14);
+    else if (this.settings.curve === 2) return (Math.log(1 + 100 * Math.min(e, 1e4)) / Math.log(10001)) * 1.6;
+    return e ** (1 / 2.2);
+  }
+}
+
+const HALF = Float32Array.from({ length: 65536 }, (_, bits) => {
+  const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
+  if (exponent === 0) return sign * fraction * 2 ** -24;
+  return exponent === 31 ? sign * 65504 : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
+});

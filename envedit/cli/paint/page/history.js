@@ -1,0 +1,42 @@
+// The document (what is saved), and what undo and redo go through.
+
+export const EMPTY = { strokes: [], lights: [], rotate_degrees: 0, exposure: 0, white_balance: 0 };
+
+export class History {
+  constructor(changed) {
+    this.changed = changed;
+    this.begin(EMPTY);
+  }
+
+  // A document that was left earlier: its strokes can be taken back one by one.
+  begin(document) {
+    this.steps = document.strokes.map((_, i) => ({ ...document, strokes: document.strokes.slice(0, i) }));
+    this.steps.push(document);
+    this.at = this.steps.length - 1;
+  }
+
+  get document() { return this.steps[this.at]; }
+  get undoable() { return this.at > 0; }
+  get redoable() { return this.at < this.steps.length - 1; }
+
+  push(change) {
+    this.steps.length = this.at + 1;
+    this.steps.push({ ...this.document, ...change });
+    if (this.steps.length > 500) this.steps.shift();
+    this.at = this.steps.length - 1;
+    this.changed("done");
+  }
+
+  // What is being changed, by a pointer that is still down: shown, and no step of its own.
+  preview(change, phase) { this.changed(phase, { ...this.document, ...change }); }
+
+  undo() { if (this.undoable) { this.at--; this.changed("done"); } }
+  redo() { if (this.redoable) { this.at++; this.changed("done"); } }
+
+  // Another page has changed the document.
+  follow(document) {
+    this.steps.length = this.at + 1;
+    this.steps.push(document);
+    this.at = this.steps.length - 1;
+  }
+}

@@ -1,0 +1,233 @@
+// The lights of the map as handles, and the panel of the one that is chosen.
+// Entries are as in [[input.lights]]: with `light` one of the map's own, with factors; without it an added one.
+
+export class Lights {
+  constructor(stack, holder, panel, on) {
+    Object.assign(this, { stack, holder, panel, on }); // on: document(), preview(change), done(change)
+    this.own = [];
+    this.found = [];
+    this.chosen = -1;
+    this.turning = false;
+    this.draft = null;
+    holder.addEventListener("pointerdown", (e) => this.turn(e));
+    panel.flux.addEventListener("input", () => this.change("flux"));
+    panel.color.addEventListener("input", () => this.change("flux"));
+    panel.size.addEventListener("input", () => this.change("size"));
+    for (const input of [panel.flux, panel.color, panel.size]) input.addEventListener("change", () => this.commit());
+    panel.mute.addEventListener("click", () => this.mute());
+    panel.remove.addEventListener("click", () => this.remove());
+  }
+
+  set(message) {
+    this.own = message.own;
+    this.found = message.found;
+    this.draw();
+  }
+
+  // All lights as they are: {entry, own, azimuth, elevation, factor}, the map's own first.
+  list(document = this.draft ?? this.on.document()) {
+    const own = this.own.map((light) => {
+      const entry = document.lights.find((one) => one.light === light.light) ?? { light: light.light, flux: [1, 1, 1], size: 1 };
+      const { azimuth, elevation } = { ...light, ...entry };
+      return { entry, own: light, azimuth, elevation };
+    });
+    const added = document.lights.filter((one) => !one.light).map((entry) => ({ entry, own: null, azimuth: entry.azimuth, elevation: entry.elevation }));
+    return [...own, ...added];
+  }
+
+  get unit() { return this.own.length ? Math.max(...this.own[0].flux, 1e-6) : 1; }
+
+  // The document's lights with one of them changed, or left out (null).
+  changed(index, change) {
+    const document = this.on.document(), light = this.list(document)[index];
+    if (!light) return null;
+    const next = change && { ...light.entry, ...change };
+    if (light.own) return [...document.lights.filter((one) => one.light !== light.entry.light), ...(next ? [next] : [])];
+    return document.lights.flatMap((one) => (one === light.entry ? (next ? [next] : []) : [one]));
+  }
+
+  preview(index, change) {
+    const lights = this.changed(index, change);
+    if (!lights) return;
+    this.pending = lights;
+    this.draft = { ...this.on.document(), lights };
+    this.on.preview({ lights });
+    this.draw();
+  }
+
+  commit() {
+    if (!this.pending) return;
+    const lights = this.pending;
+    this.pending = this.draft = null;
+    this.on.done({ lights });
+    this.draw();
+  }
+
+  moveTo(index, azimuth, elevation) {
+    this.preview(index, { azimuth: round(((azimuth % 360) + 360) % 360), elevation: round(Math.max(-90, Math.min(90, elevation))) });
+  }
+
+  drag(event, index) {
+    if (event.button !== 0 || this.turning) return;
+    event.preventDefault();
+    event.stopPropagation();
+    this.choose(index);
+    const handle = event.currentTarget, box = this.stack.getBoundingClientRect(), rotate = this.on.document().rotate_degrees;
+    const light = this.list()[index], start = [event.clientX, event.clientY];
+    handle.focus();
+    handle.setPointerCapture(event.pointerId);
+    handle.onpointermove = (e) => {
+      const dx = ((e.clientX - start[0]) / box.width) * 360, dy = ((e.clientY - start[1]) / box.height) * 180;
+      if (dx || dy) this.moveTo(index, light.azimuth + dx, light.elevation - dy);
+    };
+    handle.onpointerup = handle.onpointercancel = () => {
+      handle.onpointermove = handle.onpointerup = handle.onpointercancel = null;
+      this.commit();
+    };
+  }
+
+  key(event, index) {
+    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (move) {
+      const step = event.shiftKey ? 5 : 1, light = this.list()[index];
+      this.moveTo(index, light.azimuth + move[0] * step, light.elevation + move[1] * step);
+      this.commit();
+    } else if (event.key === "Delete") this.remove();
+    else if (event.key === "Enter" || event.key === " ") this.choose(index);
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  wheel(event, index) {
+    event.preventDefault();
+    this.choose(index);
+    const input = event.shiftKey ? this.panel.size : this.panel.flux;
+    input.value = Number(input.value) - Math.sign(event.deltaY || event.deltaX) * 0.2;
+    input.dispatchEvent(new Event("input"));
+    clearTimeout(this.later);
+    this.later = setTimeout(() => this.commit(), 250);
+  }
+
+  // Drag the sky sideways.
+  turn(event) {
+    if (!this.turning || event.button !== 0) return;
+    event.preventDefault();
+    const start = event.clientX, before = this.on.document().rotate_degrees, width = this.stack.clientWidth;
+    let degrees = before;
+    this.holder.setPointerCapture(event.pointerId);
+    this.holder.onpointermove = (e) => {
+      degrees = round((before - ((e.clientX - start) / width) * 360) % 360);
+      this.draft = { ...this.on.document(), rotate_degrees: degrees };
+      this.on.preview({ rotate_degrees: degrees });
+      this.draw();
+    };
+    this.holder.onpointerup = this.holder.onpointercancel = () => {
+      this.holder.onpointermove = this.holder.onpointerup = this.holder.onpointercancel = null;
+      this.draft = null;
+      if (degrees !== before) this.on.done({ rotate_degrees: degrees });
+    };
+  }
+
+  choose(index) {
+    this.chosen = index;
+    this.draw();
+  }
+
+  change(what) {
+    const light = this.list()[this.chosen];
+    if (!light) return;
+    const { flux, color, size } = this.panel;
+    const tint = linear(color.value), most = Math.max(...tint, 1e-3);
+    const strength = 2 ** Number(flux.value) * (light.own ? 1 : this.unit);
+    const next = what === "flux" ? { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) } : { size: round(2 ** Number(size.value)) };
+    this.preview(this.chosen, next);
+  }
+
+  mute() {
+    const light = this.list()[this.chosen];
+    if (!light) return;
+    const dark = light.entry.flux.every((v) => v === 0), back = this.before?.[this.chosen];
+    this.before = { ...this.before, [this.chosen]: light.entry.flux };
+    this.preview(this.chosen, { flux: dark ? (back ?? [1, 1, 1]).map((v) => v * 1) : [0, 0, 0] });
+    this.commit();
+  }
+
+  // An added light goes; one of the map's own is put out.
+  remove() {
+    const light = this.list()[this.chosen];
+    if (!light) return;
+    if (light.own) { this.preview(this.chosen, { flux: [0, 0, 0] }); this.commit(); return; }
+    const lights = this.changed(this.chosen, null);
+    this.chosen = -1;
+    this.on.done({ lights });
+    this.draw();
+  }
+
+  add() {
+    const rotate = this.on.document().rotate_degrees, n = this.list().length;
+    const entry = { azimuth: (180 + rotate + 40 * n + 360) % 360, elevation: 40, flux: [1, 1, 1].map((v) => v * Math.min(1e6, 0.5 * this.unit)), size: 3 };
+    this.on.done({ lights: [...this.on.document().lights, entry] });
+    this.choose(n);
+  }
+
+  draw() {
+    const document = this.draft ?? this.on.document(), lights = this.list();
+    const place = (element, { azimuth, elevation }, turned) => {
+      const seen = (((azimuth - (turned ? 0 : document.rotate_degrees)) % 360) + 360) % 360;
+      element.style.left = `${(100 * seen) / 360}%`;
+      element.style.top = `${(100 * (90 - elevation)) / 180}%`;
+    };
+    while (this.holder.querySelectorAll(".handle").length > lights.length) [...this.holder.querySelectorAll(".handle")].at(-1).remove();
+    lights.forEach((light, i) => {
+      let handle = this.holder.querySelectorAll(".handle")[i];
+      if (!handle) {
+        handle = window.document.createElement("button");
+        handle.className = "handle";
+        handle.dataset.testid = `handle-${i + 1}`;
+        handle.textContent = i + 1;
+        handle.addEventListener("pointerdown", (e) => this.drag(e, i));
+        handle.addEventListener("keydown", (e) => this.key(e, i));
+        handle.addEventListener("focus", () => this.choose(i));
+        handle.addEventListener("wheel", (e) => this.wheel(e, i), { passive: false });
+        this.holder.append(handle);
+      }
+      const muted = light.entry.flux.every((v) => v === 0);
+      handle.classList.toggle("muted", muted);
+      handle.setAttribute("aria-pressed", String(i === this.chosen));
+      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
+      place(handle, light, false);
+    });
+    this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());
+    if (!this.draft && document.strokes.length) for (const light of this.found) {
+      const ring = window.document.createElement("span");
+      ring.className = "found";
+      ring.title = "where the solution has this light";
+      place(ring, light, true);
+      this.holder.append(ring);
+    }
+    this.fill(lights[this.chosen]);
+  }
+
+  fill(light) {
+    const { set, name, flux, color, size, mute, remove, fluxValue, sizeValue } = this.panel;
+    set.disabled = !light;
+    name.textContent = light ? `${light.own ? "Light of the map" : "Added light"} ${this.chosen + 1}` : "No light chosen";
+    if (!light) return;
+    const most = Math.max(...light.entry.flux), muted = most === 0;
+    if (!muted) {
+      flux.value = Math.log2(most / (light.own ? 1 : this.unit));
+      color.value = hex(light.entry.flux.map((v) => v / most));
+    }
+    size.value = Math.log2(light.entry.size);
+    fluxValue.textContent = muted ? "off" : light.own ? `x${(+most).toPrecision(2)}` : (+most).toPrecision(2);
+    sizeValue.textContent = light.own ? `x${(+light.entry.size).toPrecision(2)}` : `${(+light.entry.size).toPrecision(2)}°`;
+    mute.setAttribute("aria-pressed", String(muted));
+    remove.textContent = light.own ? "Put out" : "Delete";
+  }
+}
+
+const round = (v) => Math.round(v * 100) / 100;
+// sRGB of a colour input from and to linear values.
+export const linear = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+const hex = (rgb) => "#" + rgb.map((v) => (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055)).map((v) => Math.round(255 * Math.min(1, Math.max(0, v))).toString(16).padStart(2, "0")).join("");

@@ -1,0 +1,322 @@
+// The page: what is sent when, and what is shown where.
+
+import { Connection } from "./connection.js";
+import { Display } from "./display.js";
+import { EMPTY, History } from "./history.js";
+import { Lights, linear } from "./lights.js";
+import { Strokes } from "./strokes.js";
+
+const $ = (id) => document.getElementById(id);
+const plain = new URLSearchParams(location.search).get("canvas") === "2d"; // without WebGL2
+const displays = {
+  render: new Display($("render"), "radiance", plain),
+  map: new Display($("map"), "radiance", plain),
+  difference: new Display($("difference"), "signed", plain),
+  unreachable: new Display($("unreachable"), "values", plain),
+};
+const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
+const log = []; // of edits and frames, for measurements
+window.envedit = { log, displays };
+
+let client = "", sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
+
+// ---- the document
+
+const history = new History((phase, document) => {
+  send(document ?? history.document, phase);
+  if (phase === "done") refresh();
+});
+
+function send(document, phase) {
+  waiting = { document, phase };
+  since ??= performance.now();
+  if (phase === "done") flush();
+  else if (!send.due) {
+    send.due = true;
+    requestAnimationFrame(() => { send.due = false; flush(); });
+  }
+}
+
+function flush() {
+  if (!waiting || !opened) return;
+  const message = { type: "document", number: ++sent, ...waiting };
+  if (!connection.send(message)) return; // sent again when the server is back
+  note({ edit: sent, phase: waiting.phase, since });
+  since = null;
+  waiting = null;
+}
+
+function note(entry) {
+  log.push({ at: performance.now(), ...entry });
+  if (log.length > 5000) log.splice(0, 1000);
+}
+
+// ---- from the server
+
+const connection = new Connection({
+  lost() { state("error", "The server cannot be reached; trying again"); },
+  frame(frame) {
+    if (frame.kind === "before") { displays.render.compare(frame); return; }
+    if (frame.kind === "render") {
+      const box = $("render-stack");
+      box.parentElement.style.setProperty("--aspect", frame.width / frame.height);
+      $("badge").textContent = NAMES[frame.source];
+    }
+    if (frame.kind !== "map") displays[frame.kind].canvas.style.setProperty("aspect-ratio", frame.width / frame.height);
+    displays[frame.kind].show(frame);
+  },
+  message(message) { RECEIVED[message.type]?.(message); },
+});
+
+displays.render.drawn = (frame) => {
+  $("status").dataset.frame = frame.number;
+  $("status").dataset.source = frame.source;
+  note({ frame: frame.number, source: frame.source });
+};
+
+const RECEIVED = {
+  hello(message) { client = message.client; },
+  start(message) {
+    if (opened) return;
+    $("start").hidden = false;
+    list($("shipped"), message.configurations.concat(message.scenes).map((name) => [name, name]));
+    list($("recent"), message.recent.map((one) => [one.path, `${one.title}: ${one.path}`]));
+    $("names").replaceChildren(...message.scenes.concat(message.configurations).map((name) => Object.assign(document.createElement("option"), { value: name })));
+    state("ready", "Choose what to paint on");
+  },
+  opened(message) {
+    $("start").hidden = true;
+    $("work").hidden = false;
+    $("title").textContent = message.title;
+    const mine = opened && waiting; // made while the server was away
+    if (!opened || JSON.stringify(message.document) !== JSON.stringify(history.document)) {
+      if (!mine) history.begin({ ...EMPTY, ...message.document });
+    }
+    opened = true;
+    if (mine) flush();
+    say(message.again && !message.notes.length ? `Goes on from ${message.folder}/painted.toml` : message.notes.join("; "), true);
+    refresh();
+  },
+  document(message) { history.follow({ ...EMPTY, ...message.document }); refresh(); },
+  lights(message) { lights.set(message); },
+  status(message) {
+    last = message;
+    $("unreachable").classList.toggle("stale", message.reachable == null);
+    $("progress").hidden = message.state !== "loading" && message.state !== "saving";
+    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations });
+    state(message.state, message.text ?? told(message));
+  },
+  doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },
+  progress(message) {
+    $("progress").hidden = false;
+    $("progress").max = Math.max(1, message.total);
+    $("progress").value = message.done;
+  },
+  saving(message) { state("saving", `Saving: ${message.text}`); },
+  saved(message) {
+    say("", true);
+    $("progress").hidden = true;
+    const links = message.files.filter((name) => ["report.html", "edited.exr", "lights.json"].includes(name));
+    $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...message.warnings.map((line) => `${line}. `));
+  },
+  refused(message) { say(message.text); },
+  error(message) { $("progress").hidden = true; say(message.text); state("error", "Error"); },
+};
+
+function told(message) {
+  const parts = [message.state === "solving" ? "Solving" : "Done"];
+  if (message.iterations) parts.push(`${message.iterations} iterations`);
+  if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
+  if (message.reachable != null) parts.push(`${Math.round(100 * message.reachable)} % of the paint is reachable`);
+  if (message.state === "done" && message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
+  return parts.join(" · ");
+}
+
+function state(name, text) {
+  const status = $("status");
+  status.textContent = text;
+  if (status.dataset.state !== name) $("live").textContent = text;
+  status.dataset.state = name;
+  document.querySelector(".group").toggleAttribute("inert", name === "saving");
+}
+
+function say(text, good = false) {
+  $("message").textContent = text ?? "";
+  $("message").classList.toggle("good", good);
+}
+
+function list(holder, entries) {
+  holder.replaceChildren(...entries.map(([name, text]) => {
+    const item = document.createElement("li"), button = document.createElement("button");
+    button.textContent = text;
+    button.addEventListener("click", () => open(name));
+    item.append(button);
+    return item;
+  }));
+}
+
+// ---- painting
+
+const strokes = new Strokes($("overlay"), () => ({
+  type: tool,
+  shape,
+  size: Number($("size").value),
+  softness: Number($("softness").value),
+  opacity: Number($("opacity").value),
+  amount: Number($("amount").value),
+  color: linear($("color").value).map((v) => Math.round(v * 1e4) / 1e4),
+  kelvin: Number($("kelvin").value),
+  radius: Number($("radius").value),
+}), {
+  preview(stroke) { history.preview({ strokes: [...history.document.strokes, stroke] }, "drawing"); },
+  done(stroke) { history.push({ strokes: [...history.document.strokes, stroke] }); },
+  cancel() { send(history.document, "done"); },
+  drag(phase, x, y) { pick(phase, x, y); },
+});
+
+// A highlight is dragged: first ask whose it is, then where that light must go.
+let picked = -1, asked = 0, ended = false;
+function pick(phase, x, y) {
+  if (phase === "start") { picked = -1; ended = false; }
+  if (phase === "end") { ended = true; setTimeout(() => { if (ended) lights.commit(); }, 300); return; }
+  if (phase === "move" && picked < 0) return;
+  connection.send({ type: "pick", x, y, light: picked, number: ++asked });
+}
+RECEIVED.picked = (message) => {
+  if (message.client !== client) return;
+  if (message.azimuth === undefined) {
+    picked = message.light;
+    if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
+    else lights.choose(picked);
+  } else if (!ended || message.number === asked) {
+    lights.moveTo(message.light, message.azimuth, message.elevation);
+    if (ended) lights.commit();
+  }
+};
+
+const lights = new Lights($("map-stack"), $("handles"), {
+  set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),
+  mute: $("light-mute"), remove: $("light-delete"), fluxValue: $("light-flux-value"), sizeValue: $("light-size-value"),
+}, {
+  document: () => history.document,
+  preview: (change) => history.preview(change, "dragging"),
+  done: (change) => history.push(change),
+});
+
+// ---- controls
+
+function refresh() {
+  const now = history.document;
+  $("undo").disabled = !history.undoable;
+  $("redo").disabled = !history.redoable;
+  $("clear").disabled = JSON.stringify(now) === JSON.stringify(EMPTY);
+  $("degrees").value = now.rotate_degrees;
+  $("map-exposure").value = now.exposure;
+  $("map-white").value = now.white_balance;
+  lights.draft = null;
+  lights.draw();
+}
+
+function choose(name, value) {
+  if (name === "tool") tool = value;
+  else shape = value;
+  for (const button of document.querySelectorAll(`[data-${name}]`)) button.setAttribute("aria-pressed", String(button.dataset[name] === value));
+  for (const label of document.querySelectorAll("[data-for]")) {
+    const wanted = label.dataset.for.split(" ");
+    label.hidden = wanted[0] === "size" ? shape !== "brush" && shape !== "line" : !wanted.includes(tool);
+  }
+  $("shapes").hidden = $("options").hidden = tool === "move";
+  strokes.reset();
+  strokes.draw();
+}
+
+for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => choose("tool", button.dataset.tool));
+for (const button of document.querySelectorAll("[data-shape]")) button.addEventListener("click", () => choose("shape", button.dataset.shape));
+$("undo").addEventListener("click", () => history.undo());
+$("redo").addEventListener("click", () => history.redo());
+$("clear").addEventListener("click", () => history.push(EMPTY));
+$("save").addEventListener("click", save);
+$("add").addEventListener("click", () => lights.add());
+$("turn").addEventListener("click", () => {
+  lights.turning = !lights.turning;
+  $("turn").setAttribute("aria-pressed", String(lights.turning));
+  $("handles").classList.toggle("turning", lights.turning);
+});
+$("exposure").addEventListener("input", () => look({ stops: Number($("exposure").value) }));
+$("tonemap").addEventListener("change", () => look({ curve: Number($("tonemap").value) }));
+$("split").addEventListener("input", () => displays.render.set({ split: Number($("split").value) }));
+$("size").addEventListener("input", () => strokes.draw());
+$("kelvin").addEventListener("input", () => { $("kelvin-value").textContent = $("kelvin").value; });
+for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposure"], ["map-white", "white_balance"]]) {
+  $(id).addEventListener("change", () => {
+    const value = Number($(id).value);
+    if (!$(id).checkValidity() || !Number.isFinite(value) || (key === "white_balance" && value && value < 2000)) {
+      say(`${$(id).closest("label").textContent.trim()}: ${key === "white_balance" ? "0, or 2000 to 25000 kelvin" : `${$(id).min} to ${$(id).max}`}`);
+      refresh();
+    } else history.push({ [key]: value });
+  });
+}
+
+function look(changed) {
+  $("exposure-value").textContent = $("exposure").value;
+  displays.render.set(changed);
+  displays.map.set(changed);
+}
+
+function save() {
+  if (!opened || $("status").dataset.state === "saving") return;
+  say("");
+  if (connection.send({ type: "save" })) state("saving", "Saving");
+}
+
+window.addEventListener("keydown", (event) => {
+  if (!opened || event.target.matches("input, select")) return;
+  const key = event.key.toLowerCase();
+  if (event.ctrlKey || event.metaKey) {
+    if (key === "z" && !event.shiftKey) history.undo();
+    else if (key === "y" || key === "z") history.redo();
+    else if (key === "s") save();
+    else return;
+  } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
+  else if (key === "[" || key === "]") { $("size")[key === "[" ? "stepDown" : "stepUp"](); strokes.draw(); }
+  else if (/^[1-8]$/.test(key)) choose("tool", document.querySelectorAll("[data-tool]")[key - 1].dataset.tool);
+  else return;
+  event.preventDefault();
+});
+window.addEventListener("keyup", (event) => {
+  if (event.key.toLowerCase() === "b") displays.render.set({ split: Number($("split").value) });
+});
+window.addEventListener("resize", () => { for (const one of Object.values(displays)) one.draw(); strokes.draw(); });
+
+// ---- start page
+
+function open(name, envmap = $("open-map").value.trim()) {
+  say("");
+  state("loading", `Opening ${name}`);
+  connection.send({ type: "open", name, envmap });
+}
+$("open").addEventListener("submit", (event) => { event.preventDefault(); open($("open-name").value.trim()); });
+
+async function upload(file) {
+  state("loading", `Taking ${file.name}`);
+  const answer = await fetch(`map/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+  const text = await answer.text();
+  if (!answer.ok) { say(text); state("ready", "Choose what to paint on"); return; }
+  $("open-map").value = text;
+  $("open-name").value ||= "sphere";
+  state("ready", "Choose what to paint on");
+}
+$("drop").addEventListener("click", () => $("file").click());
+$("drop").addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") $("file").click(); });
+$("file").addEventListener("change", () => { if ($("file").files[0]) upload($("file").files[0]); });
+$("drop").addEventListener("dragover", (event) => { event.preventDefault(); $("drop").classList.add("over"); });
+$("drop").addEventListener("dragleave", () => $("drop").classList.remove("over"));
+$("drop").addEventListener("drop", (event) => {
+  event.preventDefault();
+  $("drop").classList.remove("over");
+  if (event.dataTransfer.files[0]) upload(event.dataTransfer.files[0]);
+});
+
+choose("tool", "shadow");
+choose("shape", "brush");
+refresh();

@@ -1,0 +1,205 @@
+"""A project: the folder of one painting, and ``painted.toml`` in it, which ``envedit run`` carries out."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from envedit import config
+from envedit.cli import run
+from envedit.cli.paint.protocol import Document
+from envedit.core import array_cache, atomic_files
+from envedit.core.errors import ConfigError
+
+NAME = "painted.toml"
+_RECENT = 12
+
+
+@dataclass(frozen=True)
+class Project:
+    """What is painted on, and where results go.
+
+    Attributes
+    ----------
+    settings : config.Config
+        Without strokes and lights placed by hand, which the document has.
+    folder : Path
+        Of the results and ``painted.toml``.
+    base : Path
+        Folder that file names in scene parameters are relative to.
+    document : Document
+        As it was left the last time.
+    again : bool
+        Whether ``painted.toml`` was there already.
+    """
+
+    settings: config.Config
+    folder: Path
+    base: Path
+    document: Document
+    again: bool = False
+
+    def configured(self, document: Document) -> config.Config:
+        """Return the configuration that makes the map of a document."""
+        return _resolved(self.text(document), self.folder)
+
+    def text(self, document: Document) -> str:
+        """Return ``painted.toml``: what was given, and what was painted."""
+        settings = self.settings
+        target = {"kind": "strokes", "strokes": document.strokes} if document.strokes else {"kind": "none"}
+        kept = ("tonemap", "paint", "hold", "spp") if document.strokes else ("spp",)
+        given = {
+            f.name: {key: getattr(table, key) for key in sorted(table.given)}
+            for f in fields(settings)
+            if hasattr(table := getattr(settings, f.name), "given")
+        }
+        given["target"] = {key: given["target"][key] for key in kept if key in given["target"]} | target
+        given["scene"]["file"] = settings.scene.file
+        if "parameters" in given["scene"]:
+            named = given["scene"]["parameters"]
+            given["scene"]["parameters"] = {key: self._found(value) for key, value in named.items()}
+        own = {"rotate_degrees": document.rotate_degrees} if document.rotate_degrees else {}
+        given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
+        moved = {"exposure": document.exposure, "white_balance": document.white_balance}
+        given["output"] = given["output"] | {key: value for key, value in moved.items() if value}
+        given["output"].pop("dir", None)
+        lines = [
+            f"# Painted with `envedit paint`; `envedit run {NAME}` makes the same map.",
+            f"preset = {config.quote(settings.preset)}",
+            f"seed = {settings.seed}",
+            f"variant = {config.quote(settings.variant)}",
+        ]
+        for name, table in given.items():
+            plain = {key: value for key, value in table.items() if key not in ("strokes", "lights")}
+            if plain:
+                lines += ["", f"[{name}]", *(f"{key} = {config.quote(v)}" for key, v in plain.items())]
+        for name, entries in (("input.lights", document.lights), ("target.strokes", document.strokes)):
+            for entry in entries:
+                lines += ["", f"[[{name}]]", *(f"{key} = {config.quote(v)}" for key, v in entry.items())]
+        return "\n".join(lines) + "\n"
+
+    def _found(self, value):
+        """Make a parameter that names a file beside the configuration absolute."""
+        with contextlib.suppress(OSError, ValueError):
+            if isinstance(value, str) and value and (self.base / value).is_file():
+                return str((self.base / value).absolute())
+        return value
+
+    def keep(self, document: Document) -> None:
+        """Write ``painted.toml``, whole or not at all.
+
+        Raises
+        ------
+        InputError
+            It cannot be written.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic_files.write_atomically(self.folder / NAME, self.text(document).encode())
+
+
+def _resolved(text, folder):
+    settings = config.loads(text, folder, str(folder / NAME))
+    return replace(settings, output=_without(settings.output, dir=str(folder)))
+
+
+def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
+    """Open a configuration, a scene or what was painted before.
+
+    Parameters
+    ----------
+    name : str
+        A file, or the name of a shipped configuration or scene.
+    envmap : str
+        In place of the configuration's; "" for that.
+    preset : str, optional
+        In place of the configuration's.
+
+    Raises
+    ------
+    ConfigError
+        As of :func:`.schema.load`; also for a target that is no paint, where the configuration says so.
+    """
+    overrides = [f"input.envmap={config.quote(_path(envmap))}"] if envmap else []
+    settings, file, base = run.load(name, preset, overrides)
+    if settings.representation.kind != "layers" or settings.renderer.kind != "transport":
+        raise ConfigError(
+            f"{name}: got representation.kind {settings.representation.kind!r} and renderer.kind "
+            f"{settings.renderer.kind!r}, expected layers and transport: paint solves with these"
+        )
+    document = Document(
+        strokes=settings.target.strokes if settings.target.kind == "strokes" else (),
+        lights=settings.input.lights,
+        rotate_degrees=settings.input.rotate_degrees,
+        exposure=settings.output.exposure,
+        white_balance=settings.output.white_balance,
+    )
+    painted = file is not None and file.name == NAME
+    folder = file.absolute().parent if painted else Path(settings.output.dir)
+    plain = _plain(settings, folder)
+    if painted:
+        return Project(plain, folder, base, document, True)
+    return _continued(Project(plain, folder, base, document))
+
+
+def _path(envmap):
+    """Return a word as it is, and a path from the working folder as an absolute one."""
+    return envmap if envmap in ("auto", "scene", "sunsky") else str(Path(envmap).absolute())
+
+
+def _plain(settings, folder):
+    """Return settings without what the document has."""
+    return replace(
+        settings,
+        input=_without(settings.input, "lights", "rotate_degrees"),
+        output=_without(settings.output, "exposure", "white_balance", dir=str(folder)),
+        target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees"),
+    )
+
+
+def _without(table, *names, **more):
+    """Return a table with some keys as if they had not been given, and others as given."""
+    kept = {key: getattr(table, key) for key in table.given if key not in names}
+    return type(table)(**kept | more)
+
+
+def _continued(project):
+    """Go on from a ``painted.toml`` of the same scene and map; of another, in a folder beside it."""
+    folder, tried = project.folder, 1
+    while (folder / NAME).exists():
+        try:
+            before = config.load(folder / NAME)
+            one, other = before, project.settings
+            if (one.scene, one.input.envmap) == (other.scene, other.input.envmap):
+                return replace(opened(str(folder / NAME)), base=project.base)
+        except ConfigError:
+            pass  # not ours to overwrite
+        tried += 1
+        folder = project.folder.with_name(f"{project.folder.name}-{tried}")
+    return replace(project, settings=_plain(project.settings, folder), folder=folder)
+
+
+def recent() -> list[dict]:
+    """List what was painted lately, the last first: ``path`` of ``painted.toml``, ``title``."""
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
+        listed = json.loads(_recent_file().read_text(encoding="utf-8"))
+        found = [{"path": str(one["path"]), "title": str(one["title"])} for one in listed]
+        return [one for one in found if Path(one["path"]).is_file()][:_RECENT]
+    return []
+
+
+def note(project: Project) -> None:
+    """Note that a project was worked on; a cache that cannot be written is no error."""
+    path = str(project.folder / NAME)
+    title = f"{Path(project.settings.scene.file).stem}, {Path(project.settings.input.envmap).stem}"
+    listed = [{"path": path, "title": title}, *(one for one in recent() if one["path"] != path)]
+    with contextlib.suppress(OSError, AttributeError):
+        file = _recent_file()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(listed[:_RECENT]), encoding="utf-8")
+
+
+def _recent_file():
+    folder = array_cache.cache_folder("paint")
+    return None if folder is None else folder / "recent.json"

@@ -1,0 +1,190 @@
+"""What page and server say to each other: JSON messages from the page, JSON and frames to it.
+
+A frame is 16 bytes and half floats, little-endian: "EVPF", kind (:data:`KINDS`), source (:data:`SOURCES`),
+width and height as uint16, number as uint32, two bytes of zeros; then RGB, row by row.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from envedit.config.light_schema import light_list
+from envedit.config.stroke_schema import stroke_list
+from envedit.config.validators import WantedError, kelvin, number, show, string
+from envedit.core.errors import ConfigError
+
+MOST_BYTES = 1 << 20
+"""Length of a message from the page."""
+MOST_STROKES, MOST_POINTS = 500, 20_000
+"""Of a document: what is more would take seconds to paint."""
+KINDS = ("render", "map", "difference", "unreachable", "before")
+SOURCES = ("transport", "mitsuba", "saved")
+PHASES = ("drawing", "dragging", "done")
+"""A stroke is being drawn, a light is being dragged, or neither."""
+_LARGEST = 65504.0
+
+
+class BadMessageError(ValueError):
+    """A message that is refused; the text says why."""
+
+
+@dataclass(frozen=True)
+class Document:
+    """What a user has done: all that is saved.
+
+    Attributes
+    ----------
+    strokes : tuple of dict
+        As in ``[[target.strokes]]``.
+    lights : tuple of dict
+        As in ``[[input.lights]]``.
+    rotate_degrees : float
+        ``[input] rotate_degrees``.
+    exposure, white_balance : float
+        As in ``[output]``.
+    """
+
+    strokes: tuple[dict, ...] = ()
+    lights: tuple[dict, ...] = ()
+    rotate_degrees: float = 0.0
+    exposure: float = 0.0
+    white_balance: float = 0.0
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing has been done."""
+        return self == Document()
+
+    def plain(self) -> dict:
+        """Return it as JSON has it."""
+        return {name: getattr(self, name) for name in _CHECKS}
+
+
+_CHECKS = {
+    "strokes": stroke_list,
+    "lights": light_list,
+    "rotate_degrees": number(-360, 360),
+    "exposure": number(-20, 20),
+    "white_balance": kelvin,
+}
+
+
+def document(value: Any) -> Document:
+    """Read a document; raises BadMessageError."""
+    if not isinstance(value, dict) or not value.keys() <= _CHECKS.keys():
+        raise BadMessageError(f"document: got {show(value)[:80]}, expected keys among {', '.join(_CHECKS)}")
+    found = {}
+    for name, given in value.items():
+        try:
+            found[name] = _CHECKS[name](given)
+        except ConfigError as error:
+            raise BadMessageError(str(error)) from None
+        except WantedError as error:
+            raise BadMessageError(f"document.{name}: got {show(given)[:80]}, expected {error}") from None
+    made = Document(**found)
+    points = sum(len(s.get("points", ())) + len(s.get("polygon", ())) for s in made.strokes)
+    if len(made.strokes) > MOST_STROKES or points > MOST_POINTS:
+        raise BadMessageError(
+            f"document: got {len(made.strokes)} strokes of {points} points, expected at most {MOST_STROKES} "
+            f"of {MOST_POINTS}"
+        )
+    return made
+
+
+@dataclass(frozen=True)
+class Edit:
+    """The document as it is now, which edit of whose it is, and whether it is still being made."""
+
+    document: Document
+    phase: str = "done"
+    client: str = ""
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A place on the rendering (shares of width and height) that a light is dragged from, or to.
+
+    ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: tell which.
+    """
+
+    x: float
+    y: float
+    light: int = -1
+    number: int = 0
+    client: str = ""
+
+
+@dataclass(frozen=True)
+class Open:
+    """A scene or configuration, and a map in place of its own ("" for that)."""
+
+    name: str
+    envmap: str = ""
+
+
+@dataclass(frozen=True)
+class Save:
+    """Write the results."""
+
+
+def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
+    """Read a message from the page.
+
+    Raises
+    ------
+    BadMessageError
+        It is not JSON, of no known type, or has unusable values.
+    """
+    if isinstance(text, bytes) or len(text) > MOST_BYTES:
+        raise BadMessageError(f"got {len(text)} bytes, expected JSON text of at most {MOST_BYTES}")
+    try:
+        found = json.loads(text, parse_constant=_refused)
+    except (ValueError, RecursionError):
+        raise BadMessageError("got something else, expected JSON") from None
+    kind = found.get("type") if isinstance(found, dict) else None
+    try:
+        if kind == "document":
+            phase = found.get("phase", "done")
+            if phase not in PHASES:
+                raise BadMessageError(f"phase: got {show(phase)[:80]}, expected one of {', '.join(PHASES)}")
+            return Edit(document(found.get("document")), phase, client, _count(found.get("number", 0)))
+        if kind == "pick":
+            at = (number(0, 1)(found.get(name)) for name in "xy")
+            light = int(number(-1, 100)(found.get("light", -1)))
+            return Pick(*at, light, _count(found.get("number", 0)), client)
+        if kind == "open":
+            name, envmap = string(found.get("name")), string(found.get("envmap", ""))
+            if not name:
+                raise BadMessageError("open: got no name, expected a scene or a configuration")
+            return Open(name, envmap)
+    except WantedError as error:
+        raise BadMessageError(f"{kind}: expected {error}") from None
+    if kind == "save":
+        return Save()
+    raise BadMessageError(f"type: got {show(kind)[:80]}, expected document, pick, open or save")
+
+
+def _refused(name):
+    raise ValueError(name)
+
+
+def _count(value):
+    if not isinstance(value, int) or not 0 <= value < 2**53:
+        raise BadMessageError(f"number: got {show(value)[:80]}, expected a count")
+    return value
+
+
+def frame(kind: str, source: str, count: int, image: np.ndarray) -> bytes:
+    """Return an image (h, w, 3) as a frame; what is beyond half floats is cut at their largest."""
+    height, width, _ = image.shape
+    head = struct.pack(
+        "<4sBBHHIH", b"EVPF", KINDS.index(kind), SOURCES.index(source), width, height, count % 2**32, 0
+    )
+    pixels = np.nan_to_num(image, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
+    return head + np.clip(pixels, -_LARGEST, _LARGEST).astype("<f2").tobytes()

@@ -1,0 +1,283 @@
+"""The server of the page: 127.0.0.1 only, a token in every address, the page's own origin only.
+
+Addresses: ``/TOKEN/`` the page and its modules, ``/TOKEN/ws`` the WebSocket, ``/TOKEN/result/NAME`` a file of
+the results, ``/TOKEN/map/NAME`` (PUT) a map that is dropped on the page. Nothing else is served or written.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import re
+import secrets
+import socket
+from pathlib import Path
+
+from starlette.applications import Starlette
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from envedit.cli.paint import project, protocol
+from envedit.cli.paint.session import Tell
+from envedit.cli.paint.worker import Again, Worker
+from envedit.core import shipped
+from envedit.report import output_folder
+
+HOST = "127.0.0.1"
+PAGE = Path(__file__).parent / "page"
+TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+MOST_CLIENTS = 8
+LARGEST_MAP = 1 << 30
+"""Bytes of a map that is dropped on the page."""
+MAPS = "maps"
+"""Folder, in the working folder, that maps are put in which are dropped on the start page."""
+_MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|pfm|png|jpg|jpeg)", re.IGNORECASE)
+_SAFE = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+_KEPT = ("opened", "lights", "status", "error", "saved", "start")
+"""Kinds of message of which the last is sent to a page that comes later."""
+
+
+class Client:
+    """What waits for one page: of each kind of frame and of state the latest, everything else in turn."""
+
+    def __init__(self):
+        self.waiting: dict[str, bytes | dict] = {}
+        self.event = asyncio.Event()
+
+    def put(self, key: str, value) -> None:
+        """Let something wait, in the place of what waits under that key."""
+        self.waiting[key] = value
+        self.event.set()
+
+    async def next(self) -> list:
+        """Wait for something, and take all that waits."""
+        await self.event.wait()
+        self.event.clear()
+        taken, self.waiting = list(self.waiting.values()), {}
+        return taken
+
+
+class Hub(Tell):
+    """Hands what the worker tells to all pages; called from the worker's thread."""
+
+    def __init__(self):
+        self.clients: set[Client] = set()
+        self.loop: asyncio.AbstractEventLoop | None = None
+        self.last: dict[str, dict] = {}
+        self.count = 0
+
+    def frame(self, kind, source, image):
+        """Show an image, with the number of the frame in front."""
+        if kind == "render":
+            self.count += 1
+        self._send(f"frame {kind}", protocol.frame(kind, source, self.count, image))
+
+    def say(self, message):
+        """Send a message, of each type the latest; a status says which frame it is about."""
+        kind = message["type"]
+        if kind == "status":
+            message = {**message, "frame": self.count}
+        if kind in _KEPT:
+            self.last[kind] = message
+        if kind in ("opened", "status"):  # what went wrong before is over
+            self.last.pop("error", None)
+        self._send(kind, message)
+
+    def _send(self, key, value):
+        if self.loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self.loop.call_soon_threadsafe(self._put, key, value)
+
+    def _put(self, key, value):
+        for client in self.clients:
+            client.put(key, value)
+
+
+class Server:
+    """Page, worker and what lies between them.
+
+    Parameters
+    ----------
+    opened : Project, optional
+        What is painted on; None: the start page.
+    port : int
+        0: any that is free.
+    token : str, optional
+        Part of every address; None: a random one.
+
+    Raises
+    ------
+    OSError
+        The port is in use.
+    """
+
+    def __init__(self, opened: project.Project | None = None, port: int = 0, token: str | None = None):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self.socket.bind((HOST, port))
+            self.socket.listen(64)
+        except OSError:
+            self.socket.close()
+            raise
+        self.port, self.token = self.socket.getsockname()[1], token or secrets.token_urlsafe(16)
+        self.hub = Hub()
+        self.opened, self.worker = opened, Worker(self.hub, opened)
+        if opened is None:
+            self.hub.say(_start())
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{HOST}:{self.port}/{self.token}/"
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """Origins that the page may have."""
+        return f"http://{HOST}:{self.port}", f"http://localhost:{self.port}"
+
+    def app(self) -> Starlette:
+        """Return the application."""
+
+        @contextlib.asynccontextmanager
+        async def lifespan(app):
+            self.hub.loop = asyncio.get_running_loop()
+            self.worker.start()
+            yield
+            self.worker.stop()
+
+        return Starlette(
+            routes=[
+                Route("/{token}/", self._page),
+                WebSocketRoute("/{token}/ws", self._socket),
+                Route("/{token}/result/{name}", self._result),
+                Route("/{token}/map/{name}", self._map, methods=["PUT"]),
+                Route("/{token}/{name}", self._page),
+            ],
+            lifespan=lifespan,
+        )
+
+    def _known(self, request) -> bool:
+        """Whether a request has the token, and comes to this machine's own name."""
+        host = request.headers.get("host", "")
+        own = [origin.removeprefix("http://") for origin in self.origins]
+        return host in own and hmac.compare_digest(request.path_params["token"].encode(), self.token.encode())
+
+    async def _page(self, request: Request) -> Response:
+        if not self._known(request):
+            return PlainTextResponse("the address lacks its token: take it from the terminal", 403, _SAFE)
+        name = request.path_params.get("name", "index.html")
+        served = {path.name: path for path in PAGE.iterdir() if path.suffix in TYPES}
+        if name not in served:
+            return PlainTextResponse("no such file", 404, _SAFE)
+        return FileResponse(served[name], media_type=TYPES[served[name].suffix], headers=_SAFE)
+
+    async def _result(self, request: Request) -> Response:
+        if not self._known(request):
+            return PlainTextResponse("the address lacks its token", 403, _SAFE)
+        session, name = self.worker.session, request.path_params["name"]
+        file = session.project.folder / name if session is not None else None
+        if file is None or name not in output_folder.RESULTS or not file.is_file() or file.is_symlink():
+            return PlainTextResponse("no such result", 404, _SAFE)
+        # The report has its pictures and its style in itself.
+        policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+        safe = {**_SAFE, "Content-Security-Policy": policy}
+        return FileResponse(file, headers=safe)
+
+    async def _map(self, request: Request) -> Response:
+        if not self._known(request) or request.headers.get("origin") not in self.origins:
+            return PlainTextResponse("not from the page", 403, _SAFE)
+        if self.worker.session is not None:
+            return PlainTextResponse("a painting is open: maps are taken before that", 409, _SAFE)
+        name = request.path_params["name"]
+        if not _MAP_NAME.fullmatch(name):
+            wanted = "expected a plain name that ends in .exr, .hdr, .pfm, .png or .jpg"
+            return PlainTextResponse(wanted, 400, _SAFE)
+        folder = Path.cwd() / MAPS
+        folder.mkdir(exist_ok=True)
+        part, size = folder / f".{name}.{secrets.token_hex(8)}", 0
+        try:
+            with open(part, "xb") as file:
+                async for piece in request.stream():
+                    size += len(piece)
+                    if size > LARGEST_MAP:
+                        return PlainTextResponse(f"more than {LARGEST_MAP} bytes", 413, _SAFE)
+                    file.write(piece)
+            part.replace(folder / name)
+        except (OSError, ClientDisconnect) as error:
+            return PlainTextResponse(f"not written: {error}", 500, _SAFE)
+        finally:
+            part.unlink(missing_ok=True)
+        return PlainTextResponse(str(folder / name), headers=_SAFE)
+
+    async def _socket(self, socket: WebSocket) -> None:
+        if not self._known(socket) or socket.headers.get("origin") not in self.origins:
+            await socket.close(4403)  # before it is accepted: HTTP 403
+            return
+        if len(self.hub.clients) >= MOST_CLIENTS:
+            await socket.close(1013)
+            return
+        await socket.accept()
+        client, name = Client(), secrets.token_hex(4)
+        for kind, message in self.hub.last.items():
+            client.put(kind, message)
+        self.hub.clients.add(client)
+        await socket.send_json({"type": "hello", "client": name})
+        self.worker.post(Again())
+        sender = asyncio.create_task(_send(client, socket))
+        try:
+            while True:
+                received = await socket.receive()
+                if received["type"] == "websocket.disconnect":
+                    break
+                given = received.get("text")
+                try:
+                    request = protocol.read(received["bytes"] if given is None else given, name)
+                except protocol.BadMessageError as error:
+                    client.put("error", {"type": "refused", "text": str(error)})
+                    continue
+                self._take(request, client)
+        except WebSocketDisconnect:
+            pass
+        finally:
+            self.hub.clients.discard(client)
+            sender.cancel()
+            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+                await sender
+
+    def _take(self, request, client):
+        if isinstance(request, protocol.Edit):
+            opened = self.hub.last.get("opened")
+            if opened is not None:
+                opened["document"] = request.document.plain()
+            told = {"type": "document", "client": request.client, "document": request.document.plain()}
+            for other in self.hub.clients - {client}:
+                other.put("document", told)
+        self.worker.post(request)
+
+
+async def _send(client, socket):
+    """Send what waits for a page, until it goes."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            for one in await client.next():
+                await (socket.send_bytes(one) if isinstance(one, bytes) else socket.send_json(one))
+
+
+def _start():
+    """Return what the start page offers."""
+    return {
+        "type": "start",
+        "scenes": list(shipped.scenes()),
+        "configurations": [name for name in shipped.configurations() if name.startswith("edits/")],
+        "recent": project.recent(),
+    }

@@ -1,0 +1,460 @@
+"""One painting: the scene, its transport, and the map that follows what is painted.
+
+Everything here runs on the thread that owns Dr.Jit. What an edit asks for at once is done by
+:meth:`Session.update`; what takes longer, in pieces by :meth:`Session.advance`, until it returns False or a
+new edit comes.
+
+While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
+target. The target is painted on T E_0. The edit that is saved is the pipeline's, which paints on Mitsuba's
+rendering, tries several starts, and judges its result.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from envedit import config, inputs, pipeline, renderers
+from envedit.cli.paint.project import Project
+from envedit.cli.paint.protocol import Document, Edit, Pick
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.errors import NumericalError
+from envedit.export import adjustments
+from envedit.losses import display_curve
+from envedit.report import output_folder, run_folder
+from envedit.representations.layers import below_horizon
+from envedit.representations.layers.layers import Layers, unseen_kept
+from envedit.representations.layers.placed_lights import PlacedLights, angles
+from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
+from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
+from envedit.targets import strokes
+from envedit.targets.target import pixel_weight
+
+DRAGGED_COLUMNS, COLUMNS = 8, 32
+"""Most exact columns of T traced in one frame while a light is dragged, and otherwise."""
+QUICK_SPP = 32
+"""Paths a pixel of the transport by which it is told what a dragged light changes: an eighth of the texels'
+weights to read in every frame, and its errors cancel where nothing changes."""
+SHARPER = 2
+"""Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
+PASS, FIRST_PASSES, PASSES = 16, 4, 16
+"""Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
+RENDER_SEED = 9_000_021
+"""Added to the run's seed."""
+PATCH = 1
+"""Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
+
+
+class SupersededError(Exception):
+    """A newer edit has come: what was going on is given up."""
+
+
+class Tell:
+    """What a session reports; :class:`.server.Hub` sends it to the pages."""
+
+    def frame(self, kind: str, source: str, image: np.ndarray) -> None:
+        """Show an image (h, w, 3)."""
+
+    def say(self, message: dict) -> None:
+        """Send a message."""
+
+
+class Session:
+    """A painting that is open.
+
+    Parameters
+    ----------
+    project : Project
+        What is painted on.
+    tell : Tell
+        Told of frames and of progress.
+    newer : callable
+        Whether something newer waits.
+    """
+
+    def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
+        self.project, self.tell, self.newer = project, tell, newer
+        self.document, self.resting, self.phase = Document(), False, "done"
+        self.status = {"reachable": None, "iterations": 0, "number": 0, "client": ""}
+        settings = project.settings
+        self._stage("loading the scene")
+        self.lit = inputs.load_scene(settings.scene, project.base)
+        self._stage("reading the map")
+        self.given = inputs.read_map(settings.input, self.lit, settings.input.width)
+        self.notes = self.given.warnings
+        self.map = self.given.radiance
+        height = len(self.map)
+        first, last = inputs.active_rows(settings.input.rows, height)
+        self.rows = slice(first, last + 1)
+        renderers.check(settings, self.lit, self.map.shape[:2])
+        self._stage("tracing light transport")
+        self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
+        self._stage("separating lights")
+        self.placed = PlacedLights(self.map, settings.input.horizon)
+        self._watched, self._quick = _Watched(self.transport, newer), self.transport
+        if self.transport.spp > QUICK_SPP:
+            fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
+            self._quick = renderers.trace(fewer, self.lit, self.map.shape[:2], self._progress)
+        self._sharp = None
+        self.transport.resolve(self.map, limit=COLUMNS)
+        self.before = self.transport.apply(tensor(self.map)).numpy()
+        self._aim(project.document)
+
+    # ---- edits ---------------------------------------------------------------------------------------------
+
+    def update(self, edit: Edit) -> None:
+        """Take a document: paint, move lights, and show what is known at once."""
+        began = time.perf_counter()
+        before, self.document = self.document, edit.document
+        moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
+        self.phase, self._rendered, self.resting = edit.phase, None, False
+        self.status = {"reachable": None, "iterations": 0, "number": edit.number, "client": edit.client}
+        if edit.phase == "dragging":
+            self._drag()
+        elif moved or self._dragged:
+            self._aim(edit.document)
+        else:
+            self._paint()
+        if edit.phase == "done":
+            self.project.keep(self.document)
+        self._show("transport")
+        self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
+        self.tell_state()
+
+    def _aim(self, document):
+        """Take lights and turn of a document for the map that is painted on."""
+        self.document, self._dragged = document, False
+        self.origin = self._by_hand(document)
+        layers = Layers((self.rows.start, len(self.origin)), horizon=self._horizon())
+        params = layers.encode(self.origin[self.rows])
+        self.transport.resolve(self.origin, limit=COLUMNS)
+        self.base = self.transport.apply(tensor(self.origin)).numpy()
+        self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
+        self.still = self.start = self.problem.state(params)
+        self.run = gauss_newton.Run(self.start, self.start)
+        self.point = self.problem.evaluate(self.run.state, resolve=False)
+        self._painted: tuple[list, strokes.Painted] | None = None
+        self._rendered = None
+        self._paint()
+        self._tell_lights()
+
+    def _horizon(self):
+        chosen, rows = self.project.settings.input.horizon, self.project.settings.input.rows
+        if rows != "all":
+            return "free"
+        return below_horizon.kind_of(self.origin) if chosen == "auto" else chosen
+
+    def _by_hand(self, document):
+        return latlong.rotate(self.placed.place(document.lights), document.rotate_degrees)
+
+    def _drag(self):
+        """Show the map with its lights placed, and what paint has added to it before."""
+        if not self._dragged:
+            self._quick.resolve(self.point.edited, limit=COLUMNS)
+            self._still_quick = self._quick.apply(tensor(self.point.edited)).numpy()
+        self._dragged, self.solving = True, False
+        origin = self._by_hand(self.document)
+        found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
+        self._quick.resolve(found, limit=DRAGGED_COLUMNS)
+        changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
+        self._preview = found, np.maximum(self.point.rendering + changed, 0)
+
+    def _paint(self):
+        """Paint the strokes and aim the solution at them."""
+        chosen, self.reach, self.searched = self.project.settings.target, None, False
+        painted = self._after(list(self.document.strokes), chosen.tonemap)
+        self.solving = bool(painted is not None and painted.coverage.any())
+        if not self.solving:
+            self.start = self.still
+            self.run = gauss_newton.Run(self.start, self.start)
+            self.point = self.problem.evaluate(self.start, resolve=False)
+            self.target, self.weight, self.coverage = self.base, None, None
+            return
+        self.target, self.coverage = painted.picture, painted.coverage
+        untold = np.zeros(self.coverage.shape[:2], bool)
+        self.weight = self._seen(pixel_weight(self.coverage, untold, chosen.paint, chosen.hold))
+        self.point = self.problem.aimed_at(self.target, self.weight, self.point)
+        self.run = gauss_newton.Run(self.run.state, self.start)
+
+    def _seen(self, weight):
+        """Leave out pixels that see no surface, where the scene hides what lights it."""
+        return weight if self.lit.alpha is None else weight * (self.lit.alpha > 0)[..., None]
+
+    def _after(self, painted, tonemap):
+        """Paint strokes; all but the last as they were painted before, where they are the same."""
+        if not painted:
+            return None
+        first = painted[:-1]
+        if self._painted is None or self._painted[0] != first:
+            kept = strokes.paint(self.base, first, tonemap) if first else strokes.Painted(self.base, 0)
+            self._painted = first, kept
+        kept = self._painted[1]
+        last = strokes.paint(kept.picture, painted[-1:], tonemap)
+        coverage = 1 - (1 - kept.coverage) * (1 - last.coverage)
+        return strokes.Painted(last.picture, np.float32(coverage), kept.warnings + last.warnings)
+
+    # ---- what goes on --------------------------------------------------------------------------------------
+
+    def advance(self) -> bool:
+        """Do the next piece of work; False where there is none left."""
+        if self._dragged or self.resting:
+            return False
+        if not self.converged:
+            self._step()
+            return True
+        if self.phase != "done":
+            return False
+        try:
+            if self._render(FIRST_PASSES):
+                return True
+            if self.solving and not self.searched:
+                self._search()
+                return True
+            if self.solving and self.reach is None:
+                self._reach()
+                return True
+            return self._render(PASSES)
+        except SupersededError:
+            return True
+
+    @property
+    def converged(self) -> bool:
+        """Whether no further step is made towards what is painted."""
+        return not self.solving or self.run.finished or len(self.run.history) >= gauss_newton.ITERATIONS
+
+    def _step(self):
+        began = time.perf_counter()
+        self.point = gauss_newton.descended(self.problem, self.run, self.point)
+        self.status["iterations"] = len(self.run.history)
+        self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
+        self._show("transport")
+        self.tell_state()
+        if self.converged:
+            self._tell_lights()
+
+    def _search(self):
+        """Ask whether another start leads further, as the pipeline does; a newer edit ends it.
+
+        A light that jumps, or that is added, is where no small step leads.
+        """
+        self._tell_doing("looking for other lights")
+        layers, params = self.problem.layers, self.problem.params(self.still)
+        asked = layers, params, self._watched, self.base, self.target, self.weight, self.origin
+        starts = [painted_change.start(*asked, bold=bold)[0] for bold in (False, True)]
+        if layers.separation.lights:
+            starts.append(painted_change.softened(layers, params)[0])
+        more = {"iterations": 0, "run": self.run, "trial": True, "sparing": False}
+        best = gauss_newton.solve(self.problem, params, **more)
+        least, found = best.loss - LIKELIER, None
+        for start in [params, *starts]:
+            tried = self._tried(start)
+            if tried is not None and tried.loss < least:
+                least, found = tried.loss, tried.run
+        self.searched = True
+        if found is not None:
+            self.run, self.start = found, found.start
+            self._rendered = None
+        self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns
+        self._show("transport")
+        self._tell_lights()
+        self.tell_state()
+
+    def _tried(self, start):
+        """Return the solution after a few steps from a start; None where it cannot begin."""
+        more = {"iterations": NEWTON_TRIAL, "after_step": self._unless_newer, "trial": True, "sparing": False}
+        try:
+            return gauss_newton.solve(self.problem, start, **more)
+        except NumericalError:
+            return None
+
+    def _unless_newer(self, *_):
+        if self.newer():
+            raise SupersededError
+
+    def _render(self, passes):
+        """Add a pass to Mitsuba's rendering of the map that is shown; False where it has so many."""
+        if self._rendered is None:
+            self._rendered = 0, 0.0
+        done, total = self._rendered
+        if done >= passes:
+            return False
+        if self._sharp is None:
+            scene = self.project.settings.scene
+            wider = {"width": SHARPER * self.lit.width, "height": SHARPER * self.lit.height}
+            self._sharp = inputs.load_scene(replace(scene, **wider), self.project.base)
+        seed = (self.project.settings.seed + RENDER_SEED + done) % 2**32
+        total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
+        done += 1
+        self._rendered = done, total
+        if done in (1, 2, 4, 8, PASSES):
+            self.tell.frame("render", "mitsuba", total / done)
+            self.tell_state()
+        return True
+
+    def _reach(self):
+        """Ask how much of what is painted any light could do; a newer edit ends it."""
+        self._tell_doing("asking what any light could do")
+        asked = self.problem.envmap, self.target, self.weight, self.rows, None
+        self.reach = feasibility.reachable(self._watched, *asked, self.coverage[..., 0], self.base)
+        self.status["reachable"] = self.reach.share
+        self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach))
+        self.tell_state()
+
+    # ---- what is shown -------------------------------------------------------------------------------------
+
+    def _edited(self):
+        """Return the map as it is edited (H, W, 3), before exposure and white balance."""
+        return self._preview[0] if self._dragged else unseen_kept(self.origin, self.point.edited)
+
+    def _adjusted(self, edited):
+        """Return a map as it is shown: with exposure and white balance; the map itself without."""
+        document, settings = self.document, self.project.settings
+        output = config.Output(exposure=document.exposure, white_balance=document.white_balance)
+        return adjustments.adjust(edited, settings.lights, output, self.given.scale)[0]
+
+    def _show(self, source):
+        edited = self._edited()
+        shown = self._adjusted(edited)
+        rendering = self._preview[1] if self._dragged else self.point.rendering
+        if shown is not edited:
+            by = self._quick if self._dragged else self.transport
+            rendering = by.apply(tensor(shown)).numpy()
+        self.tell.frame("render", source, rendering)
+        self.tell.frame("map", source, shown)
+        if not self._dragged:
+            both = self.target, self.point.rendering
+            target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
+            self.tell.frame("difference", source, target - solution)
+
+    def again(self) -> None:
+        """Show everything anew, to a page that has just come."""
+        self.resting = False
+        self.tell.frame("before", "transport", self.before)
+        self._show("transport")
+        self._rendered = None
+        self._tell_lights()
+        self.tell_state()
+
+    def _tell_lights(self):
+        """Say which lights the map has, and where the solution has put them."""
+        own = []
+        for i, light in enumerate(self.placed.lights):
+            azimuth, elevation = angles(light.direction)
+            flux = self.placed.layers.lights.flux[i].tolist()
+            own.append({"light": i + 1, "azimuth": azimuth, "elevation": elevation, "flux": flux})
+        found, layers = [], self.problem.layers
+        for i in self.problem.lit(self.run.state):
+            azimuth, elevation = angles(self.problem.direction(self.run.state, i))
+            flux = layers.lights.flux[i] * np.exp(self.run.state["flux"][i])
+            found.append({"azimuth": azimuth, "elevation": elevation, "flux": flux.tolist()})
+        self.tell.say({"type": "lights", "own": own, "found": found})
+
+    def tell_state(self) -> None:
+        """Say whether there is a solution yet, and how good it is."""
+        busy = not self._dragged and not self.converged
+        rendered = self._rendered[0] * PASS if self._rendered else 0
+        self.tell.say(
+            {"type": "status", "state": "solving" if busy else "done", "samples": rendered, **self.status}
+        )
+
+    def _tell_doing(self, text):
+        self.tell.say({"type": "doing", "text": text})
+
+    def _stage(self, text):
+        self.tell.say({"type": "status", "state": "loading", "text": text})
+
+    def _progress(self, done, total, text=""):
+        self.tell.say({"type": "progress", "done": done, "total": total, "text": text})
+
+    # ---- lights by the rendering ---------------------------------------------------------------------------
+
+    def pick(self, asked: Pick) -> None:
+        """Tell which light a pixel is lit by most, or where one must go for its highlight to lie there."""
+        height, width = self.base.shape[:2]
+        row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
+        patch = np.zeros((height, width, 3), np.float32)
+        patch[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
+        seen = self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
+        answer = {"type": "picked", "number": asked.number, "client": asked.client}
+        if asked.light < 0:
+            answer["light"] = self._lit_by(seen)
+        else:
+            omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
+            toward = latlong.directions(*seen.shape)
+            best = _smooth(seen / np.maximum(omega, 1e-12))
+            best[self.rows.stop :] = 0
+            i = int(best.argmax())
+            azimuth, elevation = angles(toward.reshape(-1, 3)[i])
+            answer |= {"light": asked.light, "azimuth": (azimuth + self.document.rotate_degrees) % 360}
+            answer["elevation"] = elevation
+        self.tell.say(answer)
+
+    def _lit_by(self, seen):
+        """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
+        degrees, best, most = self.document.rotate_degrees, -1, 0.0
+        dark = [{**light, "flux": [0.0] * 3} for light in self.document.lights if "light" in light]
+        named = {light["light"] for light in dark}
+        dark += [{"light": i + 1, "flux": [0.0] * 3, "size": 1.0} for i in range(len(self.placed.lights))
+                 if i + 1 not in named]  # fmt: skip
+        added = [light for light in self.document.lights if "light" not in light]
+        whole = self.placed.place(self.document.lights)
+        for i in range(len(self.placed.lights) + len(added)):
+            if i < len(self.placed.lights):
+                out = [one for one in dark if one["light"] == i + 1]
+                kept = [one for one in self.document.lights if one.get("light") != i + 1]
+                without = self.placed.place([*kept, *out])
+            else:
+                gone = added[i - len(self.placed.lights)]
+                without = self.placed.place([one for one in self.document.lights if one is not gone])
+            lost = latlong.rotate(whole - without, degrees).mean(axis=2)
+            share = float((seen * lost).sum())
+            if share > most:
+                best, most = i, share
+        return best
+
+    # ---- results -------------------------------------------------------------------------------------------
+
+    def save(self, import_s: float = 0.0) -> list[str]:
+        """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings."""
+        project = self.project
+        project.keep(self.document)
+        settings, folder = project.configured(self.document), project.folder
+        with output_folder.alone(folder):
+            named = (settings.input.envmap, settings.scene.file)
+            output_folder.prepare_folder(folder, output_folder.RESULTS, [path for path in named if path])
+            watch = pipeline.Watch(
+                lambda text: self.tell.say({"type": "saving", "text": text}),
+                lambda done, total, text: self._progress(done, total, text),
+            )
+            result = pipeline.run(settings, folder=folder, base=project.base, watch=watch)
+            self.tell.say({"type": "saving", "text": "writing"})
+            warnings = run_folder.write(settings, folder, result, import_s, project.base)
+        self.tell.frame("render", "saved", result.renders["edited"])
+        self.tell.frame("map", "saved", result.maps["edited"])
+        self.resting = True  # what is shown is what was saved
+        files = [name for name in output_folder.RESULTS if (folder / name).exists()]
+        self.tell.say({"type": "saved", "folder": str(folder), "files": files, "warnings": warnings})
+        return warnings
+
+
+class _Watched:
+    """A transport whose every call first asks whether a newer edit waits."""
+
+    def __init__(self, transport, newer):
+        self._transport, self._newer = transport, newer
+
+    def __getattr__(self, name):
+        found = getattr(self._transport, name)
+        if callable(found) and self._newer():
+            raise SupersededError
+        return found
+
+
+def _smooth(image):
+    """Sum an image (H, W) over 3x3 texels, around the horizon."""
+    wide = np.pad(np.pad(image, ((1, 1), (0, 0)), mode="edge"), ((0, 0), (1, 1)), mode="wrap")
+    return np.lib.stride_tricks.sliding_window_view(wide, (3, 3)).sum(axis=(2, 3))

@@ -1,0 +1,135 @@
+"""The thread that owns Dr.Jit, and the queue before it: of each kind of request, the latest wins."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import traceback
+from pathlib import Path
+
+from envedit.cli.paint import project
+from envedit.cli.paint.protocol import Edit, Open, Pick, Save
+from envedit.cli.paint.session import Session, SupersededError, Tell
+from envedit.core.errors import EnveditError, unwrapped
+
+ORDER = (Open, Pick, Edit, Save)
+"""Of requests that wait, which kind goes first: what is saved has all edits."""
+
+
+class Again:
+    """A page has come: show it everything."""
+
+
+class Worker(threading.Thread):
+    """Carries requests out, one at a time, and what goes on between them.
+
+    Parameters
+    ----------
+    tell : Tell
+        Told of everything.
+    opened : Project, optional
+        What to begin with.
+    """
+
+    def __init__(self, tell: Tell, opened: project.Project | None = None):
+        super().__init__(name="envedit-paint", daemon=True)
+        self.tell, self.session, self._opened = tell, None, opened
+        self._waiting: dict[type, object] = {}
+        self._lock = threading.Condition()
+        self._over = False
+        self.faults: list[Exception] = []  # of ours, no user's mistakes
+
+    def post(self, request) -> None:
+        """Let a request wait, in the place of an earlier one of its kind."""
+        with self._lock:
+            self._waiting[type(request)] = request
+            self._lock.notify()
+
+    def stop(self) -> None:
+        """End after what is going on; safe to call twice."""
+        with self._lock:
+            self._over = True
+            self._lock.notify()
+
+    @property
+    def newer(self) -> bool:
+        """Whether something waits."""
+        return self._over or bool(self._waiting)
+
+    def run(self) -> None:
+        """Work until :meth:`stop`."""
+        if self._opened is not None:
+            self._attempt(lambda: self._open(self._opened))
+        busy = self.session is not None
+        while not self._over:
+            with self._lock:
+                while not (self._waiting or busy or self._over):
+                    self._lock.wait()
+                kinds = [kind for kind in (*ORDER, Again) if kind in self._waiting]
+                request = self._waiting.pop(kinds[0]) if kinds else None
+            if self._over:
+                return
+            if request is not None:
+                self._attempt(lambda request=request: self._carry_out(request))
+                busy = self.session is not None
+            else:
+                busy = bool(self._attempt(self.session.advance))
+
+    def _carry_out(self, request):
+        if isinstance(request, Open):
+            self._open(project.opened(request.name, request.envmap))
+        elif self.session is None:
+            if not isinstance(request, Again):
+                self.tell.say({"type": "error", "text": "no scene is open: open one first"})
+        elif isinstance(request, Edit):
+            self.session.update(request)
+        elif isinstance(request, Pick):
+            self.session.pick(request)
+        elif isinstance(request, Save):
+            self.tell.say({"type": "status", "state": "saving", "text": "saving"})
+            try:
+                self.session.save()
+            finally:
+                self.session.tell_state()
+        else:
+            self.session.again()
+
+    def _open(self, opened):
+        import mitsuba as mi
+
+        from envedit.cli import doctor
+
+        self.session = None
+        doctor.ensure(opened.settings.variant)
+        mi.set_variant(opened.settings.variant)
+        mi.set_log_level(mi.LogLevel.Error)
+        self.session = Session(opened, self.tell, lambda: self.newer)
+        project.note(opened)
+        self.tell.say(
+            {
+                "type": "opened",
+                "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
+                "folder": str(opened.folder),
+                "again": opened.again,
+                "document": opened.document.plain(),
+                "width": self.session.lit.width,
+                "height": self.session.lit.height,
+                "notes": self.session.notes,
+            }
+        )
+        self.session.again()
+
+    def _attempt(self, work):
+        """Do something; a user's mistake is told, and so is a fault of ours, which also goes to stderr."""
+        try:
+            with unwrapped():
+                return work()
+        except SupersededError:
+            return True
+        except EnveditError as error:
+            self.tell.say({"type": "error", "text": str(error)})
+        except Exception as error:
+            traceback.print_exc(file=sys.stderr)
+            self.faults.append(error)
+            self.tell.say({"type": "error", "text": f"{type(error).__name__}: {error}"})
+        return None

@@ -1,0 +1,123 @@
+"""Lights of a map that are moved, changed or added by hand, before any edit: ``[[input.lights]]``.
+
+Lights of the map move as :mod:`.layers` moves them, with their glow. A light that is added is a lobe: its
+radiance falls off as a Gaussian of the angle, and its sum over the texels' solid angles is its flux.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.representations.layers import below_horizon
+from envedit.representations.layers.layers import Layers, unseen_kept
+from envedit.representations.layers.lights import DARK, rotation_vector
+
+NARROWEST = 0.6
+"""Least standard deviation of an added light in texels: one that is narrower would vanish between them."""
+
+
+class PlacedLights:
+    """A map whose lights can be placed anew.
+
+    Parameters
+    ----------
+    envmap : ndarray (H, W, 3) float32
+        Linear radiance, finite and not negative.
+    horizon : str
+        What rows below the horizon do, as of :class:`.Layers`, or "auto".
+
+    Attributes
+    ----------
+    layers : Layers
+        The map, told apart.
+    lights : list of Light
+        Its lights, those with most flux first: ``light = 1`` is the first.
+    """
+
+    def __init__(self, envmap: np.ndarray, horizon: str = "auto"):
+        self.envmap = envmap
+        kind = below_horizon.kind_of(envmap) if horizon == "auto" else horizon
+        self.layers = Layers(horizon=kind)
+        self._still = self.layers.encode(envmap)
+        self.lights = self.layers.separation.lights
+
+    def params(self, placed: Sequence[dict]) -> dict:
+        """Return the layers' parameters of entries of :func:`.light_schema.light_list`; others are left out.
+
+        An entry of a light that the map does not have does nothing.
+        """
+        found = {name: self._still[name].numpy().copy() for name in ("turn", "flux", "size")}
+        for light in placed:
+            i = light.get("light", 0) - 1
+            if not 0 <= i < len(self.lights):
+                continue
+            flux = np.maximum(np.float64(light["flux"]), 1e-30)
+            found["flux"][i] = np.maximum(np.log(flux), DARK) / self.layers.scales["flux"]
+            found["size"][i] = np.log(light["size"]) / self.layers.scales["size"]
+            if "azimuth" in light:
+                to = direction(light["azimuth"], light["elevation"])
+                turn = rotation_vector(self.layers.lights.centres[i], to)
+                found["turn"][i] = turn / self.layers.scales["turn"]
+        return self._still | {name: tensor(value) for name, value in found.items()}
+
+    def place(self, placed: Sequence[dict]) -> np.ndarray:
+        """Return the map with its lights placed, (H, W, 3) float32.
+
+        Raises
+        ------
+        InputError
+            A texel becomes brighter than :data:`.radiance.BRIGHTEST`.
+        """
+        found = self.envmap
+        if any("light" in light for light in placed):
+            found = unseen_kept(found, self.layers.decode(self.params(placed)).numpy())
+        found = add(found, [light for light in placed if "light" not in light])
+        require_radiance(found, "input.lights", brightest=BRIGHTEST)
+        return found
+
+
+def missing(placed: Sequence[dict], count: int) -> list[int]:
+    """List the numbers of lights that are asked for and that a map of ``count`` lights does not have."""
+    return sorted(light["light"] for light in placed if light.get("light", 0) > count)
+
+
+def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
+    """Add lights to a map (H, W, 3) of any resolution.
+
+    A light's radiance is flux g / sum(g omega), with g = exp(-angle^2 / (2 size^2)) and omega the solid
+    angles by which Mitsuba looks texels up.
+    """
+    if not added:
+        return envmap
+    height, width, _ = envmap.shape
+    found = envmap.astype(np.float64)
+    omega = latlong.lookup_solid_angles(height, width)[:, None]
+    toward = latlong.directions(height, width)
+    for light in added:
+        size = max(np.radians(light["size"]), NARROWEST * np.pi / max(height - 1, 1))
+        cosine = toward @ direction(light["azimuth"], light["elevation"])
+        angle = np.arccos(np.clip(cosine, -1, 1))
+        lobe = np.where(angle < 5 * size, np.exp(-0.5 * (angle / size) ** 2), 0.0)
+        total = float((lobe * omega).sum())
+        if total > 0:
+            found += (lobe / total)[..., None] * np.float64(light["flux"])
+    with np.errstate(over="ignore"):
+        return found.astype(np.float32)
+
+
+def direction(azimuth: float, elevation: float) -> np.ndarray:
+    """Return the unit vector (3,) of degrees: azimuth 0 is -z and 90 is +x, the elevation's 90 is +y."""
+    azimuth, elevation = np.radians([azimuth, elevation])
+    across = np.cos(elevation)
+    return np.array([across * np.sin(azimuth), np.sin(elevation), -across * np.cos(azimuth)])
+
+
+def angles(toward: np.ndarray) -> tuple[float, float]:
+    """Return azimuth in [0, 360) and elevation in degrees of a direction (3,)."""
+    x, y, z = (float(v) for v in toward)
+    return float(np.degrees(np.arctan2(x, -z)) % 360), float(np.degrees(np.arctan2(y, np.hypot(x, z))))

@@ -1,0 +1,61 @@
+"""A painting that is served to a test: a small scene, in a thread of its own."""
+
+import asyncio
+import contextlib
+import threading
+import time
+
+SMALL = """
+seed = 3
+[input]
+envmap = "sunsky"
+width = 64
+[scene]
+file = "sphere"
+width = 48
+[target]
+spp = 16
+[renderer]
+spp = 16
+max_depth = 3
+[output]
+spp = 16
+report = false
+"""
+
+
+@contextlib.contextmanager
+def served(name, **more):
+    """Serve a configuration until the block ends; yields the server."""
+    import uvicorn
+
+    from envedit.cli.paint import project
+    from envedit.cli.paint.protocol import MOST_BYTES
+    from envedit.cli.paint.server import Server
+
+    server = Server(None if name is None else project.opened(str(name)), **more)
+    settings = uvicorn.Config(
+        server.app(), log_level="warning", ws="websockets-sansio", ws_max_size=MOST_BYTES
+    )
+    running = uvicorn.Server(settings)
+    thread = threading.Thread(target=lambda: asyncio.run(running.serve([server.socket])), daemon=True)
+    thread.start()
+    until(lambda: running.started)
+    try:
+        yield server
+    finally:
+        running.should_exit = True
+        thread.join(60)
+        server.worker.stop()
+        server.worker.join(120)
+        server.socket.close()
+        assert not thread.is_alive() and not server.worker.is_alive()
+        assert not server.worker.faults, server.worker.faults
+
+
+def until(true, seconds=120):
+    """Wait until something holds."""
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, f"not within {seconds} s"
+        time.sleep(0.02)

@@ -1,0 +1,96 @@
+"""What page and server say to each other, and ``painted.toml``."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from envedit import config
+from envedit.cli.paint import project, protocol
+from envedit.core.errors import ConfigError
+
+STROKE = {"type": "shadow", "points": [[0.1, 0.2], [0.3, 0.4]], "width": 0.1}
+
+
+def message(**more):
+    return json.dumps({"type": "document", "document": {}} | more)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "expected JSON"),
+        ("[" * 5000, "expected JSON"),
+        ("[]", "expected document, pick, open or save"),
+        ('{"type": "run"}', "expected document, pick, open or save"),
+        (b"\x00\x01", "expected JSON text"),
+        (" " * (protocol.MOST_BYTES + 1), "at most"),
+        (message(document=3), "expected keys among"),
+        (message(document={"dir": "/"}), "expected keys among"),
+        (message(phase="later"), "expected one of drawing"),
+        (message(number=-1), "expected a count"),
+        (message(document={"exposure": float("nan")}), "expected JSON"),
+        (message(document={"exposure": 1e9}), "document.exposure"),
+        (message(document={"strokes": [{"type": "x"}]}), r"target.strokes\[0\].type"),
+        (message(document={"strokes": [{**STROKE, "width": -1}]}), r"target.strokes\[0\].width"),
+        (message(document={"strokes": [STROKE] * 501}), "expected at most 500"),
+        (message(document={"lights": [{"light": 9}]}), r"input.lights\[0\].light"),
+        (message(document={"lights": [{"light": 1}, {"light": 1}]}), "more than once"),
+        (message(document={"lights": [{"azimuth": 1}]}), "azimuth and elevation"),
+        (message(document={"lights": [{"azimuth": 1, "elevation": 1}]}), r"input.lights\[0\].flux"),
+        (message(document={"lights": [{"light": 1, "colour": 1}]}), "has no key 'colour'"),
+        ('{"type": "pick", "x": 2, "y": 0}', "pick: expected a number"),
+        ('{"type": "open"}', "open: expected a string"),
+        ('{"type": "open", "name": ""}', "expected a scene"),
+    ],
+)
+def test_bad_messages_are_refused_with_what_was_expected(text, said):
+    with pytest.raises(protocol.BadMessageError, match=said):
+        protocol.read(text)
+
+
+def test_a_document_goes_through_json_unchanged():
+    text = message(document={"strokes": [STROKE], "exposure": 1}, phase="drawing", number=7)
+    edit = protocol.read(text, "a")
+    assert (edit.phase, edit.number, edit.client, edit.document.exposure) == ("drawing", 7, "a", 1.0)
+    assert edit.document.strokes[0]["opacity"] == 1.0
+    assert protocol.document(json.loads(json.dumps(edit.document.plain()))) == edit.document
+
+
+def test_a_frame_holds_half_floats_and_nothing_that_is_not_finite():
+    image = np.float32([[[0.5, 1e6, np.nan], [np.inf, -np.inf, 1e-30]]])
+    frame = protocol.frame("map", "mitsuba", 2**32 + 5, image)
+    assert struct.unpack("<4sBBHHI", frame[:14]) == (b"EVPF", 1, 1, 2, 1, 5)
+    assert np.frombuffer(frame[16:], "<f2").tolist() == [0.5, 65504, 0, 65504, -65504, 0]
+
+
+def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
+    file = tmp_path / "edit.toml"
+    file.write_text(
+        'seed = 4\n[input]\nenvmap = "sunsky"\nwidth = 64\n[scene]\nfile = "pair"\n[target]\nhold = 2\n'
+    )
+    opened = project.opened(str(file))
+    assert opened.document.empty and opened.folder == tmp_path / "edit_out" and not opened.again
+    light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3]}
+    done = protocol.document(
+        {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "white_balance": 5000}
+    )
+    opened.keep(done)
+    again = project.opened(str(file))
+    assert again.again and again.document == done and again.folder == opened.folder
+    assert project.opened(str(opened.folder / "painted.toml")).document == done
+    settings = config.load(opened.folder / "painted.toml")
+    assert (settings.seed, settings.input.width, settings.target.hold) == (4, 64, 2)
+    assert settings.loss.given == frozenset(), "a default was written as if it had been given"
+    opened.keep(protocol.Document())
+    assert config.load(opened.folder / "painted.toml").target.kind == "none"
+    other = project.opened(str(file), envmap="scene")
+    assert other.folder == tmp_path / "edit_out-2", "another map's painting would be overwritten"
+
+
+def test_what_paint_cannot_solve_is_refused(tmp_path):
+    file = tmp_path / "edit.toml"
+    file.write_text('preset = "paper"\n')
+    with pytest.raises(ConfigError, match="expected layers and transport"):
+        project.opened(str(file))

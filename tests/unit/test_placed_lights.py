@@ -1,0 +1,116 @@
+"""Lights moved, changed or added by hand before an edit: ``[[input.lights]]`` and ``rotate_degrees``."""
+
+import numpy as np
+import pytest
+
+from envedit import config, inputs, pipeline, results
+from envedit.core import latlong
+from envedit.core.errors import ConfigError
+from envedit.images import images
+from envedit.representations.layers.placed_lights import PlacedLights, add, angles, direction, missing
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return inputs.read_map(config.Input(envmap="sunsky", width=64), None, 64).radiance
+
+
+def flux(envmap, mask=None):
+    """Integrate a map over the solid angles that Mitsuba looks up, (3,)."""
+    omega = latlong.lookup_solid_angles(*envmap.shape[:2])[:, None, None]
+    return (np.float64(envmap) * omega).sum(axis=(0, 1))
+
+
+def test_directions_and_angles_are_inverse():
+    for azimuth, elevation in [(0, 0), (90, 35), (200, -60), (359, 89)]:
+        assert angles(direction(azimuth, elevation)) == pytest.approx((azimuth, elevation))
+    height, width = 32, 64
+    row, column = latlong.texel_position(direction(90, 45), height, width)
+    assert (row, column) == (pytest.approx(45 / 180 * 31), pytest.approx(90 / 360 * 64 - 0.5))
+
+
+def test_nothing_asked_changes_no_bit(sky):
+    assert PlacedLights(sky).place([]) is sky
+    same = PlacedLights(sky).place([{"light": 1, "flux": [1.0] * 3, "size": 1.0}])
+    assert np.array_equal(same, sky)
+
+
+def test_a_light_goes_where_it_is_put_with_its_flux(sky):
+    placed = PlacedLights(sky)
+    assert len(placed.lights) == 1
+    moved = placed.place([{"light": 1, "azimuth": 200.0, "elevation": 50.0, "flux": [1.0] * 3, "size": 1.0}])
+    row, column = np.unravel_index(moved.mean(axis=2).argmax(), moved.shape[:2])
+    there = latlong.directions(*moved.shape[:2])[row, column]
+    assert np.degrees(np.arccos(there @ direction(200, 50))) < 6, "half a texel's diagonal is 4 degrees"
+    core = placed.layers.separation.core
+    assert np.allclose(flux(np.maximum(moved, 0)), flux(sky), rtol=0.1) and flux(core).min() > 0
+    out = placed.place([{"light": 1, "flux": [0.0] * 3, "size": 1.0}])
+    assert out.max() < 0.2 * sky.max() and np.isfinite(out).all()
+
+
+@pytest.mark.parametrize("size", [0.01, 3.0, 40.0])
+@pytest.mark.parametrize("elevation", [-90.0, 0.0, 33.0, 90.0])
+def test_an_added_light_has_its_flux_at_any_size_resolution_and_place(size, elevation):
+    light = {"azimuth": 0.0, "elevation": elevation, "flux": [1.0, 2.0, 1e6], "size": size}
+    for height in (3, 32, 100):
+        found = add(np.zeros((height, 2 * height, 3), np.float32), [light])
+        assert np.allclose(flux(found), [1, 2, 1e6], rtol=1e-4)
+
+
+def test_what_the_map_does_not_have_is_told(sky):
+    settings = config.Input(envmap="sunsky", width=64, lights=[{"light": 5, "flux": [0, 0, 0]}])
+    given = inputs.read_map(settings, None, 64)
+    assert missing(settings.lights, 1) == [5] and "none with number 5" in given.warnings[-1]
+    assert np.array_equal(given.radiance, sky)
+
+
+def test_keys_that_cannot_be_are_named():
+    for light, said in [
+        ({"light": 0}, r"input.lights\[0\].light"),
+        ({"light": 1, "elevation": 91, "azimuth": 0}, "elevation"),
+        ({"light": 1, "flux": [1, 1, 2e6]}, "flux"),
+        ({"flux": [1, 1, 1]}, "azimuth"),
+        ({"light": 1, "sise": 2}, "did you mean size"),
+    ]:
+        with pytest.raises(ConfigError, match=said):
+            config.Input(lights=[light])
+    text = "input.lights=[{light = 1, flux = [2, 2, 2]}]"
+    settings = config.loads("", overrides=[text])
+    assert config.loads(config.to_toml(settings)).input.lights == settings.input.lights
+
+
+def test_the_full_map_has_the_same_lights(tmp_path):
+    """The map's own resolution against the working one, without a target."""
+    wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
+    images.write_exr(tmp_path / "sky.exr", wide, {})
+    text = """
+    [input]
+    envmap = "sky.exr"
+    width = 64
+    rotate_degrees = 90
+    [[input.lights]]
+    light = 1
+    azimuth = 300
+    elevation = 40
+    [[input.lights]]
+    azimuth = 30
+    elevation = 20
+    flux = [0.3, 0.2, 0.1]
+    size = 6
+    [scene]
+    width = 8
+    [target]
+    kind = "none"
+    [output]
+    spp = 4
+    """
+    settings = config.loads(text, tmp_path)
+    result = pipeline.run(settings)
+    full = results.at_full_resolution(settings, result)
+    assert full.shape == (64, 128, 3)
+    small = latlong.resize(full, 32, 64)
+    assert np.allclose(flux(full), flux(result.envmap), rtol=0.05)
+    sun, shown = (np.unravel_index(m.mean(axis=2).argmax(), m.shape[:2]) for m in (small, result.envmap))
+    assert np.abs(np.subtract(sun, shown)).max() <= 1
+    # azimuth 300 degrees, turned by 90 to the left: column 210 / 360 of the width
+    assert abs(shown[1] - 210 / 360 * 64) < 2

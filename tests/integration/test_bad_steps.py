@@ -215,7 +215,8 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     monkeypatch.setattr(edit_job.Job, "_loop", ended)
     wanted = types.SimpleNamespace(aim=None, weight=None, coverage=None)
     fake = types.SimpleNamespace(models_edit=False)
-    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, fake, None, None, edit_job.Watch())
+    lit = types.SimpleNamespace(rows=None)
+    work = edit_job.Job(config.Config(), lit, None, 0, None, wanted, fake, None, None, edit_job.Watch())
     assert not work.newton
     check_trials(work)
 

@@ -11,9 +11,7 @@ from envedit.images import images
 from tests.oracles.painting import SMALL, served, until
 
 pytestmark = pytest.mark.slow
-sync_api = pytest.importorskip(
-    "playwright.sync_api", reason="playwright is not installed"
-)
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
 pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -19,7 +19,8 @@ from envedit.core.errors import NumericalError, place_of
 from envedit.export.ratio_transfer import Ratio
 from envedit.export.texel_maps import Places, as_image
 from envedit.representations.layers import lights
-from envedit.representations.layers.layers import Layers, brightened, gone_of, unseen_kept
+from envedit.representations.layers.gain import brightened
+from envedit.representations.layers.layers import Layers, gone_of, unseen_kept
 from envedit.representations.layers.separation import grown
 
 POINTS_AT_ONCE = 1 << 20

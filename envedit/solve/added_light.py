@@ -99,7 +99,8 @@ class _Model:
         """Return the same for pictures (n, pixels, 3)."""
         normal, blocks, count = self.normal, self.normal.blocks, len(pictures)
         weighted = pictures * (normal.slope**2 * normal.robust).reshape(-1, 3)
-        by_pixel = weighted.transpose(1, 0, 2).reshape(*normal.slope.shape[:2], -1)
+        profiled = weighted * normal.profile.reshape(-1, 3)
+        by_pixel = profiled.transpose(1, 0, 2).reshape(*normal.slope.shape[:2], -1)
         in_blocks = self.problem.blocks.summed(by_pixel).reshape(-1, count, 3)
         mixed = np.concatenate([j.T @ in_blocks[..., c] for c, j in enumerate(blocks.jacobian)])
         if len(normal.pictures):

@@ -59,6 +59,14 @@ class BlockJacobian:
             found[..., c] = (cells.astype(np.float32) @ matrix.T)[:, self.block_of]
         return found
 
+    def profile(self, picture: np.ndarray) -> np.ndarray:
+        """Return a picture (h, w, 3) over its mean in every block; 1 where that is 0."""
+        flat = np.float64(picture).reshape(-1, 3)
+        size = np.bincount(self.block_of, minlength=self.count)
+        mean = (self.summed(flat.reshape(picture.shape)) / np.maximum(size, 1)[:, None])[self.block_of]
+        profile = np.divide(flat, mean, out=np.ones_like(flat), where=mean > 0)
+        return np.float32(profile).reshape(picture.shape)
+
     def sky_cells(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """List the cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""
         inside = np.zeros(self._cells)

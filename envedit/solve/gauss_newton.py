@@ -29,6 +29,8 @@ the start's squared error that the solution's must be below."""
 WORTH, ADDED_STEPS = 8.0, 6
 """By how much a further light must lower F to be tried and to be kept: a likelihood of e^4; and the steps
 after which that is asked, by which a solution with one more light may be longer."""
+PLACINGS = 3
+"""Most times that the map's light is placed, each time with the noise that the last has left."""
 SAME_PLACE = np.cos(np.radians(1.0))
 """Cosine of the angle below which an added light is where it would be added again."""
 
@@ -225,6 +227,8 @@ class _Search:
             raise NumericalError("the edit cannot begin: the map that the search found is not finite")
         if not self.iterations:
             return run, point
+        if self.births:
+            run, point = self._placed(run, point)
         if more is not None:
             run, point = self._better(run, point, self._new(run, more))
         for _ in range(self.births):
@@ -236,7 +240,7 @@ class _Search:
             if found is None or found[1] < WORTH:
                 break
             before = run
-            run, point = self._better(run, point, self._new(run, found[0]), self._moved(run, found[0]))
+            run, point = self._better(run, point, *self._additions(run, found[0]))
             if run is before:
                 break
         return run, point
@@ -254,9 +258,7 @@ class _Search:
                 normal = self.problem.normal(point, run.start, noise)
                 found = added_light.best(self.problem, point, normal)
                 if found is not None and found[1] >= WORTH:
-                    run, point = self._better(
-                        run, point, self._new(run, found[0]), self._moved(run, found[0])
-                    )
+                    run, point = self._better(run, point, *self._additions(run, found[0]))
             if run is before:
                 return run, point
 
@@ -272,31 +274,71 @@ class _Search:
             dark = problem.evaluate(without, resolve=False)
             noise = problem.noise(point.residual, self.sigma)
             found = added_light.best(problem, dark, problem.normal(dark, run.start, noise), i)
+            rivals = [self._moved(run, run.state, i)]
             if found is None or found[1] < WORTH:
-                run, point = self._better(run, point, (without, []))
+                rivals.append((without, []))
             elif problem.direction(found[0], i) @ problem.direction(run.state, i) < SAME_PLACE:
-                run, point = self._better(run, point, (found[0], [i]))
+                rivals.append((found[0], [i]))
+            run, point = self._better(run, point, *rivals)
         return run, point
+
+    def _additions(self, run, state):
+        """Return the rivals of a run where a state has added a light."""
+        new, lights = self._new(run, state)
+        return [(new, lights), *(self._moved(run, state, i) for i in lights)]
 
     def _new(self, run, state):
         """Return a state with more added lights, and which are new."""
         return state, [i for i in self.problem.added(state) if i not in self.problem.added(run.state)]
 
-    def _moved(self, run, state):
-        """Return the state in which the map's strongest light is where a state has added one, and its number.
+    def _strongest(self, run):
+        """Return the number of the map's own light with the largest flux, None where it has none."""
+        own = [k for k in self.problem.lit(run.state) if k not in self.problem.added(run.state)]
+        flux = self.problem.layers.lights.flux * np.exp(run.state["flux"])
+        return max(own, key=lambda k: flux[k].sum(), default=None)
 
-        What looks like a new light may be the one that the map has. None where the map has no light.
+    def _placed(self, run, point):
+        """Put the map's strongest light where it would be added were it not there, if the start errs less so.
+
+        The search has placed it for the picture alone, without a prior on the sky.
         """
-        problem, (_, new) = self.problem, self._new(run, state)
-        lights = problem.layers.lights
-        own = [i for i in problem.lit(run.state) if i not in problem.added(run.state)]
-        if not own or not new:
+        problem, k = self.problem, self._strongest(run)
+        if k is None:
+            return run, point
+        dark = {name: value.copy() for name, value in run.state.items()}
+        dark["flux"][k] = DARK
+        without, least = problem.evaluate(dark, resolve=False), problem.noise(point.residual, self.sigma)
+        noise = problem.noise(without.residual, self.sigma)
+        for _ in range(PLACINGS):
+            found = added_light.best(problem, without, problem.normal(without, run.start, noise), k)
+            if found is None:
+                break
+            state = {name: value.copy() for name, value in run.state.items()}
+            state["turn"][k] = found[0]["turn"][k]
+            there = problem.evaluate(state)
+            left = np.inf if there.residual is None else problem.noise(there.residual, self.sigma)
+            if left < least:
+                run, point, least = Run(state, state), there, left
+            if left >= noise:
+                break
+            noise = left
+        return run, point
+
+    def _moved(self, run, state, i):
+        """Return the state in which the map's strongest light is where a state has light i, and its number.
+
+        What looks like a new light may be the one that the map has: no light is added. None where the map has
+        none.
+        """
+        problem, k = self.problem, self._strongest(run)
+        if k is None:
             return None
-        flux = [float((lights.flux[i] * np.exp(run.state["flux"][i])).sum()) for i in own]
-        i, moved = own[int(np.argmax(flux))], {name: value.copy() for name, value in run.state.items()}
-        moved["turn"][i] = rotation_vector(lights.centres[i], problem.direction(state, new[0]))
-        moved["flux"][i], moved["gain"][:] = 0, 0  # what has made up for the light is in the gain
-        return moved, [i]
+        lights, moved = problem.layers.lights, {name: value.copy() for name, value in run.state.items()}
+        moved["turn"][k] = rotation_vector(lights.centres[k], problem.direction(state, i))
+        moved["flux"][problem.added(run.state)] = DARK
+        # What has made up for the light is in the gain and in other lights that were added.
+        moved["flux"][k], moved["gain"][:] = 0, 0
+        return moved, [k]
 
     def _better(self, run, point, *rivals):
         """Return the best of a run and of those from other states, after some steps.
@@ -348,6 +390,10 @@ class _Search:
                 if tried is not None and tried.residual is not None:
                     data = problem.misfit(tried.residual, run.scale)
                     penalty = problem.penalty(tried.state, run.start)
+                    if data + penalty >= before:
+                        # Columns of T that were traced for it are not in what it is compared with.
+                        point = problem.evaluate(run.state, resolve=False)
+                        before = problem.loss(point, run.start, run.scale)
                     if data + penalty < before:
                         better = tried
                         break

@@ -17,8 +17,8 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
-from envedit.representations.layers.gain import LEVELS
-from envedit.representations.layers.layers import VEIL, Layers
+from envedit.representations.layers.gain import LEVELS, VEIL
+from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 from envedit.representations.layers.separation import glow_at
 from envedit.solve.matching_pursuit import GAIN_ORDER, Given, Place, place, products, relative

@@ -26,7 +26,8 @@ import numpy as np
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.losses import display_curve
-from envedit.representations.layers.layers import VEIL, Layers
+from envedit.representations.layers.gain import VEIL
+from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 from envedit.solve.block_jacobian import BlockJacobian
 
@@ -120,8 +121,8 @@ class Normal:
     """Hessian (m, m) and gradient (m,) of F / 2.
 
     ``precision`` is K in the Hessian, ``unknowns`` names those after the gain's, ``blocks`` is what the
-    Hessian was made of; so are weights ``robust`` (h, w, 1), ``slope`` of the display curve and ``residual``
-    (h, w, 3), and ``pictures`` (k, h, w, 3) of the unknowns that are named.
+    Hessian was made of; so are weights ``robust`` (h, w, 1), ``slope`` of the display curve, ``residual`` and
+    ``profile`` of the blocks (h, w, 3), and ``pictures`` (k, h, w, 3) of the unknowns that are named.
     """
 
     hessian: np.ndarray
@@ -132,6 +133,7 @@ class Normal:
     robust: np.ndarray
     slope: np.ndarray
     residual: np.ndarray
+    profile: np.ndarray
     pictures: np.ndarray
 
     @property
@@ -350,10 +352,11 @@ class Problem:
         size = _sizes(point.residual)
         robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
         slope = display_curve.slope(point.rendering)
-        blocks, (lights, jacobian) = self.blocks, self._linearised(point)
+        blocks, (lights, profile, jacobian) = self.blocks, self._linearised(point)
         unknowns = 3 * n + len(lights.pictures)
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-        squared, pulled = blocks.summed(slope**2 * robust), blocks.summed(slope * robust * point.residual)
+        squared = blocks.summed((slope * profile) ** 2 * robust)
+        pulled = blocks.summed(slope * profile * robust * point.residual)
         seen, lit = np.zeros((len(lights.pictures), n * 3)), []
         for c, j in enumerate(jacobian):
             part = slice(c * n, (c + 1) * n)
@@ -361,7 +364,8 @@ class Problem:
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
             gradient[part] = j.T @ pulled[:, c]
             if len(lights.pictures):
-                in_blocks = blocks.summed((lights.pictures * (slope**2 * robust))[..., c].transpose(1, 2, 0))
+                weighted = lights.pictures[..., c] * (slope**2 * profile * robust)[..., c]
+                in_blocks = blocks.summed(weighted.transpose(1, 2, 0))
                 seen[:, part] = in_blocks.T @ j
                 lit.append(in_blocks)
         if len(lights.pictures):
@@ -373,13 +377,16 @@ class Problem:
         precision, back = self._precision(lights.unknowns), self._from_prior(state, start, lights.unknowns)
         hessian += precision
         gradient += precision @ back
-        parts = Blocks(jacobian, squared, pulled, lit), robust, slope, point.residual, lights.pictures
-        return Normal(hessian, gradient, precision, lights.unknowns, *parts)
+        pixels = robust, slope, point.residual, profile, lights.pictures
+        parts = Blocks(jacobian, squared, pulled, lit)
+        return Normal(hessian, gradient, precision, lights.unknowns, parts, *pixels)
 
     def _linearised(self, point):
         """Pictures of lights and Jacobian of the gain, which no weight changes: kept of the last point."""
         if self._linear is None or self._linear[0] is not point:
-            self._linear = point, self._lights(point), self.blocks.jacobian(self._slopes(point))
+            profile = self._profile(point)
+            jacobian = self.blocks.jacobian(self._slopes(point))
+            self._linear = point, self._lights(point, profile), profile, jacobian
         return self._linear[1:]
 
     def _precision(self, unknowns):
@@ -474,7 +481,16 @@ class Problem:
             slopes[:own] = np.where(self.free[:own, :, None], slopes[:own], 0)
         return slopes.reshape(-1, 3)
 
-    def _lights(self, point) -> _Lights:
+    def _profile(self, point):
+        """Return the sky's light on every pixel over the mean of its block, (h, w, 3).
+
+        What a node changes is taken to spread so over a block: by texture, shading and outlines.
+        """
+        sky = self.envmap.copy()
+        sky[self.rows] = np.maximum(point.edited[self.rows] - self._core(point.state, point.state["flux"]), 0)
+        return self.blocks.profile(self.transport.linear(tensor(sky)).numpy())
+
+    def _lights(self, point, profile) -> _Lights:
         """Pictures by which a light's unknowns change the rendering, (k, h, w, 3), and what they are.
 
         A light's core is seen through T, its glow through the block transport.
@@ -502,7 +518,7 @@ class Problem:
             cores.append((self._core(larger, alone) - now) / 0.1)
             seen = self.transport.pictures(np.stack(cores), self.rows).reshape(4, -1, 3)
             if glow is not None:
-                seen[:3] += self.blocks.pictures(np.stack(shone))
+                seen[:3] += self.blocks.pictures(np.stack(shone)) * profile.reshape(-1, 3)
             flux, *others = seen
             pictures += others
             unknowns.append(("size", i, 0))

@@ -62,6 +62,8 @@ LASTING_LOOKS = 5
 """Looks in a row at which a texel must have been a main light before a renderer spends most paths on it."""
 COLUMNS_A_LOOK = 32
 """Columns that a renderer traces at one look, the brightest: speckle comes and goes, and is not chased."""
+LEAST_LIGHT = 1 / 256
+"""Light of a texel, as a share of the brightest's, below which it gets no column for a picture of its own."""
 TYPICAL_PIXELS = 128 * 128
 """Beyond so many pixels the predicted error is the picture's: those of neighbours are independent."""
 _RECORDING = 1  # raise when the same scene, grid and seed give another recording, or other arrays of it
@@ -341,7 +343,7 @@ class LightTransport:
     def pictures(self, maps: np.ndarray, rows: slice) -> np.ndarray:
         """Render maps that are black but for few texels, without the light of other lamps.
 
-        Costs what their texels cost, not what T does.
+        Costs what their texels cost, not what T does. The texels with most light get exact columns.
 
         Parameters
         ----------
@@ -357,6 +359,7 @@ class LightTransport:
         flat = maps.reshape(len(maps), -1, 3)
         some = np.flatnonzero(flat.any(axis=(0, 2)))
         texels, values = some + rows.start * self.grid.width, flat[:, some]
+        self._trace_main(texels, values)
         exact = self._exact.slot_of[texels] >= 0
         total = np.zeros((len(maps), self.shape[0] * self.shape[1], 3), np.float32)
         if exact.any():
@@ -365,6 +368,19 @@ class LightTransport:
                 total[..., c] = values[:, exact, c] @ columns[..., c]
         total += self.reverse.transposed(texels[~exact], values[:, ~exact])
         return total.reshape(len(maps), *self.shape, 3)
+
+    def _trace_main(self, texels, values):
+        """Trace columns, with the fewest paths, of the main texels of maps (k, texels, 3) that have none."""
+        exact = self._exact
+        light = np.abs(values).sum(axis=(0, 2), dtype=np.float64) * self.influence.ravel()[texels]
+        main = np.argsort(-light, kind="stable")[:COLUMNS_A_LOOK]
+        main = texels[main[light[main] > light.max(initial=0) * LEAST_LIGHT]]
+        todo = main[exact.slot_of[main] < 0]
+        lasting = exact.texels[exact.paths_of[exact.texels] > self.paths[0]]
+        keep = np.union1d(main, lasting)
+        todo = todo[: max(exact.capacity - len(np.setdiff1d(keep, todo)), 0)]
+        if len(todo):
+            exact.trace(todo, self.paths[0], self.seed, keep)
 
     def adjoint(self, image: mi.TensorXf) -> mi.TensorXf:
         """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3)."""

@@ -160,6 +160,42 @@ def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
     assert (np.diag(plain_precision(problem, names))[: 3 * n] > 0.1 * np.diag(expected)[: 3 * n]).any()
 
 
+def test_texture_within_a_block_is_in_the_derivatives(rng):
+    """Blocks of four pixels that see the same sky, with albedos of their own: as exact as single pixels."""
+    height, width = film = (8, 64)
+    block = np.add.outer(np.arange(height) // 2 * (width // 2), np.arange(width) // 2).ravel()
+    seen = DenseTransport.random(rng, (height // 2, width // 2), GRID, even=0.8).weights[0]
+    albedo = rng.uniform(0.05, 1.0, (3, height * width, 1))
+    image, transport = clouds(rng) + lamp(), DenseTransport(albedo * seen[block], film, GRID)
+    target = shown(transport, image) * np.exp(rng.normal(0, 0.3, (*film, 3))).astype(np.float32)
+    problem, params = problem_of(image, transport, target)
+    state, n = problem.state(params), problem.nodes
+    start = copy(state)
+    state["gain"] = rng.normal(0, 0.3, state["gain"].shape)
+    point, sigma = problem.evaluate(state), 1.0
+    assert problem.blocks.count == height * width // 4
+    normal, h = problem.normal(point, start, sigma), STEPS["gain"]
+
+    def ends(k):
+        return [problem.evaluate(moved(problem, state, normal.unknowns, k, sign * h)) for sign in (1, -1)]
+
+    def f(end):
+        return problem.misfit(end.residual, sigma) + problem.penalty(end.state, start)
+
+    some = list(range(0, 3 * n, 7))
+    slope = np.array([f(ahead) - f(back) for ahead, back in map(ends, some)]) / (4 * h)
+    np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=5e-3 * np.abs(slope).max())
+    k = some[int(np.abs(slope).argmax())]
+    ahead, back = ends(k)
+    column = normal.slope * (np.float64(ahead.rendering) - back.rendering) / (2 * h)
+    lights = normal.pictures * normal.slope
+    mixed = (lights * normal.robust * column).sum(axis=(1, 2, 3))
+    np.testing.assert_allclose(normal.hessian[3 * n :, k], mixed, rtol=0, atol=5e-3 * np.abs(mixed).max())
+    # Negative control: without the profile the sum is that of the blocks' means.
+    even = problem.blocks.profile(np.ones((*film, 3)))
+    assert np.array_equal(even, np.ones_like(even)) and np.ptp(normal.profile) > 1
+
+
 def plain_precision(problem, names, prior=PRIOR):
     """Return K, written node by node."""
     n = problem.nodes
@@ -713,6 +749,19 @@ def test_a_light_is_added_where_the_target_has_one(rng):
     assert [row["iteration"] for row in found.history] == list(range(len(found.history)))
 
 
+def test_the_maps_light_is_placed_with_the_prior_before_the_first_step(rng):
+    """From the wrong place, with a light that may be added: it is not added, the map's own goes there."""
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID, even=0.8)
+    target = shown(transport, image + lamp((9, 34)))
+    problem, params = problem_of(image + lamp(), transport, target)
+    state = problem.state(solve(problem, params, 0.01, births=1).params)
+    assert problem.lit(state) == [0]
+    angle = np.degrees(np.arccos(problem.direction(state, 0) @ latlong.directions(*GRID)[9, 34]))
+    assert angle < 8  # half a texel
+    alone = problem.state(solve(problem, params, 0.01).params)
+    assert np.degrees(np.arccos(problem.direction(alone, 0) @ latlong.directions(*GRID)[9, 34])) > 20
+
+
 def test_no_light_is_added_where_none_is_missing(case):
     problem, params, _, _ = case
     whole = problem.evaluate(problem.state(params)).rendering
@@ -819,7 +868,7 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(rng):
     state["flux"][0] = -0.2
     point = problem.evaluate(state)
     normal, n = problem.normal(point, start, 1.0), problem.nodes
-    lights = problem._lights(point)
+    lights = problem._lights(point, np.ones((*FILM, 3)))
     for k, (name, _, _) in enumerate(lights.unknowns):
         if name == "size":
             continue

@@ -410,6 +410,25 @@ def test_pictures_of_few_texels_are_those_of_the_whole_map(lamp_scene, rng, rows
     assert not t.pictures(0 * maps, rows).any()
 
 
+def test_main_texels_of_pictures_get_columns(lamp_scene):
+    """As many as there is room for beside those that have lasted; texels with little light get none."""
+    t = build(lamp_scene, spp=32)
+    sun = np.full((HEIGHT, WIDTH, 3), 1e-3, np.float32)
+    sun[3, 9] = 1e5
+    t.resolve(sun)
+    lasting = t.columns[t._exact.paths_of[t.columns] > t.paths[0]]
+    assert len(lasting)
+    maps = np.zeros((1, HEIGHT, WIDTH, 3))
+    maps[0, 2, 4:8], maps[0, 2, 12] = -1.0, 1e-4
+    t.pictures(maps, slice(0, HEIGHT))
+    for column in range(4, 8):
+        assert 2 * WIDTH + column in t.columns
+    assert 2 * WIDTH + 12 not in t.columns and np.isin(lasting, t.columns).all()
+    maps[:] = 1.0
+    t.pictures(maps, slice(0, HEIGHT))
+    assert len(t.columns) <= t.capacity and np.isin(lasting, t.columns).all()
+
+
 def test_limit_bounds_the_new_columns(lamp_scene):
     t = build(lamp_scene, spp=32)
     image = noise()

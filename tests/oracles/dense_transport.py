@@ -47,6 +47,8 @@ class DenseTransport:
         rgb = [dr.matmul(w, flat[:, c : c + 1]).array for c, w in enumerate(self._tensors)]
         return mi.TensorXf(dr.ravel(mi.Color3f(*rgb)), (*self.shape, 3))
 
+    linear = apply  # no other lamps
+
     def pictures(self, maps, rows):
         whole = np.zeros((len(maps), *self.grid, 3))
         whole[:, rows] = maps

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from envedit.images import images
 from envedit.losses import naturalness
 from envedit.representations.layers import below_horizon, layers
 from envedit.representations.layers.below_horizon import Below, kind_of, sky_rows
+from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import rotation_vector
 
@@ -132,6 +134,21 @@ def test_extremes_stay_finite(value):
     assert np.isfinite(below.log_factor(tensor(np.full(sky.shape, value))).numpy()).all()
     black = Below(np.zeros_like(low), np.zeros_like(sky), "mirror")
     assert np.isfinite(black.log_factor(tensor(np.full(sky.shape, value))).numpy()).all()
+
+
+@pytest.mark.parametrize("kind", ["mirror", "keep"])
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_a_channel_that_is_black_in_the_sky_does_not_burst_below_it(kind, channel):
+    """The gain lights it up by the veil, from nothing: no ratio to nothing goes into the ground."""
+    image = mirror()
+    low, sky = halves(image)
+    sky = sky.copy()
+    sky[..., channel] = 0
+    factor = 1.5
+    lit = brightened(mi.Color3f(sky.reshape(-1, 3).T), mi.Color3f(factor)).numpy().T.reshape(sky.shape)
+    assert lit[..., channel].min() > 0
+    found = np.exp(Below(low, sky, kind).log_factor(tensor(lit)).numpy())
+    assert found.max() <= (2 * factor - 1) * 1.001 and found.min() > 0.99
 
 
 # ---- in layers ---------------------------------------------------------------------------------------------

@@ -5,7 +5,8 @@ are the original's, times a smooth factor that tells how the sky above has chang
 
     E_low = E0_low * R^f,    log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
-S and S_0 are the sky, without cores of lights, after the edit and before, m is the mirrored direction, K a
+S and S_0 are the sky, without cores of lights, after the edit and before, in every channel with some of its
+luminance (:func:`.veiled`: a ratio to a channel that is black says nothing), m is the mirrored direction, K a
 Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
 :data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio. f is 1 for
 a mirror; for ground it falls off with the angle (:data:`FADE`): what was photographed keeps its brightness.
@@ -20,6 +21,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.representations.layers.gain import veiled
 
 KINDS = "mirror", "keep"
 SMOOTH, BOX = 0.0125, 7.0
@@ -104,7 +106,7 @@ class Below:
         self._back = tensor(np.kron(self._blur.across.T, np.eye(3)))
         self.widest = WIDEST[2] if kind == "keep" else self._best_width(radiance, sky, total)
         self._blur.widen(self.widest)
-        before = tensor(sky)
+        before = _veiled(tensor(sky))
         self._before, self._before_soft = before, self._blur(before)
 
     def _best_width(self, radiance, sky, total):
@@ -137,6 +139,7 @@ class Below:
         With what is to be revealed, ``gone`` (sky_rows * W) is the share of a texel's light above the horizon
         that was a glow's and is gone.
         """
+        sky = _veiled(sky)
         soft = dr.log((self._blur(sky) + self._faint) / (self._before_soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
         sharp = dr.log((sky.array + self._faint) / (self._before.array + self._faint))
@@ -195,6 +198,10 @@ class _Blur:
         coarse = dr.matmul(dr.matmul(self._down, flat), self._across) * self._share
         soft = dr.matmul(self._kernel, dr.reshape(coarse, (rows * columns, 3)))
         return dr.reshape(soft, (rows, 3 * columns))
+
+
+def _veiled(sky):
+    return mi.TensorXf(dr.ravel(veiled(dr.unravel(mi.Color3f, sky.array))), sky.shape)
 
 
 def _tents(place, count, periodic=False):

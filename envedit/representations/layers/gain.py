@@ -22,9 +22,20 @@ LEVELS = 3
 CYCLES = 12
 """Cycles around the horizon that any picture may move; what is finer must be told by it."""
 
-
 DETAIL = 1.0
 """A step of the nodes of finer grids, where they are well known."""
+VEIL = 0.2
+"""Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
+
+
+def veiled(radiance: mi.Color3f) -> mi.Color3f:
+    """Mix some of its luminance into every channel of radiance."""
+    return radiance * (1 - VEIL) + mi.luminance(radiance) * VEIL
+
+
+def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:
+    """Scale radiance; what is brightened is so in part by its luminance: a black channel stays in step."""
+    return dr.select(factor > 1, base + (factor - 1) * veiled(base), base * factor)
 
 
 def grid_size(cycles: float, share: float) -> tuple[int, int]:

@@ -7,7 +7,7 @@ E_0' is the original without the cores of its lights, G_l and C_l are glow and c
 gone (``behind_glow.py``), g is the smooth gain of the sky (``gain.py``), and s_l, the factor of a light's
 flux, is in G_l. Rows below the horizon follow those above (``below_horizon.py``), or are edited like them.
 Where f = exp(g) is above 1, E f is read as
-E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`brightened`. Unmoved lights and no gain give the original
+E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`.brightened`. Unmoved lights and no gain give the original
 back, bit for bit outside the cores: there is nothing to fit, the sky's own detail is kept, and the map has
 any resolution.
 """
@@ -26,15 +26,13 @@ from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.representations.layers.behind_glow import BehindGlow, behind_glow
 from envedit.representations.layers.below_horizon import Below, sky_rows
-from envedit.representations.layers.gain import CYCLES, GridGain, Octave
+from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
 from envedit.representations.layers.lights import DARK, SPARE, Lights
 from envedit.representations.layers.separation import Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
 UNSEEN = 1 / 512
 """Relative change of radiance that nobody sees: a display with 256 steps has steps twice as large."""
-VEIL = 0.2
-"""Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
 
@@ -43,12 +41,6 @@ def unseen_kept(original: np.ndarray, edited: np.ndarray) -> np.ndarray:
     """Give texels of an edited image the original's bits where no channel changes by over :data:`UNSEEN`."""
     seen = np.abs(edited - original) > UNSEEN * original
     return np.where(seen.any(axis=2, keepdims=True), edited, original)
-
-
-def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:
-    """Scale radiance; what is brightened is so in part by its luminance: a black channel stays in step."""
-    grey = base * (1 - VEIL) + mi.luminance(base) * VEIL
-    return dr.select(factor > 1, base + (factor - 1) * grey, base * factor)
 
 
 def gone_of(ratio: mi.Color3f) -> mi.Float:

@@ -235,7 +235,8 @@ class Job:
 
     def _problem(self):
         wanted = self.wanted.aim, self.wanted.weight, self.representation.free
-        return map_problem.Problem(self.representation, self.renderer.transport, self.original, *wanted)
+        transport, views = self.renderer.transport, len(self.lit.rows)
+        return map_problem.Problem(self.representation, transport, self.original, *wanted, views=views)
 
     @property
     def _sigma(self):

@@ -2,7 +2,7 @@
 
 T is traced once for a scene, its camera and a texel grid, without looking at any map; then rendering is a
 matrix product and its adjoint is exact. Nothing changes from step to step, so no Monte Carlo noise bends the
-objective (see docs/architecture.md).
+objective (see docs/light_transport.md).
 
 Two tiers, both unbiased:
 

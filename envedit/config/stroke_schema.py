@@ -6,17 +6,33 @@ What a stroke does is :mod:`envedit.targets.strokes`'s.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from envedit.config.validators import WantedError, choice, named, number, numbers, show, view
+from envedit.core.color import srgb_to_linear
 from envedit.core.errors import ConfigError
 
 _FURTHEST = 1e6
 _coordinate = number(-_FURTHEST, _FURTHEST)
 _length = number(0, _FURTHEST, positive=True)
 _point = numbers(_coordinate, _coordinate)
-_color = numbers(*3 * [number(0, 1e6)])
+_linear_color = numbers(*3 * [number(0, 1e6)])
+
+
+def _color(value: Any) -> list[float]:
+    """Accept [r, g, b], factors on linear radiance, or the sRGB colour "#rrggbb", which becomes them."""
+    if isinstance(value, str):
+        if not re.fullmatch("#[0-9a-fA-F]{6}", value):
+            raise WantedError('[r, g, b], or a colour such as "#ffd9a6"')
+        return [
+            float(round(c, 4))
+            for c in srgb_to_linear(np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255)
+        ]
+    return _linear_color(value)
 
 
 def _ellipse(value: Any) -> list[float]:

@@ -331,11 +331,8 @@ def _tonemap_of(file, info, declared, warnings):
         warnings.append(
             f"{file}: says that it is under {said[:40]!a}, which is unknown: '{declared}' is used"
         )
-    elif said != declared:
-        warnings.append(f"{file}: was written under the '{said}' tonemap: used instead of '{declared}'")
-        return said
     else:
-        warnings.append(f"{file}: read as a picture under the '{declared}' tonemap")
+        return said
     return declared
 
 
@@ -399,6 +396,8 @@ def _recognised(file, values, alpha, initial, declared, warnings):
     error = {name: _median_error(values, initial, name, where) for name in TONEMAPS}
     best = min(error, key=error.get)
     if error[best] > min(3 / 255, error[declared] / 4):
+        if error[declared] > 3 / 255:
+            warnings.append(f"{file}: names no tonemap: read under '{declared}', that of [target] tonemap")
         return declared
     if best != declared:
         warnings.append(f"{file}: is the initial rendering under '{best}', and read so, not '{declared}'")

@@ -93,7 +93,7 @@ def stroke_list(value: Any) -> tuple[dict, ...]:
 
 def _stroke(name: str, stroke: dict) -> dict:
     if "type" not in stroke:
-        raise ConfigError(f"{name}.type: came none, wanted one of {', '.join(STROKES)}")
+        raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
     kind = named(f"{name}.type", choice(*STROKES), stroke["type"])
     keys = STROKES[kind] | _ANY_STROKE
     known = ["type", *SHAPES, "width", "view", *keys]
@@ -106,9 +106,9 @@ def _stroke(name: str, stroke: dict) -> dict:
     found: dict[str, Any] = {"type": kind}
     shapes = [shape for shape in SHAPES if shape in stroke]
     if len(shapes) > 1:
-        raise ConfigError(f"{name}: came {' and '.join(shapes)}, wanted one shape")
+        raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
     if not shapes and kind not in WHOLE_IMAGE:
-        raise ConfigError(f"{name}: came no shape, wanted one of {', '.join(SHAPES)} for type {kind}")
+        raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
     for shape in shapes:
         check = SHAPES[shape]
         if callable(check):
@@ -117,20 +117,20 @@ def _stroke(name: str, stroke: dict) -> dict:
             found[shape] = _points(f"{name}.{shape}", stroke[shape], check)
     if "points" in stroke:
         if "width" not in stroke:
-            raise ConfigError(f"{name}.width: came none, wanted the width of the brush, as points are given")
+            raise ConfigError(f"{name}.width: got none, expected the width of the brush, as points are given")
         found["width"] = named(f"{name}.width", _length, stroke["width"])
     elif "width" in stroke:
-        raise ConfigError(f"{name}.width: came {show(stroke['width'])}, wanted none without points")
+        raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
     if "view" in stroke:
         found["view"] = named(f"{name}.view", view, stroke["view"])
     for key, (default, check) in keys.items():
         if key not in stroke and default is None:
-            raise ConfigError(f"{name}.{key}: came none, wanted a number, as type is {kind}")
+            raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
         found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
     return found
 
 
 def _points(name: str, value: Any, least: int) -> list[list[float]]:
     if not isinstance(value, list | tuple) or len(value) < least:
-        raise ConfigError(f"{name}: came {show(value)}, wanted [[x, y], ...], at least {least}")
+        raise ConfigError(f"{name}: got {show(value)}, expected [[x, y], ...], at least {least}")
     return [named(f"{name}[{i}]", _point, v) for i, v in enumerate(value)]

@@ -1,6 +1,6 @@
 """``envedit run``: carry out an edit; leaves the map, renderings, metrics and a report in a folder.
 
-The edit is that of a configuration, or of a scene and a few options. What is told goes to stdout as text, or
+The edit is that of a configuration, or of a scene and a few options. Output goes to stdout as text, or
 with ``--json`` as one object at the end; progress, warnings and errors go to stderr, as text or JSON lines.
 """
 
@@ -105,7 +105,7 @@ def load(name, preset, overrides):
 
 
 def _is_scene(name):
-    """Tell a scene from a configuration: an XML file, or the name of a shipped scene."""
+    """Distinguish a scene from a configuration: an XML file, or the name of a shipped scene."""
     plain = not os.path.isfile(name) and name in shipped.scenes() and name not in shipped.configurations()
     return name.lower().endswith(".xml") or plain
 
@@ -138,7 +138,7 @@ def _quick(arguments):
 
 
 def _missing(file):
-    """Tell whether a file is not there; False where it cannot be looked at, which reading it will explain."""
+    """Return whether a file is missing; False where it cannot be looked at, which reading it will explain."""
     try:
         os.stat(file)
     except FileNotFoundError:

@@ -35,7 +35,7 @@ SIGMA = 0.005
 INDEPENDENT = 256
 """Residuals of a picture that count as independent, per channel: neighbouring pixels err together."""
 ANGLE = np.radians(0.7)
-"""Rotation by which the derivative by a light's direction is told."""
+"""Rotation of the finite difference by a light's direction."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
 """Largest step of an unknown: beyond it the linear model does not hold."""
 SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
@@ -186,7 +186,7 @@ class Problem:
     weight : ndarray (h, w, 1), optional
         How much each pixel counts, 1 on average.
     free : ndarray of bool (rows, W), optional
-        Active texels whose gain is free, as :meth:`.Layers.keep` was told; None: all.
+        Active texels whose gain is free, as given to :meth:`.Layers.keep`; None: all.
     prior : Prior
         How far a sky changes.
     """

@@ -1,7 +1,8 @@
 """A painted picture: what it asks for, where it was painted, and the rendering to paint on.
 
-A picture tells nothing where it is clipped, and asks for nothing where it was not painted. The latter is seen
-by comparing it with the initial rendering, in display values, as that would look in the picture's own format.
+A picture has no information where it is clipped, and requests nothing where it was not painted. The latter is
+seen by comparing it with the initial rendering, in display values, as that would look in the picture's own
+format.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Painted:
     coverage : ndarray (h, w, 1) float32
         How much each pixel was painted, in [0, 1].
     excluded : ndarray of bool (h, w)
-        Pixels that tell nothing: clipped, or transparent over nothing.
+        Pixels without information: clipped, or transparent over nothing.
     warnings : tuple of str
         What the user should know.
     """
@@ -74,7 +75,7 @@ def check_export(file) -> None:
     """
     file = Path(os.fsdecode(file))
     if file.suffix.lower() not in ENDINGS:
-        raise ConfigError(f"--export-initial: came {str(file)!r}, wanted a name that ends in .exr or .png")
+        raise ConfigError(f"--export-initial: got {str(file)!r}, expected a name that ends in .exr or .png")
     if os.path.lexists(file):
         raise InputError(f"{file}: exists and is not overwritten: name another file, or move it away")
     if not os.path.isdir(file.parent):
@@ -84,8 +85,8 @@ def check_export(file) -> None:
 def export_tonemap(file, picture: np.ndarray, settings: config.Config) -> str:
     """Return the tonemap of an exported picture (h, w, 3): "linear" for OpenEXR, or that of the PNG.
 
-    That is [target] tonemap where it clips less than :data:`CLIPPED` of the pixels, which tell nothing when
-    they come back, and otherwise "reinhard", which clips nothing below a radiance of 10^4.
+    That is [target] tonemap where it clips less than :data:`CLIPPED` of the pixels, which have no information
+    when they come back, and otherwise "reinhard", which clips nothing below a radiance of 10^4.
     """
     if Path(os.fsdecode(file)).suffix.lower() == ".exr":
         return "linear"
@@ -143,8 +144,8 @@ def export(file, picture: np.ndarray, settings: config.Config, name: str | None 
     if share < CLIPPED:
         return []
     return [
-        f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and tell nothing "
-        "when they come back: export an .exr"
+        f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and cannot be "
+        "painted on: export an .exr"
     ]
 
 

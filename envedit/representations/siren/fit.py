@@ -376,7 +376,7 @@ def _stored(fitted: Fitted) -> dict[str, np.ndarray]:
 
 
 def _whole(arrays, network):
-    """Tell whether arrays from disk are a fit of such a network."""
+    """Return whether arrays from disk are a fit of such a network."""
     inputs = 2 if network.coordinates == "plane" else 3
     made = siren.init(0, network.hidden, network.depth, network.omega, inputs)
     shapes = {name: value.shape for name, value in made.items()}

@@ -12,6 +12,7 @@ import sys
 import numpy as np
 import pytest
 
+import envedit
 from envedit.cli.main import COMMANDS
 from tests.oracles import ROOT
 
@@ -22,7 +23,7 @@ PAGES = [
     *ROOT.glob("docs/*.md"),
     *ROOT.glob("experiments/*/*.md"),
 ]
-ELSEWHERE = ("pytest", "sphinx", "venv", "pip")
+ELSEWHERE = ("build", "pytest", "sphinx", "venv", "pip")
 """Programs of others that are run as ``python -m``."""
 
 
@@ -48,6 +49,11 @@ def test_the_site_builds_offline_without_a_warning(tmp_path):
     for page in tmp_path.rglob("*.html"):
         loaded = re.search(r'(?:src|link [^>]*href)="https?:.*', page.read_text())
         assert not loaded, f"{page}: {loaded[0]}"
+
+
+def test_the_citation_names_the_version():
+    cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)
+    assert cited and cited[1] == envedit.__version__
 
 
 class Parsed(Exception):

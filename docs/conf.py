@@ -15,9 +15,10 @@ root_doc = "docs/index"
 include_patterns = ["docs/**", "experiments/*/README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"]
 exclude_patterns = ["docs/_redirect", ".*", "envedit", "tests", "scenes", "runs", "build", "dist"]
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 4
+nb_execution_mode = "off"  # the tests execute the notebooks; -D nb_execution_mode=force shows what they print
 
 autodoc_typehints = "none"  # numpydoc's sections say them
 autodoc_member_order = "bysource"

@@ -3,6 +3,8 @@
 import argparse
 import importlib.util
 import itertools
+import json
+import os
 import re
 import runpy
 import shlex
@@ -20,7 +22,7 @@ DOCS = ROOT / "docs"
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
-    *ROOT.glob("docs/*.md"),
+    *ROOT.glob("docs/**/*.md"),
     *ROOT.glob("experiments/*/*.md"),
 ]
 ELSEWHERE = ("build", "pytest", "sphinx", "venv", "pip")
@@ -39,7 +41,7 @@ def test_painting_in_python(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_site_builds_offline_without_a_warning(tmp_path):
-    for package in ("sphinx", "myst_parser", "furo"):
+    for package in ("sphinx", "myst_nb", "furo"):
         pytest.importorskip(package, reason="the extra envedit[docs] is not installed")
     site = [sys.executable, "-m", "sphinx", "-W", "-q", "-c", "docs", ".", str(tmp_path)]
     done = subprocess.run(site, cwd=ROOT, capture_output=True, text=True)
@@ -49,6 +51,32 @@ def test_the_site_builds_offline_without_a_warning(tmp_path):
     for page in tmp_path.rglob("*.html"):
         loaded = re.search(r'(?:src|link [^>]*href)="https?:.*', page.read_text())
         assert not loaded, f"{page}: {loaded[0]}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("edit_a_map", [r"rendering: \d\d\.\d -> [3-9]\d\.\d dB", r"light at azimuth (5\d|6\d),"]),
+        ("table_1_in_small", [r"R-SIREN HDR +\d\d\.\d dB", r"Layers \(ours\) .* 3\d\.\d dB"]),
+    ],
+)
+def test_a_notebook_runs(name, says, tmp_path):
+    for package in ("jupytext", "ipykernel", "nbconvert"):
+        pytest.importorskip(package, reason="the extra envedit[docs] is not installed")
+    made = tmp_path / "made.ipynb"
+    notebook = [sys.executable, "-m", "jupytext", "--to", "ipynb", "--execute", "--output", str(made)]
+    own = {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run(
+        [*notebook, str(DOCS / "notebooks" / f"{name}.md")],
+        env=os.environ | own,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    cells = json.loads(made.read_text())["cells"]
+    printed = "".join("".join(o.get("text", [])) for cell in cells for o in cell.get("outputs", []))
+    assert all(re.search(line, printed) for line in says), printed
 
 
 def test_the_citation_names_the_version():

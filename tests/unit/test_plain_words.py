@@ -29,7 +29,7 @@ IDIOMS = {
 PACKAGE = sorted(ROOT.glob("envedit/**/*.py"))
 PAGES = [
     *ROOT.glob("*.md"),
-    *ROOT.glob("docs/*.md"),
+    *ROOT.glob("docs/**/*.md"),
     *ROOT.glob("experiments/*/README.md"),
     *ROOT.glob("envedit/cli/paint/page/*.html"),
 ]

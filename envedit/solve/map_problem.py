@@ -1,4 +1,4 @@
-"""What an edit with layers minimises, and its derivatives; ``docs/method.md``, "The edit as one problem".
+"""What an edit with layers minimises, and its derivatives; ``docs/solver.md``, "The edit as one problem".
 
 Unknowns x: the log gain g of every node, and of every light that is lit its log flux per channel, its
 direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and

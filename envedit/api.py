@@ -39,7 +39,7 @@ def edit(
     base : Path, optional
         Folder that file names in scene parameters are relative to; by default the configuration's.
     watch : Watch, optional
-        Told of progress.
+        Receives progress.
 
     Returns
     -------

@@ -86,7 +86,7 @@ def run(
     base : Path, optional
         Folder that file names in scene parameters are relative to.
     watch : Watch, optional
-        Told of progress.
+        Receives progress.
     picture : ndarray (h, w, 3), optional
         A painted picture, linear radiance, in place of the configuration's target.
     mask : ndarray (h, w), optional

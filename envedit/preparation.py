@@ -1,7 +1,7 @@
 """From a configuration's map, scene and target to an edit that can be optimised.
 
-The sky may be turned as a whole first (``solve/turning.py``); lights are then told from the background, or a
-network is fitted, and it is found out where the edit starts.
+The sky may be turned as a whole first (``solve/turning.py``); lights are then separated from the background,
+or a network is fitted, and it is found out where the edit starts.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Preparation:
     folder : Path, optional
         Of the checkpoint.
     watch : Watch
-        Told of progress.
+        Receives progress.
     dists : distances.Dists, optional
         As for :class:`.edit_job.Job`.
     clock : callable

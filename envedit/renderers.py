@@ -51,7 +51,7 @@ def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Ren
     shape : (int, int)
         Rows and columns of the maps.
     progress : callable, optional
-        Told of blocks of pixels done, and in all.
+        Receives the blocks of pixels done, and all.
     """
     chosen = settings.renderer
     if chosen.kind == "path":

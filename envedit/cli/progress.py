@@ -42,7 +42,7 @@ class Progress:
             print(text, file=self.stream, flush=True)
 
     def update(self, done: int, total: int, text: str = "") -> None:
-        """Tell that ``done`` of ``total`` parts of the stage are done.
+        """Report that ``done`` of ``total`` parts of the stage are done.
 
         Speed is counted from the first call of the stage: what resumes was not done in no time.
         """
@@ -75,7 +75,7 @@ class Progress:
 
 
 class JsonProgress:
-    """Tell stages and progress as JSON lines on stderr; used like :class:`Progress`.
+    """Report stages and progress as JSON lines on stderr; used like :class:`Progress`.
 
     A stage begins with ``{"event": "stage", "stage": text}``; then, at most every :data:`JSON_SECONDS` and
     when it is done, come ``{"event": "progress", "stage":, "done":, "total":, "text":}``.
@@ -100,7 +100,7 @@ class JsonProgress:
         self.tell("stage", stage=text)
 
     def update(self, done: int, total: int, text: str = "") -> None:
-        """Tell that ``done`` of ``total`` parts of the stage are done."""
+        """Report that ``done`` of ``total`` parts of the stage are done."""
         now = time.monotonic()
         if now - self._last >= JSON_SECONDS or done == total:
             self._last = now

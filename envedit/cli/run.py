@@ -1,6 +1,6 @@
 """``envedit run``: carry out an edit; leaves the map, renderings, metrics and a report in a folder.
 
-The edit is that of a configuration, or of a scene and a few options. What is told goes to stdout as text, or
+The edit is that of a configuration, or of a scene and a few options. Output goes to stdout as text, or
 with ``--json`` as one object at the end; progress, warnings and errors go to stderr, as text or JSON lines.
 """
 
@@ -105,7 +105,7 @@ def load(name, preset, overrides):
 
 
 def _is_scene(name):
-    """Tell a scene from a configuration: an XML file, or the name of a shipped scene."""
+    """Distinguish a scene from a configuration: an XML file, or the name of a shipped scene."""
     plain = not os.path.isfile(name) and name in shipped.scenes() and name not in shipped.configurations()
     return name.lower().endswith(".xml") or plain
 
@@ -138,7 +138,7 @@ def _quick(arguments):
 
 
 def _missing(file):
-    """Tell whether a file is not there; False where it cannot be looked at, which reading it will explain."""
+    """Return whether a file is missing; False where it cannot be looked at, which reading it will explain."""
     try:
         os.stat(file)
     except FileNotFoundError:
@@ -208,7 +208,12 @@ def _parser():
         "--export-initial",
         metavar="FILE",
         help="only write the initial rendering, to paint on: linear .exr, or 16-bit .png under "
-        "[target] tonemap",
+        "[target] tonemap, or under reinhard where that would clip",
+    )
+    instead.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="only write the target, dry_run.png and dry_run.exr in the folder of the results: no edit",
     )
     instead.add_argument(
         "--budget",
@@ -241,6 +246,8 @@ def _run(arguments, start):
     allowed = None if arguments.budget is None else _seconds(arguments.budget)
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)
+    if arguments.dry_run:
+        return _dry_run(settings, arguments)
     folder = Path(settings.output.dir)
     with output_folder.alone(folder):
         return _edit(settings, arguments, folder, allowed, start)
@@ -354,13 +361,20 @@ def _export_initial(settings, arguments):
         source = inputs.source_of(settings.input, lit)  # what the picture says that it was made from
         settings = replace(settings, input=replace(settings.input, envmap=source))
         picture = painted_image.initial(lit, envmap, settings)
+        under = painted_image.export_tonemap(file, picture, settings)
         for one, rows in files:
-            warnings += painted_image.export(one, picture[rows], settings)
+            warnings += painted_image.export(one, picture[rows], settings, under)
     for line in warnings:
         _tell(arguments, "warning", line)
     for line in notes:
         _say(arguments, line)
-    under = "linear" if file.suffix.lower() == ".exr" else f"under the '{settings.target.tonemap}' tonemap"
+    declared = settings.target.tonemap
+    if under not in ("linear", declared):
+        _say(
+            arguments,
+            f"{file}: '{declared}' would clip highlights, so it is under '{under}'; the file says so",
+        )
+    under = "linear" if under == "linear" else f"under the '{under}' tonemap"
     for k, (one, rows) in enumerate(files):
         ask = f'[target] kind = "image", file = "{one.absolute()}"' + (
             f", view = {k}" if len(files) > 1 else ""
@@ -368,6 +382,45 @@ def _export_initial(settings, arguments):
         size = f"{lit.width}x{rows.stop - rows.start}"
         _say(arguments, f"{one}: {size}, {under}; paint on it, then set {ask}")
     arguments.facts["files"] = {one.name: str(one.absolute()) for one, _ in files}
+    return 0
+
+
+def _dry_run(settings, arguments):
+    """Write what a run would edit towards, and nothing else: a picture to look at, and linear radiance."""
+    from envedit.cli import doctor
+    from envedit.report import output_folder
+
+    doctor.ensure(settings.variant)
+    import mitsuba as mi
+
+    mi.set_variant(settings.variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    from envedit import inputs
+    from envedit.images import images
+    from envedit.report import preview
+    from envedit.targets import target
+
+    folder = Path(settings.output.dir)
+    with output_folder.alone(folder), _progress(arguments) as progress:
+        progress.stage("rendering the target")
+        lit = inputs.load_scene(settings.scene, arguments.base)
+        envmap, warnings = inputs.load_map(settings.input, lit)
+        notes = inputs.notes(settings.input, lit)
+        wanted = target.make(settings, lit, envmap)
+        files = {name: folder / name for name in ("dry_run.png", "dry_run.exr")}
+        preview.preview(
+            files["dry_run.png"],
+            {"initial": wanted.initial, "target": wanted.picture},
+            {"initial": envmap, "target": wanted.envmap},
+            settings.output.tonemap,
+            views=[view.rows for view in lit.views],
+        )
+        images.write_exr(files["dry_run.exr"], wanted.picture, {"content": "target"}, panorama=False)
+    for line in (*warnings, *wanted.warnings):
+        _tell(arguments, "warning", line)
+    for line in (*notes, wanted.source, *(str(file.resolve()) for file in files.values())):
+        _say(arguments, line)
+    arguments.facts["files"] = {name: str(file.resolve()) for name, file in files.items()}
     return 0
 
 

@@ -1,6 +1,6 @@
 """Standard output and standard error that may be closed, full, or unable to show a letter.
 
-What a command prints tells of its work and is not its work: a result is written, and the exit code tells how
+What a command prints reports its work and is not its work: a result is written, and the exit code says how
 it went, whether or not anybody could read along.
 """
 
@@ -41,7 +41,7 @@ class _Steady:
             pass
 
     def isatty(self) -> bool:
-        """Tell whether it is a terminal."""
+        """Return whether it is a terminal."""
         try:
             return self._stream.isatty()
         except ValueError:

@@ -74,13 +74,13 @@ _MAPS = "auto", "scene", "sunsky"  # words that ``[input] envmap`` takes in plac
 def checked_layer(layer: Any, where: str, top: Fields, tables: dict[str, Fields]) -> dict[str, Any]:
     """Check every table, key and value that one source gives, and normalise the values."""
     if not isinstance(layer, dict):
-        raise ConfigError(f"{where}: came {show(layer)}, wanted a table of tables")
+        raise ConfigError(f"{where}: got {show(layer)}, expected a table of tables")
     found: dict[str, Any] = {}
     try:
         for name, value in layer.items():
             if name in tables:
                 if not isinstance(value, dict):
-                    raise ConfigError(f"{name}: came {show(value)}, wanted a table, [{name}]")
+                    raise ConfigError(f"{name}: got {show(value)}, expected a table, [{name}]")
                 found[name] = {}
                 for key, entry in value.items():
                     if key not in tables[name]:
@@ -137,7 +137,7 @@ def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, An
             given = source.get("target", {})
             if given.get("file") and given.get("rotate_degrees"):
                 raise ConfigError(
-                    f"{where}: target.file and target.rotate_degrees: came both, wanted one: "
+                    f"{where}: target.file and target.rotate_degrees: got both, expected one: "
                     "the other map, or the input turned"
                 )
             if given.get("rotate_degrees"):

@@ -76,7 +76,7 @@ class Input(Table):
         "auto",
         choice("auto", "mirror", "keep", "free"),
         'layers, all rows: those below the horizon follow the sky as its blurred "mirror", "keep" but for a '
-        'fade, or are "free" as the sky is; "auto" tells a mirror from ground',
+        'fade, or are "free" as the sky is; "auto" detects which',
     )
     azimuth: float = _key(90.0, number(-360, 360), "sunsky: azimuth of the sun, degrees")
     elevation: float = _key(35.0, number(0, 90), "sunsky: elevation of the sun above the horizon, degrees")
@@ -91,10 +91,10 @@ class Input(Table):
 
     def _check_together(self) -> None:
         if not self.envmap:
-            raise ConfigError('input.envmap: came "", wanted an image file, "scene", "sunsky" or "auto"')
+            raise ConfigError('input.envmap: got "", expected an image file, "scene", "sunsky" or "auto"')
         if not isinstance(self.rows, str) and self.rows[1] >= self.width // 2:
             raise ConfigError(
-                f"input.rows: came {list(self.rows)}, wanted rows below {self.width // 2}: "
+                f"input.rows: got {list(self.rows)}, expected rows below {self.width // 2}: "
                 f"a map {self.width} wide has {self.width // 2} rows"
             )
 
@@ -115,7 +115,7 @@ class Scene(Table):
 
     def _check_together(self) -> None:
         if not self.file:
-            raise ConfigError('scene.file: came "", wanted a Mitsuba XML file or the name of a shipped scene')
+            raise ConfigError('scene.file: got "", expected a Mitsuba XML file or a shipped scene')
 
 
 @dataclass(frozen=True)
@@ -172,35 +172,35 @@ class Target(Table):
 
     def _check_together(self) -> None:
         if self.kind == "envmap" and isinstance(self.file, tuple):
-            raise ConfigError('target.file: came a list, wanted one map, as target.kind is "envmap"')
+            raise ConfigError('target.file: got a list, expected one map, as target.kind is "envmap"')
         if self.view != () and self.kind == "strokes":
-            raise ConfigError("target.view: came one, wanted none: each stroke has a view of its own")
+            raise ConfigError("target.view: got one, expected none: each stroke has a view of its own")
         named = len(self.files) if self.kind == "image" else len(self.masks)
         if self.view != () and len(self.views) != named:
-            raise ConfigError(f"target.view: came {len(self.views)} views, wanted {named}, one for each file")
+            raise ConfigError(f"target.view: got {len(self.views)} views, expected {named}, one a file")
         if len({*self.views}) != len(self.views):
-            raise ConfigError("target.view: came a view twice, wanted each once")
+            raise ConfigError("target.view: got a view twice, expected each once")
         if self.kind == "image" and self.mask and len(self.masks) != named:
-            raise ConfigError(f"target.mask: came {len(self.masks)} masks, wanted {named}, one for each file")
+            raise ConfigError(f"target.mask: got {len(self.masks)} masks, expected {named}, one a file")
         if self.kind == "envmap" and self.file:
             object.__setattr__(self, "rotate_degrees", 0.0)
         if self.kind == "image" and not self.file:
-            raise ConfigError('target.file: came "", wanted the painted image, as target.kind is "image"')
+            raise ConfigError('target.file: got "", expected the painted image, as target.kind is "image"')
         if self.kind == "strokes" and not self.strokes:
-            raise ConfigError('target.strokes: came none, wanted at least one, as target.kind is "strokes"')
+            raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
         if self.kind == "none" and (self.file or self.mask):
-            raise ConfigError('target.file, target.mask: came one, wanted none, as target.kind is "none"')
+            raise ConfigError('target.file, target.mask: got one, expected none, as target.kind is "none"')
         if self.kind == "strokes" and self.file:
             raise ConfigError(
-                f"target.file: came {show(self.file)}, wanted none: strokes go on the initial rendering"
+                f"target.file: got {show(self.file)}, expected none: strokes go on the initial rendering"
             )
         if self.kind == "strokes" and self.mask:
-            raise ConfigError(f"target.mask: came {show(self.mask)}, wanted none: strokes say where they are")
+            raise ConfigError(f"target.mask: got {show(self.mask)}, expected none: strokes have a place")
         if self.kind in ("image", "strokes") and not self.paint + self.hold:
-            raise ConfigError("target.paint, target.hold: came 0 for both, wanted one above 0")
+            raise ConfigError("target.paint, target.hold: got 0 for both, expected one above 0")
         if self.kind != "strokes" and self.strokes:
             raise ConfigError(
-                f'target.strokes: came {len(self.strokes)}, wanted none, as target.kind is "{self.kind}": '
+                f'target.strokes: got {len(self.strokes)}, expected none, as target.kind is "{self.kind}": '
                 'set target.kind = "strokes"'
             )
 
@@ -232,7 +232,7 @@ class Representation(Table):
     cycles: int | str = _key(
         "auto",
         or_auto(integer(1, 256)),
-        "layers: finest detail of the gain, cycles around the horizon; auto: 12, or what the picture tells",
+        "layers: finest detail of the gain, cycles around the horizon; auto: 12, or what is identifiable",
     )
     turn: str | bool = _key(
         "auto",
@@ -254,7 +254,7 @@ class Fit(Table):
     epochs: int = _key(1200, integer(0, 10**7), "steps of Adam")
     lr: float = _key(1e-3, number(0, positive=True), "initial learning rate of Adam")
     beta2: float = _key(0.99, number(0, 0.999999), "Adam's decay of squared gradients")
-    stride: int = _key(2, integer(1, 64), "a step sees every so-manieth row and column, other ones each time")
+    stride: int = _key(2, integer(1, 64), "a step samples every stride-th row and column, at varying offsets")
     schedule: str = _key(
         "cosine", choice("cosine", "warm-restarts", "constant"), "course of both learning rates"
     )
@@ -275,7 +275,7 @@ class Fit(Table):
 
     def _check_together(self) -> None:
         if not self.log_mse + self.log_ssim + self.hdr:
-            raise ConfigError("fit.log_mse, fit.log_ssim, fit.hdr: came 0 for all, wanted one above 0")
+            raise ConfigError("fit.log_mse, fit.log_ssim, fit.hdr: got 0 for all, expected one above 0")
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ class Loss(Table):
 
     def _check_together(self) -> None:
         if not self.ssim and not self.image_l1 and not self.image_l2:
-            raise ConfigError("loss.ssim, loss.image_l1, loss.image_l2: came 0 for all, wanted one above 0")
+            raise ConfigError("loss.ssim, loss.image_l1, loss.image_l2: got 0 for all, expected one above 0")
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class Perceptual(Table):
     def _check_together(self) -> None:
         for one, other in (("vgg", "dists"), ("backbone", "heads")):
             if bool(getattr(self, one)) != bool(getattr(self, other)):
-                raise ConfigError(f"perceptual.{one}, perceptual.{other}: came one, wanted both or none")
+                raise ConfigError(f"perceptual.{one}, perceptual.{other}: got one, expected both or none")
 
 
 @dataclass(frozen=True)
@@ -344,7 +344,7 @@ class Renderer(Table):
     spp: int | str = _key(
         "auto",
         or_auto(integer(1, 1 << 20)),
-        'samples a pixel, or "auto": most where the picture tells detail',
+        'samples a pixel, or "auto": most where detail is identifiable',
     )
     max_depth: int | str = _key("auto", or_auto(integer(1, 1024)), 'longest path, in segments, or "auto"')
     refresh: int | str = _key(
@@ -427,7 +427,7 @@ class Config(Table):
         able = self.representation.kind == "layers" and self.renderer.kind == "transport"
         if self.optimizer.kind == "gauss-newton" and not able:
             raise ConfigError(
-                'optimizer.kind: came "gauss-newton", wanted adam or auto: it solves for layers '
+                'optimizer.kind: got "gauss-newton", expected adam or auto: it solves for layers '
                 "(representation.kind) through a stored transport (renderer.kind)"
             )
 
@@ -481,19 +481,19 @@ def load(path: str | PathLike, preset: str | None = None, overrides: Iterable[st
         with opened(path) as file:
             data = file.read(_MOST_BYTES + 1)
     except IsADirectoryError:
-        raise ConfigError(f"{path}: a folder, wanted a TOML file") from None
+        raise ConfigError(f"{path}: a folder, expected a TOML file") from None
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such configuration file") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"{str(path)!r}: cannot be read: {reason}") from None
     if len(data) > _MOST_BYTES:
-        raise ConfigError(f"{path}: more than {_MOST_BYTES >> 20} MiB, wanted a TOML file")
+        raise ConfigError(f"{path}: more than {_MOST_BYTES >> 20} MiB, expected a TOML file")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         row = data.count(b"\n", 0, error.start) + 1
-        raise ConfigError(f"{path}: not UTF-8 text at line {row}; wanted a TOML file") from None
+        raise ConfigError(f"{path}: not UTF-8 text at line {row}; expected a TOML file") from None
     path = Path(path)
     return loads(text, path.absolute().parent, str(path), preset, overrides)
 
@@ -598,7 +598,7 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     key, equals, raw = text.partition("=") if isinstance(text, str) else ("", "", "")
     keys = tuple(part.strip() for part in key.split("."))
     if not equals or not all(keys):
-        raise ConfigError(f"--set {show(text)}: wanted table.key=value, such as fit.epochs=100")
+        raise ConfigError(f"--set {show(text)}: expected table.key=value, such as fit.epochs=100")
     raw = raw.strip()
     try:
         parsed = _parsed(f"value = {raw}")
@@ -626,7 +626,7 @@ def quote(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        # JSON's escapes are TOML's, but for DEL, which TOML alone wants escaped.
+        # JSON's escapes are TOML's, but for DEL, which only TOML requires to be escaped.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, dict):
         bare = {k: k if re.fullmatch(r"[A-Za-z0-9_-]+", k) else quote(k) for k in value}

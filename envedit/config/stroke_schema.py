@@ -6,17 +6,33 @@ What a stroke does is :mod:`envedit.targets.strokes`'s.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from envedit.config.validators import WantedError, choice, named, number, numbers, show, view
+from envedit.core.color import srgb_to_linear
 from envedit.core.errors import ConfigError
 
 _FURTHEST = 1e6
 _coordinate = number(-_FURTHEST, _FURTHEST)
 _length = number(0, _FURTHEST, positive=True)
 _point = numbers(_coordinate, _coordinate)
-_color = numbers(*3 * [number(0, 1e6)])
+_linear_color = numbers(*3 * [number(0, 1e6)])
+
+
+def _color(value: Any) -> list[float]:
+    """Accept [r, g, b], factors on linear radiance, or the sRGB colour "#rrggbb", which becomes them."""
+    if isinstance(value, str):
+        if not re.fullmatch("#[0-9a-fA-F]{6}", value):
+            raise WantedError('[r, g, b], or a colour such as "#ffd9a6"')
+        return [
+            float(round(c, 4))
+            for c in srgb_to_linear(np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255)
+        ]
+    return _linear_color(value)
 
 
 def _ellipse(value: Any) -> list[float]:
@@ -77,7 +93,7 @@ def stroke_list(value: Any) -> tuple[dict, ...]:
 
 def _stroke(name: str, stroke: dict) -> dict:
     if "type" not in stroke:
-        raise ConfigError(f"{name}.type: came none, wanted one of {', '.join(STROKES)}")
+        raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
     kind = named(f"{name}.type", choice(*STROKES), stroke["type"])
     keys = STROKES[kind] | _ANY_STROKE
     known = ["type", *SHAPES, "width", "view", *keys]
@@ -90,9 +106,9 @@ def _stroke(name: str, stroke: dict) -> dict:
     found: dict[str, Any] = {"type": kind}
     shapes = [shape for shape in SHAPES if shape in stroke]
     if len(shapes) > 1:
-        raise ConfigError(f"{name}: came {' and '.join(shapes)}, wanted one shape")
+        raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
     if not shapes and kind not in WHOLE_IMAGE:
-        raise ConfigError(f"{name}: came no shape, wanted one of {', '.join(SHAPES)} for type {kind}")
+        raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
     for shape in shapes:
         check = SHAPES[shape]
         if callable(check):
@@ -101,20 +117,20 @@ def _stroke(name: str, stroke: dict) -> dict:
             found[shape] = _points(f"{name}.{shape}", stroke[shape], check)
     if "points" in stroke:
         if "width" not in stroke:
-            raise ConfigError(f"{name}.width: came none, wanted the width of the brush, as points are given")
+            raise ConfigError(f"{name}.width: got none, expected the width of the brush, as points are given")
         found["width"] = named(f"{name}.width", _length, stroke["width"])
     elif "width" in stroke:
-        raise ConfigError(f"{name}.width: came {show(stroke['width'])}, wanted none without points")
+        raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
     if "view" in stroke:
         found["view"] = named(f"{name}.view", view, stroke["view"])
     for key, (default, check) in keys.items():
         if key not in stroke and default is None:
-            raise ConfigError(f"{name}.{key}: came none, wanted a number, as type is {kind}")
+            raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
         found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
     return found
 
 
 def _points(name: str, value: Any, least: int) -> list[list[float]]:
     if not isinstance(value, list | tuple) or len(value) < least:
-        raise ConfigError(f"{name}: came {show(value)}, wanted [[x, y], ...], at least {least}")
+        raise ConfigError(f"{name}: got {show(value)}, expected [[x, y], ...], at least {least}")
     return [named(f"{name}[{i}]", _point, v) for i, v in enumerate(value)]

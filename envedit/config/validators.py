@@ -220,7 +220,7 @@ def named(name: str, check: Callable, value: Any) -> Any:
     try:
         return check(value)
     except WantedError as error:
-        raise ConfigError(f"{name}: came {show(value)}, wanted {error}") from None
+        raise ConfigError(f"{name}: got {show(value)}, expected {error}") from None
 
 
 # ---- tables of checked values ----------------------------------------------------------------------------
@@ -277,7 +277,7 @@ def checked(f: Any, name: str, value: Any) -> Any:
     """Check the value of a field, or of a table inside a table; raise ConfigError with the key's name."""
     if "table" in f.metadata:
         if not isinstance(value, f.metadata["table"]):
-            raise ConfigError(f"{name}: came {show(value)}, wanted a table")
+            raise ConfigError(f"{name}: got {show(value)}, expected a table")
         return value
     return named(name, f.metadata["check"], value)
 

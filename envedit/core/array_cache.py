@@ -3,7 +3,7 @@
 An entry is one file: a header with the whole key and the SHA-256 of every array, then the raw arrays, which
 are mapped into memory and not parsed. A file that is damaged, cut short or foreign is as good as none, as is
 one in a folder that others may write to, and one that cannot be written costs nothing but the time to make
-its arrays again. A digest tells damage, not intent: callers check shapes and ranges too (``wanted``).
+its arrays again. A digest detects damage, not intent: callers check shapes and ranges too (``wanted``).
 
 SHA-256 reads 1.8 GB/s where the processor has instructions for it, BLAKE2b 0.9 GB/s.
 """
@@ -59,8 +59,8 @@ class DiskCache:
         key : dict
             What the arrays were made from, as JSON knows it.
         wanted : callable, optional
-            Tells whether arrays are such as :meth:`store` was given: names, types, shapes and ranges. What it
-            raises is a no.
+            Returns whether arrays are such as :meth:`store` was given: names, types, shapes and ranges. What
+            it raises is a no.
 
         Returns
         -------
@@ -182,7 +182,7 @@ def _read(path, text):
 
 
 def holds(arrays: dict[str, np.ndarray], wanted: dict[str, tuple]) -> bool:
-    """Tell whether arrays have these names, types and shapes, and hold finite numbers.
+    """Return whether arrays have these names, types and shapes, and hold finite numbers.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def holds(arrays: dict[str, np.ndarray], wanted: dict[str, tuple]) -> bool:
 
 
 def _private(folder):
-    """Tell whether only this user (and the system's) can have written into a folder; True of none."""
+    """Return whether only this user (and the system's) can have written into a folder; True of none."""
     try:
         about = os.stat(folder)
     except FileNotFoundError:

@@ -36,18 +36,31 @@ def linear_to_srgb(e) -> np.ndarray:
 LOG_SCALE = 100.0
 """The "log" tonemap is linear well below 1/100 and logarithmic above; it ends at a radiance of 100."""
 
+REINHARD_WHITE = 1e4
+"""Radiance that the "reinhard" tonemap shows as white: a reflected sun is below."""
+
 TONEMAPS: dict[str, Callable] = {
     "gamma": lambda e: np.clip(e, 0, 1) ** (1 / 2.2),
     "srgb": linear_to_srgb,
     "log": lambda e: np.log1p(LOG_SCALE * np.clip(e, 0, LOG_SCALE)) / math.log1p(LOG_SCALE**2),
+    "reinhard": lambda e: _reinhard(np.clip(e, 0, REINHARD_WHITE)) ** (1 / 2.2),
     "linear": lambda e: np.clip(e, 0, 1),
 }
 INVERSE_TONEMAPS: dict[str, Callable] = {
     "gamma": lambda t: np.clip(t, 0, 1) ** 2.2,
     "srgb": srgb_to_linear,
     "log": lambda t: np.expm1(np.clip(t, 0, 1) * math.log1p(LOG_SCALE**2)) / LOG_SCALE,
+    "reinhard": lambda t: _reinhard_inverse(np.clip(t, 0, 1) ** 2.2),
     "linear": lambda t: np.clip(t, 0, 1),
 }
+
+
+def _reinhard(e):
+    return e / (1 + e) * (1 + 1 / REINHARD_WHITE)
+
+
+def _reinhard_inverse(t):
+    return t / (1 + 1 / REINHARD_WHITE - t)
 
 
 def tonemap(image, name: str = "gamma") -> np.ndarray:
@@ -56,6 +69,8 @@ def tonemap(image, name: str = "gamma") -> np.ndarray:
     - ``gamma``: clip(E, 0, 1)^(1/2.2)
     - ``srgb``: the sRGB curve of clip(E, 0, 1)
     - ``log``: log(1 + 100 E) / log(1 + 100^2) of clip(E, 0, 100), so that 1 maps to 0.50
+    - ``reinhard``: ((1 + 1/W) E / (1 + E))^(1/2.2) of clip(E, 0, W), W = 10^4 (Reinhard et al. 2002, Eq. 3,
+      scaled so that W is white), so that 1 maps to 0.73
     - ``linear``: clip(E, 0, 1)
 
     Raises

@@ -46,7 +46,7 @@ def place_of(bad, first_row: int = 0) -> str:
 
 @contextlib.contextmanager
 def unwrapped():
-    """Raise what a user is to be told of, and Ctrl-C, as they are; also a decorator.
+    """Raise errors that a user should see, and Ctrl-C, as they are; also a decorator.
 
     Dr.Jit raises RuntimeError from whatever is raised inside its operations and loops.
     """

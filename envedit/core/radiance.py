@@ -103,7 +103,7 @@ def require_radiance(image, what: str, first_row: int = 0, brightest: float = ma
     what : str
         What the message calls it.
     first_row : int
-        Row of its map at which the image begins; the message tells the map's rows.
+        Row of its map at which the image begins; the message gives rows of the map.
     brightest : float
         The largest value that may be.
 

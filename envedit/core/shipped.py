@@ -32,6 +32,6 @@ def configuration(name: str) -> Path | None:
 
 
 def holds(path: Path) -> bool:
-    """Tell whether a file is one of the shipped ones."""
+    """Return whether a file is one of the shipped ones."""
     root = folder()
     return root is not None and path.resolve().is_relative_to(root.resolve())

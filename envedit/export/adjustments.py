@@ -1,7 +1,7 @@
 """Adjustments of a map that need no target: exposure, white balance, lights made softer and less bright.
 
 They act on the edited map at last, at whatever resolution it is written. Lights are those that
-:mod:`.separation` tells from the background; their flux is kept.
+:mod:`.separation` separates from the background; their flux is kept.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SEARCH, _NOTHING = 20, 1e-9  # halvings of a radius; share of a peak that is ro
 
 
 def any_asked(lights: config.Lights, output: config.Output) -> bool:
-    """Tell whether anything is to be adjusted."""
+    """Return whether anything is to be adjusted."""
     return bool(lights.max_radiance or lights.soften_degrees or output.exposure or output.white_balance)
 
 

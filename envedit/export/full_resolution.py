@@ -202,7 +202,7 @@ class _LayersAt:
             row, column, radiance, share = (np.concatenate(p) for p in zip(*parts, strict=True))
             flux = np.float64(radiance) * omega[row][:, None]
             soft = flux * share[:, None]
-            # What is soft at its border for the eye's sake still is all of the light.
+            # Rescaled so that feathering preserves flux.
             kept = soft.sum(axis=0)
             flux = soft * np.divide(flux.sum(axis=0), kept, out=np.ones(3), where=kept > 0)
             for k in range(0, len(row), POINTS_AT_ONCE):

@@ -1,6 +1,6 @@
 """The lights of a map as a list, for programs that take the sun as a lamp and the sky as a map.
 
-The lights are those that :mod:`.separation` tells from the background, of any map, however it was edited.
+The lights are those that :mod:`.separation` separates from the background, of any map, however it was edited.
 Radiance is what reaches the scene, ``scale`` included. Lights of a map before and after an edit are matched
 by where they are and how much flux they have, whatever moved them.
 """

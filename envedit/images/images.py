@@ -330,7 +330,7 @@ def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
 def png(codes) -> bytes:
     """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG.
 
-    In memory: Mitsuba does not tell that the last bytes of a file did not fit on the disk.
+    In memory: Mitsuba does not report that the last bytes of a file did not fit on the disk.
     """
     import mitsuba as mi
 

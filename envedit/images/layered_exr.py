@@ -68,7 +68,7 @@ def write(
         colour = values.ndim == 3 and values.shape[2] == 3
         if not (colour or values.ndim == 2 and layer != default) or values.shape[:2] != size or 0 in size:
             raise ValueError(
-                f"{name}: layer '{layer}' has shape {values.shape}, wanted {size} with 3 channels"
+                f"{name}: layer '{layer}' has shape {values.shape}, expected {size} with 3 channels"
             )
         if layer != default and not (layer.isascii() and layer.isidentifier()):
             raise ConfigError(f"{name}: '{layer}' cannot be the name of a layer: use letters, digits and _")
@@ -101,7 +101,7 @@ def _finite(name, layer, values):
 
 @contextlib.contextmanager
 def _threads(library, count):
-    """Let the library compress on several cores; it uses one unless told, and before 3.5 cannot be told."""
+    """Let the library compress on several cores; by default it uses one, and before 3.5 always."""
     if not hasattr(library, "set_global_thread_count"):
         yield
         return

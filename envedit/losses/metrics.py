@@ -197,7 +197,7 @@ def log_rmse(a, b) -> float | None:
 
 
 def painted(edited, wanted, initial, coverage, tonemap: str = "gamma") -> dict:
-    """Tell how far a painted picture was followed, and how still the rest was held.
+    """Measure how far a painted picture was followed, and how still the rest was held.
 
     On display values d, with coverage c in [0, 1], means over pixels and channels.
 

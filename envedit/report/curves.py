@@ -3,6 +3,7 @@
 import html
 import math
 
+from envedit.losses.optimizer import ramp
 from envedit.report.manifest import columns
 
 _PALETTE = ("#22223b", "#c8553d", "#2a7f9e", "#588157", "#b5838d", "#8d6a9f", "#d4a017", "#6c757d")
@@ -74,6 +75,46 @@ def curves_svg(rows: list[dict], width=860, height=340) -> str:
             value = 10.0 ** min(last, 308.25)  # the logarithm of the largest float is rounded up
             out.append(f'<text x="{right + 38}" y="{level}">{escape(label)} {value:.3g}</text>')
     return "\n".join([*out, "</svg>"])
+
+
+def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dict], str]:
+    """Return a history whose losses have their last weights throughout, and a line that explains the curves.
+
+    A weight that rises during a run lets the loss rise while the rendering improves: values of different
+    iterations can be compared only under the same weights.
+
+    Parameters
+    ----------
+    rows : list of dict
+        A row an iteration: ``iteration``, ``loss``, and the weighted terms that it is the sum of.
+    ramps : dict of str to (float, float)
+        First and last weight of the terms.
+    iterations : int
+        That the weights take to change.
+    """
+    names = columns(rows)
+    if {"sigma", "residual"} <= set(names):
+        return rows, (
+            "Residual: root mean square, over pixels and channels, of the difference between rendering and "
+            "target in display values. The objective itself is in units of a noise level that is estimated "
+            "anew in every iteration, so its values cannot be compared."
+        )
+    changing = {name: ends for name, ends in ramps.items() if name in names and ends[0] != ends[1]}
+    about = "Losses, times their weights, and their sum." if "loss" in names else ""
+    if not changing:
+        return rows, about
+    made = []
+    for i, row in enumerate(rows):
+        row, at = dict(row), number(row.get("iteration", i)) or 0.0
+        for name, (start, end) in changing.items():
+            if (value := number(row.get(name))) is not None:
+                row[name] = value * end / ramp(start, end, at, iterations)
+        terms = [number(row.get(name)) for name in ramps if name in names]
+        if number(row.get("loss")) is not None and None not in terms:
+            row["loss"] = sum(terms)
+        made.append(row)
+    which = ", ".join(f"{name} (from {start:g} to {end:g})" for name, (start, end) in changing.items())
+    return made, f"{about} Weights change during the run: {which}. All are drawn with the last ones."
 
 
 def number(value):

@@ -14,7 +14,7 @@ from envedit.core.color import luminance
 from envedit.core.latlong import solid_angles
 from envedit.images.images import png
 from envedit.losses.metrics import saturated, score, worse
-from envedit.report.curves import curves_svg, escape, number
+from envedit.report.curves import curves_svg, escape, normalised, number
 from envedit.report.manifest import plain
 from envedit.report.preview import (
     INFLUENCE_RANGE,
@@ -44,7 +44,7 @@ ul { margin: .4rem 0; padding-left: 1.2rem; }
 figure { margin: 0; } figcaption { margin: .3rem 0 0; }
 figure img { display: block; width: 100%; border-radius: 3px; }
 img.small { image-rendering: pixelated; }
-.unknown { aspect-ratio: 2; background: #e9e9ee; border-radius: 3px; color: var(--soft);
+.unknown { min-height: 4rem; background: #e9e9ee; border-radius: 3px; color: var(--soft);
   display: grid; place-items: center; font-size: .87rem; }
 .scale { height: 8px; border-radius: 2px; margin-top: .5rem;
   background: linear-gradient(90deg, #2166ac, #92c5de, #f7f7f7, #f4a582, #b2182b); }
@@ -68,6 +68,50 @@ pre { background: #fff; border: 1px solid var(--line); border-radius: 3px; paddi
 summary { cursor: pointer; }
 @media (max-width: 640px) { .grid { grid-template-columns: 1fr !important; } }
 """.replace("RISING", ", ".join(f"rgb({r},{g},{b})" for r, g, b in RISING))
+
+
+_RUN = {
+    "iterations": "iterations",
+    "non_finite_steps": "steps that were not finite, and not taken",
+    "turn_degrees": "turn of the whole sky (degrees)",
+    "sun_offset_texels": "brightest texel, edited to true map (texels)",
+    "active_rows": "rows that were edited, first and last",
+    "natural colours_outside": "share of the sky in colours that neither map has",
+    "natural seam": "step at the horizon over the original's",
+    "natural high_frequency": "detail of the sky over the original's",
+    "painted towards": "share of the way to the paint",
+    "painted elsewhere": "change of what was not painted (display values)",
+    "painted reachable": "feasible share of the way to the paint",
+    "fit log_psnr": "fit of the network, log-PSNR (dB)",
+    "fit peak_ratio": "fit, peak over the map's",
+    "fit epochs": "fit, epochs",
+    "fit cached": "fit taken from disk",
+    "transport cached": "T taken from disk",
+    "transport entries": "T, entries",
+    "transport memory_bytes": "T, bytes",
+    "transport columns": "T, exact columns",
+    "transport samples": "T, samples a pixel",
+    "transport path_depth": "T, longest path",
+    "transport depth_error": "T, share of the light that longer paths would add",
+    "transport predicted_error": "T, predicted relative error",
+    "transport frozen": "share of texels that are frozen",
+}
+"""Numbers of metrics.json in words; terms that are ours are in docs/glossary.md."""
+_TIMES = {
+    "import": "importing",
+    "target": "rendering the target",
+    "fit": "fitting the representation",
+    "transport": "tracing T, or reading it from disk",
+    "reach": "estimating what is feasible",
+    "start": "searching for lights",
+    "edit": "optimising",
+    "solve": "searching and optimising",
+    "judge": "rendering the result",
+    "full": "the edit at the resolution of the file",
+    "report": "writing the report",
+    "total": "total",
+    "per_iteration": "one iteration",
+}
 
 
 def _show(value, digits=4):
@@ -107,8 +151,8 @@ def _figure_of(pictures, name, what, tonemap):
     return f'<div class="unknown">{escape(f"{name}, {what}: not known")}</div>'
 
 
-def _grid(figures):
-    columns = max(len(figures), 3)
+def _grid(figures, columns=None):
+    columns = columns or max(len(figures), 3)
     return f'<div class="grid" style="grid-template-columns:repeat({columns},1fr)">{"".join(figures)}</div>'
 
 
@@ -188,6 +232,7 @@ def _verdict(metrics):
         return found if number(found.get("psnr")) is not None else None
 
     before, after, true_map = table("initial"), table("render"), table("envmap")
+    unedited = table("initial_envmap")
     known = [one for one in (before, after) if one]
     total = number((metrics.get("timing") or {}).get("total_s"))
 
@@ -196,7 +241,9 @@ def _verdict(metrics):
 
     kind = "log RMSE: a display shows little of what differs" if saturated(known) else "PSNR"
     parts = [f"Rendering against the target: {told(before)} → <strong>{told(after)}</strong> {kind}"]
-    parts += [f"map against the true one: {score(true_map, [])}"] if true_map else []
+    if true_map:
+        since = f"{score(unedited, [])} → " if unedited else ""
+        parts.append(f"map against the true one: {since}{score(true_map, [])}")
     painted = metrics.get("painted") or {}
     towards, elsewhere = number(painted.get("towards")), number(painted.get("elsewhere"))
     if towards is not None:
@@ -230,6 +277,7 @@ def write_report(
     notes=(),
     tonemap="gamma",
     views=(),
+    ramps=None,
 ) -> None:
     """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
 
@@ -261,6 +309,8 @@ def write_report(
         A name of `envedit.core.color.TONEMAPS`, for the pictures.
     views : sequence of `scene.View`
         Name and rows of each view, where the renderings are of several.
+    ramps : (dict of str to (float, float), int), optional
+        First and last weight of each loss in the history, and the iterations between them.
 
     Raises
     ------
@@ -309,12 +359,19 @@ def write_report(
         differences.append(_difference_figure(a, b, f"{what}, edited − {other}: {how}", kind, tonemap))
 
     # Tables
-    quality = [metrics.get(table) or {} for table in ("initial", "render", "envmap")]
+    kinds = {"initial": "initial rendering", "render": "edited rendering"}
+    kinds |= {"initial_envmap": "unedited map", "envmap": "edited map"} if metrics.get("envmap") else {}
+    quality = [metrics.get(table) or {} for table in kinds]
     measures = {"psnr": "PSNR (dB)", "ssim": "SSIM", "mse": "MSE", "lpips": "LPIPS"}
     measures |= {"log_rmse": "log RMSE (stops)", "beyond_display": "share that a display does not show"}
-    quality_rows = [[name, *(_show(table.get(key)) for table in quality)] for key, name in measures.items()]
+    quality_rows = [
+        [name, *(_show(table.get(key)) for table in quality)]
+        for key, name in measures.items()
+        if key != "lpips" or any(table.get(key) is not None for table in quality)
+    ]
     others = [(key, value) for key, value in metrics.items() if not isinstance(value, (dict, type(None)))]
-    others = [(key, value) for key, value in others if key not in ("choices", "views")]  # they have their own
+    elsewhere = ("choices", "views", "tonemap", "worse")
+    others = [(key, value) for key, value in others if key not in elsewhere]
     view_rows = [
         [
             f"{k} ({view['name']})",
@@ -323,15 +380,17 @@ def write_report(
         for k, view in enumerate(metrics.get("views") or [])
     ]
     view_head = ["view", *(f"{what}, {name}" for name in measures.values() for what in ("initial", "edited"))]
-    for part in ("fit", "transport", "painted"):
+    for part in ("natural", "painted", "fit", "transport"):
         others += [(f"{part} {key}", value) for key, value in (metrics.get(part) or {}).items()]
+    others = [[_RUN.get(key, key.replace("_", " ")), _show_list(value)] for key, value in others]
     timing = {key: number(value) for key, value in (metrics.get("timing") or {}).items()}
     longest = max((t for key, t in timing.items() if t and key.endswith("_s")), default=0)
     timing_rows = []
     for key, seconds in timing.items():
         unit = "ms" if key.endswith("_ms") else "s"
         share = max(seconds, 0) / longest * 12 if seconds and longest and unit == "s" else 0
-        label = key.removesuffix("_ms").removesuffix("_s").replace("_", " ")
+        label = key.removesuffix("_ms").removesuffix("_s")
+        label = _TIMES.get(label, label.replace("_", " "))
         cell = f"{_show(seconds, 3)} {unit}" if seconds is not None else "–"
         timing_rows.append([label, cell, f'<span class="bar" style="width:{share:.2f}rem"></span>'])
     map_rows = [[name, *_map_statistics(maps[name])] for name in names if name in maps]
@@ -347,7 +406,9 @@ def write_report(
     seen = []
     if influence is not None:
         seen = [_influence_figure(influence, frozen), *_identified_figure(identified)]
-    curves = curves_svg(history) or f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
+    drawn, about = normalised(history, *(ramps or ({}, 1)))
+    curves = curves_svg(drawn) or f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
+    curves += f'<p class="soft">{escape(about)}</p>' if "<svg" in curves and about else ""
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
     page = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
@@ -355,17 +416,23 @@ def write_report(
         f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body>",
         f"<h1>{escape(title)}</h1>{_verdict(metrics)}",
         f'<div class="warnings"><strong>Warnings</strong>{_list(warnings)}</div>' if warnings else "",
-        f"<h2>Renderings and maps</h2>{'<p></p>'.join(figures)}<p></p>{_grid(map_figures)}" if names else "",
+        f"<h2>Renderings and maps</h2>{'<p></p>'.join(figures)}<p></p>{_grid(map_figures, 1)}"
+        if names
+        else "",
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>' if names else "",
-        f"<h2>Differences</h2>{_grid(differences)}" if differences else "",
+        f"<h2>Differences</h2>{_grid(differences, 2)}" if differences else "",
         f"<h2>Lights and background</h2>{_grid(parts)}" if parts else "",
         f"<h2>What this view determines</h2>{_grid(seen)}" if seen else "",
         f"<h2>What was painted</h2>{_grid(asked)}" if asked else "",
         f"<h2>Losses</h2>{curves}",
         "<h2>Quality</h2>",
-        _table(["", "initial rendering", "edited rendering", "edited map"], quality_rows),
+        _table(["", *kinds.values()], quality_rows),
+        '<p class="soft">Against the target, and the map that it was rendered under where that is known. '
+        f"All but log RMSE: under the tonemap {escape(metrics.get('tonemap') or tonemap)}.</p>",
         f"<h2>Views</h2>{_table(view_head, view_rows)}" if view_rows else "",
-        _table(["", ""], [[k.replace("_", " "), _show_list(v)] for k, v in others]) if others else "",
+        f"<details><summary>Numbers of the run</summary>{_table(['', ''], others)}</details>"
+        if others
+        else "",
         f"<h2>Environment maps</h2>{_table(map_head, map_rows)}" if map_rows else "",
         '<p class="soft">Luminances are linear; the mean is over the sphere.</p>' if map_rows else "",
         f"<h2>Time</h2>{_table(['', '', ''], timing_rows)}" if timing_rows else "",

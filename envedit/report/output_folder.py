@@ -59,7 +59,7 @@ def tidy(folder: Path) -> None:
 
 
 def _runs(process):
-    """Say whether another process of this number runs, as far as can be told without touching it."""
+    """Say whether another process of this number runs, as far as is visible without touching it."""
     if process == os.getpid() or os.name != "posix":
         return False
     try:

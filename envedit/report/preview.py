@@ -44,7 +44,7 @@ def checked(image, name):
     """Return a picture as an array, refusing what is not ``(H, W, 3)``."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise InputError(f"report: picture {name!r} has shape {image.shape}, wanted (H, W, 3)")
+        raise InputError(f"report: picture {name!r} has shape {image.shape}, expected (H, W, 3)")
     return image
 
 

@@ -84,6 +84,7 @@ def write(
             warnings=result.warnings,
             notes=result.notes,
             tonemap=settings.output.tonemap,
+            ramps=_ramps(settings),
         )
     timing["report_s"] = round(time.perf_counter() - start, 3)
     timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full", "report")), 3)
@@ -91,6 +92,13 @@ def write(
     checkpoint.remove(folder)
     output_folder.tidy(folder)
     return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
+
+
+def _ramps(settings):
+    """Return first and last weight of each loss, and the iterations between them."""
+    weights = {key: value for key, value in dataclasses.asdict(settings.loss).items() if value}
+    ends = {key: value if isinstance(value, tuple) else (value, value) for key, value in weights.items()}
+    return ends, max(settings.optimizer.iterations, 1)
 
 
 def _roles(name, files):

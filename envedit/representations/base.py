@@ -30,7 +30,7 @@ class Representation(Protocol):
     fitted : Fitted or None
         How well the map was fitted, where :meth:`encode` fits.
     separation : Separation or None
-        Lights and background of the map, where :meth:`encode` tells them apart.
+        Lights and background of the map, where :meth:`encode` separates them.
     """
 
     lr: float

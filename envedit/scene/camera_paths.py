@@ -156,7 +156,7 @@ def _rays_of_view(sensor, pixel, sample):
     u = sample(0)
     x, weight_x = _filter_offset(film.rfilter(), u.x, column, size.x, film.sample_border())
     y, weight_y = _filter_offset(film.rfilter(), u.y, row, size.y, film.sample_border())
-    # Relative to the crop window, as the sensor wants it.
+    # Relative to the crop window, as the sensor expects it.
     position = mi.Point2f((mi.Float(column) + x) / size.x, (mi.Float(row) + y) / size.y)
     shutter = sample(2)
     ray, weight = sensor.sample_ray(

@@ -1,7 +1,7 @@
 """Changes to the nodes of a parsed Mitsuba scene before it is built, and the digest of what they hold.
 
 Each function takes the parser's ``state`` or one of its ``nodes`` and changes it in place; ``where`` is what
-errors call the scene. What is changed and why is told in :mod:`envedit.scene.scene`.
+errors call the scene. What is changed and why is said in :mod:`envedit.scene.scene`.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     if len(found) != 1:
         kinds = ", ".join(n.props.plugin_name() for n in found)
         what = f"{len(found)} environment emitters ({kinds})" if found else "no environment emitter"
-        raise InputError(f'{where}: {what}; wanted exactly one, such as <emitter type="constant"/>')
+        raise InputError(f'{where}: {what}; expected exactly one, such as <emitter type="constant"/>')
     node, plugin = found[0], found[0].props.plugin_name()
     matrix = np.eye(4)
     if plugin != "constant" and "to_world" in node.props:
@@ -105,7 +105,7 @@ def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     if not size > 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
         raise InputError(
             f"{place_of(state, node, where)}: to_world of the environment emitter stretches, shears or "
-            "mirrors; wanted a rotation (the axis of <rotate> has length 1)"
+            "mirrors; expected a rotation (the axis of <rotate> has length 1)"
         )
     rotation = rotation @ _ENVIRONMENTS[plugin]
     matrix = np.eye(4)  # where an environment stands has no meaning: a translation is dropped
@@ -133,7 +133,7 @@ def set_film(state, where: str, sensor: int, width: int, height: int) -> None:
     own = [film.get("width", 768), film.get("height", 576)]  # Mitsuba's defaults
     if not all(isinstance(n, int) and n > 0 for n in own):
         place = place_of(state, films[0], where)
-        raise InputError(f"{place}: the film is {own[0]} x {own[1]}, wanted whole numbers above 0")
+        raise InputError(f"{place}: the film is {own[0]} x {own[1]}, expected whole numbers above 0")
     if width or height:
         if any(str(name).startswith("crop_") for name, _ in film.items()):
             raise ConfigError(
@@ -197,7 +197,7 @@ def smooth_limit(state, node) -> None:
     for key in alphas:
         if not props[key] >= 0:
             where = place_of(state, node, "scene")
-            raise ConfigError(f"{where}: roughness {key} is {props[key]}, wanted 0 or more")
+            raise ConfigError(f"{where}: roughness {key} is {props[key]}, expected 0 or more")
     if alphas and all(props[k] <= _SMALLEST_ALPHA for k in alphas):
         for key in (*alphas, "distribution", "sample_visible"):
             if key in props:
@@ -216,13 +216,13 @@ def fit_to_stage(state, node) -> None:
         if key in props:
             del props[key]
     if not (isinstance(target, int | float) and np.isfinite(target) and target > 0):
-        raise ConfigError(f"{where}: fit_height is {target}, wanted a positive number")
+        raise ConfigError(f"{where}: fit_height is {target}, expected a positive number")
     if up.removeprefix("-") not in _AXES:
-        raise ConfigError(f"{where}: the up axis is {up!r}, wanted x, y, z, -x, -y or -z")
+        raise ConfigError(f"{where}: the up axis is {up!r}, expected x, y, z, -x, -y or -z")
     filename = str(props.get("filename", ""))
     if filename:
         if (suffix := Path(filename).suffix.lower()) not in _MESHES:
-            raise InputError(f"{filename}: cannot read a mesh of this kind; wanted {', '.join(_MESHES)}")
+            raise InputError(f"{filename}: cannot read a mesh of this kind; expected {', '.join(_MESHES)}")
         props.set_plugin_name(_MESHES[suffix])
 
     # First the mesh's own up to +y, then the author's to_world (a turn about y, say), then size and place.
@@ -247,7 +247,7 @@ def fit_to_stage(state, node) -> None:
 def _matrix(transform, where: str) -> np.ndarray:
     """Return a transformation's matrix (4, 4)."""
     if not hasattr(transform, "matrix"):
-        raise InputError(f"{where}: to_world is {str(transform)[:60]!r}, wanted a <transform>")
+        raise InputError(f"{where}: to_world is {str(transform)[:60]!r}, expected a <transform>")
     return np.array(transform.matrix, np.float64).reshape(4, 4)
 
 

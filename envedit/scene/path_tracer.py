@@ -1,6 +1,6 @@
 """The paper's renderer: Mitsuba's differentiable path tracer, with fresh samples at every step.
 
-Unbiased, but its noise bends any non-linear loss (docs/architecture.md): it is here as the reference that
+Unbiased, but its noise bends any non-linear loss (docs/light_transport.md): it is here as the reference that
 the paper used, not for speed.
 """
 

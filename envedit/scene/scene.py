@@ -157,7 +157,7 @@ class Scene:
         image = np.asarray(image)
         if image.ndim != 3 or image.shape[2] != 3 or not np.issubdtype(image.dtype, np.number):
             what = f"shape {image.shape} of {image.dtype}"
-            raise InputError(f"environment map: came {what}, wanted (H, W, 3) numbers")
+            raise InputError(f"environment map: got {what}, expected (H, W, 3) numbers")
         with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
             image = image.astype(np.float32)
         if not (good := np.isfinite(image) & (image >= 0)).all():
@@ -214,9 +214,9 @@ class Scene:
     def sampled(self, image, spp: int | str = "auto", seed: int = 0, exactly: int | None = None):
         """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
 
-        Passes of 64 samples a pixel are added until the error of their mean, told by how much their display
-        values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at least,
-        768 at most.
+        Passes of 64 samples a pixel are added until the error of their mean, estimated from how much their
+        display values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at
+        least, 768 at most.
 
         Parameters
         ----------
@@ -342,7 +342,7 @@ def load(
         If a file is missing or damaged, or the scene is not lit by exactly one environment emitter.
     """
     if not (mi.variant() or "").endswith("_rgb"):
-        raise ConfigError(f"variant: came {mi.variant()}, wanted one that ends in _rgb, such as llvm_ad_rgb")
+        raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
     config, state, path, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders)
@@ -470,9 +470,9 @@ def find(file) -> Path:
     if bare and name in names:
         return shipped.folder() / f"{name}.xml"
     if os.path.isdir(path):
-        raise InputError(f"scene {file}: this is a folder, wanted a Mitsuba XML file")
+        raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML file")
     close = difflib.get_close_matches(name, names, 1) if bare else []
-    wanted = f"wanted a Mitsuba XML file or one of {', '.join(names) or 'none: install envedit again'}"
+    wanted = f"expected a Mitsuba XML file or one of {', '.join(names) or 'none: install envedit again'}"
     hint = f"did you mean {close[0]}?" if close else wanted
     raise InputError(f"scene {file}: no such file; {hint}")
 
@@ -503,15 +503,15 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], lis
         if isinstance(value, bool):
             value = "true" if value else "false"
         elif isinstance(value, float | np.floating) and not np.isfinite(value):
-            raise ConfigError(f"scene.parameters: {name} is {value}, wanted a finite number")
+            raise ConfigError(f"scene.parameters: {name} is {value}, expected a finite number")
         elif not isinstance(value, str | os.PathLike | int | float | np.integer | np.floating):
             kind = type(value).__name__
-            raise ConfigError(f"scene.parameters: {name} is a {kind}, wanted text or a number")
+            raise ConfigError(f"scene.parameters: {name} is a {kind}, expected text or a number")
         filled[name] = str(value)
     return filled, outline.folders
 
 
 def _whole(name: str, value, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
-        raise ConfigError(f"{name}: came {value!r}, wanted a whole number of at least {low}")
+        raise ConfigError(f"{name}: got {value!r}, expected a whole number of at least {low}")
     return int(value)

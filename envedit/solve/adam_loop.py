@@ -136,7 +136,7 @@ class _PlaceRows(dr.CustomOp):
 class _Slopes:
     """Notes, on the way back, whether gradients are finite; made anew for every step.
 
-    The parameters' own do not tell: what lies in between may add gradients with atomics, which drop NaN on
+    The parameters' own do not show it: what lies in between may add gradients with atomics, which drop NaN on
     LLVM. Mitsuba's path tracer does.
     """
 

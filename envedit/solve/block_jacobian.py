@@ -22,7 +22,7 @@ class BlockJacobian:
         self._directions = overview.directions
         self._total = np.bincount(overview.cell_of, omega, cells)
         self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
-        # Hats are weighed by the sky's luminance: what is bright in a cell tells its gain.
+        # Hats are weighed by the sky's luminance: what is bright in a cell determines its gain.
         sky = np.maximum(layers.background().reshape(-1, 3) @ LUMINANCE, 1e-12) * self._omega
         light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
         hats = []

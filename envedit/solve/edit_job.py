@@ -55,7 +55,7 @@ class Stopped(NumericalError):
 
 @dataclass
 class Watch:
-    """What a run tells while it works.
+    """What a run reports while it works.
 
     ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one.
     """
@@ -87,7 +87,7 @@ class Job:
     folder : Path, optional
         Of the checkpoint.
     watch : Watch
-        Told of progress.
+        Receives progress.
     dists : distances.Dists, optional
         As for :class:`.adam_loop.Objective`.
     posterior : map_problem.Posterior, optional
@@ -172,7 +172,7 @@ class Job:
 
     @property
     def trials(self) -> int:
-        """Steps that tell which of two starts is better."""
+        """Steps after which two starts are compared."""
         return NEWTON_TRIAL if self.newton else TRIAL_STEPS
 
     def better(self, loss: float, usual: float) -> bool:

@@ -5,8 +5,8 @@ before minutes are spent on an edit. With I = T E + I_0, target t and weights w,
 
     min over E >= 0  1/2 sum_p w_p s_p^2 (I_p - t_p)^2
 
-where s_p is the slope of the display curve between the pixel's present value and the wanted one, so that the
-sum is one of display values. A pixel that is wanted white is content with any value above.
+where s_p is the slope of the display curve between the pixel's present value and the target, so that the
+sum is one of display values. A pixel whose target is white has no residual at any value above.
 
 What may change is E = a E_0 + b, with a gain a and a radiance b, neither negative, in each cell of the map:
 a = 1, b = 0 is the original. Cells and not texels, because T is recorded: a column of a single texel
@@ -36,7 +36,7 @@ from envedit.solve import light_search, matching_pursuit
 CELLS = 64
 """Cells around the horizon."""
 SHARP = 4.0
-"""Samples behind an entry of T from which on the texels of a cell are told apart."""
+"""Samples behind an entry of T from which on the texels of a cell are distinguished."""
 PROBES = 8
 """Random pictures by which these samples are counted."""
 STEPS, LOOK = 40, 10
@@ -403,7 +403,8 @@ def _around_light(question, model, x, found):
     """Give the most concentrated light a place of its own: exact columns, and single texels around it.
 
     A light as wide as a cell casts soft shadows; and where few samples carry much light, T is noisy: with the
-    sun spread over its cell, a picture was told to be out of reach that a rendering showed to be 92 % there.
+    sun spread over its cell, a target was estimated to be infeasible that a rendering showed to be 92 %
+    reached.
     """
     transport, active = question.transport, question.active
     height, width = active.shape

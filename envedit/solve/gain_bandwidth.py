@@ -1,9 +1,9 @@
-r"""How fine a gain a picture can tell: octaves of detail beyond the coarse ones, where they can be seen.
+r"""How fine a gain a picture determines: octaves of detail beyond the coarse ones, where they can be seen.
 
 A mirror shows the clouds themselves, a matte thing only that there is light above it. A gain that is finer
-than what the picture tells is led by noise; one that is coarser cannot make a mirror's picture. What can be
-told is measured with T. Let J be the derivative of the picture, as a display shows it and in units of its
-noise, by the logarithm of the background's texels. A pattern v of log gain is told if
+than what is identifiable from the picture follows noise; one that is coarser cannot make a mirror's picture.
+What is identifiable is measured with T. Let J be the derivative of the picture, as a display shows it and in
+units of its noise, by the logarithm of the background's texels. A pattern v of log gain is identifiable if
 
     F(v) = |J v|^2 = E_z[(v' J' z)^2],  z = +-1 at random in every pixel and channel,
 
@@ -31,12 +31,12 @@ CONTRAST = 0.3
 ENOUGH = 2.0
 """The F of detail of that contrast at which it counts as half known, F^2 / (F^2 + ENOUGH^2)."""
 FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
-"""How much of the sky's solid angle must be told of the first octave, for detail at all, and of a further
-one: what a glossy thing tells of half of the sky is not worth a third of a run's time."""
+"""Share of the sky's solid angle in which the first octave must be identifiable, for detail at all, and a
+further one: what a glossy object determines of half of the sky is not worth a third of a run's time."""
 
 
 def octaves(transport, second, background, rows, picture, weight, coarsest: int) -> list[Octave]:
-    """Measure the octaves of detail that a picture tells.
+    """Measure the octaves of detail that a picture determines.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
     Returns
     -------
     list of Octave
-        Coarse to fine; ends before the first that is told too little (:data:`FIRST_SHARE`,
+        Coarse to fine; ends before the first that is identifiable too little (:data:`FIRST_SHARE`,
         :data:`LEAST_SHARE`).
     """
     height, width, _ = background.shape
@@ -73,7 +73,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
         for pair in _pulled_back(transport, second, slope, background, rows[0]):
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
             told += _alternating(*on_nodes)
-        # Where nothing is told, a product of two estimates may well be negative.
+        # Where nothing is identifiable, a product of two estimates may well be negative.
         told = np.maximum(_smooth(told / PROBES), 0) * CONTRAST**2
         known = told**2 / (told**2 + ENOUGH**2)
         share = float((known.mean(axis=1) * (around := down.T @ omega)).sum() / around.sum())

@@ -150,7 +150,7 @@ def solve(
     sparing : bool
         Stay at the start where steps lower the misfit by no more than noise would let them.
     judge : callable, optional
-        Error of a map (H, W, 3) that is not told by T; asked where the start is nearly as good as the
+        Error of a map (H, W, 3) that is measured without T; used where the start is nearly as good as the
         solution (:data:`NEAR`), as steps may then follow the errors of T.
 
     Raises

@@ -1,8 +1,8 @@
 """Where an edit with layers starts: how fine its gain is, which pixels count, where lights are looked for.
 
-Two recordings of T, independent of each other, tell what is seen from what is noise. Where they show that
-the picture tells detail of the sky, as a mirror does, the gain gets finer grids, and pixels that are mostly
-noise count less. Then lights are searched for, in the picture or in what was painted on it.
+Two recordings of T, independent of each other, separate what is seen from noise. Where they show that
+detail of the sky is identifiable, as a mirror does, the gain gets finer grids, and pixels that are mostly
+noise are down-weighted. Then lights are searched for, in the picture or in what was painted on it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 
 AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
-"""Added to the run's seed for the second recording of T, which tells its noise; its most samples a pixel and
-exact columns."""
+"""Added to the run's seed for the second recording of T, which measures its noise; its most samples a pixel
+and exact columns."""
 MIRRORED = 0.8
-"""Share of the sky whose detail a picture must tell, as a mirror does. Glossy scenes tell less: there finer
+"""Share of the sky whose detail must be identifiable, as in a mirror. In glossy scenes less is: there finer
 grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that no sky has."""
 
 
@@ -40,7 +40,7 @@ class Recordings:
     second : LightTransport or None
         Another recording of T, where detail is asked about.
     octaves : list of Octave
-        Detail that the picture tells; see :func:`.gain_bandwidth.octaves`.
+        Detail that the picture determines; see :func:`.gain_bandwidth.octaves`.
     notes : list of str
         What was found and chosen.
     views : tuple of slice
@@ -84,7 +84,7 @@ def recordings(
 ) -> Recordings:
     """Trace what :func:`find` looks through: T, and a second recording where detail is asked about.
 
-    Where the picture tells detail, a gain fine enough for it follows the noise of T: a large picture, whose
+    Where detail is identifiable, a gain fine enough for it follows the noise of T: a large picture, whose
     pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the
     map gains 1.6 dB over eight maps; without detail, pixels make up for each other.
 
@@ -103,7 +103,7 @@ def recordings(
     traced : LightTransport, optional
         T, where the run renders through it; of no use any more if another one is returned.
     progress : callable, optional
-        Told of blocks of pixels done, and in all.
+        Receives the blocks of pixels done, and all.
     """
 
     def trace(seed, **changed):

@@ -114,7 +114,7 @@ def start(
     total = np.ones((len(pictures), 3))
     for level in range(LEVELS):
         if np.prod(layers.gain.sizes[level]) > len(overview.omega):
-            break  # finer than the overview can tell
+            break  # finer than the overview resolves
         hats = scene.hats(level) * factor.T[..., None]
         gain, strength = spread(overview, scene.wanted, weight, picture, hats, stack)
         gain = np.clip(gain, LEAST, MOST)
@@ -139,7 +139,7 @@ class Question:
     transport : LightTransport
         T.
     picture : ndarray (h, w, 3)
-        What is asked for, linear radiance, where there is no ``wanted``; tells how bright pixels are.
+        What is asked for, linear radiance, where there is no ``wanted``: how bright pixels are.
     weight : ndarray (h, w, 1) or None
         How much each pixel counts.
     envmap : ndarray (H, W, 3)
@@ -276,7 +276,7 @@ def spread(overview, wanted, weight, known, hats, lights):
     """Find strengths, not negative, of overlapping hats of background and of lights that make a picture.
 
     Multiplicative updates (Richardson 1972, Lucy 1974), a <- a * H'(w I / H a) / H' w, from a = 1: they stay
-    positive, and what the picture does not tell about stays 1.
+    positive, and what the picture does not determine stays 1.
 
     Parameters
     ----------

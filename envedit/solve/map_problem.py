@@ -1,4 +1,4 @@
-"""What an edit with layers minimises, and its derivatives; ``docs/method.md``, "The edit as one problem".
+"""What an edit with layers minimises, and its derivatives; ``docs/solver.md``, "The edit as one problem".
 
 Unknowns x: the log gain g of every node, and of every light that is lit its log flux per channel, its
 direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and
@@ -36,7 +36,7 @@ SIGMA = 0.005
 INDEPENDENT = 256
 """Residuals of a view that count as independent, per channel: neighbouring pixels err together."""
 ANGLE = np.radians(0.7)
-"""Rotation by which the derivative by a light's direction is told."""
+"""Rotation of the finite difference by a light's direction."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
 """Largest step of an unknown: beyond it the linear model does not hold."""
 SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
@@ -188,7 +188,7 @@ class Problem:
     weight : ndarray (h, w, 1), optional
         How much each pixel counts, 1 on average.
     free : ndarray of bool (rows, W), optional
-        Active texels whose gain is free, as :meth:`.Layers.keep` was told; None: all.
+        Active texels whose gain is free, as given to :meth:`.Layers.keep`; None: all.
     prior : Prior
         How far a sky changes.
     views : int

@@ -60,7 +60,7 @@ class Given:
     weight : ndarray (h, w, 1) or None
         How much each pixel counts.
     known : ndarray (h, w, 3)
-        The picture wanted as it is; tells how bright a pixel is.
+        The target itself: how bright a pixel is.
     background : ndarray (H * W, 3)
         The map without its lights; 0 where it cannot change.
     omega : ndarray (H * W,)

@@ -2,7 +2,7 @@
 
 A caustic of a small sun, or its image in a facet of a mirror, falls on few of a pixel's samples. Which, is
 chance: in the target other pixels are hit than in T, and a loss that compares them pulls the map to nothing.
-Both noises are measured, that of T by a second recording, and such pixels count less.
+Both noises are measured, that of T by a second recording, and such pixels are down-weighted.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from envedit.losses.display_curve import to_display
 TRUSTED = 0.007
 """Standard error of display values, beyond what is usual in the picture, at which a pixel counts half."""
 AROUND = 2
-"""Pixels to each side over which noise is told: paths that have hit nothing yet do not know theirs."""
+"""Pixels to each side over which noise is averaged: paths that have hit nothing give no estimate."""
 USUAL = 4.0
-"""Multiples of the picture's median variance that are nothing special."""
+"""Noise floor, in multiples of the picture's median variance."""
 SHOWS_LIGHT = 3.0
 """Multiples of the target's median brightness from which on a noisy pixel shows a light itself."""
 LIT = 0.01

@@ -1,7 +1,8 @@
 """A painted picture: what it asks for, where it was painted, and the rendering to paint on.
 
-A picture tells nothing where it is clipped, and asks for nothing where it was not painted. The latter is seen
-by comparing it with the initial rendering, in display values, as that would look in the picture's own format.
+A picture has no information where it is clipped, and requests nothing where it was not painted. The latter is
+seen by comparing it with the initial rendering, in display values, as that would look in the picture's own
+format.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ ENDINGS = (".exr", ".png")
 """What the initial rendering can be exported as; a JPEG would not keep it."""
 
 NEARLY_ALL = 0.9
+CLIPPED = 0.001
+"""Share of the pixels that may be clipped in an exported PNG before another tonemap is used."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Painted:
     coverage : ndarray (h, w, 1) float32
         How much each pixel was painted, in [0, 1].
     excluded : ndarray of bool (h, w)
-        Pixels that tell nothing: clipped, or transparent over nothing.
+        Pixels without information: clipped, or transparent over nothing.
     warnings : tuple of str
         What the user should know.
     """
@@ -72,17 +75,34 @@ def check_export(file) -> None:
     """
     file = Path(os.fsdecode(file))
     if file.suffix.lower() not in ENDINGS:
-        raise ConfigError(f"--export-initial: came {str(file)!r}, wanted a name that ends in .exr or .png")
+        raise ConfigError(f"--export-initial: got {str(file)!r}, expected a name that ends in .exr or .png")
     if os.path.lexists(file):
         raise InputError(f"{file}: exists and is not overwritten: name another file, or move it away")
     if not os.path.isdir(file.parent):
         raise InputError(f"{file}: cannot be written (its folder does not exist)")
 
 
-def export(file, picture: np.ndarray, settings: config.Config) -> list[str]:
-    """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG under [target] tonemap.
+def export_tonemap(file, picture: np.ndarray, settings: config.Config) -> str:
+    """Return the tonemap of an exported picture (h, w, 3): "linear" for OpenEXR, or that of the PNG.
 
-    The file says which tonemap that is, and what it was rendered from.
+    That is [target] tonemap where it clips less than :data:`CLIPPED` of the pixels, which have no information
+    when they come back, and otherwise "reinhard", which clips nothing below a radiance of 10^4.
+    """
+    if Path(os.fsdecode(file)).suffix.lower() == ".exr":
+        return "linear"
+    clipped = _clipped(tonemap(picture, settings.target.tonemap))
+    return "reinhard" if clipped >= CLIPPED else settings.target.tonemap
+
+
+def _clipped(shown):
+    """Return the share of pixels with a channel that is white in a PNG of 16 bits."""
+    return float((shown >= 1 - 0.5 / 65535).any(axis=2).mean())
+
+
+def export(file, picture: np.ndarray, settings: config.Config, name: str | None = None) -> list[str]:
+    """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG.
+
+    The file says which tonemap it is under, and what it was rendered from.
 
     Parameters
     ----------
@@ -92,6 +112,8 @@ def export(file, picture: np.ndarray, settings: config.Config) -> list[str]:
         Linear radiance, of :func:`initial`.
     settings : config.Config
         What it was made from.
+    name : str, optional
+        Its tonemap; by default that of :func:`export_tonemap`.
 
     Returns
     -------
@@ -105,9 +127,9 @@ def export(file, picture: np.ndarray, settings: config.Config) -> list[str]:
     """
     check_export(file)
     linear = Path(os.fsdecode(file)).suffix.lower() == ".exr"
-    name = settings.target.tonemap
+    name = name or export_tonemap(file, picture, settings)
     facts = {
-        "envedit.tonemap": "linear" if linear else name,
+        "envedit.tonemap": name,
         "envedit.scene": Path(settings.scene.file).name,
         "envedit.envmap": Path(settings.input.envmap).name,
         "envedit.seed": settings.seed,
@@ -118,12 +140,12 @@ def export(file, picture: np.ndarray, settings: config.Config) -> list[str]:
         return []
     shown = tonemap(picture, name)
     images.write_png(file, shown, 16, facts)
-    share = float((shown >= 1 - 0.5 / 65535).any(axis=2).mean())
-    if share < 0.001:
+    share = _clipped(shown)
+    if share < CLIPPED:
         return []
     return [
-        f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and tell nothing "
-        'when they come back: export an .exr, or set [target] tonemap = "log"'
+        f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and cannot be "
+        "painted on: export an .exr"
     ]
 
 
@@ -170,6 +192,8 @@ def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask
     values, alpha, top = _planes(file, pixels, warnings)
     before = None
     if initial is not None:
+        if not info["hdr"] and "envedit.tonemap" not in info["metadata"]:
+            name = _recognised(file, values, alpha, initial, name, warnings)
         if pixels.shape[2] < 3 and not mask and _coloured(initial, name):
             raise InputError(f"{file}: is grey, the rendering is in colour: save it as RGB, or give a mask")
         before = np.asarray(initial, np.float64) if info["hdr"] else tonemap(np.float64(initial), name)
@@ -199,7 +223,7 @@ def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask
         if (excluded | (coverage == 0)).all():
             raise InputError(
                 f"{file}: all that is painted is clipped, and says only 'at least so bright': "
-                'paint below white, or on an .exr, or under [target] tonemap = "log"'
+                'paint below white, or on an .exr, or under [target] tonemap = "reinhard"'
             )
         warnings.append(f"{file}: {count} painted pixels are clipped ('at least so bright'): left out")
 
@@ -308,11 +332,8 @@ def _tonemap_of(file, info, declared, warnings):
         warnings.append(
             f"{file}: says that it is under {said[:40]!a}, which is unknown: '{declared}' is used"
         )
-    elif said != declared:
-        warnings.append(f"{file}: was written under the '{said}' tonemap: used instead of '{declared}'")
-        return said
     else:
-        warnings.append(f"{file}: read as a picture under the '{declared}' tonemap")
+        return said
     return declared
 
 
@@ -356,18 +377,32 @@ def _check_painted(file, painted, before, values, info, top, name, initial, warn
     if share < NEARLY_ALL:
         return
     line = f"{file}: {100 * share:.0f} % of the pixels differ from the initial rendering"
-    if not info["hdr"]:
-        error = {key: _median_error(values, initial, key, telling) for key in TONEMAPS}
-        best = min(error, key=error.get)
-        if error[best] < error[name] / 4:
-            warnings.append(f"{line}, but not under '{best}': set [target] tonemap = \"{best}\"")
-            return
     facts = {k[8:]: v for k, v in info["metadata"].items() if k.startswith("envedit.")}
     made = f" (it was made with {', '.join(f'{k} {v}' for k, v in facts.items())})" if facts else ""
     warnings.append(
         f"{line}: unless all of it was painted, it is of another rendering{made}; "
         "export that again with --export-initial, or give a mask"
     )
+
+
+def _recognised(file, values, alpha, initial, declared, warnings):
+    """Return the tonemap under which a picture that names none is the initial rendering, but for its paint.
+
+    That is the declared one, unless the median difference over the pixels is four times as large as under
+    another, which it equals to three steps of 8 bits: editors drop the name when they save.
+    """
+    where = alpha > 0
+    if not where.any():
+        return declared
+    error = {name: _median_error(values, initial, name, where) for name in TONEMAPS}
+    best = min(error, key=error.get)
+    if error[best] > min(3 / 255, error[declared] / 4):
+        if error[declared] > 3 / 255:
+            warnings.append(f"{file}: names no tonemap: read under '{declared}', that of [target] tonemap")
+        return declared
+    if best != declared:
+        warnings.append(f"{file}: is the initial rendering under '{best}', and read so, not '{declared}'")
+    return best
 
 
 def _median_error(values, initial, name, where):

@@ -122,7 +122,7 @@ def _checked(picture):
     image = np.asarray(picture)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype.kind not in "fiu":
         raise InputError(
-            f"picture to paint on: came shape {image.shape} of {image.dtype}, wanted (h, w, 3) numbers"
+            f"picture to paint on: got shape {image.shape} of {image.dtype}, expected (h, w, 3) numbers"
         )
     with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
         image = image.astype(np.float32)

@@ -1,6 +1,6 @@
 """The light transport at a glance: blocks of pixels against cells of texels, few enough to look at them all.
 
-Samples that are too few for a texel are many for a cell of some degrees: the overview tells, for a light
+Samples that are too few for a texel are many for a cell of some degrees: the overview shows, for a light
 anywhere on the sphere, roughly what it does to the picture.
 """
 
@@ -80,7 +80,7 @@ def make(matrix, shape: tuple[int, int], grid: tuple[int, int], views=()) -> Ove
 
 
 def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int], views=()) -> bool:
-    """Tell whether arrays from disk are an overview of such a picture and map: no index leaves it."""
+    """Return whether arrays from disk are an overview of such a picture and map: no index leaves it."""
     block_of, blocks = _blocks(shape, views)
     cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
     wanted = {

@@ -29,8 +29,8 @@ def determined(influence: np.ndarray, samples: np.ndarray, rows: slice, threshol
     """Say which texels a view determines.
 
     A texel is determined if it or a neighbour has more than ``threshold`` of the mean influence per solid
-    angle of the active rows. The neighbourhood is so wide that :data:`WANTED_SAMPLES` samples would have told
-    of it: noise may keep a texel that hardly matters, but does not take one that does.
+    angle of the active rows. The neighbourhood is so wide that :data:`WANTED_SAMPLES` samples would have
+    found of it: noise may keep a texel that hardly matters, but does not take one that does.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 T is traced once for a scene, its camera and a texel grid, without looking at any map; then rendering is a
 matrix product and its adjoint is exact. Nothing changes from step to step, so no Monte Carlo noise bends the
-objective (see docs/architecture.md).
+objective (see docs/light_transport.md).
 
 Two tiers, both unbiased:
 
@@ -61,7 +61,7 @@ RESOLVE_EVERY = 10
 LASTING_LOOKS = 5
 """Looks in a row at which a texel must have been a main light before a renderer spends most paths on it."""
 COLUMNS_A_LOOK = 32
-"""Columns that a renderer traces at one look, the brightest: speckle comes and goes, and is not chased."""
+"""Columns that a renderer traces per update, the brightest; transient speckle is ignored."""
 LEAST_LIGHT = 1 / 256
 """Light of a texel, as a share of the brightest's, below which it gets no column for a picture of its own."""
 TYPICAL_PIXELS = 128 * 128
@@ -160,7 +160,7 @@ class LightTransport:
         for name, value in (("spp", spp), ("max_depth", max_depth)):
             if value != "auto" and not value >= 1:
                 raise ConfigError(
-                    f"renderer.{name}: came {value}, wanted a whole number of at least 1, or auto"
+                    f"renderer.{name}: got {value}, expected a whole number of at least 1, or auto"
                 )
         cache = DiskCache(folder)
         origin = {
@@ -242,7 +242,7 @@ class LightTransport:
         }
 
     def _whole(self, arrays):
-        """Tell whether :meth:`_take` can take arrays from disk."""
+        """Return whether :meth:`_take` can take arrays from disk."""
         grid, pixels = (self.grid.height, self.grid.width), self.shape[0] * self.shape[1]
         own = {k: a for k, a in arrays.items() if "/" not in k}
         kept = {"influence": ("f4", grid), "lost": ("i8", ()), "offset": ("f4", (None,))}
@@ -531,7 +531,7 @@ class LightTransport:
         Raises
         ------
         InputError
-            If a texel is not finite or negative: no error can be told then.
+            If a texel is not finite or negative: no error can be predicted then.
         """
         require_radiance(envmap, "light transport")
         rest = self._exact.slot_of < 0
@@ -539,13 +539,13 @@ class LightTransport:
 
     @property
     def _samples(self):
-        """Samples by which errors are told: those of a pixel, or of a typical picture's pixel if larger."""
+        """Samples from which errors are predicted: of a pixel, or of a typical picture's pixel if larger."""
         return self.spp * max(1.0, self.shape[0] * self.shape[1] / TYPICAL_PIXELS)
 
     def _radiance(self, envmap):
         """List every texel's radiance, its largest channel, and solid angle; 0 where no light comes from."""
         omega = np.repeat(latlong.solid_angles(self.grid.height, self.grid.width), self.grid.width)
-        # A texel that no sample has met may matter as much as its row: rows are told by many samples.
+        # A texel that no sample has met may matter as much as its row: rows are known from many samples.
         seen = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
         return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen, omega * seen
 

@@ -75,7 +75,7 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
     scene : mi.Scene
         Its sensors are the views.
     grid : Grid
-        Texels that escapes are told by.
+        Texels that escaping rays are recorded by.
     pixels : int
         Pixels of the picture.
     count : int

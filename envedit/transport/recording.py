@@ -218,7 +218,7 @@ def choose_bounces(scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[
     bounces : int
         Path depth - 1.
     choices : list of str
-        What to tell the user about an automatic choice.
+        What to report about an automatic choice.
 
     Raises
     ------
@@ -262,7 +262,7 @@ def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tupl
     spp, capacity : int
         Paths a pixel, and most exact columns.
     choice : str
-        What to tell the user.
+        What to report to the user.
 
     Raises
     ------

@@ -79,7 +79,7 @@ class ColourMatrix:
 
     @staticmethod
     def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int]) -> bool:
-        """Tell whether :meth:`from_arrays` can take arrays as a matrix of this shape: no index leaves it."""
+        """Return whether :meth:`from_arrays` takes arrays as a matrix of this shape: no index leaves it."""
         lanes = -(-shape[0] // SLICE) * SLICE
         numbers = {"shape": ("i8", (2,)), "entries": ("i8", ())}
         places = {"start": ("u4", (lanes,)), "stop": ("u4", (lanes,)), "lane": ("u4", (shape[0],))}

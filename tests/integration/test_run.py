@@ -21,6 +21,7 @@ import pytest
 
 from envedit import config, pipeline
 from envedit.cli import run
+from envedit.core.color import tonemap
 from envedit.images import images
 from envedit.solve import adam_loop, checkpoint, edit_job, map_problem
 from envedit.transport.light_transport import LightTransport
@@ -723,13 +724,33 @@ def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsy
     assert all(after[key] == before[key] for key in before)
     assert after["a.exr"] == after["c.exr"]  # the same picture again
     assert pixels(tmp_path / "a.exr").shape == (18, 24, 3)
-    expected = np.rint(np.clip(pixels(tmp_path / "a.exr").astype(np.float64), 0, 1) ** (1 / 2.2) * 65535)
+    expected = np.rint(tonemap(pixels(tmp_path / "a.exr").astype(np.float64), "reinhard") * 65535)
+    assert expected.max() < 65535 and pixels(tmp_path / "a.exr").max() > 1
     assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
+
+
+def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
+    stroke = {"type": "light", "rectangle": [0, 0, 0.5, 1], "amount": 0.25, "color": "#ffffff"}
+    path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]})
+    before = content(tmp_path)
+    assert call(path, "--export-initial", tmp_path / "initial.exr", "--quiet") == 0
+    assert call(path, "--dry-run") == 0
+    out, err = capsys.readouterr()
+    assert "1 strokes on the initial rendering" in out and "dry_run.png" in out
+    after = content(tmp_path)
+    assert after.keys() - before.keys() == {"initial.exr", "c_out/dry_run.png", "c_out/dry_run.exr"}
+    painted = pixels(tmp_path / "c_out" / "dry_run.exr") - pixels(tmp_path / "initial.exr")
+    np.testing.assert_allclose(painted[:, :12], 0.25, rtol=1e-5)
+    assert not painted[:, 12:].any()
+    assert (
+        call(path, "--dry-run", "--quiet", "--set", "target.kind=envmap", "--set", "target.strokes=[]") == 0
+    )
 
 
 def test_the_export_says_what_to_do_next(tmp_path, rng, capsys):
     path = world(tmp_path, rng)
     assert call(path, "--export-initial", tmp_path / "b.png") == 0
     out, _ = capsys.readouterr()
-    assert len(out.splitlines()) == 1 and "24x18" in out and "'gamma'" in out
+    assert "'gamma' would clip highlights" in out.splitlines()[0]
+    assert len(out.splitlines()) == 2 and "24x18, under the 'reinhard' tonemap" in out
     assert f'[target] kind = "image", file = "{tmp_path / "b.png"}"' in out

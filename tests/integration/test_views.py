@@ -111,7 +111,7 @@ def test_views_that_cannot_be_are_refused(tmp_path, two):
 
 @pytest.mark.parametrize("given", ["[]", "['a', 'a']", "'front'", "[-1]", "[true]", "0"])
 def test_lists_of_sensors_that_say_nothing(given):
-    with pytest.raises(ConfigError, match=r'scene.sensors: came .*, wanted "all", or a list'):
+    with pytest.raises(ConfigError, match=r'scene.sensors: got .*, expected "all", or a list'):
         config.loads(f"[scene]\nsensors = {given}")
 
 
@@ -156,11 +156,11 @@ def test_what_is_painted_belongs_to_a_view_and_the_others_hold(two):
 
 
 @pytest.mark.parametrize("keys, what", [
-    ('file = ["a.exr", "b.exr"]', "target.file: came a list"),
-    ('kind = "image"\nfile = "a.exr"\nview = [0, 1]', "target.view: came 2 views, wanted 1"),
-    ('kind = "image"\nfile = ["a.exr", "b.exr"]\nview = [1, 1]', "target.view: came a view twice"),
-    ('kind = "image"\nfile = ["a.exr", "b.exr"]\nmask = "c.png"', "target.mask: came 1 masks, wanted 2"),
-    ('kind = "strokes"\nstrokes = [{ type = "blur", radius = 1 }]\nview = 1', "target.view: came one"),
+    ('file = ["a.exr", "b.exr"]', "target.file: got a list"),
+    ('kind = "image"\nfile = "a.exr"\nview = [0, 1]', "target.view: got 2 views, expected 1"),
+    ('kind = "image"\nfile = ["a.exr", "b.exr"]\nview = [1, 1]', "target.view: got a view twice"),
+    ('kind = "image"\nfile = ["a.exr", "b.exr"]\nmask = "c.png"', "target.mask: got 1 masks, expected 2"),
+    ('kind = "strokes"\nstrokes = [{ type = "blur", radius = 1 }]\nview = 1', "target.view: got one"),
     ("view = -1", "the index of a view from 0, or a list of them"),
 ])  # fmt: skip
 def test_targets_that_fit_no_views(keys, what):

@@ -1,4 +1,4 @@
-"""The wheel: holds the whole package and its scenes, and runs where there is no checkout."""
+"""The sdist and the wheel built from it: hold the whole package, which runs where there is no checkout."""
 
 import importlib.metadata
 import os
@@ -49,7 +49,8 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Build the wheel from a copy of the sources, which leaves no build folder in the checkout."""
+    """Build the sdist from a copy of the sources, and the wheel from the sdist, as for a release."""
+    pytest.importorskip("build", reason="the package build, of the extra envedit[dev], is not installed")
     if not (ROOT / "pyproject.toml").is_file():
         pytest.skip("no sources beside these tests")
     folder = tmp_path_factory.mktemp("wheel")
@@ -62,10 +63,10 @@ def wheel(tmp_path_factory):
         recent = int(importlib.metadata.version("setuptools").split(".")[0]) >= 77
     except importlib.metadata.PackageNotFoundError:
         recent = False
-    offline = ["--no-build-isolation"] if recent else []  # else pip fetches setuptools
-    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
-    call(*pip, "wheel", source, "--no-deps", *offline, "-w", folder, cwd=folder)
-    (built,) = folder.glob("*.whl")
+    offline = ["--no-isolation"] if recent else []  # else setuptools is fetched
+    call(sys.executable, "-m", "build", *offline, "--outdir", folder, source, cwd=folder)
+    (built,), (archive,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    assert built.name.split("-")[:2] == archive.name.removesuffix(".tar.gz").split("-")
     return built
 
 

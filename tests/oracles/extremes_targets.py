@@ -226,7 +226,7 @@ TARGETS = {
         refused(
             InputError,
             "p.exr: nothing of it is painted",
-            "It adds less than a half float rounds by, and cannot be told from a file's rounding.",
+            "It adds less than a half float rounds by, and cannot be distinguished from a file's rounding.",
         ),
     ),
     "alpha 1e-4, 1000 times as bright": (

@@ -14,7 +14,7 @@ def test_luminance():
 
 @pytest.mark.parametrize("name", list(color.TONEMAPS))
 def test_tonemaps(name):
-    top = 100.0 if name == "log" else 1.0
+    top = {"log": 100.0, "reinhard": 1e4}.get(name, 1.0)
     e = np.concatenate([[0, 1e-30, 1e-6], np.linspace(0, top, 1001)])
     t = color.tonemap(e, name)
     assert (
@@ -31,7 +31,10 @@ def test_tonemap_values():
     assert color.tonemap(0.5) == pytest.approx(0.5 ** (1 / 2.2))
     assert color.tonemap(0.5, "srgb") == pytest.approx(0.7353569831, rel=1e-9)
     assert color.tonemap(1.0, "log") == pytest.approx(np.log(101) / np.log(10001))
-    with pytest.raises(ConfigError, match="unknown tonemap 'filmic'; use one of gamma, srgb, log, linear"):
+    assert color.tonemap(1.0, "reinhard") == pytest.approx((1.0001 / 2) ** (1 / 2.2))
+    with pytest.raises(
+        ConfigError, match="unknown tonemap 'filmic'; use one of gamma, srgb, log, reinhard, linear"
+    ):
         color.tonemap(0.5, "filmic")
 
 

@@ -1,6 +1,7 @@
 """The HTML report: parsed, and read for what it says about good, failed and empty runs."""
 
 import ast
+import re
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from envedit.report import html_report
+from envedit.report.curves import normalised
 from tests.oracles import ROOT
 from tests.oracles.builders import grey
 
@@ -102,7 +104,7 @@ def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
     metrics = {"transport": {"entries": 12345, "cached": True}, "choices": ["path depth 5"]}
     page = write(tmp_path / "r.html", metrics=metrics, notes=["path depth 5"])
     assert page.text.count("path depth 5") == 1 and "choices" not in page.text
-    assert "transport entries 12345" in page.text
+    assert "T, entries 12345" in page.text
 
 
 def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
@@ -123,6 +125,10 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
     metrics = {"initial": {"psnr": 20.0}, "render": {"psnr": 15.0}, "envmap": {"psnr": 12.34}}
     page = write(tmp_path / "r.html", metrics=metrics, maps={"target": truth, "edited": grey(1.0)})
     assert "map against the true one: 12.3 dB" in page.text
+    metrics["initial_envmap"] = {"psnr": 9.87}
+    page = write(tmp_path / "r.html", metrics=metrics, maps={"target": truth, "edited": grey(1.0)})
+    assert "map against the true one: 9.9 dB → 12.3 dB" in page.text
+    assert "unedited map edited map PSNR (dB) 20 15 9.87 12.34" in page.text
     assert "further from the target" in page.text
     assert "target 16 × 8 1e+06 3, 5" in page.text
 
@@ -161,6 +167,32 @@ def test_report_of_a_run_that_went_wrong(tmp_path, bad):
     assert not {"nan", "inf"} & words
     if bad is not None:
         assert "history[0].loss" in page.text and "rendering edited: 1 pixels are not finite" in page.text
+
+
+def test_losses_are_drawn_with_their_last_weights():
+    """A ramp from 1 to 100 over three iterations: 1, 10, 100."""
+    rows = [{"iteration": i, "loss": 2.0 + w * e, "ssim": 2.0, "image_l2": w * e} for i, (w, e) in
+            enumerate([(1, 0.5), (10, 0.2), (100, 0.1)])]  # fmt: skip
+    drawn, about = normalised(rows, {"ssim": (1, 1), "image_l2": (1, 100)}, 3)
+    np.testing.assert_allclose([row["image_l2"] for row in drawn], [50, 20, 10])
+    np.testing.assert_allclose([row["loss"] for row in drawn], [52, 22, 12])  # falls; as stored it rises
+    assert "image_l2 (from 1 to 100)" in about and rows[0]["loss"] == 2.5
+    assert normalised([], {}, 1)[0] == []
+    bad = [{"iteration": 0, "loss": np.nan, "image_l2": None}]
+    assert normalised(bad, {"image_l2": (1, 100)}, 3)[0] == bad
+
+
+def test_every_term_of_ours_in_the_report_is_in_the_glossary(tmp_path):
+    """Words of metrics.json are in words; what only this program calls so is looked up."""
+    glossary = (ROOT / "docs" / "glossary.md").read_text()
+    source = (ROOT / "envedit" / "report" / "html_report.py").read_text()
+    ours = {"background", "glow", "influence", "T", "column", "turn", "feasible", "frozen", "light", "view"}
+    for term in ours:
+        assert re.search(rf"^(.*, )?{term}\b.*\n:", glossary, re.M), f"{term} is not in the glossary"
+        assert re.search(rf"\b{term}s?\b", source), f"{term} is not in the report"
+    metrics = {"transport": {"frozen": 0.5}, "timing": {"judge_s": 1.0}, "painted": {"towards": 0.5}}
+    page = write(tmp_path / "r.html", metrics=metrics)
+    assert not {"towards", "judge", "reach"} & set(page.text.split())
 
 
 def test_report_of_nothing(tmp_path):

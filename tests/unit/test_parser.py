@@ -50,16 +50,16 @@ def test_names_of_plugins_in_capitals_are_those_of_mitsuba_3(tmp_path, rng):
 def test_a_film_without_a_size_is_refused(tmp_path, key, value):
     number = f'<integer name="{key}" value="{16 if key == "width" else 12}"/>'
     path = write_scene(tmp_path, SENSOR.replace(number, value.replace("KEY", key)), BALL, LIGHT)
-    with pytest.raises(InputError, match="the film is .*, wanted whole numbers above 0"):
+    with pytest.raises(InputError, match="the film is .*, expected whole numbers above 0"):
         scene.load(path, width=8)
 
 
 def test_text_where_a_transform_or_a_number_should_be_is_refused(tmp_path):
     light = '<emitter type="envmap"><string name="to_world" value="up"/></emitter>'
-    with pytest.raises(InputError, match="to_world is 'up', wanted a <transform>"):
+    with pytest.raises(InputError, match="to_world is 'up', expected a <transform>"):
         scene.load(write_scene(tmp_path, SENSOR, BALL, light))
     ball = BALL.replace("<bsdf", '<string name="fit_height" value="tall"/><bsdf', 1)
-    with pytest.raises(ConfigError, match="fit_height is tall, wanted a positive number"):
+    with pytest.raises(ConfigError, match="fit_height is tall, expected a positive number"):
         scene.load(write_scene(tmp_path, SENSOR, ball, LIGHT))
 
 
@@ -139,7 +139,7 @@ def test_a_mesh_that_cannot_stand_is_refused(tmp_path):
     with pytest.raises(InputError, match="no height along its up axis"):
         scene.load("mesh", parameters={"mesh": box_obj(tmp_path / "flat.obj", (1, 0, 1))})
     (tmp_path / "a.stl").write_text("solid")
-    with pytest.raises(InputError, match="a.stl: cannot read a mesh of this kind; wanted .ply"):
+    with pytest.raises(InputError, match="a.stl: cannot read a mesh of this kind; expected .ply"):
         scene.load("mesh", parameters={"mesh": tmp_path / "a.stl"})
     with pytest.raises(InputError, match="missing file: gone.ply\nlooked in .* and "):
         scene.load("mesh", parameters={"mesh": "gone.ply"}, base=tmp_path)

@@ -79,7 +79,7 @@ def test_label_is_drawn_dot_by_dot_and_cut_to_its_width():
 
 
 def test_wrong_pictures_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"'a' has shape \(4, 4\), wanted \(H, W, 3\)"):
+    with pytest.raises(InputError, match=r"'a' has shape \(4, 4\), expected \(H, W, 3\)"):
         preview.preview(tmp_path / "p.png", {"a": np.zeros((4, 4))}, {})
     with pytest.raises(InputError, match="no picture"):
         preview.preview(tmp_path / "p.png", {}, {"a": None})

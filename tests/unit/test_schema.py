@@ -52,7 +52,7 @@ def test_layers_through_a_transport_take_every_solver(solver):
 )
 def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
     message = refused(tables + "\n[optimizer]\nkind = 'gauss-newton'")
-    assert "optimizer.kind" in message and "wanted adam or auto" in message
+    assert "optimizer.kind" in message and "expected adam or auto" in message
     for solver in ("auto", "adam"):
         assert cfg.loads(tables + f"\n[optimizer]\nkind = '{solver}'").optimizer.kind == solver
     assert "optimizer.kind" in refused(tables, "optimizer.kind=gauss-newton")
@@ -97,7 +97,7 @@ def test_overrides_are_toml_or_bare_words(text, keys, value):
 
 @pytest.mark.parametrize("text", ["", "fit.epochs", "=3", "fit.=3", ".epochs=3", 3])
 def test_an_override_without_key_or_value_is_refused(text):
-    with pytest.raises(ConfigError, match="wanted table.key=value"):
+    with pytest.raises(ConfigError, match="expected table.key=value"):
         cfg.parse_override(text)
 
 
@@ -112,32 +112,32 @@ def test_an_override_without_key_or_value_is_refused(text):
         ("[ouput]\ndir = 'x'", ["unknown table or key ouput", "did you mean output?"]),
         ("[loss]\nrestart_period = 3", ["[loss] has no key", "did you mean fit.restart_period?"]),
         ("[fit]\nxyzzy = 3", ["[fit] has no key xyzzy", "known: epochs, lr"]),
-        ("fit = 3", ["fit: came 3, wanted a table"]),
-        ("[seed]\na = 1", ["seed: came {'a': 1}, wanted an integer"]),
-        ('preset = "drift"', ["preset: came 'drift'", "did you mean draft?"]),
-        ('[representation]\nkind = "layer"', ["representation.kind: came 'layer'", "did you mean layers?"]),
-        ("[representation]\ncycles = 0", ["representation.cycles: came 0", "from 1 to 256"]),
-        ('[fit]\nschedule = "cosin"', ["fit.schedule: came 'cosin'", "did you mean cosine?"]),
+        ("fit = 3", ["fit: got 3, expected a table"]),
+        ("[seed]\na = 1", ["seed: got {'a': 1}, expected an integer"]),
+        ('preset = "drift"', ["preset: got 'drift'", "did you mean draft?"]),
+        ('[representation]\nkind = "layer"', ["representation.kind: got 'layer'", "did you mean layers?"]),
+        ("[representation]\ncycles = 0", ["representation.cycles: got 0", "from 1 to 256"]),
+        ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
         ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
-        ("[target]\nkind = 'image'", ["target.file", "wanted the painted image"]),
-        ("[target]\nkind = 'strokes'", ["target.strokes: came none, wanted at least one"]),
+        ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
+        ("[target]\nkind = 'strokes'", ["target.strokes: got none, expected at least one"]),
         (
             "[[target.strokes]]\ntype = 'contrast'",
-            ["target.strokes: came 1, wanted none", 'kind = "strokes"'],
+            ["target.strokes: got 1, expected none", 'kind = "strokes"'],
         ),
         (
             "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
-            ["target.mask: came '", "m.png', wanted none"],
+            ["target.mask: got '", "m.png', expected none"],
         ),
-        ("[target]\nkind = 'imgae'", ["target.kind: came 'imgae'", "did you mean image?"]),
-        ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: came [0, 64], wanted rows below 64"]),
-        ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: came 0"]),
-        ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["came 0 for all"]),
+        ("[target]\nkind = 'imgae'", ["target.kind: got 'imgae'", "did you mean image?"]),
+        ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: got [0, 64], expected rows below 64"]),
+        ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: got 0"]),
+        ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["got 0 for all"]),
         ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
         ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
         ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
         ("seed = " + "9" * 5000, ["not TOML"]),
-        ("seed = 0x" + "f" * 5000, ["seed: came a huge int"]),
+        ("seed = 0x" + "f" * 5000, ["seed: got a huge int"]),
     ],
 )
 def test_a_refusal_says_where_what_and_what_to_do(text, parts):
@@ -171,10 +171,10 @@ def test_a_refusal_is_short_whatever_the_file_holds():
 
 
 def test_an_error_names_the_override_it_came_from():
-    assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: came -3, wanted")
+    assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: got -3, expected")
     assert "did you mean epochs?" in refused("", "fit.epoch=3")
-    assert "wanted a table" in refused("", "fit=3")
-    assert "preset: came 'fast'" in refused("", preset="fast")
+    assert "expected a table" in refused("", "fit=3")
+    assert "preset: got 'fast'" in refused("", preset="fast")
 
 
 def test_unreadable_files_are_refused(tmp_path):
@@ -184,7 +184,7 @@ def test_unreadable_files_are_refused(tmp_path):
         return str(info.value)
 
     assert "no such configuration file" in message(tmp_path / "none.toml")
-    assert "a folder, wanted a TOML file" in message(tmp_path)
+    assert "a folder, expected a TOML file" in message(tmp_path)
     assert "cannot be read" in message("a\0b")
     (tmp_path / "latin.toml").write_bytes(b"seed = 1\n# caf\xe9\n")
     assert "latin.toml: not UTF-8 text at line 2" in message(tmp_path / "latin.toml")
@@ -314,5 +314,5 @@ def test_junk_files_raise_nothing_but_config_errors(tmp_path_factory, data):
     "text", ['vgg = "a.npz"', 'dists = "a.npz"', 'backbone = "a.npz"', 'heads = "a.npz"']
 )
 def test_perceptual_weights_come_in_pairs(text):
-    with pytest.raises(ConfigError, match="wanted both or none"):
+    with pytest.raises(ConfigError, match="expected both or none"):
         cfg.loads(f"[perceptual]\n{text}")

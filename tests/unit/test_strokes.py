@@ -163,6 +163,12 @@ def test_what_no_stroke_covers_is_the_same_bit_for_bit(stroke, name, rng):
     assert changed.mean() > 0.2 or stroke["type"] == "hold"
 
 
+def test_a_colour_is_given_as_numbers_or_as_on_a_display():
+    (stroke,) = stroke_list([{"type": "light", "points": [[0.5, 0.5]], "width": 0.1, "color": "#FFd9a6"}])
+    assert stroke["color"] == [1.0, 0.6939, 0.3813]  # the sRGB curve of 255, 217, 166
+    assert stroke_list([stroke]) == (stroke,)
+
+
 def test_a_shadow_is_a_factor_on_radiance_by_coverage_and_opacity():
     picture = grey(2.0, 64, 64)  # above display white: a factor all the same
     soft = {"type": "shadow", "ellipse": [0.5, 0.5, 0.3, 0.3], "softness": 0.2, "amount": 0.75}
@@ -309,7 +315,7 @@ def test_display_values_go_on_above_white_and_come_back(name):
     radiance = np.array([0, 1e-30, 1e-3, 0.5, 1, 1.001, 99.9, 100.1, 65504, 1e6, 3e38])
     values = display.show(radiance)
     assert (np.diff(values) > 0).all()
-    np.testing.assert_allclose(display.radiance(values), radiance, rtol=1e-12)
+    np.testing.assert_allclose(display.radiance(values), radiance, rtol=1e-11)  # a slope of 5e-5: reinhard
     below = radiance[radiance < display.white]
     np.testing.assert_array_equal(display.show(below), tonemap(below, name))
     near = display.white * np.exp([-1e-3, 0, 1e-3])
@@ -385,7 +391,7 @@ def test_a_picture_that_is_not_finite_is_refused_by_place(bad):
 
 @pytest.mark.parametrize("picture", [np.zeros((4, 4)), np.zeros((0, 4, 3)), np.zeros((4, 4, 4)), [["a"]]])
 def test_a_picture_of_another_shape_is_refused(picture):
-    with pytest.raises(InputError, match=r"came shape \(.*wanted \(h, w, 3\)"):
+    with pytest.raises(InputError, match=r"got shape \(.*expected \(h, w, 3\)"):
         strokes.paint(picture, [])
 
 
@@ -402,71 +408,72 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
 @pytest.mark.parametrize(
     "stroke, says",
     [
-        ("amount = 1", "target.strokes[1].type: came none, wanted one of shadow, light, erase-shadow"),
-        ("type = 'shade'", "target.strokes[1].type: came 'shade', wanted one of"),
+        ("amount = 1", "target.strokes[1].type: got none, expected one of shadow, light, erase-shadow"),
+        ("type = 'shade'", "target.strokes[1].type: got 'shade', expected one of"),
         ("type = 'shade'", "did you mean shadow?"),
-        ("type = 3", "target.strokes[1].type: came 3"),
+        ("type = 3", "target.strokes[1].type: got 3"),
         (f"type = 'shadow', {DOT}, widht = 1", "type shadow, has no key 'widht'; did you mean width?"),
         (
             f"type = 'shadow', {DOT}, kelvin = 1",
             "target.strokes[1], type shadow, has no key 'kelvin'; known:",
         ),
-        ("type = 'shadow'", "target.strokes[1]: came no shape, wanted one of points, polygon"),
-        ("type = 'erase-shadow', softness = 1", "came no shape"),
-        (f"type = 'light', {DOT}, ellipse = [0, 0, 1, 1]", "came points and ellipse, wanted one shape"),
-        ("type = 'light', points = [[0, 0]]", "target.strokes[1].width: came none, wanted the width"),
+        ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
+        ("type = 'erase-shadow', softness = 1", "got no shape"),
+        (f"type = 'light', {DOT}, ellipse = [0, 0, 1, 1]", "got points and ellipse, expected one shape"),
+        ("type = 'light', points = [[0, 0]]", "target.strokes[1].width: got none, expected the width"),
         (
             "type = 'light', points = [[0, 0]], width = 0",
-            "target.strokes[1].width: came 0, wanted a number above",
+            "target.strokes[1].width: got 0, expected a number above",
         ),
         (
             "type = 'light', points = [[0, 0]], width = inf",
-            "target.strokes[1].width: came inf, wanted a finite",
+            "target.strokes[1].width: got inf, expected a finite",
         ),
         (
             "type = 'blur', radius = 1, width = 1",
-            "target.strokes[1].width: came 1, wanted none without points",
+            "target.strokes[1].width: got 1, expected none without points",
         ),
-        ("type = 'light', width = 1, points = []", "target.strokes[1].points: came [], wanted [[x, y], ...]"),
-        ("type = 'light', width = 1, points = 3", "target.strokes[1].points: came 3"),
-        ("type = 'light', width = 1, points = [[0, 0], [1]]", "target.strokes[1].points[1]: came [1]"),
+        ("type = 'light', width = 1, points = []", "target.strokes[1].points: got [], expected [[x, y]"),
+        ("type = 'light', width = 1, points = 3", "target.strokes[1].points: got 3"),
+        ("type = 'light', width = 1, points = [[0, 0], [1]]", "target.strokes[1].points[1]: got [1]"),
         (
             "type = 'light', width = 1, points = [[0, nan]]",
-            "target.strokes[1].points[0]: came [0, nan], wanted a",
+            "target.strokes[1].points[0]: got [0, nan], expected a",
         ),
         (
             "type = 'light', polygon = [[0, 0], [1, 1]]",
-            "target.strokes[1].polygon: came [[0, 0], [1, 1]], wanted",
+            "target.strokes[1].polygon: got [[0, 0], [1, 1]], expected",
         ),
         ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
-        ("type = 'light', ellipse = [0, 0, 1]", "ellipse: came [0, 0, 1], wanted [cx, cy, rx, ry] or"),
-        ("type = 'light', ellipse = [0, 0, 1, 0]", "ellipse: came [0, 0, 1, 0], wanted a number above 0"),
+        ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
+        ("type = 'light', ellipse = [0, 0, 1, 0]", "ellipse: got [0, 0, 1, 0], expected a number above 0"),
         (
             "type = 'light', rectangle = [1, 0, 0, 1]",
-            "rectangle: came [1, 0, 0, 1], wanted [x0, y0, x1, y1] with",
+            "rectangle: got [1, 0, 0, 1], expected [x0, y0, x1, y1] with",
         ),
-        ("type = 'light', rectangle = [0, 0, 1, 'a']", "rectangle: came [0, 0, 1, 'a'], wanted a number"),
-        (f"type = 'light', {DOT}, color = [1, -1, 1]", "target.strokes[1].color: came [1, -1, 1], wanted"),
-        (f"type = 'light', {DOT}, color = [1, 1]", "wanted a list of 3 numbers"),
+        ("type = 'light', rectangle = [0, 0, 1, 'a']", "rectangle: got [0, 0, 1, 'a'], expected a number"),
+        (f"type = 'light', {DOT}, color = [1, -1, 1]", "target.strokes[1].color: got [1, -1, 1], expected"),
+        (f"type = 'light', {DOT}, color = [1, 1]", "expected a list of 3 numbers"),
+        (f"type = 'light', {DOT}, color = '#ffd9a'", "[r, g, b], or a colour such as"),
         (
             f"type = 'light', {DOT}, amount = -1",
-            "target.strokes[1].amount: came -1, wanted a number of at least 0",
+            "target.strokes[1].amount: got -1, expected a number of at least 0",
         ),
-        (f"type = 'shadow', {DOT}, amount = 1.5", "target.strokes[1].amount: came 1.5, wanted"),
-        (f"type = 'shadow', {DOT}, opacity = 2", "target.strokes[1].opacity: came 2, wanted"),
-        (f"type = 'shadow', {DOT}, softness = -1", "target.strokes[1].softness: came -1, wanted"),
-        (f"type = 'shadow', {DOT}, softness = true", "target.strokes[1].softness: came true, wanted"),
+        (f"type = 'shadow', {DOT}, amount = 1.5", "target.strokes[1].amount: got 1.5, expected"),
+        (f"type = 'shadow', {DOT}, opacity = 2", "target.strokes[1].opacity: got 2, expected"),
+        (f"type = 'shadow', {DOT}, softness = -1", "target.strokes[1].softness: got -1, expected"),
+        (f"type = 'shadow', {DOT}, softness = true", "target.strokes[1].softness: got true, expected"),
         (
             f"type = 'shadow', {DOT}, units = 'pixel'",
-            "units: came 'pixel', wanted one of fraction, pixels; did",
+            "units: got 'pixel', expected one of fraction, pixels; did",
         ),
-        ("type = 'temperature'", "target.strokes[1].kelvin: came none, wanted a number"),
+        ("type = 'temperature'", "target.strokes[1].kelvin: got none, expected a number"),
         (
             "type = 'temperature', kelvin = 1000",
-            "target.strokes[1].kelvin: came 1000, wanted a number of at least",
+            "target.strokes[1].kelvin: got 1000, expected a number of at least",
         ),
-        ("type = 'blur'", "target.strokes[1].radius: came none"),
-        ("type = 'blur', radius = 0", "target.strokes[1].radius: came 0, wanted a number above 0"),
+        ("type = 'blur'", "target.strokes[1].radius: got none"),
+        ("type = 'blur', radius = 0", "target.strokes[1].radius: got 0, expected a number above 0"),
     ],
 )
 def test_a_stroke_that_cannot_be_understood_is_refused_by_name(stroke, says):
@@ -477,11 +484,11 @@ def test_a_stroke_that_cannot_be_understood_is_refused_by_name(stroke, says):
 
 
 def test_strokes_and_the_kind_of_target_go_together():
-    assert "target.strokes: came none, wanted at least one" in refused("[target]\nkind = 'strokes'")
+    assert "target.strokes: got none, expected at least one" in refused("[target]\nkind = 'strokes'")
     contrast = "strokes = [{type = 'contrast'}]"
     for kind, more in (("envmap", ""), ("image", "file = 'a.png'")):
         message = refused(f"[target]\nkind = '{kind}'\n{more}\n{contrast}")
-        assert "target.strokes: came 1, wanted none" in message and 'target.kind = "strokes"' in message
+        assert "target.strokes: got 1, expected none" in message and 'target.kind = "strokes"' in message
     assert "target.file" in refused(f"[target]\nkind = 'strokes'\nfile = 'a.exr'\n{contrast}")
     assert "--set" in refused("", "target.strokes=[{type = 'blur'}]")
 

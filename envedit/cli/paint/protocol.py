@@ -110,7 +110,8 @@ class Edit:
 class Pick:
     """A place on the rendering (shares of width and height) that a light is dragged from, or to.
 
-    ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: tell which.
+    ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: the server
+    chooses.
     """
 
     x: float

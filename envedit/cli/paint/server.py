@@ -67,7 +67,7 @@ class Client:
 
 
 class Hub(Tell):
-    """Hands what the worker tells to all pages; called from the worker's thread."""
+    """Hands the worker's messages to all pages; called from the worker's thread."""
 
     def __init__(self):
         self.clients: set[Client] = set()

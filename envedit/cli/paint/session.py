@@ -37,7 +37,7 @@ from envedit.targets.target import pixel_weight
 DRAGGED_COLUMNS, COLUMNS = 8, 32
 """Most exact columns of T traced in one frame while a light is dragged, and otherwise."""
 QUICK_SPP = 32
-"""Paths a pixel of the transport by which it is told what a dragged light changes: an eighth of the texels'
+"""Paths a pixel of the transport that estimates what a dragged light changes: an eighth of the texels'
 weights to read in every frame, and its errors cancel where nothing changes."""
 SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
@@ -71,7 +71,7 @@ class Session:
     project : Project
         What is painted on.
     tell : Tell
-        Told of frames and of progress.
+        Receives frames and progress.
     newer : callable
         Whether something newer waits.
     """
@@ -299,7 +299,7 @@ class Session:
 
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
-        self._tell_doing("asking what any light could do")
+        self._tell_doing("estimating how much of the target is feasible")
         asked = self.problem.envmap, self.target, self.weight, self.rows, None
         self.reach = feasibility.reachable(self._watched, *asked, self.coverage[..., 0], self.base)
         self.status["reachable"] = self.reach.share
@@ -375,7 +375,7 @@ class Session:
     # ---- lights by the rendering ---------------------------------------------------------------------------
 
     def pick(self, asked: Pick) -> None:
-        """Tell which light a pixel is lit by most, or where one must go for its highlight to lie there."""
+        """Find which light a pixel is lit by most, or where one must go for its highlight to lie there."""
         height, width = self.base.shape[:2]
         row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
         patch = np.zeros((height, width, 3), np.float32)

@@ -26,7 +26,7 @@ class Worker(threading.Thread):
     Parameters
     ----------
     tell : Tell
-        Told of everything.
+        Receives every message.
     opened : Project, optional
         What to begin with.
     """
@@ -120,7 +120,7 @@ class Worker(threading.Thread):
         self.session.again()
 
     def _attempt(self, work):
-        """Do something; a user's mistake is told, and so is a fault of ours, which also goes to stderr."""
+        """Do something; a user's mistake is reported, as is a fault of ours, which also goes to stderr."""
         try:
             with unwrapped():
                 return work()

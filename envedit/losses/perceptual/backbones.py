@@ -114,7 +114,7 @@ class Backbone:
 
        backbone = Backbone.load("vgg", "vgg16.safetensors")
        stack = backbone.stack(64, 256)
-       tape = stack.forward(x)              # flat, 64 * 256 * 3 numbers, normalised as the network wants
+       tape = stack.forward(x)              # flat, 64 * 256 * 3 numbers, normalised as the network requires
        taps = stack.taps(tape)              # [(flat array of N * C numbers, N, C), ...]
        gradient = stack.backward(tape, [gradient of the first tap, None, ...])
 
@@ -245,7 +245,7 @@ class Stack:
         Parameters
         ----------
         x : Float
-            Image, H * W * 3 numbers, normalised as the network wants; not differentiated.
+            Image, H * W * 3 numbers, normalised as the network requires; not differentiated.
 
         Returns
         -------

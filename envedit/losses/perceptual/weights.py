@@ -35,7 +35,7 @@ def read(file, wanted: dict[str, tuple[int, ...]], what: str, source: str) -> di
     Parameters
     ----------
     file : path-like
-        The file. Which format it has is told by its first bytes, not by its name.
+        The file. Its first bytes decide which format it has, not by its name.
     wanted : dict
         Name -> shape. Further tensors in the file are not looked at.
     what : str

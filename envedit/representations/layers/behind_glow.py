@@ -9,7 +9,7 @@ seen there instead is
 
 the texture stays, at no more than the contrast that it has at this elevation, but for that within K of a
 light, where k is 0: it is bloom and no cloud. Level and colour are those of the elevation. Means are weighted
-by 1 / glow^2: they tell of the sky away from the lights. A texel goes from B to R by w, the share of its
+by 1 / glow^2: they describe the sky away from the lights. A texel goes from B to R by w, the share of its
 radiance that was the glow's and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a light
 that has not moved changes nothing, and there is no edge.
 """
@@ -51,7 +51,7 @@ class BehindGlow:
 def behind_glow(
     background: np.ndarray, glow: np.ndarray, away: np.ndarray, rows: tuple[int, int]
 ) -> BehindGlow:
-    """Tell what is seen where the glow has gone.
+    """Predict the sky where the glow has gone.
 
     Parameters
     ----------

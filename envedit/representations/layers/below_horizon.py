@@ -1,7 +1,7 @@
 """The rows below the horizon, which follow the sky above them.
 
 On PureSky maps they are a blurred mirror of the sky; on others they are photographed ground. Either way they
-are the original's, times a smooth factor that tells how the sky above has changed:
+are the original's, times a smooth factor, the change of the sky above:
 
     E_low = E0_low * R^f,    log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
@@ -48,7 +48,7 @@ def sky_rows(total: int) -> int:
 
 
 def kind_of(envmap: np.ndarray) -> str:
-    """Tell what a map (H, W, 3) shows below the horizon: a "mirror" of the sky, or ground to "keep"."""
+    """Detect what a map (H, W, 3) shows below the horizon: a "mirror" of the sky, or ground to "keep"."""
     low = np.float64(envmap[sky_rows(len(envmap)) :]) @ LUMINANCE
     if not low.size or not low.max() > 0:
         return "keep"
@@ -110,7 +110,7 @@ class Below:
         self._before, self._before_soft = before, self._blur(before)
 
     def _best_width(self, radiance, sky, total):
-        """Choose the widest K by how well K S_0 tells the variation of each row around the horizon."""
+        """Choose the widest K by how well K S_0 explains the variation of each row around the horizon."""
         blur = _Blur(sky.shape[:2], total, COARSE)
         omega = latlong.solid_angles(total, sky.shape[1])[sky.shape[0] :]
 

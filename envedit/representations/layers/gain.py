@@ -2,7 +2,8 @@
 
 A sum of bilinear grids over the active rows, periodic in azimuth, each twice as fine as the one before. The
 three coarse ones, up to a stated number of cycles around the horizon, are each half as strong per step of
-their nodes: what a coarse grid can say is said by it. Finer ones are added where a picture tells them.
+their nodes: what a coarse grid can represent is left to it. Finer ones are added where they are identifiable
+from the picture.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ MOST = 12.0
 LEVELS = 3
 """Coarse grids, which any picture may move."""
 CYCLES = 12
-"""Cycles around the horizon that any picture may move; what is finer must be told by it."""
+"""Cycles around the horizon that are free with any picture; finer detail must be identifiable from it."""
 
 DETAIL = 1.0
 """A step of the nodes of finer grids, where they are well known."""
@@ -63,9 +64,9 @@ class Octave:
     size : (int, int)
         Its rows and columns of nodes.
     known : ndarray (rows, columns)
-        How well the picture tells it at each node, in [0, 1).
+        How well the picture determines it at each node, in [0, 1).
     share : float
-        How much of the active rows' solid angle it tells, in [0, 1].
+        Share of the active rows' solid angle in which it is identifiable, in [0, 1].
     """
 
     size: tuple[int, int]

@@ -79,7 +79,7 @@ class Layers:
     behind : BehindGlow or None
         What is seen where a glow has gone; None without glows.
     free : ndarray of bool (rows, W) or None
-        As :meth:`keep` was told.
+        As given to :meth:`keep`.
     scales : dict
         What a unit of each parameter is.
     """

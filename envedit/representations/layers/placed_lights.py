@@ -34,7 +34,7 @@ class PlacedLights:
     Attributes
     ----------
     layers : Layers
-        The map, told apart.
+        The separated map.
     lights : list of Light
         Its lights, those with most flux first: ``light = 1`` is the first.
     """

@@ -1,6 +1,6 @@
 """Separation of a map into lights and background: which texels are lights, and what they do to the sky.
 
-A map is told apart as E = B * prod(1 + G_l) + sum(C_l). The **core** C_l of a light is the radiance that
+A map is separated as E = B * prod(1 + G_l) + sum(C_l). The **core** C_l of a light is the radiance that
 stands out: a sun's disc, a lamp, a softbox. Its **glow** G_l is what the light does to the sky around it, as
 a factor that falls with the angle to the light: when the sun moves, the clouds stay and their lighting
 changes. What is left is the background B, the map as it would be without its lights.
@@ -25,11 +25,11 @@ SURROUNDINGS = 20.0
 LEAST_SHARE = 0.005
 """Share of the map's irradiance below which something bright is no light."""
 MOST_LIGHTS = 8
-"""Lights that are told apart, those with most flux; weaker ones stay in the background."""
+"""Most lights that are separated, those with most flux; weaker ones stay in the background."""
 DETECT_WIDTH = 512
 """Lights are looked for in a copy of at most this width: what is smaller has no flux."""
 RING_SHARE = (0.1, 0.5)
-"""Part of a ring around a light, by luminance, that tells its glow: clouds and the horizon are brighter."""
+"""Quantiles of luminance in a ring around a light that give its glow: clouds and the horizon are brighter."""
 FARTHEST = 90.0
 """Largest radius of a glow, degrees."""
 SOFT = 1 / 12
@@ -73,7 +73,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Separation:
-    """A map told apart; ``background * glow + core`` is the map to float precision.
+    """A separated map; ``background * glow + core`` is the map to float precision.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Separation:
     lights : list of Light
         Those with most flux first.
     survey : Survey or None
-        Where the lights were found, to tell the same lights in another resolution of the map; None without.
+        Where the lights were found, to find the same lights in another resolution of the map; None without.
     """
 
     background: np.ndarray
@@ -94,7 +94,7 @@ class Separation:
 
 @dataclass(frozen=True)
 class Survey:
-    """What the small copy of a map tells of its lights: all that does not depend on the map's resolution.
+    """What the small copy of a map says of its lights: all that does not depend on the map's resolution.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Survey:
 
 
 def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separation:
-    """Tell the lights of a map from its background.
+    """Separate the lights of a map from its background.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def _survey(small: _Small) -> Survey | None:
 class _Small:
     """The copy of an image in which lights are looked for.
 
-    ``first`` and ``total`` tell the image's own rows in its map, ``rows`` the same of the copy.
+    ``first`` and ``total`` are the image's own rows in its map, ``rows`` the same of the copy.
     """
 
     image: np.ndarray

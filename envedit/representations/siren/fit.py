@@ -86,7 +86,7 @@ def unpolished(settings: config.Fit) -> config.Fit:
     """Return a recipe that perturbs to the end and leaves the last layer as it was trained.
 
     A polished fit has the map's sun, sharp and bright; a robust one is vague about it. To move a sun that is
-    not there yet is easier: edits of sunny maps that start from a robust fit end better (docs/engine.md).
+    not there yet is easier: edits of sunny maps that start from a robust fit end better (docs/siren.md).
     """
     return replace(settings, awp_until=1.0, light=0.0)
 
@@ -376,7 +376,7 @@ def _stored(fitted: Fitted) -> dict[str, np.ndarray]:
 
 
 def _whole(arrays, network):
-    """Tell whether arrays from disk are a fit of such a network."""
+    """Return whether arrays from disk are a fit of such a network."""
     inputs = 2 if network.coordinates == "plane" else 3
     made = siren.init(0, network.hidden, network.depth, network.omega, inputs)
     shapes = {name: value.shape for name, value in made.items()}

@@ -18,8 +18,8 @@ from envedit.representations.siren import fit
 class Siren:
     """The weights of a SIREN fitted to the image (Eq. 1-3); robust (R-SIREN) when fitted with awp_gamma > 0.
 
-    ``rows`` tells which rows of a map the images are: (first row, rows of the whole map); None: all of it.
-    ``fitted`` tells, after :meth:`encode`, how well the network reproduces the image.
+    ``rows`` says which rows of a map the images are: (first row, rows of the whole map); None: all of it.
+    ``fitted`` says, after :meth:`encode`, how well the network reproduces the image.
     """
 
     lr = 5e-5

@@ -180,7 +180,7 @@ def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, m
             assert asked(f"{server.url}map/{name}", **put)[0] in (400, 403, 404), name
         assert asked(f"{server.url}map/a.hdr", **{**put, "headers": {}})[0] == 403
         code, path = asked(f"{server.url}map/a.hdr", **put)
-        assert code == 200 and Path(path).read_bytes() == b"#?RADIANCE"
+        assert code == 200 and path == "maps/a.hdr" and Path(path).read_bytes() == b"#?RADIANCE"
         assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.*")) == [
             "edit.toml",
             "maps/a.hdr",

@@ -289,7 +289,7 @@ function choose(name, value) {
 // Write what a slider is set to beside it.
 function valued(input) {
   const value = Number(input.value), unit = input.dataset.unit;
-  const output = input.parentElement.querySelector("output");
+  const output = input.parentElement.querySelector(".value");
   output.textContent = unit === "%" ? `${+(100 * value).toFixed(1)} %` : unit ? `${value} ${unit}` : value;
 }
 for (const input of document.querySelectorAll("#options input[type=range]")) {

@@ -8,7 +8,8 @@ import pytest
 
 from envedit import config, pipeline
 from envedit.images import images
-from tests.oracles.painting import SMALL, served, until
+from tests.oracles.builders import LIGHT, write_scene
+from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, served, until
 
 pytestmark = pytest.mark.slow
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -27,6 +28,30 @@ def browser():
         found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *gl])
         yield found
         found.close()
+
+
+UNNAMED = """() => [...document.querySelectorAll("button, input, select, canvas[tabindex]")]
+  .filter((e) => e.checkVisibility() && !(e.getAttribute("aria-label")
+    || [...(e.labels ?? [])].some((l) => l.textContent.trim())
+    || (!e.labels?.length && e.textContent.trim())))
+  .map((e) => e.id || e.outerHTML)"""
+FAINT = """() => {
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+  const luminance = (c) => [0.2126, 0.7152, 0.0722].reduce((sum, w, i) => {
+    const v = c[i] / 255;
+    return sum + w * (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  }, 0);
+  const ground = (e) => {
+    const c = rgb(getComputedStyle(e).backgroundColor);
+    return c.length === 3 || !e.parentElement ? c : ground(e.parentElement);
+  };
+  return [...document.querySelectorAll("body *")].filter((e) => e.checkVisibility() && !e.closest("#handles")
+    && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())).map((e) => {
+      const [a, b] = [luminance(rgb(getComputedStyle(e).color)), luminance(ground(e))].sort((x, y) => y - x);
+      return [(a + 0.05) / (b + 0.05), e.id || e.outerHTML.slice(0, 80)];
+    }).filter(([ratio]) => ratio < 4.5);
+}"""
+"""What has no name for assistive tools, and text with less contrast than WCAG 2.2 AA asks (1.4.3)."""
 
 
 class Page:
@@ -109,4 +134,43 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         sync_api.expect(page.page.get_by_test_id("undo")).to_be_enabled()
         assert "elevation" in page.page.get_by_test_id("handle-1").get_attribute("aria-label")
         page.shot("reopened")
+        assert not page.faults, page.faults
+
+
+def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
+    write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
+    (tmp_path / "edit.toml").write_text(OF_TWO)
+    with served(tmp_path / "edit.toml") as server:
+        page = Page(browser, server.url)
+        tabs = page.page.get_by_role("tab")
+        sync_api.expect(tabs.nth(0)).to_be_visible(timeout=120_000)
+        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
+        assert tabs.all_inner_texts() == ["front", "behind"]
+        ratio = "() => document.querySelector('#render').getBoundingClientRect()"
+        first = page.page.evaluate(ratio)
+        tabs.nth(0).focus()
+        page.page.keyboard.press("ArrowRight")
+        assert tabs.nth(1).get_attribute("aria-selected") == "true"
+        second = page.page.evaluate(ratio)
+        assert first["width"] / first["height"] == pytest.approx(32 / 20, rel=0.02)
+        assert second["width"] / second["height"] == pytest.approx(32 / 28, rel=0.02)
+        page.page.get_by_test_id("shape-rectangle").click()
+        page.drag(page.at("#overlay", 0.3, 0.3), page.at("#overlay", 0.7, 0.7))
+        kept = tmp_path / "edit_out" / "painted.toml"
+        until(lambda: kept.exists() and "view = 1" in kept.read_text())
+        page.shot("views")
+
+        assert not page.page.evaluate(UNNAMED)
+        assert not page.page.evaluate(FAINT)
+        page.page.get_by_test_id("undo").focus()
+        reached = []
+        while len(reached) < 60 and "map-exposure" not in reached:
+            page.page.keyboard.press("Tab")
+            reached.append(page.page.evaluate(
+                "() => { const e = document.activeElement;"
+                " return e.dataset.testid ?? (e.id || e.tagName.toLowerCase()); }"
+            ))  # fmt: skip
+        order = ["save", "tool-light", "shape-brush", "softness", "view-1", "overlay", "handle-1",
+                 "tool-turn", "map-exposure"]  # fmt: skip
+        assert [name for name in reached if name in order] == order, reached
         assert not page.faults, page.faults

@@ -23,6 +23,19 @@ spp = 16
 report = false
 """
 
+_CAMERA = """<sensor type="perspective" id="{name}"><float name="fov" value="30"/>
+<transform name="to_world"><lookat origin="0,1,{z}" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="32"/>
+<integer name="height" value="{height}"/></film></sensor>"""
+BALL = '<shape type="sphere"><bsdf type="roughplastic"><float name="alpha" value="0.2"/></bsdf></shape>'
+TWO_VIEWS = (
+    _CAMERA.format(name="front", z=5, height=20),
+    _CAMERA.format(name="behind", z=-4, height=28),
+    BALL,
+)
+"""Parts of a scene with two sensors, for :func:`.builders.write_scene`."""
+OF_TWO = SMALL.replace('file = "sphere"\nwidth = 48', 'file = "scene.xml"\nwidth = 32\nsensors = "all"')
+
 
 @contextlib.contextmanager
 def served(name, **more):

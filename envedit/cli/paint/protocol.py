@@ -1,7 +1,7 @@
 """What page and server say to each other: JSON messages from the page, JSON and frames to it.
 
 A frame is 16 bytes and half floats, little-endian: "EVPF", kind (:data:`KINDS`), source (:data:`SOURCES`),
-width and height as uint16, number as uint32, two bytes of zeros; then RGB, row by row.
+width and height as uint16, number as uint32, view (an index) as uint16; then RGB, row by row.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Edit:
 
 @dataclass(frozen=True)
 class Pick:
-    """A place on the rendering (shares of width and height) that a light is dragged from, or to.
+    """A place on the rendering of a view (shares of width and height) that a light is dragged from, or to.
 
     ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: the server
     chooses.
@@ -119,6 +119,7 @@ class Pick:
     light: int = -1
     number: int = 0
     client: str = ""
+    view: int = 0
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,8 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
         if kind == "pick":
             at = (number(0, 1)(found.get(name)) for name in "xy")
             light = int(number(-1, 100)(found.get("light", -1)))
-            return Pick(*at, light, _count(found.get("number", 0)), client)
+            view = _count(found.get("view", 0))
+            return Pick(*at, light, _count(found.get("number", 0)), client, view)
         if kind == "open":
             name, envmap = string(found.get("name")), string(found.get("envmap", ""))
             if not name:
@@ -181,11 +183,11 @@ def _count(value):
     return value
 
 
-def frame(kind: str, source: str, count: int, image: np.ndarray) -> bytes:
+def frame(kind: str, source: str, count: int, image: np.ndarray, view: int = 0) -> bytes:
     """Return an image (h, w, 3) as a frame; what is beyond half floats is cut at their largest."""
     height, width, _ = image.shape
     head = struct.pack(
-        "<4sBBHHIH", b"EVPF", KINDS.index(kind), SOURCES.index(source), width, height, count % 2**32, 0
+        "<4sBBHHIH", b"EVPF", KINDS.index(kind), SOURCES.index(source), width, height, count % 2**32, view
     )
     pixels = np.nan_to_num(image, nan=0.0, posinf=_LARGEST, neginf=-_LARGEST)
     return head + np.clip(pixels, -_LARGEST, _LARGEST).astype("<f2").tobytes()

@@ -75,11 +75,13 @@ class Hub(Tell):
         self.last: dict[str, dict] = {}
         self.count = 0
 
-    def frame(self, kind, source, image):
-        """Show an image, with the number of the frame in front."""
+    def frame(self, kind, source, image, rows=(slice(None),)):
+        """Show an image, each view by itself, with the number of the frame in front."""
         if kind == "render":
             self.count += 1
-        self._send(f"frame {kind}", protocol.frame(kind, source, self.count, image))
+        for view, part in enumerate(rows):
+            sent = protocol.frame(kind, source, self.count, image[part], view)
+            self._send(f"frame {kind} {view}", sent)
 
     def say(self, message):
         """Send a message, of each type the latest; a status says which frame it is about."""
@@ -217,7 +219,7 @@ class Server:
             return PlainTextResponse(f"not written: {error}", 500, _SAFE)
         finally:
             part.unlink(missing_ok=True)
-        return PlainTextResponse(str(folder / name), headers=_SAFE)
+        return PlainTextResponse(f"{MAPS}/{name}", headers=_SAFE)
 
     async def _socket(self, socket: WebSocket) -> None:
         if not self._known(socket) or socket.headers.get("origin") not in self.origins:

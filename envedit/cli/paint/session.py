@@ -22,7 +22,7 @@ from envedit.cli.paint.project import Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.errors import NumericalError
+from envedit.core.errors import ConfigError, NumericalError
 from envedit.export import adjustments
 from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
@@ -56,8 +56,8 @@ class SupersededError(Exception):
 class Tell:
     """What a session reports; :class:`.server.Hub` sends it to the pages."""
 
-    def frame(self, kind: str, source: str, image: np.ndarray) -> None:
-        """Show an image (h, w, 3)."""
+    def frame(self, kind: str, source: str, image: np.ndarray, rows=(slice(None),)) -> None:
+        """Show an image (h, w, 3), with the rows of each view in it."""
 
     def say(self, message: dict) -> None:
         """Send a message."""
@@ -192,12 +192,20 @@ class Session:
             return None
         first = painted[:-1]
         if self._painted is None or self._painted[0] != first:
-            kept = strokes.paint(self.base, first, tonemap) if first else strokes.Painted(self.base, 0)
-            self._painted = first, kept
-        kept = self._painted[1]
-        last = strokes.paint(kept.picture, painted[-1:], tonemap)
-        coverage = 1 - (1 - kept.coverage) * (1 - last.coverage)
-        return strokes.Painted(last.picture, np.float32(coverage), kept.warnings + last.warnings)
+            bare = strokes.Painted(self.base, np.zeros((*self.base.shape[:2], 1), np.float32))
+            self._painted = first, self._on_views(bare, first, tonemap)
+        return self._on_views(self._painted[1], painted[-1:], tonemap)
+
+    def _on_views(self, before, painted, tonemap):
+        """Paint strokes, each on its view, over what was painted before."""
+        picture, coverage = before.picture.copy(), before.coverage.copy()
+        views = [self.lit.view(one.get("view", 0), "target.strokes.view") for one in painted]
+        for view in sorted(set(views)):
+            rows = self.lit.rows[view]
+            own = [one for one, on in zip(painted, views, strict=True) if on == view]
+            made = strokes.paint(picture[rows], own, tonemap)
+            picture[rows], coverage[rows] = made.picture, 1 - (1 - coverage[rows]) * (1 - made.coverage)
+        return strokes.Painted(picture, coverage)
 
     # ---- what goes on --------------------------------------------------------------------------------------
 
@@ -285,17 +293,25 @@ class Session:
         if done >= passes:
             return False
         if self._sharp is None:
-            scene = self.project.settings.scene
-            wider = {"width": SHARPER * self.lit.width, "height": SHARPER * self.lit.height}
-            self._sharp = inputs.load_scene(replace(scene, **wider), self.project.base)
+            self._sharp = self._sharper()
         seed = (self.project.settings.seed + RENDER_SEED + done) % 2**32
         total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
         done += 1
         self._rendered = done, total
         if done in (1, 2, 4, 8, PASSES):
-            self.tell.frame("render", "mitsuba", total / done)
+            self.tell.frame("render", "mitsuba", total / done, self._sharp.rows)
             self.tell_state()
         return True
+
+    def _sharper(self):
+        """Return the scene with more pixels; of a cropped film, which takes no other size, as it is."""
+        chosen = self.project.settings.scene
+        height = self.lit.height if len(self.lit.views) == 1 else chosen.height
+        more = {"width": SHARPER * self.lit.width, "height": SHARPER * height}
+        try:
+            return inputs.load_scene(replace(chosen, **more), self.project.base)
+        except ConfigError:
+            return self.lit
 
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
@@ -303,7 +319,7 @@ class Session:
         asked = self.problem.envmap, self.target, self.weight, self.rows, None
         self.reach = feasibility.reachable(self._watched, *asked, self.coverage[..., 0], self.base)
         self.status["reachable"] = self.reach.share
-        self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach))
+        self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
         self.tell_state()
 
     # ---- what is shown -------------------------------------------------------------------------------------
@@ -325,17 +341,17 @@ class Session:
         if shown is not edited:
             by = self._quick if self._dragged else self.transport
             rendering = by.apply(tensor(shown)).numpy()
-        self.tell.frame("render", source, rendering)
+        self.tell.frame("render", source, rendering, self.lit.rows)
         self.tell.frame("map", source, shown)
         if not self._dragged:
             both = self.target, self.point.rendering
             target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
-            self.tell.frame("difference", source, target - solution)
+            self.tell.frame("difference", source, target - solution, self.lit.rows)
 
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
         self.resting = False
-        self.tell.frame("before", "transport", self.before)
+        self.tell.frame("before", "transport", self.before, self.lit.rows)
         self._show("transport")
         self._rendered = None
         self._tell_lights()
@@ -376,10 +392,11 @@ class Session:
 
     def pick(self, asked: Pick) -> None:
         """Find which light a pixel is lit by most, or where one must go for its highlight to lie there."""
-        height, width = self.base.shape[:2]
+        patch = np.zeros(self.base.shape, np.float32)
+        seen = patch[self.lit.rows[min(asked.view, len(self.lit.rows) - 1)]]
+        height, width = seen.shape[:2]
         row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
-        patch = np.zeros((height, width, 3), np.float32)
-        patch[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
+        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
         seen = self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
         if asked.light < 0:
@@ -435,11 +452,11 @@ class Session:
             result = pipeline.run(settings, folder=folder, base=project.base, watch=watch)
             self.tell.say({"type": "saving", "text": "writing"})
             warnings = run_folder.write(settings, folder, result, import_s, project.base)
-        self.tell.frame("render", "saved", result.renders["edited"])
+        self.tell.frame("render", "saved", result.renders["edited"], self.lit.rows)
         self.tell.frame("map", "saved", result.maps["edited"])
         self.resting = True  # what is shown is what was saved
         files = [name for name in output_folder.RESULTS if (folder / name).exists()]
-        self.tell.say({"type": "saved", "folder": str(folder), "files": files, "warnings": warnings})
+        self.tell.say({"type": "saved", "folder": folder.name, "files": files, "warnings": warnings})
         return warnings
 
 

@@ -109,7 +109,8 @@ class Worker(threading.Thread):
             {
                 "type": "opened",
                 "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
-                "folder": str(opened.folder),
+                "folder": opened.folder.name,
+                "views": [view.name for view in self.session.lit.views],
                 "again": opened.again,
                 "document": opened.document.plain(),
                 "width": self.session.lit.width,

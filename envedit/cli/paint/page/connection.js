@@ -42,6 +42,7 @@ function unpacked(buffer) {
     width: head.getUint16(6, true),
     height: head.getUint16(8, true),
     number: head.getUint32(10, true),
+    view: head.getUint16(14, true),
     pixels: new Uint16Array(buffer, 16),
   };
 }

@@ -153,11 +153,10 @@ export class Lights {
     this.commit();
   }
 
-  // An added light goes; one of the map's own is put out.
+  // One of the map's own can only be muted.
   remove() {
     const light = this.list()[this.chosen];
-    if (!light) return;
-    if (light.own) { this.preview(this.chosen, { flux: [0, 0, 0] }); this.commit(); return; }
+    if (!light || light.own) return;
     const lights = this.changed(this.chosen, null);
     this.chosen = -1;
     this.on.done({ lights });
@@ -199,7 +198,9 @@ export class Lights {
       place(handle, light, false);
     });
     this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());
-    if (!this.draft && document.strokes.length) for (const light of this.found) {
+    const solved = !this.draft && document.strokes.length > 0;
+    this.panel.hint.hidden = !solved || !this.found.length;
+    if (solved) for (const light of this.found) {
       const ring = window.document.createElement("span");
       ring.className = "found";
       ring.title = "where the solution has this light";
@@ -223,7 +224,7 @@ export class Lights {
     fluxValue.textContent = muted ? "off" : light.own ? `x${(+most).toPrecision(2)}` : (+most).toPrecision(2);
     sizeValue.textContent = light.own ? `x${(+light.entry.size).toPrecision(2)}` : `${(+light.entry.size).toPrecision(2)}°`;
     mute.setAttribute("aria-pressed", String(muted));
-    remove.textContent = light.own ? "Put out" : "Delete";
+    remove.disabled = Boolean(light.own);
   }
 }
 

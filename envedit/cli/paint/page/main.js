@@ -18,6 +18,10 @@ const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
 window.envedit = { log, displays };
 
+const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
+const frames = { render: [], map: [], difference: [], unreachable: [], before: [] }; // the last of each view
+
+let view = 0, views = [], outlined = false;
 let client = "", sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
@@ -56,17 +60,56 @@ function note(entry) {
 const connection = new Connection({
   lost() { state("error", "The server cannot be reached; trying again"); },
   frame(frame) {
-    if (frame.kind === "before") { displays.render.compare(frame); return; }
-    if (frame.kind === "render") {
-      const box = $("render-stack");
-      box.parentElement.style.setProperty("--aspect", frame.width / frame.height);
-      $("badge").textContent = NAMES[frame.source];
-    }
-    if (frame.kind !== "map") displays[frame.kind].canvas.style.setProperty("aspect-ratio", frame.width / frame.height);
-    displays[frame.kind].show(frame);
+    frames[frame.kind][frame.view] = frame;
+    if (frame.view === view || frame.kind === "map") show(frame);
   },
   message(message) { RECEIVED[message.type]?.(message); },
 });
+
+function show(frame) {
+  if (frame.kind === "before") { displays.render.compare(frame); return; }
+  if (frame.kind === "render") {
+    $("render-stack").parentElement.style.setProperty("--aspect", frame.width / frame.height);
+    $("badge").textContent = NAMES[frame.source];
+  }
+  if (frame.kind !== "map") displays[frame.kind].canvas.style.setProperty("aspect-ratio", frame.width / frame.height);
+  displays[frame.kind].show(frame);
+}
+
+// ---- views of the scene, one at a time
+
+function tabs(names) {
+  views = names;
+  view = Math.min(view, names.length - 1);
+  $("views").hidden = names.length < 2;
+  $("views").replaceChildren(...names.map((name, i) => {
+    const tab = Object.assign(document.createElement("button"), { textContent: name, id: `view-${i}` });
+    tab.dataset.testid = `view-${i}`;
+    tab.setAttribute("role", "tab");
+    tab.setAttribute("aria-controls", "render-stack");
+    tab.addEventListener("click", () => chooseView(i));
+    tab.addEventListener("keydown", (event) => {
+      const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+      if (!step) return;
+      chooseView((i + step + names.length) % names.length);
+      $("views").children[view].focus();
+      event.preventDefault();
+    });
+    return tab;
+  }));
+  chooseView(view);
+}
+
+function chooseView(i) {
+  if (i !== view && (strokes.drawing || strokes.corners)) strokes.cancel();
+  view = i;
+  [...$("views").children].forEach((tab, k) => {
+    tab.setAttribute("aria-selected", String(k === i));
+    tab.tabIndex = k === i ? 0 : -1;
+  });
+  for (const kind of ["before", "render", "difference", "unreachable"]) if (frames[kind][i]) show(frames[kind][i]);
+  strokes.draw();
+}
 
 displays.render.drawn = (frame) => {
   $("status").dataset.frame = frame.number;
@@ -80,21 +123,23 @@ const RECEIVED = {
     if (opened) return;
     $("start").hidden = false;
     list($("shipped"), message.configurations.concat(message.scenes).map((name) => [name, name]));
-    list($("recent"), message.recent.map((one) => [one.path, `${one.title}: ${one.path}`]));
+    list($("recent"), message.recent.map((one) => [one.path, `${one.title}, in ${one.path.split(/[\\/]/).slice(-3, -1).join("/")}`]));
     $("names").replaceChildren(...message.scenes.concat(message.configurations).map((name) => Object.assign(document.createElement("option"), { value: name })));
     state("ready", "Choose what to paint on");
   },
   opened(message) {
     $("start").hidden = true;
     $("work").hidden = false;
-    $("title").textContent = message.title;
+    $("title").textContent = $("title").title = message.title;
+    document.title = `${message.title} · envedit paint`;
+    tabs(message.views);
     const mine = opened && waiting; // made while the server was away
     if (!opened || JSON.stringify(message.document) !== JSON.stringify(history.document)) {
       if (!mine) history.begin({ ...EMPTY, ...message.document });
     }
     opened = true;
     if (mine) flush();
-    say(message.again && !message.notes.length ? `Goes on from ${message.folder}/painted.toml` : message.notes.join("; "), true);
+    say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();
   },
   document(message) { history.follow({ ...EMPTY, ...message.document }); refresh(); },
@@ -167,6 +212,8 @@ const strokes = new Strokes($("overlay"), () => ({
   color: linear($("color").value).map((v) => Math.round(v * 1e4) / 1e4),
   kelvin: Number($("kelvin").value),
   radius: Number($("radius").value),
+  view,
+  outlined: outlined ? history.document.strokes.filter((one) => viewed(one) === view && one.units !== "pixels") : [],
 }), {
   preview(stroke) { history.preview({ strokes: [...history.document.strokes, stroke] }, "drawing"); },
   done(stroke) { history.push({ strokes: [...history.document.strokes, stroke] }); },
@@ -174,13 +221,19 @@ const strokes = new Strokes($("overlay"), () => ({
   drag(phase, x, y) { pick(phase, x, y); },
 });
 
+// Strokes name their view by its index, or by the id of its sensor.
+function viewed(stroke) {
+  const named = views.indexOf(stroke.view);
+  return named < 0 ? stroke.view ?? 0 : named;
+}
+
 // A highlight is dragged: first ask whose it is, then where that light must go.
 let picked = -1, asked = 0, ended = false;
 function pick(phase, x, y) {
   if (phase === "start") { picked = -1; ended = false; }
   if (phase === "end") { ended = true; setTimeout(() => { if (ended) lights.commit(); }, 300); return; }
   if (phase === "move" && picked < 0) return;
-  connection.send({ type: "pick", x, y, light: picked, number: ++asked });
+  connection.send({ type: "pick", x, y, light: picked, view, number: ++asked });
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
@@ -196,7 +249,7 @@ RECEIVED.picked = (message) => {
 
 const lights = new Lights($("map-stack"), $("handles"), {
   set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),
-  mute: $("light-mute"), remove: $("light-delete"), fluxValue: $("light-flux-value"), sizeValue: $("light-size-value"),
+  mute: $("light-mute"), remove: $("light-delete"), hint: $("ring-hint"), fluxValue: $("light-flux-value"), sizeValue: $("light-size-value"),
 }, {
   document: () => history.document,
   preview: (change) => history.preview(change, "dragging"),
@@ -215,6 +268,7 @@ function refresh() {
   $("map-white").value = now.white_balance;
   lights.draft = null;
   lights.draw();
+  strokes.draw();
 }
 
 function choose(name, value) {
@@ -225,10 +279,24 @@ function choose(name, value) {
     const wanted = label.dataset.for.split(" ");
     label.hidden = wanted[0] === "size" ? shape !== "brush" && shape !== "line" : !wanted.includes(tool);
   }
+  if (AMOUNTS[tool]) [$("amount").max, $("amount").value] = AMOUNTS[tool];
+  valued($("amount"));
   $("shapes").hidden = $("options").hidden = tool === "move";
   strokes.reset();
   strokes.draw();
 }
+
+// Write what a slider is set to beside it.
+function valued(input) {
+  const value = Number(input.value), unit = input.dataset.unit;
+  const output = input.parentElement.querySelector(".value");
+  output.textContent = unit === "%" ? `${+(100 * value).toFixed(1)} %` : unit ? `${value} ${unit}` : value;
+}
+for (const input of document.querySelectorAll("#options input[type=range]")) {
+  input.addEventListener("input", () => valued(input));
+  valued(input);
+}
+$("amount").addEventListener("input", () => { AMOUNTS[tool][1] = Number($("amount").value); });
 
 for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => choose("tool", button.dataset.tool));
 for (const button of document.querySelectorAll("[data-shape]")) button.addEventListener("click", () => choose("shape", button.dataset.shape));
@@ -246,7 +314,9 @@ $("exposure").addEventListener("input", () => look({ stops: Number($("exposure")
 $("tonemap").addEventListener("change", () => look({ curve: Number($("tonemap").value) }));
 $("split").addEventListener("input", () => displays.render.set({ split: Number($("split").value) }));
 $("size").addEventListener("input", () => strokes.draw());
-$("kelvin").addEventListener("input", () => { $("kelvin-value").textContent = $("kelvin").value; });
+$("outlines").addEventListener("click", outline);
+$("help").addEventListener("click", () => $("keys").showModal());
+$("keys-close").addEventListener("click", () => $("keys").close());
 for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposure"], ["map-white", "white_balance"]]) {
   $(id).addEventListener("change", () => {
     const value = Number($(id).value);
@@ -255,6 +325,12 @@ for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposu
       refresh();
     } else history.push({ [key]: value });
   });
+}
+
+function outline() {
+  outlined = !outlined;
+  $("outlines").setAttribute("aria-pressed", String(outlined));
+  strokes.draw();
 }
 
 function look(changed) {
@@ -270,7 +346,7 @@ function save() {
 }
 
 window.addEventListener("keydown", (event) => {
-  if (!opened || event.target.matches("input, select")) return;
+  if (!opened || event.target.matches("input, select") || $("keys").open) return;
   const key = event.key.toLowerCase();
   if (event.ctrlKey || event.metaKey) {
     if (key === "z" && !event.shiftKey) history.undo();
@@ -278,7 +354,12 @@ window.addEventListener("keydown", (event) => {
     else if (key === "s") save();
     else return;
   } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
-  else if (key === "[" || key === "]") { $("size")[key === "[" ? "stepDown" : "stepUp"](); strokes.draw(); }
+  else if (key === "o" && !event.repeat) outline();
+  else if (key === "[" || key === "]") {
+    $("size")[key === "[" ? "stepDown" : "stepUp"]();
+    valued($("size"));
+    strokes.draw();
+  }
   else if (/^[1-8]$/.test(key)) choose("tool", document.querySelectorAll("[data-tool]")[key - 1].dataset.tool);
   else return;
   event.preventDefault();

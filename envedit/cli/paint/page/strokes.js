@@ -121,7 +121,8 @@ export class Strokes {
     if (!p.length) return null;
     const made = { type: o.type, softness: o.softness, opacity: o.opacity };
     if (o.type === "light" || o.type === "shadow") Object.assign(made, { amount: o.amount, color: o.color });
-    if (o.type === "contrast") made.amount = 3 * o.amount;
+    if (o.type === "contrast") made.amount = o.amount;
+    if (o.view) made.view = o.view;
     if (o.type === "temperature") made.kelvin = o.kelvin;
     if (o.type === "blur") made.radius = o.radius;
     const pressure = this.pressures.length ? this.pressures.reduce((a, b) => a + b) / this.pressures.length : 0.5;
@@ -143,6 +144,8 @@ export class Strokes {
     const pen = this.overlay.getContext("2d"), { width, height } = this.overlay;
     pen.clearRect(0, 0, width, height);
     const o = this.options(), place = this.shown ? this.cursor : this.hover;
+    const stroke = this.drawing && this.stroke();
+    for (const one of [...o.outlined, ...(stroke ? [stroke] : [])]) outline(pen, one, width, height);
     if (place && o.type !== "move") {
       const radius = o.shape === "brush" || o.shape === "line" ? Math.max(2, (o.size * width) / 2) : 4;
       for (const [color, line] of [["#000", 3], ["#fff", 1.2]]) {
@@ -161,6 +164,26 @@ export class Strokes {
       pen.stroke();
       for (const [x, y] of this.points) pen.strokeRect(x * width - 3, y * height - 3, 6, 6);
     }
+  }
+}
+
+// A brush by its middle line, everything else by its border.
+function outline(pen, stroke, width, height) {
+  pen.beginPath();
+  if (stroke.ellipse) {
+    const [x, y, rx, ry, degrees = 0] = stroke.ellipse;
+    pen.ellipse(x * width, y * height, rx * width, ry * height, (degrees * Math.PI) / 180, 0, 7);
+  } else if (stroke.rectangle) {
+    const [x0, y0, x1, y1] = stroke.rectangle;
+    pen.rect(x0 * width, y0 * height, (x1 - x0) * width, (y1 - y0) * height);
+  } else {
+    for (const [x, y] of stroke.polygon ?? stroke.points ?? []) pen.lineTo(x * width, y * height);
+    if (stroke.polygon) pen.closePath();
+  }
+  for (const [color, line] of [["#000", 3], ["#fff", 1.2]]) {
+    pen.strokeStyle = color;
+    pen.lineWidth = line;
+    pen.stroke();
   }
 }
 

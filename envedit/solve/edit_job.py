@@ -280,7 +280,7 @@ class Job:
                     raise Interrupted(point.edited, done)
 
             rendered = self.wanted.coverage is None  # paint is no noisy picture, and asks for what it shows
-            more = {"births": SPARE, "judge": self._display_error} if rendered else {"sparing": False}
+            more = {"most_added": SPARE, "judge": self._display_error} if rendered else {"sparing": False}
             asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
             found = gauss_newton.solve(*asked, **more)
         self.posterior, self.note = found.posterior, found.note

@@ -121,7 +121,7 @@ def solve(
     after_step: Callable[[Run | None, Point], None] | None = None,
     run: Run | None = None,
     trial: bool = False,
-    births: int = 0,
+    most_added: int = 0,
     sparing: bool = True,
     judge: Callable[[np.ndarray], float] | None = None,
 ) -> Solution:
@@ -145,7 +145,7 @@ def solve(
         To continue an earlier solution, in place of ``params``.
     trial : bool
         Only :attr:`Solution.loss` is asked for: no posterior is computed.
-    births : int
+    most_added : int
         Most lights that may be added.
     sparing : bool
         Stay at the start where steps lower the misfit by no more than noise would let them.
@@ -158,7 +158,7 @@ def solve(
     NumericalError
         If the start is not finite.
     """
-    search, start = _Search(problem, sigma, iterations, births, after_step), problem.state(params)
+    search, start = _Search(problem, sigma, iterations, most_added, after_step), problem.state(params)
     if run is None:
         run, point = search.begun(start)
     else:  # it has the columns with which its last point was rendered
@@ -202,6 +202,10 @@ def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, st
     return _Search(problem, sigma, steps, 0, None)._descended(run, point, len(run.history) + steps, None)
 
 
+def _copy(state):
+    return {name: value.copy() for name, value in state.items()}
+
+
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
     noise = problem.noise(point.residual, sigma)
@@ -211,14 +215,14 @@ def _unlikeliness(problem, run, point, sigma):
 class _Search:
     """Descents with and without further lights."""
 
-    def __init__(self, problem, sigma, iterations, births, after_step):
+    def __init__(self, problem, sigma, iterations, most_added, after_step):
         self.problem, self.sigma, self.iterations = problem, sigma, iterations
-        self.births, self.after_step = births, after_step
+        self.most_added, self.after_step = most_added, after_step
 
     def begun(self, start):
         """Return the run that begins at a start, with lights beside it that lower F; and its point."""
         problem = self.problem
-        more = problem.beyond(start) if self.iterations and self.births else None
+        more = problem.beyond(start) if self.iterations and self.most_added else None
         if self.iterations:
             problem.clear(start)
         run = Run(start, start)
@@ -227,11 +231,11 @@ class _Search:
             raise NumericalError("the edit cannot begin: the map that the search found is not finite")
         if not self.iterations:
             return run, point
-        if self.births:
+        if self.most_added:
             run, point = self._placed(run, point)
         if more is not None:
             run, point = self._better(run, point, self._new(run, more))
-        for _ in range(self.births):
+        for _ in range(self.most_added):
             began = point
             if run.state["gain"].any():
                 began = problem.evaluate(run.state | {"gain": np.zeros_like(run.state["gain"])})
@@ -249,11 +253,11 @@ class _Search:
         """Descend, put added lights where they lower F more, and add others while they lower it."""
         while True:
             point = self._descended(run, point, min(self.iterations, run.most), self.after_step)
-            if not self.births or run.asked > self.births or not run.history:
+            if not self.most_added or run.asked > self.most_added or not run.history:
                 return run, point
             before, run.asked = run, run.asked + 1
             run, point = self._placed_again(run, point)
-            if len(self.problem.added(run.state)) < self.births:
+            if len(self.problem.added(run.state)) < self.most_added:
                 noise = self.problem.noise(point.residual, self.sigma)
                 normal = self.problem.normal(point, run.start, noise)
                 found = added_light.best(self.problem, point, normal)
@@ -268,8 +272,8 @@ class _Search:
         It was placed where the sky was still as it had been.
         """
         problem = self.problem
-        for i in problem.added(run.state) if run.history and self.births else ():
-            without = {name: value.copy() for name, value in run.state.items()}
+        for i in problem.added(run.state) if run.history and self.most_added else ():
+            without = _copy(run.state)
             without["flux"][i] = DARK
             dark = problem.evaluate(without, resolve=False)
             noise = problem.noise(point.residual, self.sigma)
@@ -305,7 +309,7 @@ class _Search:
         problem, k = self.problem, self._strongest(run)
         if k is None:
             return run, point
-        dark = {name: value.copy() for name, value in run.state.items()}
+        dark = _copy(run.state)
         dark["flux"][k] = DARK
         without, least = problem.evaluate(dark, resolve=False), problem.noise(point.residual, self.sigma)
         noise = problem.noise(without.residual, self.sigma)
@@ -313,7 +317,7 @@ class _Search:
             found = added_light.best(problem, without, problem.normal(without, run.start, noise), k)
             if found is None:
                 break
-            state = {name: value.copy() for name, value in run.state.items()}
+            state = _copy(run.state)
             state["turn"][k] = found[0]["turn"][k]
             there = problem.evaluate(state)
             left = np.inf if there.residual is None else problem.noise(there.residual, self.sigma)
@@ -328,17 +332,24 @@ class _Search:
         """Return the state in which the map's strongest light is where a state has light i, and its number.
 
         What looks like a new light may be the one that the map has: no light is added. None where the map has
-        none.
+        none, or where its start errs more than where the map's lights have started.
         """
         problem, k = self.problem, self._strongest(run)
         if k is None:
             return None
-        lights, moved = problem.layers.lights, {name: value.copy() for name, value in run.state.items()}
+        lights, moved, alone = problem.layers.lights, _copy(run.state), _copy(run.start)
         moved["turn"][k] = rotation_vector(lights.centres[k], problem.direction(state, i))
-        moved["flux"][problem.added(run.state)] = DARK
         # What has made up for the light is in the gain and in other lights that were added.
-        moved["flux"][k], moved["gain"][:] = 0, 0
+        for one in (moved, alone):
+            one["flux"][problem.added(one)], one["gain"][:] = DARK, 0
+        moved["flux"][k] = 0
+        if self._noise(moved) >= self._noise(alone):
+            return None
         return moved, [k]
+
+    def _noise(self, state):
+        point = self.problem.evaluate(state)
+        return np.inf if point.residual is None else self.problem.noise(point.residual, self.sigma)
 
     def _better(self, run, point, *rivals):
         """Return the best of a run and of those from other states, after some steps.
@@ -350,7 +361,7 @@ class _Search:
         problem, ends = self.problem, []
         most = min(self.iterations, len(run.history) + ADDED_STEPS)
         for state, new in filter(None, rivals):
-            start = {name: value.copy() for name, value in run.start.items()}
+            start = _copy(run.start)
             for name in ("turn", "flux", "size"):
                 start[name][new] = state[name][new]
             rival = replace(run, state=state, start=start, history=list(run.history), finished=False)

@@ -23,11 +23,11 @@ GAIN_ORDER = 2
 """Order of the gains, as polynomials of the direction, that the background may take on meanwhile."""
 APART = 20.0
 """Degrees from all others that an added light has at least."""
-BIRTH_ORDER = 4
+ADDED_ORDER = 4
 """Order of the background's gains that must fail to explain what a new light explains."""
-BIRTH = 0.6
+ADDED = 0.6
 """A light is added where it explains this share of what all others leave unexplained."""
-BIRTH_LIGHT = 0.03
+ADDED_LIGHT = 0.03
 """And adds this share to the light of the picture."""
 SEEN, UNWANTED = 1e-3, 1e-2
 """A light that adds less than the first share to the picture, and would explain less than the second of its
@@ -142,7 +142,7 @@ def place(
     # Whether lights are missing is asked only where much is left.
     missing = search.left() > UNEXPLAINED * search.asked()
     if missing:
-        search.allow(products(given.directions, BIRTH_ORDER))
+        search.allow(products(given.directions, ADDED_ORDER))
         atom = search.atoms(spare_flux, None)
     for _ in range(spare if missing else 0):
         score = search.scores(atom)
@@ -153,7 +153,7 @@ def place(
         candidate = atom[..., best]
         grown = search.solve([*atoms, candidate])
         light = (candidate * grown[-1][:, None]).sum()
-        if not (score[best] > BIRTH * search.left() and light > BIRTH_LIGHT * search.light):
+        if not (score[best] > ADDED * search.left() and light > ADDED_LIGHT * search.light):
             break
         directions.append(search.between(score, best))
         atoms.append(candidate)

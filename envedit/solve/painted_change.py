@@ -16,7 +16,7 @@ from envedit.solve.light_search import LEAST, MOST, PROBES, Question, rotations
 from envedit.solve.matching_pursuit import LEAST_FLUX, Given, Place, Pursuit, not_negative, relative
 from envedit.transport.light_transport import LightTransport
 
-BIRTH_BESIDE, BIRTH_ASKED = 0.3, 0.1
+ADDED_BESIDE, ADDED_ASKED = 0.3, 0.1
 """For a painted change a light is added where it explains the first share of what is left unexplained, and
 the second of the squared change."""
 BOLD = 0.01
@@ -137,8 +137,8 @@ def place(
         for there in [*(light.direction for light in lights), *new_places]:
             score[overview.directions[search.candidates] @ there > np.cos(np.radians(BESIDE))] = 0
         best = int(score.argmax())
-        enough = BOLD * search.left() if bold else BIRTH_BESIDE * search.left()
-        if not score[best] > max(enough, 0 if bold and not new_places else BIRTH_ASKED * search.asked()):
+        enough = BOLD * search.left() if bold else ADDED_BESIDE * search.left()
+        if not score[best] > max(enough, 0 if bold and not new_places else ADDED_ASKED * search.asked()):
             break
         new_places.append(search.between(score, best))
         added.append(atom[..., best])

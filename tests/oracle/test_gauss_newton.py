@@ -744,7 +744,7 @@ def test_a_light_is_added_where_the_target_has_one(rng):
     place = (9, 30)
     target = lobe_in(image, transport, place, 300.0)
     problem, params = problem_of(image, transport, target)
-    without, found = (solve(problem, params, 0.01, births=births) for births in (0, 1))
+    without, found = (solve(problem, params, 0.01, most_added=most) for most in (0, 1))
     state = problem.state(found.params)
     (new,) = problem.lit(state)
     assert not problem.lit(problem.state(without.params)) and found.loss < without.loss - gauss_newton.WORTH
@@ -758,7 +758,7 @@ def test_the_maps_light_is_placed_with_the_prior_before_the_first_step(rng):
     image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID, even=0.8)
     target = shown(transport, image + lamp((9, 34)))
     problem, params = problem_of(image + lamp(), transport, target)
-    state = problem.state(solve(problem, params, 0.01, births=1).params)
+    state = problem.state(solve(problem, params, 0.01, most_added=1).params)
     assert problem.lit(state) == [0]
     angle = np.degrees(np.arccos(problem.direction(state, 0) @ latlong.directions(*GRID)[9, 34]))
     assert angle < 8  # half a texel
@@ -770,7 +770,7 @@ def test_no_light_is_added_where_none_is_missing(case):
     problem, params, _, _ = case
     whole = problem.evaluate(problem.state(params)).rendering
     there = Problem(problem.layers, problem.transport, problem.envmap, whole * 0.9, free=problem.free)
-    ends = [there.state(solve(there, params, 0.1, births=births).params) for births in (0, 2)]
+    ends = [there.state(solve(there, params, 0.1, most_added=most).params) for most in (0, 2)]
     assert same(*ends)
 
 
@@ -782,7 +782,7 @@ def test_an_added_light_is_put_where_it_is_needed_once_the_sky_has_changed(rng):
     wrong, right = latlong.directions(*GRID)[4, 10], latlong.directions(*GRID)[place]
     state["turn"][spare] = rotation_vector(problem.layers.lights.centres[spare], wrong)
     state["flux"][spare] = 0.0
-    found = solve(problem, params, 0.01, run=Run(state, copy(state)), births=1)
+    found = solve(problem, params, 0.01, run=Run(state, copy(state)), most_added=1)
     there = problem.direction(problem.state(found.params), spare)
     assert there @ right > np.cos(np.radians(12)) and there @ right > there @ wrong
 
@@ -792,7 +792,7 @@ def test_a_light_that_explains_nothing_goes_out(rng):
     problem, params = problem_of(image, transport, shown(transport, 1.5 * image))
     state, spare = problem.state(params), problem.layers.lights.count - SPARE
     state["flux"][spare] = -6.0
-    found = solve(problem, params, 0.05, run=Run(state, copy(state)), births=1)
+    found = solve(problem, params, 0.05, run=Run(state, copy(state)), most_added=1)
     assert not problem.lit(problem.state(found.params))
 
 

@@ -251,10 +251,10 @@ def test_a_light_that_stays_is_scaled_in_place(sunny):
 @pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
 def test_a_light_that_was_added_is_carried(degrees, sunny):
     source, working, made, params = sunny
-    new, born = toward(60, 60), made.lights.count - SPARE
-    changed = sent(made, params, new, light=born)
-    changed["flux"][born] = 0.0
-    changed["size"][born] = np.log(degrees / LOBE_DEGREES) / layers.SCALES["size"]
+    new, added = toward(60, 60), made.lights.count - SPARE
+    changed = sent(made, params, new, light=added)
+    changed["flux"][added] = 0.0
+    changed["size"][added] = np.log(degrees / LOBE_DEGREES) / layers.SCALES["size"]
     result, edited = carried(made, changed, working, source)
     there = near(source.shape[:2], new, 24), near(WORKING, new, 24)
     np.testing.assert_allclose(flux(result, there[0]), flux(edited, there[1]), rtol=0.02)

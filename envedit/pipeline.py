@@ -303,7 +303,7 @@ def _as_seen(traced, original, wanted):
 
 
 def _perceptual(settings):
-    """Load DISTS, where the loss asks for it, and LPIPS; None where no weights are named."""
+    """Load DISTS, where the loss has it, and LPIPS; None where no weights are named."""
     named, dists, lpips = settings.perceptual, None, None
     if settings.loss.dists and named.vgg:
         dists = distances.Dists(backbones.Backbone.load("vgg", named.vgg), named.dists)

@@ -237,6 +237,7 @@ def _parser():
 
 def _run(arguments, start):
     from envedit import config
+    from envedit.core.errors import ConfigError
     from envedit.report import output_folder
 
     overrides = [*_quick(arguments), *arguments.overrides]
@@ -247,6 +248,8 @@ def _run(arguments, start):
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)
     if arguments.dry_run:
+        if settings.target.kind == "none":
+            raise ConfigError('--dry-run: got target.kind "none", expected a target to write: run without it')
         return _dry_run(settings, arguments)
     folder = Path(settings.output.dir)
     with output_folder.alone(folder):
@@ -358,7 +361,7 @@ def _export_initial(settings, arguments):
             painted_image.check_export(one)
         envmap, warnings = inputs.load_map(settings.input, lit)
         notes = inputs.notes(settings.input, lit)
-        source = inputs.source_of(settings.input, lit)  # what the picture says that it was made from
+        source = inputs.source_of(settings.input, lit)  # what the picture is marked as made from
         settings = replace(settings, input=replace(settings.input, envmap=source))
         picture = painted_image.initial(lit, envmap, settings)
         under = painted_image.export_tonemap(file, picture, settings)

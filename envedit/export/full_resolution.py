@@ -1,6 +1,6 @@
 """An edit that was found on a small working map, carried to the map's own resolution.
 
-What a working map says of an edit is smooth (a gain, a glow) or few (lights that have moved). It is applied
+What a working map gives of an edit is smooth (a gain, a glow) or few (lights that have moved). It is applied
 to the texels of the source, whose detail the working map never had: clouds, the horizon, a sun's disc of a
 tenth of a degree. Work goes in bands of rows of one size: memory stays bounded, kernels are compiled once.
 """

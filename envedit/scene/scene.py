@@ -324,7 +324,7 @@ def load(
         Folder for relative file names that are not beside the XML, such as a mesh in ``parameters``.
         Default: the working folder.
     sampler : str
-        Sampler of Mitsuba's renderings, where the scene asks for none or for ``independent``. Stratified
+        Sampler of Mitsuba's renderings, where the scene has none or ``independent``. Stratified
         samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
     sensors : "all" or sequence of int and str
         Indices or ids of the sensors whose pictures a rendering consists of; all of one width.

@@ -40,7 +40,7 @@ _SKIPPED = {"<!--": ("-->", "comment"), "<![CDATA[": ("]]>", "CDATA section"), "
 
 @dataclass
 class Outline:
-    """What the text of a scene says, with all it includes.
+    """What the text of a scene contains, with all it includes.
 
     Attributes
     ----------

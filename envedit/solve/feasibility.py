@@ -143,8 +143,7 @@ def reachable(
     Parameters
     ----------
     transport : LightTransport
-        T; gets exact columns for the bright texels of the original, and around a light that the target asks
-        for.
+        T; gets exact columns for the bright texels of the original, and around a light that the target needs.
     original : ndarray (H, W, 3)
         The map, linear radiance.
     target : ndarray (h, w, 3)

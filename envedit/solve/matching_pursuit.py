@@ -1,4 +1,4 @@
-"""Which lights a picture asks for, and where on the sphere: a matching pursuit through the overview of T.
+"""Which lights a target requires, and where on the sphere: a matching pursuit through the overview of T.
 
 The atoms are pictures of a light in each cell of the sphere, its glow taken along; the background may
 meanwhile take on any gain of low order. The strongest light is placed first, each where it explains most of

@@ -158,7 +158,7 @@ def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask
 
     - Float files are linear radiance. Others are undone by the tonemap that they were painted under; the one
       that the file names goes before ``tonemap_name``.
-    - Where a PNG or JPEG is white in a channel, the picture says "at least so bright": such pixels are
+    - Where a PNG or JPEG is white in a channel, the value is a lower bound: such pixels are
       excluded, but for those that were neither painted nor clipped before. Black is no such limit: there is
       nothing below it.
     - With alpha, colour counts as laid over the initial rendering; without that the colour is taken as it

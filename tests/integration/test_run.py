@@ -742,9 +742,11 @@ def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     painted = pixels(tmp_path / "c_out" / "dry_run.exr") - pixels(tmp_path / "initial.exr")
     np.testing.assert_allclose(painted[:, :12], 0.25, rtol=1e-5)
     assert not painted[:, 12:].any()
-    assert (
-        call(path, "--dry-run", "--quiet", "--set", "target.kind=envmap", "--set", "target.strokes=[]") == 0
-    )
+    bare = ["--dry-run", "--quiet", "--set", "target.strokes=[]"]
+    assert call(path, *bare, "--set", "target.kind=envmap") == 0
+    capsys.readouterr()
+    assert call(path, *bare, "--set", "target.kind=none") == 2
+    assert '--dry-run: got target.kind "none"' in capsys.readouterr().err
 
 
 def test_the_export_says_what_to_do_next(tmp_path, rng, capsys):

@@ -23,6 +23,7 @@ IDIOMS = {
     r"\bcomes? and goes?\b|\b(?:is|are) (?:not )?chased\b": "transient; is ignored",
     r"\bcounts? (?:for )?less\b(?! than)": "is down-weighted",
     r"\basking what\b": "estimating what",
+    r"\b(?:picture|paint|target|rendering|scene|loss)s? (?:does not )?(?:asks?|asked)\b": "requires",
     r"\b(?:picture|pixel|paint|map|sky|loss|network)s? (?:knows?|is content|likes?)\b": "who does what",
 }  # fmt: skip
 """Pattern, and what to write instead."""

@@ -94,7 +94,7 @@ class Separation:
 
 @dataclass(frozen=True)
 class Survey:
-    """What the small copy of a map says of its lights: all that does not depend on the map's resolution.
+    """What the small copy of a map gives of its lights: all that does not depend on the map's resolution.
 
     Attributes
     ----------

@@ -1,6 +1,7 @@
 """``envedit paint`` in a real browser: paint, drag, undo, save, reopen."""
 
 import os
+import re
 import shutil
 
 import numpy as np
@@ -66,11 +67,12 @@ class Page:
         self.page.goto(url)
         self.status = self.page.get_by_test_id("status")
 
-    def settled(self, samples=64):
+    def settled(self, rendered=True):
         """Wait for a solution and the rendering that follows it."""
         sync_api.expect(self.status).to_have_attribute("data-state", "done", timeout=120_000)
-        if samples:
-            sync_api.expect(self.status).to_contain_text(f"path traced with {samples}", timeout=120_000)
+        if rendered:
+            done = re.compile(r"path traced with (64|128|256)")  # by a busy machine not each is seen
+            sync_api.expect(self.status).to_contain_text(done, timeout=120_000)
 
     def at(self, name, x, y):
         box = self.page.locator(name).bounding_box()
@@ -130,7 +132,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
 
     with served(folder / "painted.toml") as server:
         page = Page(browser, server.url + "?canvas=2d")
-        page.settled(0)
+        page.settled(False)
         sync_api.expect(page.page.get_by_test_id("undo")).to_be_enabled()
         assert "elevation" in page.page.get_by_test_id("handle-1").get_attribute("aria-label")
         page.shot("reopened")

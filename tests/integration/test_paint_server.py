@@ -9,13 +9,11 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.oracles.builders import LIGHT, write_scene
-from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, served, until
+from tests.oracles.painting import SMALL, asked, connected, heard, served, until
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
@@ -37,21 +35,6 @@ def server(tmp_path_factory):
     os.chdir(before)
 
 
-def connected(server, **more):
-    origin = more.pop("origin", server.origins[0])
-    return client.connect(server.url.replace("http", "ws") + "ws", origin=origin, max_size=None, **more)
-
-
-def heard(socket, kind, wanted=lambda message: True):
-    """Return the next message of a kind."""
-    while True:
-        received = socket.recv(timeout=60)
-        if isinstance(received, str):
-            message = json.loads(received)
-            if message["type"] == kind and wanted(message):
-                return message
-
-
 def shown(socket):
     """Return the next picture of T E, (h, w, 3)."""
     while True:
@@ -59,16 +42,6 @@ def shown(socket):
         if isinstance(received, bytes) and received[4:6] == b"\0\0":
             width, height = struct.unpack("<HH", received[6:10])
             return np.frombuffer(received[16:], "<f2").reshape(height, width, 3).astype(np.float32)
-
-
-def asked(address, **more):
-    """Return status and body of an HTTP request."""
-    try:
-        with urllib.request.urlopen(urllib.request.Request(address, **more), timeout=30) as answer:
-            return answer.status, answer.read().decode("utf-8", "replace")
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
 
 
 def test_without_the_token_or_from_elsewhere_nobody_is_let_in(server):
@@ -169,74 +142,6 @@ def test_a_light_that_was_placed_is_told_with_the_number_of_its_edit(server):
     left, right = (slice(36, 39), slice(8, 11)), (slice(36, 39), slice(40, 43))
     assert moved[left].mean() > 1.5 * bare[left].mean(), "its shadow is still where it was"
     assert moved[right].mean() < bare[right].mean()
-
-
-def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path):
-    write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
-    (tmp_path / "edit.toml").write_text(OF_TWO)
-    square = {"rectangle": [0.3, 0.3, 0.7, 0.7], "softness": 0.05}
-    light, shadow = {"type": "light", "amount": 0.1, **square}, {"type": "shadow", "amount": 0.4, **square}
-
-    with served(tmp_path / "edit.toml") as server, connected(server) as page:
-        assert heard(page, "opened")["views"] == ["front", "behind"]
-        session, count = server.worker.session, 0
-
-        def painted(*strokes):
-            """Return what strokes ask for in each view, and what the solution leaves of it."""
-            nonlocal count
-            count += 1
-            page.send(json.dumps({"type": "document", "number": count, "document": {"strokes": strokes}}))
-            heard(page, "status", lambda m: m.get("number") == count and m["state"] == "done")
-            under = session.coverage
-            changes = session.target - session.base, under * (session.target - session.point.rendering)
-            return [change[rows] for change in changes for rows in session.lit.rows]
-
-        front, behind, _, _ = painted({**shadow, "view": 1})
-        assert not front.any() and behind[10:18, 11:21].mean() < -0.02 and not behind[0].any()
-        front, behind, *left = painted(light, {**shadow, "view": "behind"})
-        assert front[6:14, 11:21].mean() > 0.05 and behind[10:18, 11:21].mean() < -0.02
-        for asked, rest in zip((front, behind), left, strict=True):
-            assert np.square(rest).sum() < 0.5 * np.square(asked).sum(), "not solved for together"
-        with connected(server) as other:
-            sizes = {}
-            while {(source, v) for source in (0, 1) for v in (0, 1)} - set(sizes):
-                received = other.recv(timeout=60)
-                if isinstance(received, bytes) and received[4] == 0:
-                    width, height, _, view = struct.unpack("<HHIH", received[6:16])
-                    sizes[received[5], view] = width, height
-        assert sizes == {(0, 0): (32, 20), (0, 1): (32, 28), (1, 0): (64, 40), (1, 1): (64, 56)}
-        page.send(json.dumps({"type": "document", "document": {"strokes": [{**light, "view": 2}]}}))
-        assert "got view 2, expected one of 0 (front), 1 (behind)" in heard(page, "error")["text"]
-        toward = []
-        for view in (0, 1):
-            page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.5, "light": 0, "view": view}))
-            toward.append(heard(page, "picked")["azimuth"])
-        assert abs((toward[1] - toward[0]) % 360 - 180) < 60, toward
-
-
-def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "edit.toml").write_text(SMALL)
-    with served(None) as server, connected(server) as page:
-        assert "sphere" in heard(page, "start")["scenes"]
-        put = {"method": "PUT", "data": b"#?RADIANCE", "headers": {"Origin": server.origins[0]}}
-        for name in ("..%2fout.exr", "out.py", ".exr", "a%00.exr"):
-            assert asked(f"{server.url}map/{name}", **put)[0] in (400, 403, 404), name
-        assert asked(f"{server.url}map/a.hdr", **{**put, "headers": {}})[0] == 403
-        code, path = asked(f"{server.url}map/a.hdr", **put)
-        assert code == 200 and path == "maps/a.hdr" and Path(path).read_bytes() == b"#?RADIANCE"
-        assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.*")) == [
-            "edit.toml",
-            "maps/a.hdr",
-        ]
-        page.send(json.dumps({"type": "save"}))
-        assert "no scene is open" in heard(page, "error")["text"]
-        page.send(json.dumps({"type": "open", "name": "nowhere.toml"}))
-        assert "no such configuration" in heard(page, "error")["text"]
-        page.send(json.dumps({"type": "open", "name": "edit.toml", "envmap": "missing.exr"}))
-        assert "missing.exr" in heard(page, "error")["text"]
-        page.send(json.dumps({"type": "open", "name": "edit.toml"}))
-        assert heard(page, "opened")["width"] == 48
 
 
 def test_a_busy_port_is_told_and_ctrl_c_ends_it(tmp_path):

@@ -2,8 +2,11 @@
 
 import asyncio
 import contextlib
+import json
 import threading
 import time
+import urllib.error
+import urllib.request
 
 SMALL = """
 seed = 3
@@ -72,3 +75,31 @@ def until(true, seconds=120):
     while not true():
         assert time.monotonic() < end, f"not within {seconds} s"
         time.sleep(0.02)
+
+
+def connected(server, **more):
+    """Open the WebSocket of a served painting."""
+    origin = more.pop("origin", server.origins[0])
+    from websockets.sync import client
+
+    return client.connect(server.url.replace("http", "ws") + "ws", origin=origin, max_size=None, **more)
+
+
+def heard(socket, kind, wanted=lambda message: True):
+    """Return the next message of a kind."""
+    while True:
+        received = socket.recv(timeout=60)
+        if isinstance(received, str):
+            message = json.loads(received)
+            if message["type"] == kind and wanted(message):
+                return message
+
+
+def asked(address, **more):
+    """Return status and body of an HTTP request."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, **more), timeout=30) as answer:
+            return answer.status, answer.read().decode("utf-8", "replace")
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()

@@ -238,6 +238,8 @@ class Session:
         began = time.perf_counter()
         self.point = gauss_newton.descended(self.problem, self.run, self.point)
         self.status["iterations"] = len(self.run.history)
+        if self.run.history:
+            self.status["residual"] = self.run.history[-1]["residual"]
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._show("transport")
         self.tell_state()

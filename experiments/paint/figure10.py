@@ -59,7 +59,7 @@ def encoded(color):
 
 def paint(page, stroke):
     """Paint a stroke with the pointer, after its tool, shape and sliders."""
-    at = lambda place: browser.place(page, "#overlay", *np.clip(place, 0, 1))  # noqa: E731
+    at = lambda place: browser.place(page, "#overlay", *np.clip(place, 0.001, 0.999))  # noqa: E731
     kind, amount, color = stroke["type"], stroke.get("amount"), stroke.get("color", [1.0, 1.0, 1.0])
     most = max(1.0, *color)
     if kind == "shadow":

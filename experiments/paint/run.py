@@ -54,11 +54,8 @@ def drag(page):
         shown = [e["at"] for e in frames if e["frame"] >= one["of"]]
         if shown:
             waits.append(shown[0] - sent[one["status"]])
-    return (
-        len({e["frame"] for e in frames}) / DRAG_S,
-        float(np.median(waits)),
-        float(np.quantile(waits, 0.95)),
-    )
+    median, most = np.quantile(waits, (0.5, 0.95)) if waits else (np.nan, np.nan)
+    return len({e["frame"] for e in frames}) / DRAG_S, float(median), float(most)
 
 
 def paint(page):
@@ -74,9 +71,9 @@ def paint(page):
     page.mouse.up()
     time.sleep(SOON_S)
     soon = residual(page)
-    solved = {e["of"] for e in log if "status" in e and e.get("iterations")}
+    steps = {e["steps"] for e in log if "status" in e}  # that of the first is of before
     converged(page)
-    return len(solved) / STROKE_S, soon, residual(page)
+    return max(0, len(steps) - 1) / STROKE_S, soon, residual(page)
 
 
 def residual(page):

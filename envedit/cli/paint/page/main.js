@@ -150,7 +150,7 @@ const RECEIVED = {
     last = message;
     $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
-    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, residual: message.residual });
+    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps, residual: message.residual });
     state(message.state, message.text ?? told(message));
   },
   doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },

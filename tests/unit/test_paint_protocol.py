@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from envedit import config
-from envedit.cli.paint import project, protocol
+from envedit.cli.paint import project, protocol, worker
+from envedit.cli.paint.session import Tell
 from envedit.core.errors import ConfigError
 
 STROKE = {"type": "shadow", "points": [[0.1, 0.2], [0.3, 0.4]], "width": 0.1}
@@ -94,3 +95,27 @@ def test_what_paint_cannot_solve_is_refused(tmp_path):
     file.write_text('preset = "paper"\n')
     with pytest.raises(ConfigError, match="expected layers and transport"):
         project.opened(str(file))
+
+
+def test_a_stroke_is_solved_for_while_it_is_drawn_however_fast_the_pointer_moves():
+    """Something always waits: still each edit is followed by a step."""
+    done = []
+
+    class Drawn:
+        def update(self, edit):
+            done.append("edit")
+            painting.post(edit)
+
+        def advance(self):
+            done.append("step")
+            if len(done) >= 20:
+                painting.stop()
+            return True
+
+    painting = worker.Worker(Tell())
+    painting.session = Drawn()
+    painting.post(protocol.Edit(protocol.Document(), "drawing"))
+    painting.start()
+    painting.join(30)
+    painting.stop()
+    assert not painting.is_alive() and done[:20] == ["edit", "step"] * 10, done[:20]

@@ -79,7 +79,8 @@ class Session:
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
         self.project, self.tell, self.newer = project, tell, newer
         self.document, self.resting, self.phase = Document(), False, "done"
-        self.status = {"reachable": None, "iterations": 0, "number": 0, "client": ""}
+        self._shown = None  # the rendering by T that the pages show
+        self.status = {"reachable": None, "iterations": 0, "steps": 0, "number": 0, "client": ""}
         settings = project.settings
         self._stage("loading the scene")
         self.lit = inputs.load_scene(settings.scene, project.base)
@@ -112,7 +113,8 @@ class Session:
         before, self.document = self.document, edit.document
         moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
         self.phase, self._rendered, self.resting = edit.phase, None, False
-        self.status = {"reachable": None, "iterations": 0, "number": edit.number, "client": edit.client}
+        whose = {"steps": self.status["steps"], "number": edit.number, "client": edit.client}
+        self.status = {"reachable": None, "iterations": 0, **whose}
         if edit.phase == "dragging":
             self._drag()
         elif moved or self._dragged:
@@ -240,6 +242,9 @@ class Session:
         began = time.perf_counter()
         self.point = gauss_newton.descended(self.problem, self.run, self.point)
         self.status["iterations"] = len(self.run.history)
+        self.status["steps"] += 1
+        if self.run.history:
+            self.status["residual"] = self.run.history[-1]["residual"]
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._show("transport")
         self.tell_state()
@@ -299,6 +304,7 @@ class Session:
         done += 1
         self._rendered = done, total
         if done in (1, 2, 4, 8, PASSES):
+            self._shown = None
             self.tell.frame("render", "mitsuba", total / done, self._sharp.rows)
             self.tell_state()
         return True
@@ -341,8 +347,10 @@ class Session:
         if shown is not edited:
             by = self._quick if self._dragged else self.transport
             rendering = by.apply(tensor(shown)).numpy()
-        self.tell.frame("render", source, rendering, self.lit.rows)
-        self.tell.frame("map", source, shown)
+        if rendering is not self._shown:  # a stroke that is being drawn has changed nothing yet
+            self._shown = rendering
+            self.tell.frame("render", source, rendering, self.lit.rows)
+            self.tell.frame("map", source, shown)
         if not self._dragged:
             both = self.target, self.point.rendering
             target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
@@ -350,7 +358,7 @@ class Session:
 
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
-        self.resting = False
+        self.resting, self._shown = False, None
         self.tell.frame("before", "transport", self.before, self.lit.rows)
         self._show("transport")
         self._rendered = None
@@ -454,6 +462,7 @@ class Session:
             warnings = run_folder.write(settings, folder, result, import_s, project.base)
         self.tell.frame("render", "saved", result.renders["edited"], self.lit.rows)
         self.tell.frame("map", "saved", result.maps["edited"])
+        self._shown = None
         self.resting = True  # what is shown is what was saved
         files = [name for name in output_folder.RESULTS if (folder / name).exists()]
         self.tell.say({"type": "saved", "folder": folder.name, "files": files, "warnings": warnings})

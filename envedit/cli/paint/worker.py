@@ -36,7 +36,7 @@ class Worker(threading.Thread):
         self.tell, self.session, self._opened = tell, None, opened
         self._waiting: dict[type, object] = {}
         self._lock = threading.Condition()
-        self._over = False
+        self._over = self._owed = False
         self.faults: list[Exception] = []  # of ours, no user's mistakes
 
     def post(self, request) -> None:
@@ -66,10 +66,13 @@ class Worker(threading.Thread):
                 while not (self._waiting or busy or self._over):
                     self._lock.wait()
                 kinds = [kind for kind in (*ORDER, Again) if kind in self._waiting]
-                request = self._waiting.pop(kinds[0]) if kinds else None
+                owed, self._owed = self._owed and busy, False
+                request = self._waiting.pop(kinds[0]) if kinds and not owed else None
             if self._over:
                 return
             if request is not None:
+                # Pointer moves come faster than they are painted: each is followed by a step, or none were.
+                self._owed = isinstance(request, Edit) and request.phase == "drawing"
                 self._attempt(lambda request=request: self._carry_out(request))
                 busy = self.session is not None
             else:

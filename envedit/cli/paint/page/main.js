@@ -122,7 +122,8 @@ const RECEIVED = {
   start(message) {
     if (opened) return;
     $("start").hidden = false;
-    list($("shipped"), message.configurations.concat(message.scenes).map((name) => [name, name]));
+    list($("shipped"), message.scenes.map((name) => [name, name]));
+    list($("edits"), message.configurations.map((name) => [name, name.replace(/.*\//, "").replaceAll("_", " ")]));
     list($("recent"), message.recent.map((one) => [one.path, `${one.title}, in ${one.path.split(/[\\/]/).slice(-3, -1).join("/")}`]));
     $("names").replaceChildren(...message.scenes.concat(message.configurations).map((name) => Object.assign(document.createElement("option"), { value: name })));
     state("ready", "Choose what to paint on");
@@ -130,6 +131,7 @@ const RECEIVED = {
   opened(message) {
     $("start").hidden = true;
     $("work").hidden = false;
+    for (const group of document.querySelectorAll("header .group")) group.hidden = false;
     $("title").textContent = $("title").title = message.title;
     document.title = `${message.title} · envedit paint`;
     tabs(message.views);
@@ -148,7 +150,7 @@ const RECEIVED = {
     last = message;
     $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
-    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations });
+    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps, residual: message.residual });
     state(message.state, message.text ?? told(message));
   },
   doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },

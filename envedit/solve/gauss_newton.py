@@ -302,7 +302,7 @@ class _Search:
         return max(own, key=lambda k: flux[k].sum(), default=None)
 
     def _placed(self, run, point):
-        """Put the map's strongest light where it would be added were it not there, if the start errs less so.
+        """Put the map's strongest light where it would be added were it not there, if noise is halved by it.
 
         The search has placed it for the picture alone, without a prior on the sky.
         """
@@ -311,7 +311,7 @@ class _Search:
             return run, point
         dark = _copy(run.state)
         dark["flux"][k] = DARK
-        without, least = problem.evaluate(dark, resolve=False), problem.noise(point.residual, self.sigma)
+        without, least = problem.evaluate(dark, resolve=False), problem.noise(point.residual, self.sigma) / 2
         noise = problem.noise(without.residual, self.sigma)
         for _ in range(PLACINGS):
             found = added_light.best(problem, without, problem.normal(without, run.start, noise), k)

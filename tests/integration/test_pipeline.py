@@ -217,8 +217,9 @@ def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
     wanted = picture.copy()
     picture[10, 12], wanted[14, 20] = 300, 300
     images.write_exr(tmp_path / "wanted.exr", wanted)
-    target = {"file": "wanted.exr", "rotate_degrees": 0.0, "spp": 4096}
-    found = pipeline.run(plated(tmp_path, picture, target=target, optimizer={"iterations": 5}))
+    target = {"file": "wanted.exr", "rotate_degrees": 0.0, "spp": 256}
+    tables = {"target": target, "optimizer": {"iterations": 5}, "output": {"spp": 1024}}
+    found = pipeline.run(plated(tmp_path, picture, **tables))
     assert not found.frozen.any() and len(found.separation.lights) == 1
     x = latlong.directions(32, 64)[..., 0]
     change = np.abs(np.log(found.envmap / found.maps["initial"])).max(axis=2)

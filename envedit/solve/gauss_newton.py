@@ -307,17 +307,18 @@ class _Search:
         The search has placed it for the picture alone, without a prior on the sky.
         """
         problem, k = self.problem, self._strongest(run)
-        if k is None:
+        least = problem.noise(point.residual, self.sigma) / 2
+        if k is None or least < self.sigma:  # no noise is below sigma
             return run, point
-        dark = _copy(run.state)
+        dark, last = _copy(run.state), problem.direction(run.state, k)
         dark["flux"][k] = DARK
-        without, least = problem.evaluate(dark, resolve=False), problem.noise(point.residual, self.sigma) / 2
+        without = problem.evaluate(dark, resolve=False)
         noise = problem.noise(without.residual, self.sigma)
         for _ in range(PLACINGS):
             found = added_light.best(problem, without, problem.normal(without, run.start, noise), k)
-            if found is None:
+            if found is None or problem.direction(found[0], k) @ last > SAME_PLACE:
                 break
-            state = _copy(run.state)
+            state, last = _copy(run.state), problem.direction(found[0], k)
             state["turn"][k] = found[0]["turn"][k]
             there = problem.evaluate(state)
             left = np.inf if there.residual is None else problem.noise(there.residual, self.sigma)

@@ -100,7 +100,7 @@ class Session:
         if self.transport.spp > QUICK_SPP:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
             self._quick = renderers.trace(fewer, self.lit, self.map.shape[:2], self._progress)
-        self._sharp = None
+        self._sharp, self._recorded = None, self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
         self._aim(project.document)
@@ -222,6 +222,10 @@ class Session:
             return False
         try:
             if self._render(FIRST_PASSES):
+                return True
+            if not self._recorded:  # paths, before the first light is dragged: that takes seconds
+                self._recorded = True
+                self._quick.resolve(self.point.edited, limit=COLUMNS)
                 return True
             if self.solving and not self.searched:
                 self._search()

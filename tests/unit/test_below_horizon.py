@@ -180,6 +180,27 @@ def test_layers_give_a_whole_map_back_and_have_no_edge_when_the_sun_moves():
     assert seams[0] < 2 and seams[1] > 2 * seams[0]
 
 
+def test_gradient_of_a_whole_map_is_that_of_finite_differences(rng):
+    """By a gain: rows below the horizon follow it through the sky above, which has a gradient of its own."""
+    _, made, params, _ = moved()
+    weight = rng.normal(size=(64, 128, 3))
+    grid = rng.normal(0, 0.3, params["gain.0"].shape)
+
+    leaf = tensor(grid)
+    dr.enable_grad(leaf)
+    dr.backward(dr.sum((made.decode(params | {"gain.0": leaf}) * tensor(weight)).array))
+    gradient = leaf.grad.numpy()
+
+    def total(values):
+        return (np.float64(made.decode(params | {"gain.0": tensor(values)}).numpy()) * weight).sum()
+
+    for _ in range(3):
+        way = rng.normal(size=grid.shape)
+        slope = (total(grid + 1e-2 * way) - total(grid - 1e-2 * way)) / 2e-2
+        assert slope == pytest.approx((gradient * way).sum(), rel=6e-2, abs=6e-2)
+    assert np.abs(gradient).max() > 1
+
+
 def test_hats_of_rows_that_follow_are_those_of_the_rows_that_they_mirror():
     _, made, params, _ = moved()
     for level in range(3):

@@ -6,7 +6,7 @@ are the original's, times a smooth factor, the change of the sky above:
     E_low = E0_low * R^f,    log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
 S and S_0 are the sky, without cores of lights, after the edit and before, in every channel with some of its
-luminance (:func:`.veiled`: a ratio to a channel that is black says nothing), m is the mirrored direction, K a
+luminance (:data:`.VEIL`; a ratio to a channel that is black says nothing), m is the mirrored direction, K a
 Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
 :data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio. f is 1 for
 a mirror; for ground it falls off with the angle (:data:`FADE`): what was photographed keeps its brightness.
@@ -21,7 +21,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
-from envedit.representations.layers.gain import veiled
+from envedit.representations.layers.gain import VEIL
 
 KINDS = "mirror", "keep"
 SMOOTH, BOX = 0.0125, 7.0
@@ -201,7 +201,9 @@ class _Blur:
 
 
 def _veiled(sky):
-    return mi.TensorXf(dr.ravel(veiled(dr.unravel(mi.Color3f, sky.array))), sky.shape)
+    """Mix some of its luminance into every channel of a sky (rows, W, 3)."""
+    mixed = (1 - VEIL) * np.eye(3) + VEIL * np.asarray(LUMINANCE)[:, None]
+    return dr.reshape(dr.matmul(dr.reshape(sky, (-1, 3)), tensor(mixed)), sky.shape)
 
 
 def _tents(place, count, periodic=False):

@@ -29,14 +29,10 @@ VEIL = 0.2
 """Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
 
 
-def veiled(radiance: mi.Color3f) -> mi.Color3f:
-    """Mix some of its luminance into every channel of radiance."""
-    return radiance * (1 - VEIL) + mi.luminance(radiance) * VEIL
-
-
 def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:
     """Scale radiance; what is brightened is so in part by its luminance: a black channel stays in step."""
-    return dr.select(factor > 1, base + (factor - 1) * veiled(base), base * factor)
+    grey = base * (1 - VEIL) + mi.luminance(base) * VEIL
+    return dr.select(factor > 1, base + (factor - 1) * grey, base * factor)
 
 
 def grid_size(cycles: float, share: float) -> tuple[int, int]:

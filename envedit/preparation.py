@@ -142,8 +142,7 @@ class Preparation:
         with self.clock("start_s"):
             loss, other = _loss(turned), _loss(still)
             still.job.begun = None  # lights are added before the first step too
-        residuals = 3 * map_problem.INDEPENDENT * len(self.lit.rows)
-        chosen = still if other < loss - 2 * residuals * np.log1p(PREFERRED) else turned
+        chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
         chosen.notes.append(f"likelihood (AIC) with the sky turned {loss:.5g}, as it is {other:.5g}")
         return chosen
 

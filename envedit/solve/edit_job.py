@@ -235,8 +235,7 @@ class Job:
 
     def _problem(self):
         wanted = self.wanted.aim, self.wanted.weight, self.representation.free
-        transport, views = self.renderer.transport, len(self.lit.rows)
-        return map_problem.Problem(self.representation, transport, self.original, *wanted, views=views)
+        return map_problem.Problem(self.representation, self.renderer.transport, self.original, *wanted)
 
     @property
     def _sigma(self):

@@ -16,7 +16,7 @@ import numpy as np
 from envedit.core.errors import NumericalError
 from envedit.representations.layers.lights import DARK, rotation_vector
 from envedit.solve import added_light
-from envedit.solve.map_problem import SIGMA, Point, Posterior, Problem
+from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
 """Most steps where no light is added or moved, and the relative decrease of F below which no further step is
@@ -209,7 +209,7 @@ def _copy(state):
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
     noise = problem.noise(point.residual, sigma)
-    return problem.loss(point, run.start, noise) + 6 * problem.independent * float(np.log(noise))
+    return problem.loss(point, run.start, noise) + 6 * INDEPENDENT * float(np.log(noise))
 
 
 class _Search:

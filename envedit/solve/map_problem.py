@@ -8,7 +8,7 @@ E(x) the map that the layers compose, minimised is
 
 * rho_s is Huber's loss: quadratic up to s, linear beyond. Pixels that no light can explain (caustics, shadow
   edges, paint) then do not outvote the others.
-* A is the number of pixels whose errors go together, a share of a view (:data:`INDEPENDENT`).
+* A is the number of pixels whose errors go together, a share of the picture (:data:`INDEPENDENT`).
 * K is the inverse covariance of a sky's change (:class:`Prior`): luminance, blue-amber and green-magenta each
   with their standard deviation, smaller by half for every finer grid; of lights flux, size and direction.
 
@@ -34,7 +34,7 @@ from envedit.solve.block_jacobian import BlockJacobian
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
 INDEPENDENT = 256
-"""Residuals of a view that count as independent, per channel: neighbouring pixels err together."""
+"""Residuals of a picture that count as independent, per channel: neighbouring pixels err together."""
 ANGLE = np.radians(0.7)
 """Rotation of the finite difference by a light's direction."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
@@ -191,21 +191,16 @@ class Problem:
         Active texels whose gain is free, as given to :meth:`.Layers.keep`; None: all.
     prior : Prior
         How far a sky changes.
-    views : int
-        Of which the picture consists, one below the other.
     """
 
-    def __init__(
-        self, layers: Layers, transport, envmap, picture, weight=None, free=None, prior=None, views: int = 1
-    ):
+    def __init__(self, layers: Layers, transport, envmap, picture, weight=None, free=None, prior=None):
         self.layers, self.transport, self.envmap, self.free = layers, transport, envmap, free
         self.prior = prior or Prior()
         self.rows = layers.active
         self.target = display_curve.to_display(tensor(picture)).numpy()
         shape = picture.shape[:2]
         self.weight = np.ones((*shape, 1), np.float32) if weight is None else np.float32(weight)
-        self.independent = INDEPENDENT * views
-        self.area = max(1.0, shape[0] * shape[1] / self.independent)
+        self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
         self.sizes = layers.gain.sizes
         self.nodes = sum(rows * columns for rows, columns in self.sizes)
         self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
@@ -308,12 +303,11 @@ class Problem:
         """
         size = _sizes(residual)  # once: the bisection is part of every step
         low, high = least, max(least, float(np.abs(residual).max()))
-        if self._huber(size, low) <= 3 * self.independent:
+        if self._huber(size, low) <= 3 * INDEPENDENT:
             return low
         for _ in range(40):
             middle = np.sqrt(low * high)
-            above = self._huber(size, middle) > 3 * self.independent
-            low, high = (middle, high) if above else (low, middle)
+            low, high = (middle, high) if self._huber(size, middle) > 3 * INDEPENDENT else (low, middle)
         return float(high)
 
     def loss(self, point: Point, start: dict, sigma: float) -> float:

@@ -277,10 +277,6 @@ def test_large_pictures_have_no_more_independent_pixels(rng):
     size = np.sqrt((residual**2).mean(axis=2))
     sums = 3 * sum(huber(s, 0.1) for s in size.ravel()) / 0.1**2
     assert problem.misfit(residual, 0.1) == pytest.approx(sums * 256 / (24 * 32), rel=1e-6)
-    # Of two views, one below the other, each has as many.
-    two, _ = problem_of(image, transport, 2 * shown(transport, image), views=2)
-    assert two.misfit(residual, 0.1) == pytest.approx(2 * problem.misfit(residual, 0.1), rel=1e-6)
-    assert two.noise(residual, 1e-4) == pytest.approx(problem.noise(residual, 1e-4), rel=1e-6)
 
 
 @pytest.mark.parametrize(

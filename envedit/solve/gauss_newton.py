@@ -273,6 +273,8 @@ class _Search:
         """
         problem = self.problem
         for i in problem.added(run.state) if run.history and self.most_added else ():
+            if i not in problem.added(run.state):  # it went out for another's sake
+                continue
             without = _copy(run.state)
             without["flux"][i] = DARK
             dark = problem.evaluate(without, resolve=False)

@@ -132,12 +132,7 @@ class Scene:
             There is none; ``key`` is what asked for it.
         """
         names = [view.name for view in self.views]
-        if asked in names:
-            return names.index(asked)
-        if isinstance(asked, int) and 0 <= asked < len(names):
-            return asked
-        known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
-        raise ConfigError(f"{key}: got view {asked!r}, expected one of {known}; see [scene] sensors")
+        return supported.index_of(asked, names, names, f"{key}: got view", "; see [scene] sensors")
 
     def set_envmap(self, image) -> None:
         """Light the scene by a map.

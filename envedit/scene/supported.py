@@ -198,7 +198,10 @@ def take_sensors(state, where: str, asked="all") -> tuple[list[int], list[str], 
     if not found:
         raise InputError(f'{where}: the scene has no sensor; add <sensor type="perspective">')
     ids = [state.nodes[i].props.id() for i in found]
-    chosen = list(range(len(found))) if asked == "all" else [_sensor(one, ids, state, found) for one in asked]
+    chosen = list(range(len(found)))
+    if asked != "all":
+        shown = [_name(state.nodes[i]) for i in found]
+        chosen = [index_of(one, ids, shown, "scene.sensors: got") for one in asked]
     if len({*chosen}) != len(chosen):
         raise ConfigError(f"scene.sensors: got {list(asked)}, expected each sensor once")
     nodes = [found[k] for k in chosen]
@@ -224,14 +227,20 @@ def take_sensors(state, where: str, asked="all") -> tuple[list[int], list[str], 
     return nodes, names, (f"{len(found)} sensors: {which} is used ({used}), not {more}",)
 
 
-def _sensor(asked, ids, state, found):
-    """Return the place of a sensor among all."""
-    if asked in ids:
-        return ids.index(asked)
-    if isinstance(asked, int) and 0 <= asked < len(ids):
+def index_of(asked: int | str, names: list[str], shown: list[str], said: str, more: str = "") -> int:
+    """Return the index of what is asked for by index or name; ``shown`` is what an error lists.
+
+    Raises
+    ------
+    ConfigError
+        There is none; its text begins with ``said`` and ends with ``more``.
+    """
+    if asked in names:
+        return names.index(asked)
+    if isinstance(asked, int) and 0 <= asked < len(names):
         return asked
-    known = ", ".join(f"{k} ({_name(state.nodes[i])})" for k, i in enumerate(found))
-    raise ConfigError(f"scene.sensors: got {asked!r}, expected one of {known}")
+    known = ", ".join(f"{k} ({name})" for k, name in enumerate(shown))
+    raise ConfigError(f"{said} {asked!r}, expected one of {known}{more}")
 
 
 def _keep_only(state, nodes):

@@ -406,8 +406,9 @@ class _Search:
                     penalty = problem.penalty(tried.state, run.start)
                     if data + penalty >= before:
                         # Columns of T that were traced for it are not in what it is compared with.
-                        point = problem.evaluate(run.state, resolve=False)
-                        before = problem.loss(point, run.start, run.scale)
+                        again = problem.evaluate(run.state, resolve=False)
+                        if again.residual is not None:
+                            point, before = again, problem.loss(again, run.start, run.scale)
                     if data + penalty < before:
                         better = tried
                         break

@@ -201,7 +201,11 @@ class _Blur:
 
 
 def _veiled(sky):
-    """Mix some of its luminance into every channel of a sky (rows, W, 3)."""
+    """Mix some of its luminance into every channel of a sky (rows, W, 3).
+
+    By a matrix: ``dr.unravel`` of an array that is used afterwards too loses
+    the derivative of that use (drjit 1.5.0).
+    """
     mixed = (1 - VEIL) * np.eye(3) + VEIL * np.asarray(LUMINANCE)[:, None]
     return dr.reshape(dr.matmul(dr.reshape(sky, (-1, 3)), tensor(mixed)), sky.shape)
 

@@ -28,13 +28,15 @@ class Vertex:
     """Surface points of one bounce; lane = pixel * paths + path.
 
     ``bounce`` counts from 1, the point that the camera sees. ``throughput`` is the RGB weight of the path up
-    to the point, before its BSDF; lanes that left the scene have zero throughput.
+    to the point, before its BSDF; lanes that left the scene have zero throughput. ``hit`` is the ray and its
+    intersection from which ``si`` was computed, a third of its size.
     """
 
     bounce: int
     si: mi.SurfaceInteraction3f
     throughput: mi.Color3f
     active: mi.Bool
+    hit: tuple[mi.Ray3f, mi.PreliminaryIntersection3f] | None = None
 
 
 @dataclass
@@ -105,16 +107,17 @@ def trace(
     pdf = dr.full(mi.Float, dr.inf, n)
     hidden = getattr(scene.integrator(), "hide_emitters", False)
     for bounce in range(bounces + 1):
-        si = scene.ray_intersect(ray, active)
+        hit = ray, scene.ray_intersect_preliminary(ray, active=active)
+        si = hit[1].compute_surface_interaction(ray, mi.RayFlags.All, active)
         if hidden and bounce == 0:
-            si = _behind_lamps(scene, ray, si, active)
-        dr.eval(si, throughput, pdf, active, ray)
+            hit, si = _behind_lamps(scene, hit, si, active)
+        dr.eval(si, throughput, pdf, active, ray, hit)
         seen = mi.Bool(bounce > 0 or not hidden)
         yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid() & seen)
         active &= si.is_valid()
         if bounce == bounces:
             break
-        yield Vertex(bounce + 1, si, dr.select(active, throughput, 0), mi.Bool(active))
+        yield Vertex(bounce + 1, si, dr.select(active, throughput, 0), mi.Bool(active), hit)
         bs, value = si.bsdf().sample(context, si, sample(3 * bounce + 3).x, sample(3 * bounce + 4), active)
         ray = si.spawn_ray(si.to_world(bs.wo))
         throughput = throughput * mi.Color3f(
@@ -124,13 +127,14 @@ def trace(
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
 
 
-def _behind_lamps(scene, ray, si, active):
+def _behind_lamps(scene, hit, si, active):
     """Return what camera rays meet behind shapes that are lamps."""
+    ray, _ = hit
     lamp = active & si.is_valid() & (si.shape.emitter() != None)  # noqa: E711 (an array)
     onwards = si.spawn_ray(ray.d)
     found = scene.integrator().skip_area_emitters(scene, onwards, False, lamp)
     behind = found.compute_surface_interaction(onwards, mi.RayFlags.All, lamp)
-    return dr.select(lamp, behind, si)
+    return dr.select(lamp, (onwards, found), hit), dr.select(lamp, behind, si)
 
 
 def _camera_rays(scene, pixels, pixel, sample):

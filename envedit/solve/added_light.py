@@ -14,10 +14,12 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.representations.layers.lights import SPARE, rotation_vector
-from envedit.solve.map_problem import Normal, Point, Problem
+from envedit.solve.map_problem import Normal, Point, Problem, forward
 
 SPACINGS, REACH = (2, 1), (2, 1)
 """Distances in texels of the exact columns around the best cell, and how many of them to each side."""
+LEAST_REST = 1e-4
+"""Share of a light's squared picture that other unknowns must leave unexplained for it to be a candidate."""
 
 
 def best(
@@ -45,8 +47,8 @@ def best(
     except np.linalg.LinAlgError:
         return None
     i, flux = dark[0], layers.lights.flux[dark[0]]
-    cells, directions = problem.blocks.sky_cells(layers.shape)
-    strength, fall = model.of_cells([m * f for m, f in zip(problem.blocks.lit(cells), flux, strict=True)])
+    _, directions = problem.blocks.sky
+    strength, fall = model.of_cells(flux)
     found = int(np.argmax(fall))
     if not fall[found] > 0:
         return None
@@ -80,40 +82,42 @@ class _Model:
 
     def __init__(self, problem, normal):
         self.problem, self.normal = problem, normal
-        # numpy has no substitution: the inverse of the factor is what serves two models of candidates.
-        self._inverse = np.linalg.inv(np.linalg.cholesky(normal.hessian))
-        self._gradient = self._inverse @ normal.gradient
+        self._lower = np.linalg.cholesky(normal.hessian)
+        self._gradient = forward(self._lower, normal.gradient)
 
-    def of_cells(self, atoms):
-        """Return strength and fall of F for pictures in blocks, (blocks, n) per channel."""
-        blocks = self.normal.blocks
-        channels = zip(blocks.jacobian, blocks.squared.T, atoms, strict=True)
-        mixed = np.concatenate([j.T @ (w[:, None] * a) for j, w, a in channels])
-        if blocks.lights:
-            mixed = np.concatenate([mixed, sum(b.T @ a for b, a in zip(blocks.lights, atoms, strict=True))])
-        pull = sum(a.T @ p for a, p in zip(atoms, blocks.pulled.T, strict=True))
-        power = sum((a * a).T @ w for a, w in zip(atoms, blocks.squared.T, strict=True))
-        return self._best(mixed, pull, power)
+    def of_cells(self, flux):
+        """Return strength and fall of F for a flux (3,) in each cell of the sky."""
+        parts, blocks = self.normal.blocks, self.problem.blocks
+        columns = zip(parts.jacobian, parts.squared.T, flux, strict=True)
+        mixed = [*blocks.seen([j * (f * w)[:, None] for j, w, f in columns])]
+        if parts.lights:
+            mixed.append(sum(blocks.seen([b * f for b, f in zip(parts.lights, flux, strict=True)])))
+        pull = sum(blocks.seen(list((parts.pulled * flux).T[..., None])))[0]
+        return self._best(np.concatenate(mixed), pull, blocks.power(parts.squared * flux**2).sum(axis=0))
 
     def of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
-        normal, blocks, count = self.normal, self.normal.blocks, len(pictures)
-        weighted = pictures * (normal.slope**2 * normal.robust).reshape(-1, 3)
-        profiled = weighted * normal.profile.reshape(-1, 3)
-        by_pixel = profiled.transpose(1, 0, 2).reshape(*normal.slope.shape[:2], -1)
-        in_blocks = self.problem.blocks.summed(by_pixel).reshape(-1, count, 3)
-        mixed = np.concatenate([j.T @ in_blocks[..., c] for c, j in enumerate(blocks.jacobian)])
-        if len(normal.pictures):
-            flat = normal.pictures.reshape(len(normal.pictures), -1)
-            mixed = np.concatenate([mixed, flat @ weighted.reshape(count, -1).T])
-        pull = pictures.reshape(count, -1) @ (normal.slope * normal.robust * normal.residual).ravel()
-        return self._best(mixed, pull, (pictures * weighted).sum(axis=(1, 2)))
+        normal, count = self.normal, len(pictures)
+        known = normal.pictures.reshape(len(normal.pictures), pictures.shape[1], 3)
+        mixed, seen, pull, power = [], 0.0, 0.0, 0.0
+        for c, j in enumerate(normal.blocks.jacobian):
+            mine = np.ascontiguousarray(pictures[..., c])
+            slope, robust, residual, profile = (
+                np.broadcast_to(v, normal.slope.shape)[..., c].ravel()
+                for v in (normal.slope, normal.robust, normal.residual, normal.profile)
+            )
+            weighted = mine * np.float32(slope**2 * robust)
+            mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)
+            seen = seen + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
+            pull = pull + mine @ (slope * robust * residual)
+            power = power + np.einsum("np,np->n", mine, weighted)
+        return self._best(np.concatenate([*mixed, seen]), pull, power)
 
     def _best(self, mixed, pull, power):
-        half = self._inverse @ mixed
+        half = forward(self._lower, mixed)
         along = half.T @ self._gradient - pull
         rest = power - np.square(half).sum(axis=0)
-        strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > 1e-6 * power)
+        strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_REST * power)
         fall = np.maximum(strength, 0) * along
         finite = np.isfinite(strength) & np.isfinite(fall)
         return np.where(finite, strength, 0), np.where(finite, fall, 0)

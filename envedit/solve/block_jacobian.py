@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import numpy as np
 
@@ -17,9 +19,14 @@ class BlockJacobian:
         overview = transport.overview()
         self.block_of, self.count = overview.block_of, len(overview.matrix[0])
         active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])
-        self._shape = layers.whole
+        self._shape, self._own = layers.whole, layers.shape[0] * layers.shape[1]
         cells, omega = len(overview.omega), np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
         self._directions = overview.directions
+        # Pixels in the order of their blocks, where each block begins, and which these are.
+        self._order = np.argsort(self.block_of, kind="stable")
+        ordered = self.block_of[self._order]
+        self._starts = np.flatnonzero(np.diff(ordered, prepend=-1))
+        self._present = ordered[self._starts]
         self._total = np.bincount(overview.cell_of, omega, cells)
         self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
         # Hats are weighed by the sky's luminance: what is bright in a cell determines its gain.
@@ -50,14 +57,14 @@ class BlockJacobian:
 
     def pictures(self, changes: np.ndarray) -> np.ndarray:
         """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
-        found = np.empty((len(changes), len(self.block_of), 3), np.float32)
+        found = np.empty((3, len(changes), len(self.block_of)), np.float32)
         for c, matrix in enumerate(self._matrix):
             cells = np.stack(
                 [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
             )
             cells = (cells / np.maximum(self._total, 1e-30))[:, self._used]
-            found[..., c] = (cells.astype(np.float32) @ matrix.T)[:, self.block_of]
-        return found
+            np.take(cells.astype(np.float32) @ matrix.T, self.block_of, axis=1, out=found[c])
+        return found.transpose(1, 2, 0)
 
     def profile(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture (h, w, 3) over its mean in every block; 1 where that is 0."""
@@ -67,18 +74,32 @@ class BlockJacobian:
         profile = np.divide(flat, mean, out=np.ones_like(flat), where=mean > 0)
         return np.float32(profile).reshape(picture.shape)
 
-    def sky_cells(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """List the cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""
-        inside = np.zeros(self._cells)
-        own = self._cell[: shape[0] * shape[1]]
-        np.add.at(inside, own, self._omega[: len(own)])
+    @functools.cached_property
+    def sky(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""
+        own = self._cell[: self._own]
+        inside = np.bincount(own, self._omega[: len(own)], self._cells)
         cells = np.flatnonzero(inside[self._used] > 0.5 * self._total[self._used])
         return cells, self._directions[self._used[cells]]
 
-    def lit(self, cells: np.ndarray) -> list[np.ndarray]:
-        """Return pictures of unit flux in each of some cells, (blocks, n), per channel."""
-        size = self._total[self._used[cells]]
-        return [m[:, cells] / np.float32(np.maximum(size, 1e-30)) for m in self._matrix]
+    @functools.cached_property
+    def _lit(self):
+        """Pictures of unit flux in each cell of the sky, (blocks, n), per channel."""
+        cells, _ = self.sky
+        size = np.maximum(self._total[self._used[cells]], 1e-30)
+        return [tensor(m[:, cells] / np.float32(size)) for m in self._matrix]
+
+    def seen(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
+        """Return, per channel, products of pictures (blocks, k) with those of :attr:`sky`'s cells: (k, n).
+
+        The latter are of a flux of 1.
+        """
+        return [dr.matmul(tensor(p), m, At=True).numpy() for m, p in zip(self._lit, pictures, strict=True)]
+
+    def power(self, weights: np.ndarray) -> np.ndarray:
+        """Return sums of weights (blocks, 3) times the squared pictures of those cells, (3, n)."""
+        squares = zip(self._lit, weights.T, strict=True)
+        return np.stack([dr.matmul(tensor(w[None]), dr.square(m)).numpy()[0] for m, w in squares])
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""
@@ -89,5 +110,10 @@ class BlockJacobian:
 
     def summed(self, picture: np.ndarray) -> np.ndarray:
         """Sum a picture (h, w, k) over blocks: (blocks, k)."""
-        flat = picture.reshape(-1, picture.shape[2])
-        return np.stack([np.bincount(self.block_of, v, self.count) for v in flat.T], axis=1)
+        return self.sums(picture.reshape(-1, picture.shape[2]).T).T
+
+    def sums(self, pictures: np.ndarray) -> np.ndarray:
+        """Sum pictures (k, pixels) over blocks: (k, blocks)."""
+        found = np.zeros((len(pictures), self.count), pictures.dtype)
+        found[:, self._present] = np.add.reduceat(pictures[:, self._order], self._starts, axis=1)
+        return found

@@ -42,6 +42,8 @@ LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
 SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
 """Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
 larger lobe would be seen."""
+ROWS = 64
+"""Rows of a triangular matrix that are solved for together."""
 _AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 
 
@@ -301,14 +303,19 @@ class Problem:
         Huber's concomitant scale (his proposal 2): the first part of F is then their number. At least
         ``least``.
         """
-        size = _sizes(residual)  # once: the bisection is part of every step
-        low, high = least, max(least, float(np.abs(residual).max()))
-        if self._huber(size, low) <= 3 * INDEPENDENT:
-            return low
-        for _ in range(40):
-            middle = np.sqrt(low * high)
-            low, high = (middle, high) if self._huber(size, middle) > 3 * INDEPENDENT else (low, middle)
-        return float(high)
+        size = _sizes(residual)
+        if self._huber(size, least) <= 3 * INDEPENDENT:
+            return least
+        # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
+        # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
+        order = np.argsort(size, axis=None)
+        r, w = np.float64(size.ravel()[order]), np.float64(self.weight.ravel()[order])
+        a = np.cumsum(np.append(0, w * r * r))
+        b, c = (np.append(np.cumsum(part[::-1])[::-1], 0) for part in (w * r, w))
+        d = self.area * INDEPENDENT
+        sigma = (b + np.sqrt(b * b + (d + c) * a)) / (d + c)
+        inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
+        return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
 
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""
@@ -365,7 +372,7 @@ class Problem:
             gradient[part] = j.T @ pulled[:, c]
             if len(lights.pictures):
                 weighted = lights.pictures[..., c] * (slope**2 * profile * robust)[..., c]
-                in_blocks = blocks.summed(weighted.transpose(1, 2, 0))
+                in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
                 seen[:, part] = in_blocks.T @ j
                 lit.append(in_blocks)
         if len(lights.pictures):
@@ -519,14 +526,21 @@ class Problem:
             seen = self.transport.pictures(np.stack(cores), self.rows).reshape(4, -1, 3)
             if glow is not None:
                 seen[:3] += self.blocks.pictures(np.stack(shone)) * profile.reshape(-1, 3)
-            flux, *others = seen
-            pictures += others
-            unknowns.append(("size", i, 0))
+            pictures.append(seen)
+            unknowns += [("size", i, 0), *(("flux", i, c) for c in range(3))]
+        return _Lights(self._apart(pictures), unknowns)
+
+    def _apart(self, pictures):
+        """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
+
+        By direction, size, and flux per channel; in memory channel by channel.
+        """
+        found = np.zeros((3, len(pictures), 6, self.target[..., 0].size), np.float32)
+        for k, seen in enumerate(pictures):
             for c in range(3):
-                pictures.append(flux * (np.arange(3) == c))
-                unknowns.append(("flux", i, c))
-        shape = (len(pictures), *self.target.shape)
-        return _Lights(np.asarray(pictures, np.float32).reshape(shape), unknowns)
+                found[c, k, :3] = seen[1:, :, c]
+                found[c, k, 3 + c] = seen[0, :, c]
+        return found.reshape(3, -1, *self.target.shape[:2]).transpose(1, 2, 3, 0)
 
     def _tangents(self, state, i):
         """Two directions in which a light can move, (3,) each: axes of rotation."""
@@ -547,16 +561,20 @@ def _sizes(residual):
     return np.sqrt((residual**2).mean(axis=2, keepdims=True))
 
 
-def _solved(lower, values):
-    """Solve L L' x = values by substitution, 64 rows at a time."""
-    size = 64
+def forward(lower: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Solve L x = values, (n,) or (n, k), by substitution, :data:`ROWS` at a time; L is lower triangular."""
     x = np.array(values, np.float64)
-    starts = range(0, len(x), size)
-    for k in starts:
-        part = slice(k, k + size)
+    for k in range(0, len(x), ROWS):
+        part = slice(k, k + ROWS)
         x[part] = np.linalg.solve(lower[part, part], x[part] - lower[part, :k] @ x[:k])
-    for k in reversed(starts):
-        part, rest = slice(k, k + size), slice(k + size, None)
+    return x
+
+
+def _solved(lower, values):
+    """Solve L L' x = values."""
+    x = forward(lower, values)
+    for k in reversed(range(0, len(x), ROWS)):
+        part, rest = slice(k, k + ROWS), slice(k + ROWS, None)
         x[part] = np.linalg.solve(lower[part, part].T, x[part] - lower[rest, part].T @ x[rest])
     return x
 

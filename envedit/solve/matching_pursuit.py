@@ -10,8 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import tensor
+from envedit.representations.layers.lights import interpolated_glow
 from envedit.representations.layers.separation import Light, glow_at
 from envedit.transport.block_transport import CELLS, Overview
 
@@ -217,7 +221,7 @@ class Pursuit:
         share = overview.to_cells(given.active[:, None].astype(float), omega)[:, 0]
         self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
         self.directions = d = given.directions
-        self.cosine = np.float32(d @ d[self.candidates].T)
+        self.cosine = mi.Float(np.float32(d @ d[self.candidates].T).ravel())
         self.wanted = [w * self.weight for w in wanted]
         self.residual = list(self.wanted)
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
@@ -240,15 +244,15 @@ class Pursuit:
 
         ``glow`` as of :class:`.separation.Light`; it comes along.
         """
-        matrix = self.overview.matrix
-        unit = flux[:, None] / self.overview.omega[self.candidates]
-        found, shine = [], None if glow is None else glow_at(glow, self.cosine)
-        for c in range(3):
-            atom = matrix[c][:, self.candidates] * unit[c].astype(np.float32)
-            if glow is not None:
-                atom = atom + matrix[c] @ (self.background[:, c : c + 1] * shine[..., c]).astype(np.float32)
-            found.append(atom * self.weight[:, None])
-        return np.stack(found)
+        matrix, size = self.overview.matrix, (len(self.directions), len(self.candidates))
+        unit = np.float32(flux[:, None] / self.overview.omega[self.candidates])
+        found = np.stack([m[:, self.candidates] * u for m, u in zip(matrix, unit, strict=True)])
+        if glow is not None:
+            shine = interpolated_glow(dr.opaque(mi.Float(np.float32(glow).ravel())), self.cosine)
+            for c in range(3):
+                lit = mi.TensorXf(shine[c], size) * tensor(self.background[:, c : c + 1])
+                found[c] += dr.matmul(tensor(matrix[c]), lit).numpy()
+        return found * np.float32(self.weight[:, None])
 
     def atom_of(self, cells, flux, centre, glow):
         """Picture, (3, blocks, 1), of a light with flux (n, 3) in cells (n,) and its glow around a centre."""

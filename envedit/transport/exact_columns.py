@@ -183,13 +183,21 @@ class ExactColumns:
         """
         traced = np.zeros(self.grid.texels, bool)
         traced[texels] = True
-        taps = np.flatnonzero(traced[block.texel])
-        if not len(taps):
+        wanted = dr.opaque(mi.Bool(traced))
+        hit = mi.Bool(False)
+        for texel in block.texels:
+            hit |= dr.gather(mi.Bool, wanted, texel)
+        index = dr.compress(hit)
+        if not len(index):
             return
-        escape = block.escape[taps]
-        value = block.light[escape] * block.share[taps, None]
-        pixel = block.first + block.at[escape].astype(np.int64)
-        slot = self.slot_of[block.texel[taps]]
+        around, shares, light, pixel = (
+            np.stack([dr.gather(type(v), v, index).numpy() for v in values])
+            for values in (block.texels, block.shares, block.light, [block.at])
+        )
+        tap, escape = np.nonzero(traced[around] & (shares > 0))
+        value = light[:, escape].T * shares[tap, escape, None]
+        texel, pixel = around[tap, escape], pixel[0, escape].astype(np.int64)
+        slot = self.slot_of[texel]
         target = (pixel // SLICE * self.capacity + slot) * SLICE + pixel % SLICE
         finite = np.isfinite(value).all(axis=1)
         self._lost += int((~finite).sum())
@@ -216,10 +224,17 @@ class ExactColumns:
         return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity)
 
     def read(self, texels: np.ndarray) -> np.ndarray:
-        """Return the columns of texels that have one: (n, pixels, 3)."""
-        store = self._store.numpy().reshape(_slices(self.pixels), self.capacity, SLICE, 4)
-        columns = store[:, self.slot_of[texels], :, :3].transpose(1, 0, 2, 3)
-        return columns.reshape(len(texels), -1, 3)[:, : self.pixels]
+        """Return the columns of texels that have one, (n, pixels, 3); in memory channel by channel."""
+        if not len(texels):
+            return np.zeros((0, self.pixels, 3), np.float32)
+        slots = path_vertices.on_device(mi.UInt32, (self.slot_of[texels] * SLICE).astype(np.uint32))
+        lane, pixels = dr.arange(mi.UInt32, len(texels) * self.pixels), dr.opaque(mi.UInt32, self.pixels)
+        texel = lane // pixels
+        place = _first_place(lane - texel * pixels, self.capacity) + dr.gather(mi.UInt32, slots, texel)
+        columns = dr.gather(mi.Vector4f, self._store, place)
+        dr.eval(columns)
+        planes = np.stack([columns[c].numpy() for c in range(3)])
+        return planes.reshape(3, len(texels), self.pixels).transpose(1, 2, 0)
 
     def add_adjoint(self, flat: mi.Float, packets: mi.Float) -> None:
         """Put the adjoint, the sum over pixels of column * I, in the places of the texels that have a column.

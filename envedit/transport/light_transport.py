@@ -355,18 +355,18 @@ class LightTransport:
         Returns
         -------
         ndarray (k, h, w, 3) float32
+            In memory channel by channel.
         """
         flat = maps.reshape(len(maps), -1, 3)
         some = np.flatnonzero(flat.any(axis=(0, 2)))
         texels, values = some + rows.start * self.grid.width, flat[:, some]
         self._trace_main(texels, values)
         exact = self._exact.slot_of[texels] >= 0
-        total = np.zeros((len(maps), self.shape[0] * self.shape[1], 3), np.float32)
+        total = self.reverse.transposed(texels[~exact], values[:, ~exact])
         if exact.any():
             columns = self._exact.read(texels[exact])
             for c in range(3):
-                total[..., c] = values[:, exact, c] @ columns[..., c]
-        total += self.reverse.transposed(texels[~exact], values[:, ~exact])
+                total[..., c] += values[:, exact, c] @ columns[..., c]
         return total.reshape(len(maps), *self.shape, 3)
 
     def _trace_main(self, texels, values):

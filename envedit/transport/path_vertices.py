@@ -1,7 +1,7 @@
 """Camera paths that are kept: their vertices, for columns of T that are traced one after the other.
 
 The paths of a picture are the same for every texel. What a column of T needs of them is kept: of each vertex
-that a light can reach, its surface interaction, throughput, pixel and path; of each path that leaves the
+that a light can reach, its ray and intersection, throughput, pixel and path; of each path that leaves the
 scene, the texels around its direction. A column then costs one shadow ray and one BSDF evaluation a vertex.
 """
 
@@ -19,14 +19,14 @@ from envedit.transport.recording import LANES, bsdf_weight, connect
 from envedit.transport.sparse_matrix import SLICE
 from envedit.transport.texel_sampling import Grid
 
-VERTEX_BYTES, ESCAPE_BYTES = 216, 64
+VERTEX_BYTES, ESCAPE_BYTES = 80, 48
 """Memory of a kept vertex and of a path that leaves the scene."""
 _SHADING = mi.BSDFFlags.Smooth
 
 
 @dataclass
 class Block:
-    """The paths of some pixels: vertices sorted by pixel, then bounce, then path; and escapes, on the host.
+    """The paths of some pixels: vertices sorted by pixel, then bounce, then path; and escapes.
 
     Attributes
     ----------
@@ -34,32 +34,35 @@ class Block:
         First pixel, and how many.
     vertices, escapes : int
         How many there are.
-    si, throughput, bounce, path, pixel : arrays (vertices,)
+    hits : tuple of arrays (vertices,)
+        Origin, direction and time of rays; distance, coordinates, primitive, shape and instance that they
+        meet: what surface interactions are computed from again.
+    throughput, bounce, path, pixel : arrays (vertices,)
         As of :class:`.camera_paths.Vertex`; ``pixel`` counts from the picture's first.
     start : UInt32 (pixels + 1,)
         First vertex of each pixel.
-    texel, share, escape : ndarrays (n,)
-        Texels around the directions of escapes, four or fewer of each: the texel, its share, and the escape
-        that it belongs to.
-    light, at : ndarrays (escapes, 3), (escapes,)
-        What an escape adds for a radiance of 1, and its pixel, from the block's first.
+    texels, shares : tuples of four UInt32, Float (escapes,)
+        Texels around the direction of an escape, and their shares.
+    light : tuple of three Float (escapes,)
+        What an escape adds for a radiance of 1.
+    at : UInt32 (escapes,)
+        Its pixel, from the picture's first.
     """
 
     first: int
     pixels: int
     vertices: int = 0
     escapes: int = 0
-    si: mi.SurfaceInteraction3f | None = None
+    hits: tuple | None = None
     throughput: mi.Color3f | None = None
     bounce: mi.UInt32 | None = None
     path: mi.UInt32 | None = None
     pixel: mi.UInt32 | None = None
     start: mi.UInt32 | None = None
-    texel: np.ndarray | None = None
-    share: np.ndarray | None = None
-    escape: np.ndarray | None = None
-    light: np.ndarray | None = None
-    at: np.ndarray | None = None
+    texels: tuple[mi.UInt32, ...] = ()
+    shares: tuple[mi.Float, ...] = ()
+    light: tuple[mi.Float, ...] = ()
+    at: mi.UInt32 | None = None
 
     @property
     def bytes(self) -> int:
@@ -91,87 +94,109 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
         block, vertices, escapes = Block(first, len(some)), [], []
         for event in camera_paths.trace(scene, some, count, bounces, seed):
             if isinstance(event, camera_paths.Escape):
-                escapes.append(_escapes(event, grid, count))
+                escapes.append(_escapes(event, grid, count, first))
             else:
                 vertices.append(_vertices(event, count, first))
         _sort(block, [part for part in vertices if part is not None])
-        _join(block, escapes)
+        _join(block, [part for part in escapes if part is not None])
         yield block
+
+
+def _where(mask):
+    """Return the lanes of a mask, and how many there are; of a single one there are two, see on_device."""
+    index = dr.compress(mask)
+    count = len(index)
+    return (on_device(mi.UInt32, index.numpy()) if count == 1 else index), count
+
+
+def _of_first(value, count):
+    """Return a value of lanes; 0 of those beyond a count."""
+    return dr.select(dr.arange(mi.UInt32, dr.width(value)) < dr.opaque(mi.UInt32, count), value, 0)
 
 
 def _vertices(event, count, first):
     """Take the vertices that a light can reach; None if there are none."""
     # A filter with negative lobes makes negative throughputs; NaN is kept: what uses it counts what it loses.
     lit = event.active & mi.has_flag(event.si.bsdf().flags(), _SHADING) & dr.any(event.throughput != 0)
-    keep = np.flatnonzero(lit.numpy()).astype(np.uint32)
-    if not len(keep):
+    index, some = _where(lit)
+    if not some:
         return None
-    index = on_device(mi.UInt32, keep)
-    si, throughput = (dr.gather(type(v), v, index) for v in (event.si, event.throughput))
-    dr.eval(si, throughput)
-    n = len(index)
-    if len(keep) < n:  # of a single one there are two, see on_device: the other counts for nothing
-        keep = np.repeat(keep, n)
-        throughput = dr.select(dr.arange(mi.UInt32, n) == 0, throughput, 0)
-    numbers = np.full(n, event.bounce, np.uint32), keep % count, first + keep // count
-    return si, throughput, numbers
+    ray, hit = event.hit
+    at = hit.t, hit.prim_uv, hit.prim_index, hit.shape_index, hit.shape, hit.instance
+    kept = tuple(dr.gather(type(v), v, index) for v in (ray.o, ray.d, ray.time, *at))
+    throughput = _of_first(dr.gather(mi.Color3f, event.throughput, index), some)
+    pixel = index // dr.opaque(mi.UInt32, count)
+    path, bounce = index - pixel * dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, event.bounce)
+    found = kept, throughput, bounce + 0 * index, path, pixel + dr.opaque(mi.UInt32, first)
+    dr.make_opaque(found)  # literals would make other kernels
+    return found
 
 
 def _sort(block, parts):
+    """Put vertices in the order of their pixels, then bounces, then paths."""
     if not parts:
         return
-    bounce, path, pixel = (np.concatenate([part[2][i] for part in parts]) for i in range(3))
-    sizes = [len(part[2][0]) for part in parts]
-    order = np.argsort(pixel, kind="stable").astype(np.uint32)  # by bounce and path they are sorted already
-    index = on_device(mi.UInt32, order)
-    block.si = dr.gather(mi.SurfaceInteraction3f, _concatenated([part[0] for part in parts], sizes), index)
-    block.throughput = dr.gather(mi.Color3f, _concatenated([part[1] for part in parts], sizes), index)
-    dr.eval(block.si, block.throughput)
-    block.vertices = len(order)
-    block.bounce, block.path, block.pixel = (on_device(mi.UInt32, v[order]) for v in (bounce, path, pixel))
-    count = np.bincount(pixel[order] - block.first, minlength=block.pixels)
-    block.start = on_device(mi.UInt32, np.concatenate([[0], np.cumsum(count)]).astype(np.uint32))
+    # By pixel and path each part is sorted: a vertex comes after those of earlier pixels and bounces.
+    pixels = [part[4] - dr.opaque(mi.UInt32, block.first) for part in parts]
+    counts = np.stack([_counted(pixel, block.pixels) for pixel in pixels])
+    start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
+    offsets = start[:-1] + np.cumsum(counts, axis=0) - np.cumsum(counts, axis=1)
+    places = [
+        dr.arange(mi.UInt32, len(pixel)) + dr.gather(mi.UInt32, on_device(mi.UInt32, offset), pixel)
+        for pixel, offset in zip(pixels, offsets.astype(np.uint32), strict=True)
+    ]
+    block.hits, block.throughput, block.bounce, block.path, block.pixel = _joined(parts, places)
+    block.vertices = int(start[-1])
+    block.start = on_device(mi.UInt32, start.astype(np.uint32))
 
 
-def _escapes(event, grid, count):
-    """Take the paths that left the scene: texels around them and their shares (4, n), light, pixel."""
-    taps, _, jacobian = grid.locate(event.direction)
-    uniform = grid.width * max(grid.height - 1, 1)
-    light = event.throughput * (bsdf_weight(event.pdf, uniform / jacobian) / dr.opaque(mi.Float, count))
+def _counted(pixel, count):
+    """Count how often each of so many numbers occurs, on the host."""
+    counts = dr.zeros(mi.UInt32, max(count, 2))
+    # Not in copies for every thread, the default: such a kernel has the size in it.
+    dr.scatter_add(counts, mi.UInt32(1), pixel, mode=dr.ReduceMode.Local)
+    return counts.numpy()[:count].astype(np.int64)
+
+
+def _escapes(event, grid, count, first):
+    """Take the paths that left the scene: what a :class:`Block` keeps of them; None if there are none."""
     # NaN is kept: what uses it counts what it leaves out.
-    active = event.active & ~dr.all(light == 0)
-    dr.eval(taps, light, active)
-    active = active.numpy()
-    keep = np.flatnonzero(active)
-    texels, shares = (np.stack([tap[k].numpy()[keep] for tap in taps]) for k in (0, 1))
-    # By channel: a Color3f is interleaved by a kernel that has its length in it. Literals have one value.
-    light = [np.broadcast_to(light[c].numpy(), active.shape)[keep] for c in range(3)]
-    return texels, shares, np.stack(light, axis=1), keep // count
+    index, some = _where(event.active & dr.any(event.throughput != 0))
+    if not some:
+        return None
+    direction, throughput = dr.gather(mi.Vector3f, event.direction, index), event.throughput
+    taps, _, jacobian = grid.locate(direction)
+    uniform = grid.width * max(grid.height - 1, 1)
+    weight = bsdf_weight(dr.gather(mi.Float, event.pdf, index), uniform / jacobian)
+    light = dr.gather(mi.Color3f, throughput, index) * (weight / dr.opaque(mi.Float, count))
+    texels, shares = zip(*taps, strict=True)
+    pixel = dr.opaque(mi.UInt32, first) + index // dr.opaque(mi.UInt32, count)
+    found = texels, shares, tuple(_of_first(light, some)), pixel
+    dr.eval(found)
+    return found
 
 
 def _join(block, parts):
-    texels, shares, light, at = zip(*parts, strict=True)
-    block.light, block.at = np.concatenate(light), np.concatenate(at).astype(np.uint32)
-    block.escapes = len(block.at)
-    texel, share = (np.concatenate(both, axis=1).ravel() for both in (texels, shares))
-    some = np.flatnonzero(share > 0)
-    block.texel, block.share = texel[some], share[some]
-    block.escape = (some % max(block.escapes, 1)).astype(np.uint32)
+    if not parts:
+        return
+    sizes = [len(part[3]) for part in parts]
+    places = [
+        dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
+        for size, start in zip(sizes, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True)
+    ]
+    block.escapes = sum(sizes)
+    block.texels, block.shares, block.light, block.at = _joined(parts, places)
 
 
-def _concatenated(parts, sizes):
-    """Concatenate arrays of so many elements, or structures of them member by member.
+def _joined(parts, places):
+    """Join structures of arrays member by member; ``places`` says where the elements of each come to lie.
 
     Not by ``dr.concat``, whose kernels have the sizes in them; and a single part too, for its literals would
     make other kernels later.
     """
-    starts = np.cumsum([0, *sizes[:-1]])
-    places = [
-        dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, int(start))
-        for size, start in zip(sizes, starts, strict=True)
-    ]
     leaves = [list(_leaves(part)) for part in parts]
-    joined = [dr.empty(type(leaf), sum(sizes)) for leaf in leaves[0]]
+    total = sum(len(place) for place in places)
+    joined = [dr.empty(type(leaf), total) for leaf in leaves[0]]
     for place, one in zip(places, leaves, strict=True):
         for target, leaf in zip(joined, one, strict=True):
             dr.scatter(target, leaf, place)
@@ -182,7 +207,10 @@ def _concatenated(parts, sizes):
 def _leaves(value):
     """Yield the flat arrays that a structure consists of; pointers as the numbers that they are."""
     kind = type(value)
-    if members := getattr(kind, "DRJIT_STRUCT", None):
+    if kind is tuple:
+        for member in value:
+            yield from _leaves(member)
+    elif members := getattr(kind, "DRJIT_STRUCT", None):
         for name in members:
             yield from _leaves(getattr(value, name))
     elif dr.depth_v(kind) > 1:
@@ -195,6 +223,8 @@ def _leaves(value):
 def _of_leaves(like, leaves):
     """Put flat arrays together to a structure like another."""
     kind = type(like)
+    if kind is tuple:
+        return tuple(_of_leaves(member, leaves) for member in like)
     if members := getattr(kind, "DRJIT_STRUCT", None):
         made = kind()
         for name in members:
@@ -259,14 +289,21 @@ def contributions(scene: mi.Scene, grid: Grid, block: Block, texels, count: int,
     return total, lost
 
 
+def _interaction(hits, lane):
+    """Return the surface interactions of kept vertices, as :mod:`.camera_paths` had them."""
+    o, d, time, t, uv, prim, index, shape, instance = (dr.gather(type(v), v, lane) for v in hits)
+    hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(lane))
+    hit.valid, hit.t, hit.prim_uv, hit.prim_index = mi.Bool(True), t, uv, prim
+    hit.shape_index, hit.shape, hit.instance = index, shape, instance
+    ray = mi.Ray3f(o, d, time, [])
+    return hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(True))
+
+
 @dr.syntax
 def _connect(scene, grid, block, texels, each, count, values, lost):
     """Write what a vertex adds for every texel: value t * vertices + v."""
     v = dr.arange(mi.UInt32, block.vertices)
-    si, throughput = (
-        dr.gather(mi.SurfaceInteraction3f, block.si, v),
-        dr.gather(mi.Color3f, block.throughput, v),
-    )
+    si, throughput = _interaction(block.hits, v), dr.gather(mi.Color3f, block.throughput, v)
     bounce, path, pixel = (dr.gather(mi.UInt32, a, v) for a in (block.bounce, block.path, block.pixel))
     vertices, per_pixel = dr.opaque(mi.UInt32, block.vertices), dr.opaque(mi.Float, count)
     uniform = dr.opaque(mi.Float, grid.width * max(grid.height - 1, 1))  # over (u, v), one sample a texel

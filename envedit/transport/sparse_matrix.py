@@ -141,8 +141,9 @@ class ColourMatrix:
         Returns
         -------
         ndarray (k, columns, 3) float32
+            In memory channel by channel.
         """
-        total = np.zeros((len(values), self.shape[1], 3), np.float32)
+        total = np.zeros((3, len(values), self.shape[1]), np.float32).transpose(1, 2, 0)
         if not len(rows):
             return total
         packed = self._packed.numpy().reshape(-1, 4)

@@ -90,10 +90,10 @@ def test_a_single_escape():
         if dr.any(events[0].active)[0]:
             break
     assert dr.count(events[0].active)[0] == 1
-    texels, shares, light, at = path_vertices._escapes(events[0], grid, 1)
-    assert texels.shape == shares.shape == (4, 1) and at.tolist() == [0]
-    np.testing.assert_allclose(light, [[1, 1, 1]], rtol=1e-6)
-    assert shares.sum() == pytest.approx(1, rel=1e-6)
+    texels, shares, light, at = path_vertices._escapes(events[0], grid, 1, pixel)
+    assert len(texels) == len(shares) == 4 and at.numpy().tolist() == [pixel] * 2
+    np.testing.assert_allclose(np.stack([c.numpy() for c in light]), [[1, 0]] * 3, rtol=1e-6)
+    assert sum(share.numpy()[0] for share in shares) == pytest.approx(1, rel=1e-6)
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------
@@ -164,8 +164,8 @@ def test_memory_of_kept_paths_is_what_is_stated(name):
     columns = columns_of(load(name))
     traced(columns)
     blocks = columns._kept[COUNT, SEED]
-    real = sum(size_of([b.si, b.throughput, b.bounce, b.path, b.pixel]) for b in blocks)
-    real += sum(v.nbytes for b in blocks for v in (b.texel, b.share, b.escape, b.light, b.at))
+    real = sum(size_of([b.hits, b.throughput, b.bounce, b.path, b.pixel]) for b in blocks)
+    real += sum(size_of([b.texels, b.shares, b.light, b.at]) for b in blocks)
     assert real <= sum(b.bytes for b in blocks) <= 1.25 * real
     assert columns.kept_bytes == sum(b.bytes for b in blocks)
 
@@ -243,7 +243,8 @@ def test_escapes_that_are_not_finite_are_left_out_and_counted(monkeypatch):
     columns = columns_of(s)
     got = traced(columns)
     (block,) = columns._kept[COUNT, SEED]
-    bad = ~np.isfinite(block.light).all(axis=1)
-    hits = (np.isin(block.texel, TEXELS) & bad[block.escape]).sum()
+    bad = ~np.isfinite([c.numpy() for c in block.light]).all(axis=0)
+    around, shares = (np.stack([v.numpy() for v in tap]) for tap in (block.texels, block.shares))
+    hits = (np.isin(around, TEXELS) & (shares > 0) & bad).sum()
     assert columns.lost == hits > 0
     assert np.isfinite(got).all() and got.sum() < clean.sum()

@@ -154,7 +154,7 @@ class Lights:
             return mi.Color3f(1)
         index = dr.opaque(mi.UInt32, i)
         centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
-        return 1 + _glow_of(self._glow[i], dr.dot(d, centre)) * _exp(_colour(log_flux, index))
+        return 1 + interpolated_glow(self._glow[i], dr.dot(d, centre)) * _exp(_colour(log_flux, index))
 
 
 def placed(point, centre, turn, size, sine, finer: float, grid: tuple[int, int]):
@@ -298,8 +298,11 @@ def _snapped(place, snap):
     return dr.replace_grad(dr.select(dr.abs(place - whole) < snap, whole, place), place)
 
 
-def _glow_of(table, cosine):
-    """Interpolate a table over GLOW_DEGREES at an angle; level within the first node, 0 beyond the last."""
+def interpolated_glow(table: mi.Float, cosine: mi.Float) -> mi.Color3f:
+    """Interpolate a :attr:`.separation.Light.glow`, flat, at angles given by their cosines.
+
+    Level within the first of GLOW_DEGREES, 0 beyond the last.
+    """
     step, last = float(GLOW_DEGREES[1]), len(GLOW_DEGREES) - 1
     # The derivative of acos is infinite at 1: held off by less than the level part.
     angle = dr.acos(dr.clip(cosine, -1 + 1e-6, 1 - 1e-6)) * (180 / math.pi / step)

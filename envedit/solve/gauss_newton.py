@@ -312,7 +312,7 @@ class _Search:
         least = problem.noise(point.residual, self.sigma) / 2
         if k is None or least < self.sigma:  # no noise is below sigma
             return run, point
-        dark, last = _copy(run.state), problem.direction(run.state, k)
+        dark, last, began = _copy(run.state), problem.direction(run.state, k), run
         dark["flux"][k] = DARK
         without = problem.evaluate(dark, resolve=False)
         noise = problem.noise(without.residual, self.sigma)
@@ -322,14 +322,14 @@ class _Search:
                 break
             state, last = _copy(run.state), problem.direction(found[0], k)
             state["turn"][k] = found[0]["turn"][k]
-            there = problem.evaluate(state)
+            there = problem.evaluate(state, resolve=False)  # the columns that it was found by will do
             left = np.inf if there.residual is None else problem.noise(there.residual, self.sigma)
             if left < least:
-                run, point, least = Run(state, state), there, left
+                run, least = Run(state, state), left
             if left >= noise:
                 break
             noise = left
-        return run, point
+        return run, point if run is began else problem.evaluate(run.state)
 
     def _moved(self, run, state, i):
         """Return the state in which the map's strongest light is where a state has light i, and its number.

@@ -20,7 +20,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.losses import display_curve
-from envedit.representations.layers.gain import Octave, grid_size, tents
+from envedit.representations.layers.gain import Octave, grid_size, splines
 
 PROBES = 12
 """Random z; what is averaged over them, three patterns and the nodes of a patch is within a third."""
@@ -67,7 +67,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
     found, cycles = [], coarsest
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
-        down, across = tents(size, (height, width))
+        down, across = splines(size, (height, width))
         told = np.zeros(size)
         # Drawn anew for each octave: of a large map all of them together would take gigabytes.
         for pair in _pulled_back(transport, second, slope, background, rows[0]):

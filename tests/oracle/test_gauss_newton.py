@@ -364,7 +364,7 @@ def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     # exp is linear to a hundredth, and the map rounded to 1e-4 of its change: flat directions of F show it.
     least = ((jacobian @ expected - by_channel) ** 2).sum() / sigma**2 + expected @ precision @ expected
     assert (got - expected) @ hessian @ (got - expected) < 1e-4 * least
-    assert np.linalg.norm(got - expected) < 0.02 * np.linalg.norm(expected)
+    assert np.linalg.norm(got - expected) < 0.04 * np.linalg.norm(expected)
     assert solution.history[-1]["loss"] == pytest.approx(least, rel=2e-3)
     # As noise would let steps do: what is asked for is noise.
     kept = solve(problem, params, sigma, iterations=60)

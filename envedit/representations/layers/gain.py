@@ -1,9 +1,9 @@
 """The smooth gain of the sky: a field of log factors that starts at zero.
 
-A sum of bilinear grids over the active rows, periodic in azimuth, each twice as fine as the one before. The
-three coarse ones, up to a stated number of cycles around the horizon, are each half as strong per step of
-their nodes: what a coarse grid can represent is left to it. Finer ones are added where they are identifiable
-from the picture.
+A sum of grids of quadratic B-splines over the active rows, periodic in azimuth, each twice as fine as the
+one before; a pole is a single node. The three coarse ones, up to a stated number of cycles around the
+horizon, are each half as strong per step of their nodes: what a coarse grid can represent is left to it.
+Finer ones are added where they are identifiable from the picture.
 """
 
 from __future__ import annotations
@@ -41,14 +41,28 @@ def grid_size(cycles: float, share: float) -> tuple[int, int]:
     return max(2, round(columns / 2 * share) + 1), columns
 
 
-def tents(size, shape) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of a grid's rows (height, rows) and columns (width, columns) at texel centres."""
+def splines(size, shape) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of a grid's rows (height, rows) and columns (width, columns) at texel centres.
+
+    Quadratic B-splines: a field has no kinks. Beyond the first and the last row nodes go on along a straight
+    line, so that a field has their values there.
+    """
     (rows, columns), (height, width) = size, shape
     y = (np.arange(height) + 0.5) / height * (rows - 1)
     x = (np.arange(width) + 0.5) / width * columns
-    down = np.maximum(1 - np.abs(y[:, None] - np.arange(rows)), 0)
-    apart = np.abs(x[:, None] - np.arange(columns))
-    return down, np.maximum(1 - np.minimum(apart, columns - apart), 0)
+    ends = _spline(y[:, None] - np.array([-1, rows]))
+    down = _spline(y[:, None] - np.arange(rows))
+    for beyond, last, inner in zip(ends.T, (0, rows - 1), (1, rows - 2), strict=True):
+        down[:, last] += 2 * beyond
+        down[:, inner] -= beyond
+    across = sum(_spline(x[:, None] - np.arange(columns) - turn * columns) for turn in (-1, 0, 1))
+    return np.maximum(down, 0), across
+
+
+def _spline(t):
+    """Quadratic B-spline: 3/4 at 0, 1/8 at distance 1, 0 from 3/2 on."""
+    t = np.abs(t)
+    return np.where(t < 0.5, 0.75 - t**2, 0.5 * np.maximum(1.5 - t, 0) ** 2)
 
 
 @dataclass(frozen=True)
@@ -76,7 +90,7 @@ class Octave:
 
 
 class GridGain:
-    """Log gain per channel on bilinear grids.
+    """Log gain per channel on grids of quadratic B-splines.
 
     Parameters
     ----------
@@ -84,9 +98,13 @@ class GridGain:
         Cycles around the horizon that the finest grid can hold: it has twice as many columns.
     share : float
         Rows of the image over rows of its map: the grids are as fine in elevation as in azimuth.
+    top : bool
+        The image begins at the zenith.
     """
 
-    def __init__(self, cycles: int, share: float):
+    def __init__(self, cycles: int, share: float, top: bool = True):
+        self.poles = [row for row, there in ((0, top), (-1, top and share == 1)) if there]
+        """Rows of nodes that lie at a pole: the first of each counts for all."""
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
         self._units = [0.5**level for level in range(LEVELS)]
 
@@ -105,21 +123,23 @@ class GridGain:
         return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
 
     def hats(self, level: int, shape) -> list[tuple[np.ndarray, np.ndarray]]:
-        """List the four nodes around every texel of an image (rows, W): (index of the node, bilinear weight).
+        """List the nodes around every texel of an image (rows, W), nine at most: (index of the node, weight).
 
-        Each is an array (rows * W,); the same map as :func:`tents` as matrices.
+        Each is an array (rows * W,); the same map as :meth:`prepare` has as matrices.
         """
         (rows, columns), (height, width) = self.sizes[level], shape
-        y = (np.arange(height) + 0.5) / height * (rows - 1)
-        x = (np.arange(width) + 0.5) / width * columns
-        top = np.minimum(y.astype(int), rows - 2)
-        left = x.astype(int) % columns
-        fy, fx = (y - top)[:, None], (x - np.floor(x))[None]
-        taps = []
-        for a in (0, 1):
-            for b in (0, 1):
-                node = np.add.outer((top + a) * columns, (left + b) % columns)
-                weight = (fy if a else 1 - fy) * (fx if b else 1 - fx)
+        down, across = splines((rows, columns), shape)
+        tall, wide = min(3, rows), min(3, columns)
+        y = np.round((np.arange(height) + 0.5) / height * (rows - 1)).astype(int)
+        x = np.round((np.arange(width) + 0.5) / width * columns).astype(int)
+        first, left = np.clip(y - 1, 0, rows - tall), x - 1
+        poles, taps = [row % rows for row in self.poles], []
+        for a in range(tall):
+            for b in range(wide):
+                row, column = first + a, (left + b) % columns
+                at_pole = np.isin(row, poles)[:, None]
+                node = row[:, None] * columns + np.where(at_pole, 0, column)
+                weight = down[np.arange(height), row][:, None] * across[np.arange(width), column]
                 taps.append((node.ravel(), weight.ravel()))
         return taps
 
@@ -127,9 +147,14 @@ class GridGain:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
         found = []
         for size in self.sizes:
-            down, across = tents(size, shape)
-            across = np.kron(across.T, np.eye(3))  # three channels, one apart from the other
-            found.append([tensor(m) for m in (down, across)])
+            down, across = splines(size, shape)
+            at_pole = np.zeros_like(down)
+            at_pole[:, self.poles], down[:, self.poles] = down[:, self.poles], 0
+            around = np.zeros_like(across)
+            around[:, 0] = 1
+            channels = np.eye(3)  # one apart from the other
+            wide = [np.kron(m.T, channels) for m in (across, around)]
+            found.append([tensor(m) for m in (down, wide[0], at_pole, wide[1])])
         return found
 
     def evaluate(self, params: dict, prepared) -> mi.Color3f:
@@ -138,8 +163,10 @@ class GridGain:
         Products of matrices and not gathers, whose adjoint adds in the order in which threads come.
         """
         g = 0
-        for level, (down, across) in enumerate(prepared):
+        for level, (down, across, at_pole, around) in enumerate(prepared):
             rows, columns = self.sizes[level]
             nodes = dr.reshape(params[f"gain.{level}"], (rows, 3 * columns))
             g = g + dr.matmul(dr.matmul(down, nodes), across)
+            if self.poles:
+                g = g + dr.matmul(dr.matmul(at_pole, nodes), around)
         return dr.clip(dr.unravel(mi.Color3f, g.array), -MOST, MOST)

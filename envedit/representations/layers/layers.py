@@ -120,7 +120,7 @@ class Layers:
             told = self.separation.background, self.separation.glow, self._away()
             self.behind = behind_glow(*told, self.rows)
         self.below = self._below(low) if low is not None and len(low) else None
-        self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1])
+        self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1], self.rows[0] == 0)
         self.scales = SCALES | self.gain.scales()
         self._prepared = {}
         n = self.lights.count

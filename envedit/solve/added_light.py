@@ -46,7 +46,11 @@ def best(
         model = _Model(problem, normal)
     except np.linalg.LinAlgError:
         return None
-    i, flux = dark[0], layers.lights.flux[dark[0]]
+    i, flux = dark[0], np.float64(layers.lights.flux[dark[0]])
+    scale = flux.max()
+    if not scale > 0:
+        return None
+    flux = flux / scale  # of any strength, in single precision
     _, directions = problem.blocks.sky
     strength, fall = model.of_cells(flux)
     found = int(np.argmax(fall))
@@ -63,7 +67,7 @@ def best(
         first = problem.rows.start
         rows = np.unique(np.clip(row + steps, first, first + layers.shape[0] - 1))
         texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
-        unit = flux / omega[texels // width][:, None]
+        unit = np.float32(flux / omega[texels // width][:, None])
         strengths, falls = model.of_pixels(transport.probe(texels) * unit[:, None, :])
         found = int(np.argmax(falls))
         if not falls[found] > 0:
@@ -73,7 +77,7 @@ def best(
         direction = latlong.directions(height, width)[row, column]
     state = {name: value.copy() for name, value in point.state.items()}
     state["turn"][i] = rotation_vector(layers.lights.centres[i], direction)
-    state["flux"][i], state["size"][i] = np.log(strength), 0.0
+    state["flux"][i], state["size"][i] = np.log(strength) - np.log(scale), 0.0
     return state, float(fall)
 
 

@@ -14,8 +14,8 @@ from envedit.core import latlong
 from envedit.core.errors import EnveditError, InputError
 from envedit.images import images
 from envedit.losses import metrics
+from envedit.sweep import DONE
 from experiments.painted_edits.run import layers
-from experiments.sweep.process import DONE
 
 from .plan import Cell
 

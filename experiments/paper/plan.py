@@ -18,8 +18,8 @@ from envedit.config import presets
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene
+from envedit.sweep import Job, job
 from experiments import puresky
-from experiments.sweep import Job, job
 
 from . import skies
 from .kinds import KINDS

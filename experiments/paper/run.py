@@ -5,7 +5,7 @@ r"""Carry out a table or figure of the paper: every run of it that is missing.
         [--angle 60] [--workers N] [--scheduler ADDRESS] [--set table.key=value ...] [--out runs/paper]
 
 It only computes; ``python -m experiments.paper.plot NAME`` draws and prints what is done, at any time.
-Runs are found again by their content (``python -m experiments.sweep --help``): what is done is skipped, what
+Runs are found again by their content (``envedit sweep --help``): what is done is skipped, what
 was interrupted continues, and tables share the runs they have in common.
 """
 
@@ -15,7 +15,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from experiments.sweep import COMMAND, Outcome, options, sweep, table
+from envedit.cli import sweep as options
+from envedit.sweep import COMMAND, Outcome, sweep, table
 
 from . import kinds, network, plan
 
@@ -37,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--target", default="", metavar="MAP", help="figure8: the true map")
     made.add_argument("--edit", default="", help="figure9: an edit of scenes/edits (move_shadow)")
     made.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
-    options.add(made)
+    options.add_options(made)
     made.add_argument("--out", type=Path, default=OUT)
     made.add_argument(
         "--dry-run", action="store_true", help="list the runs and what is done; compute nothing"
@@ -51,7 +52,7 @@ def carry_out(given: argparse.Namespace) -> list[Outcome]:
     Raises
     ------
     ConfigError, InputError
-        As :func:`plan.build` and :func:`experiments.sweep.sweep`.
+        As :func:`plan.build` and :func:`envedit.sweep.sweep`.
     """
     question = plan.Question(given.scene, given.angle, given.target, given.edit, tuple(given.sets))
     question = plan.resolved(given.name, question, given.maps, given.only)
@@ -77,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0, 1 if a run is not done, 2, 3 as envedit.run, 130."""
     asked = parser()
     given = asked.parse_args(argv)
-    options.check(asked, given)
+    options.check_options(asked, given)
 
     def tell():
         outcomes = carry_out(given)

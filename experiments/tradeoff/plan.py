@@ -11,7 +11,7 @@ import numpy as np
 
 from envedit.config.presets import overlaid
 from envedit.core.errors import InputError
-from experiments.sweep import Job, job
+from envedit.sweep import Job, job
 
 MAPS = ("overcast_soil", "wasteland_clouds", "kloofendal_48d_partly_cloudy")
 """Overcast, in between, and sunny: peaks of 4.5, 309 and 8,963 at 256 texels across."""

@@ -18,9 +18,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from envedit.cli import sweep as options
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import EnveditError, InputError
-from experiments.sweep import Job, options, sweep
+from envedit.sweep import Job, sweep
 
 from . import plan
 from .analyse import disturbed, flat, ratios
@@ -68,7 +69,7 @@ def carry_out(given, command: Sequence[str] = COMMAND) -> int:
     Raises
     ------
     ConfigError, InputError
-        As :func:`experiments.sweep.sweep`; also if a map is missing.
+        As :func:`envedit.sweep.sweep`; also if a map is missing.
     """
     out = given.out.absolute()
     wanted = [(cell, setting, plan.job_of(cell, setting)) for cell, setting in pairs(given)]

@@ -18,7 +18,7 @@ from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.images import images
 from envedit.losses import metrics
-from experiments.sweep import drive
+from envedit.sweep import drive
 from experiments.tradeoff import analyse, levels, measured, plan, plot, run
 from experiments.tradeoff.judge import Judge, loss_noise, without_noise
 

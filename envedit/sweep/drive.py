@@ -1,4 +1,4 @@
-"""All jobs: given to processes or to a cluster, looked after until the last, and summed up."""
+"""All jobs: submitted, awaited, and summed up."""
 
 from __future__ import annotations
 
@@ -6,22 +6,20 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import logging
-import queue
 import re
-import sys
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import ConfigError, EnveditError, InputError
+from envedit.core.errors import ConfigError, InputError
 
 from .board import Board
 from .jobs import Job
-from .process import COMMAND, DONE, LONGEST, POLL, Outcome, cores, run_job
+from .process import COMMAND, DONE, GRACE, LONGEST, POLL, STOPPED, Outcome, cores, run_job
 
 CORES_A_JOB = 4
 """A run is parallel kernels with serial stretches between: two jobs on eight cores beat one."""
@@ -31,87 +29,98 @@ CONNECT = 10.0
 """Seconds in which a scheduler must answer at first."""
 
 
-class Processes:
-    """Run jobs in threads of this process, a child process each; the cores are divided among them."""
+class _OneByOne:
+    """Jobs of this machine, one at a time; needs no Dask."""
 
-    def __init__(self, run: Callable[..., Outcome], workers: int, threads: int | None):
-        self.slots, self._run, self._stop = workers, run, threading.Event()
-        self._pool = concurrent.futures.ThreadPoolExecutor(workers)
-        self._shares = queue.SimpleQueue()
-        total = max(cores(), workers)
-        for i in range(workers):
-            self._shares.put(threads or (total + i) // workers)
-        self.words = f"{workers} at a time, {threads or total / workers:.3g} threads each"
+    slots = 1
+
+    def __init__(self, run: Callable[..., Outcome], threads: int | None):
+        self._stop, self._pool = uuid.uuid4().hex, concurrent.futures.ThreadPoolExecutor(1)
+        self._run = functools.partial(run, threads=threads or cores(), stop=self._stop)
+        self.description = f"1 at a time, {threads or cores()} threads"
 
     def submit(self, job: Job, waited: bool = False):
         """Return a future of an outcome."""
-        return self._pool.submit(self._one, job, waited)
-
-    def _one(self, job, waited):
-        share = self._shares.get()
-        try:
-            return self._run(job, threads=share, stop=self._stop, waited=waited)
-        finally:
-            self._shares.put(share)
-
-    def outcome(self, job: Job, future) -> Outcome:
-        """Return what became of a job whose future is done."""
-        try:
-            return future.result()
-        except (OSError, EnveditError) as error:  # a disk that is full, a folder of somebody else
-            return _broken(job, error)
+        return self._pool.submit(self._run, job, waited=waited)
 
     def close(self) -> None:
-        """Interrupt what runs, and wait until it has written its checkpoints."""
-        self._stop.set()
+        """Interrupt what runs, and wait until it has written its checkpoint."""
+        STOPPED.add(self._stop)
         self._pool.shutdown(cancel_futures=True)
+        STOPPED.discard(self._stop)
 
 
-class Cluster:
-    """Run jobs as tasks of a Dask cluster."""
+class _Dask:
+    """Jobs as tasks of Dask: of a cluster in this process, or of the scheduler at an address."""
 
-    slots = None  # workers come and go
-
-    def __init__(self, run: Callable[..., Outcome], address: str, threads: int | None):
+    def __init__(self, run: Callable[..., Outcome], workers: int, address: str | None, threads: int | None):
+        asked = f"--scheduler {address}" if address else f"--workers {workers}"
         try:
-            from distributed import Client
+            from distributed import Client, LocalCluster
         except ImportError:
             missing = "dask.distributed is missing: pip install 'envedit[cluster]'"
-            raise ConfigError(f"--scheduler {address}: {missing}") from None
-        if not re.fullmatch(r"((tcp|tls|wss?|ucx)://)?[^\s/]+:\d+", address):
-            raise ConfigError(f"--scheduler {address}: wanted HOST:PORT or tcp://HOST:PORT")
-        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # its tracebacks when it is gone
-        try:
-            self._client = Client(address, timeout=CONNECT, set_as_default=False)
-            jobs = sum(self._client.nthreads().values())
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"--scheduler {address}: no scheduler there ({error})") from None
-        self._run, self._threads = run, threads
-        self.words = f"{jobs} at a time on {address}" if jobs else f"waiting for workers of {address}"
+            raise ConfigError(f"{asked}: {missing}") from None
+        # Its tracebacks when a scheduler is gone.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+        self._submitted, self._stop, self._cluster = [], uuid.uuid4().hex, None
+        self.slots = None if address else workers  # a cluster's workers come and go
+        if address is None:
+            threads = threads or max(1, cores() // workers)
+            self.description = f"{workers} at a time, {threads} threads each"
+            # Threads of this process, each of which waits for the process of a job.
+            shape = {"n_workers": 1, "threads_per_worker": workers, "processes": False}
+            shape |= dict.fromkeys(("dashboard_address", "worker_dashboard_address"), "127.0.0.1:0")
+            shape |= {"scheduler_kwargs": {"dashboard": False}}
+            self._cluster = LocalCluster(**shape, silence_logs=logging.CRITICAL)
+            self._client = Client(self._cluster, set_as_default=False)
+        else:
+            if not re.fullmatch(r"((tcp|tls|wss?|ucx)://)?[^\s/]+:\d+", address):
+                raise ConfigError(f"{asked}: got {address}, expected HOST:PORT or tcp://HOST:PORT")
+            try:
+                self._client = Client(address, timeout=CONNECT, set_as_default=False)
+                jobs = sum(self._client.nthreads().values())
+            except (OSError, ValueError) as error:
+                raise ConfigError(f"{asked}: no scheduler there ({error})") from None
+            self.description = f"{jobs} at a time on {address}" if jobs else f"no workers at {address} yet"
+        self._run = functools.partial(run, threads=threads, stop=self._stop)
 
     def submit(self, job: Job, waited: bool = False):
         """Return a future of an outcome."""
-        # A key of its own for every try: the scheduler is to remember none.
-        key, with_ = f"{job.key}-{uuid.uuid4().hex}", {"threads": self._threads, "waited": waited}
-        return self._client.submit(self._run, job, **with_, key=key, pure=False, retries=2)
-
-    def outcome(self, job: Job, future) -> Outcome:
-        """Return what became of a job whose future is done."""
-        if future.status == "cancelled":
-            return Outcome(job, "lost", error="the scheduler went away")
-        try:
-            return future.result()
-        except Exception as error:  # whatever a task raises, or the death of its workers
-            return _broken(job, error)
+        # A key of its own for every try: the scheduler remembers results by their keys.
+        key = f"{job.key}-{uuid.uuid4().hex}"
+        how = {"key": key, "pure": False, "retries": 2}
+        how["priority"] = -len(self._submitted)  # in the order of the jobs, which Dask does not keep itself
+        future = self._client.submit(self._run, job, waited=waited, **how)
+        self._submitted.append(future)
+        return future
 
     def close(self) -> None:
-        """Give back what has not begun; what runs on a worker runs to its end."""
+        """Give back what has not begun.
+
+        What runs in this process is interrupted, and awaited until it has written its checkpoint; what runs on
+        the workers of another machine runs to its end.
+        """
         with contextlib.suppress(Exception):  # a scheduler that is gone
+            if self._cluster is not None:
+                STOPPED.add(self._stop)
+                until = time.monotonic() + GRACE + POLL
+                while not all(future.done() for future in self._submitted) and time.monotonic() < until:
+                    time.sleep(POLL)
             self._client.close(timeout=2)
+        if self._cluster is not None:
+            self._cluster.close()
+            STOPPED.discard(self._stop)
 
 
-def _broken(job, error):
-    return Outcome(job, "failed", error=" ".join(f"{type(error).__name__}: {error}".split())[:LONGEST])
+def _outcome(job, future):
+    """Return what became of a job whose future is done."""
+    if getattr(future, "status", "") == "cancelled":
+        return Outcome(job, "lost", error="the scheduler went away")
+    try:
+        return future.result()
+    except Exception as error:  # a full disk, a folder of somebody else, the death of workers
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        return Outcome(job, "failed", error=words[:LONGEST])
 
 
 def sweep(
@@ -121,10 +130,9 @@ def sweep(
     scheduler: str | None = None,
     threads: int | None = None,
     command: Sequence[str] = COMMAND,
-    quiet: bool = False,
     stream=None,
 ) -> list[Outcome]:
-    """Carry out all jobs that are not done, and tell how far it has come.
+    """Carry out all jobs that are not done, and report the progress.
 
     .. code-block:: python
 
@@ -142,17 +150,16 @@ def sweep(
     out : path
         Folder of the jobs' folders; ``sweep.tsv`` in it lists names, states, seconds, folders and errors.
     workers : int, optional
-        Jobs at a time on this machine; None: one for every four cores.
+        Jobs at a time on this machine; None: one for every four cores, or one where Dask is missing. Several
+        need Dask.
     scheduler : str, optional
         Address of a Dask scheduler; ``workers`` does not count then.
     threads : int, optional
         Threads of a job; None: the cores divided by the jobs at a time.
     command : sequence of str
         What carries out a job, as :data:`COMMAND`.
-    quiet : bool
-        Tell nothing.
     stream : file, optional
-        Where to; stderr. A bar if it is a terminal.
+        Where the progress is written, as a bar if it is a terminal; None: nowhere.
 
     Returns
     -------
@@ -162,7 +169,7 @@ def sweep(
     Raises
     ------
     ConfigError, InputError
-        Two jobs of one name; no scheduler; a folder that cannot be used.
+        Two jobs of one name; no Dask; no scheduler; a folder that cannot be used.
     KeyboardInterrupt
         After the running jobs have had time for their checkpoints.
     """
@@ -181,10 +188,15 @@ def sweep(
     todo = [job for job in jobs if distinct[job.key] is job and job.key not in found]
     if todo:
         run = functools.partial(run_job, out=out, command=tuple(command))
-        workers = min(workers or max(1, cores() // CORES_A_JOB), len(todo))
-        engine = Cluster(run, scheduler, threads) if scheduler else Processes(run, workers, threads)
-        board = Board(len(todo), engine.slots, quiet, stream or sys.stderr)
-        board.begin(f"{len(distinct)} jobs, {len(found)} done before, {len(todo)} to run: {engine.words}")
+        if workers is None:
+            workers = max(1, cores() // CORES_A_JOB) if importlib.util.find_spec("distributed") else 1
+        workers = min(workers, len(todo))
+        alone = workers == 1 and scheduler is None
+        engine = _OneByOne(run, threads) if alone else _Dask(run, workers, scheduler, threads)
+        board = Board(len(todo), engine.slots, stream)
+        board.begin(
+            f"{len(distinct)} jobs, {len(found)} done before, {len(todo)} to run: {engine.description}"
+        )
         try:
             for outcome in _drive(todo, engine, board):
                 found[outcome.job.key] = outcome
@@ -203,7 +215,7 @@ def _drive(todo, engine, board):
     while running or held:
         for future in [future for future in running if future.done()]:
             job = running.pop(future)
-            outcome = engine.outcome(job, future)
+            outcome = _outcome(job, future)
             if outcome.state == "held":
                 board.once(f"{job.name}: waiting, {outcome.error} is at it")
                 held.append((time.monotonic() + AGAIN, job))

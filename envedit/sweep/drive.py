@@ -97,8 +97,8 @@ class _Dask:
     def close(self) -> None:
         """Give back what has not begun.
 
-        What runs in this process is interrupted, and awaited until it has written its checkpoint; what runs on
-        the workers of another machine runs to its end.
+        What runs in this process is interrupted, and awaited until it has written its checkpoint; what runs
+        on the workers of a scheduler runs to its end.
         """
         with contextlib.suppress(Exception):  # a scheduler that is gone
             if self._cluster is not None:

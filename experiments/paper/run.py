@@ -70,7 +70,9 @@ def carry_out(given: argparse.Namespace) -> list[Outcome]:
     for store in dict.fromkeys(cell.store for cell, _ in made):
         jobs = [job for cell, job in made if cell.store == store]
         call = COMMAND if store == "edits" else network.command(store)
-        outcomes += sweep(jobs, given.out / store, given.workers, given.scheduler, given.threads, call)
+        outcomes += sweep(
+            jobs, given.out / store, given.workers, given.scheduler, given.threads, call, sys.stderr
+        )
     return outcomes
 
 

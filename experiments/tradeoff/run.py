@@ -99,7 +99,9 @@ def carry_out(given, command: Sequence[str] = COMMAND) -> int:
     ]
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(kept, (json.dumps(told, indent=1) + "\n").encode())
-    ended = sweep([job for *_, job in work], out, given.workers, command=(*command, session))
+    ended = sweep(
+        [job for *_, job in work], out, given.workers, command=(*command, session), stream=sys.stderr
+    )
     return sum(one.state not in ("done", "skipped") for one in ended)
 
 

@@ -327,7 +327,7 @@ def test_what_is_done_is_skipped_and_failures_are_told(maps, tmp_path, monkeypat
 def test_every_kind_of_run_has_its_own_command_and_folder(maps, tmp_path, monkeypatch):
     asked = []
 
-    def sweep(jobs, out, workers, scheduler, threads, command):
+    def sweep(jobs, out, workers, scheduler, threads, command, stream):
         asked.append(([job.name.split(": ")[1] for job in jobs], out.name, command))
         assert (workers, scheduler, threads) == (2, None, 3)
         return []

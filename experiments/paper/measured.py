@@ -15,7 +15,7 @@ from envedit.core.errors import EnveditError, InputError
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.sweep import DONE
-from experiments.painted_edits.run import layers
+from experiments.harness import layer
 
 from .plan import Cell
 
@@ -76,7 +76,7 @@ def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:
         return {name: images.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")}
     first, last = numbers(out, cell)["active_rows"]
     rows = slice(first, last + 1)
-    edited, original = layers(folder)
+    edited, original = images.read(str(folder / "edited.exr"))[0], layer(folder, "initial")
     true = _true_map(folder, original)
     found = {"initial_map": original[rows], "true_map": None if true is None else true[rows]}
     found["map"] = edited[rows]

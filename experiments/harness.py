@@ -167,18 +167,26 @@ class Experiment:
         Case -> name of the sheet, without ending.
     options : callable
         Adds the experiment's own options to the parser.
+    tabulate, draw : callable, optional
+        In place of columns and panels: (all cases with their jobs, folder of the runs, command line) ->
+        Markdown, or, with the folder of the sheets before the command line, -> files.
+    file : callable
+        Command line -> name of the table's file, without ending.
     """
 
     name: str
     description: str
     cases: Callable[[argparse.Namespace], list[Case]]
-    measure: Callable[[Done], dict]
-    columns: dict[str, str | Callable[[dict], str]]
+    measure: Callable[[Done], dict] = lambda done: done.metrics
+    columns: dict[str, str | Callable[[dict], str]] = field(default_factory=dict)
     group: Callable[[dict], str] = lambda row: ""
     summary: Callable[[list[dict]], str] | None = None
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
     sheet: Callable[[Case], str] = lambda case: "sheet"
     options: Callable[[argparse.ArgumentParser], None] = lambda parser: None
+    tabulate: Callable[[list, Path, argparse.Namespace], str] | None = None
+    draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
+    file: Callable[[argparse.Namespace], str] = lambda given: "table"
 
 
 def overridden(tables: dict, overrides: Iterable[str]) -> dict:
@@ -351,9 +359,11 @@ def _act(experiment, given):
             print(sweep.table(missing), file=sys.stderr)
     done, to = done_of(cases, out), make(given.to or out)
     if given.action == "sheet":
-        print("\n".join(map(str, sheets(experiment, done, to))))
+        draw = experiment.draw
+        print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
     else:
-        text = table(experiment, done)
-        write_atomically(to / "table.md", f"{text}\n".encode())
+        tabulate = experiment.tabulate
+        text = tabulate(cases, out, given) if tabulate else table(experiment, done)
+        write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
         print(text)
     return 1 if missing else 0

@@ -36,7 +36,7 @@ def numbers(out, cell: Cell) -> dict | None:
     folder = cell.folder(out)
     if not (folder / DONE).exists():
         return None
-    path = folder / ("metrics.json" if cell.store == "edits" else "fit.json")
+    path = folder / ("fit.json" if cell.fitted else "metrics.json")
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
@@ -51,7 +51,7 @@ def seconds(out, cells: list[Cell]) -> dict[Cell, tuple[float | None, float]]:
     """
     found = {}
     for cell in done(out, cells):
-        if cell.store != "edits":
+        if cell.fitted:
             continue
         read, ended = numbers(out, cell), json.loads((cell.folder(out) / DONE).read_bytes())
         timing, about = read["timing"], read["fit"]
@@ -72,7 +72,7 @@ def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:
     folder = cell.folder(out)
     if not (folder / DONE).exists():
         return {}
-    if cell.store != "edits":
+    if cell.fitted:
         return {name: images.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")}
     first, last = numbers(out, cell)["active_rows"]
     rows = slice(first, last + 1)

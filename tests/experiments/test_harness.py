@@ -129,4 +129,4 @@ def test_the_same_options_everywhere():
     assert json.dumps(sorted(vars(given))) == json.dumps(
         ["dry_run", "only", "out", "scheduler", "sets", "threads", "workers"]
     )
-    assert sweep.COMMAND == Case("x", {}).command
+    assert Case("x", {}).command == sweep.COMMAND

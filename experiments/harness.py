@@ -75,7 +75,8 @@ class Case:
 
     def job(self, overrides: Iterable[str] = ()) -> sweep.Job:
         """Return its job under overrides ``table.key=value``."""
-        return sweep.job(self.name, overridden(self.tables, overrides), version=self.version)
+        how = {"version": self.version, "command": self.command}
+        return sweep.job(self.name, overridden(self.tables, overrides), **how)
 
 
 @dataclass(frozen=True)
@@ -222,12 +223,8 @@ def carry_out(cases, out: Path, given, stream=None) -> list[sweep.Outcome]:
     if given.dry_run:
         states = ["done" if (job.folder(out) / sweep.DONE).exists() else "missing" for _, job in cases]
         return [sweep.Outcome(job, state) for (_, job), state in zip(cases, states, strict=True)]
-    outcomes = []
-    for command in dict.fromkeys(tuple(case.command) for case, _ in cases):
-        jobs = [job for case, job in cases if tuple(case.command) == command]
-        where = given.workers, given.scheduler, given.threads, command, stream
-        outcomes += sweep.sweep(jobs, out, *where)
-    return outcomes
+    jobs = [job for _, job in cases]
+    return sweep.sweep(jobs, out, given.workers, given.scheduler, given.threads, stream=stream)
 
 
 # ---- tables and sheets -------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from envedit.core.errors import EnveditError, unwrapped
 
 
 @steady
-def main(argv: list[str] | None = None, command: Sequence[str] = sweeps.COMMAND) -> int:
+def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
     """Carry out jobs; returns the exit code: 0, 1 if a job is not done, 2, 3 as ``envedit run``, 130."""
     parser = argparse.ArgumentParser(
         prog="envedit sweep",

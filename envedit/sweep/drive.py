@@ -19,7 +19,7 @@ from envedit.core.errors import ConfigError, InputError
 
 from .board import Board
 from .jobs import Job
-from .process import COMMAND, DONE, GRACE, LONGEST, POLL, STOPPED, Outcome, cores, run_job
+from .process import DONE, GRACE, LONGEST, POLL, STOPPED, Outcome, cores, run_job
 
 CORES_A_JOB = 4
 """A run is parallel kernels with serial stretches between: two jobs on eight cores beat one."""
@@ -129,7 +129,7 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     threads: int | None = None,
-    command: Sequence[str] = COMMAND,
+    command: Sequence[str] = (),
     stream=None,
 ) -> list[Outcome]:
     """Carry out all jobs that are not done, and report the progress.
@@ -157,7 +157,7 @@ def sweep(
     threads : int, optional
         Threads of a job; None: the cores divided by the jobs at a time.
     command : sequence of str
-        What carries out a job, as :data:`COMMAND`.
+        What carries out every job, as :data:`.process.COMMAND`; empty: what each job says.
     stream : file, optional
         Where the progress is written, as a bar if it is a terminal; None: nowhere.
 

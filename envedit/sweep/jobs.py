@@ -10,6 +10,7 @@ import json
 import os
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,12 +34,15 @@ class Job:
         32 hexadecimal digits of the SHA-256 of the configuration, of the files it names and of the program.
     program : str
         :func:`program` where the job was made.
+    command : tuple of str
+        What carries it out, as :data:`.process.COMMAND`; empty: that.
     """
 
     name: str
     toml: str
     key: str
     program: str
+    command: tuple[str, ...] = ()
 
     def folder(self, out) -> Path:
         """Return the job's folder under ``out``."""
@@ -54,7 +58,7 @@ def program() -> str:
     return f"{envedit.__version__}+{found.hexdigest()[:12]}"
 
 
-def job(name: str, toml: str | dict, base=".", version: str = "") -> Job:
+def job(name: str, toml: str | dict, base=".", version: str = "", command: Sequence[str] = ()) -> Job:
     """Make a job of a configuration.
 
     Parameters
@@ -66,7 +70,9 @@ def job(name: str, toml: str | dict, base=".", version: str = "") -> Job:
     base : path
         Folder that relative paths start from.
     version : str
-        Whatever else decides what comes out, such as the code of a command other than ``envedit run``.
+        Whatever else decides what comes out, such as the code of ``command``.
+    command : sequence of str
+        What carries it out in place of ``envedit run``; no part of the key.
 
     Raises
     ------
@@ -96,7 +102,7 @@ def job(name: str, toml: str | dict, base=".", version: str = "") -> Job:
     content["scene"] |= {"file": _scene_digest(scene.file), "parameters": given | files}
     content["program"] = [program(), version]
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
-    return Job(name, config.to_toml(settings), key, program())
+    return Job(name, config.to_toml(settings), key, program(), tuple(command))
 
 
 def read_jobs(path) -> list[Job]:

@@ -92,7 +92,7 @@ def cores() -> int:
 def run_job(
     job: Job,
     out,
-    command: Sequence[str] = COMMAND,
+    command: Sequence[str] = (),
     threads: int | None = None,
     stop: str = "",
     waited: bool = False,
@@ -106,8 +106,9 @@ def run_job(
     out : path
         Folder of all jobs.
     command : sequence of str
-        What to call, as :data:`COMMAND`. Exit code 0: done. 3 with a line that says so, after it was started
-        with a checkpoint: that is damaged or belongs to something else, and is removed for a second try.
+        What to call in place of the job's own command, as :data:`COMMAND`. Exit code 0: done. 3 with a line
+        that says so, after it was started with a checkpoint: that is damaged or belongs to something else,
+        and is removed for a second try.
     threads : int, optional
         Threads of the job; None: the cores of this machine over the jobs at a time of this Dask worker.
     stop : str
@@ -141,6 +142,7 @@ def run_job(
         if waited and (folder / FAILED).exists():
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 return Outcome(job, "failed", error=json.loads((folder / FAILED).read_bytes())["error"])
+        command = command or job.command or COMMAND
         return _run(job, folder, command, threads or max(1, cores() // _jobs_at_a_time()), stop, lock)
 
 

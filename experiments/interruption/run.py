@@ -13,6 +13,7 @@ if a trial fails.
 
 import argparse
 import csv
+import hashlib
 import json
 import os
 import re
@@ -28,7 +29,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from experiments import trials
+from envedit.sweep import program
+from experiments.harness import markdown
 
 ROOT = Path(__file__).parents[2]
 KINDS = ("layers", "siren", "pixels", "log-pixels")
@@ -233,7 +235,7 @@ def table(rows: list[dict]) -> str:
     """Return the table of all trials, in Markdown."""
     head = ["trial", "representation", "renderer", "killed after", "while", "checkpoint of step",
             "files / temporary / half", "result"]  # fmt: skip
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for number, row in enumerate(rows):
         kills = row["kills"]
         lines.append([
@@ -244,7 +246,7 @@ def table(rows: list[dict]) -> str:
             ", ".join(f"{k.get('files', 0)} / {k.get('temporary', 0)} / {len(k['half'])}" for k in kills),
             "the same bytes" if row["good"] else "DIFFERS: " + ", ".join(row["differs"] or ["half files"]),
         ])  # fmt: skip
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown(head, lines)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -260,7 +262,8 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     chosen = parser.parse_args(argv)
-    base = trials.folder(chosen.out.absolute(), chosen.overrides)
+    asked = "\n".join([program(), *chosen.overrides])  # results of another version are not of this table
+    base = chosen.out.absolute() / hashlib.sha256(asked.encode()).hexdigest()[:16]
     base.mkdir(parents=True, exist_ok=True)
     rows = []
     for number in tqdm(range(chosen.kills), unit="trial"):

@@ -42,7 +42,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(workers=1)
 
 
-def _folder(given):
+def folder_of_maps(given) -> Path:
+    """Return the folder of ``--maps``, or of ENVEDIT_DATA."""
     if given.maps is None and not (root := os.environ.get("ENVEDIT_DATA")):
         raise InputError("no maps: name their folder with --maps, or set ENVEDIT_DATA")
     return given.maps or Path(root) / "puresky"
@@ -50,7 +51,7 @@ def _folder(given):
 
 def pairs(given) -> list[tuple[Cell, Setting]]:
     """List all cells and settings that are asked for, but for the standard preset's own runs."""
-    cells = plan.cells(_folder(given))
+    cells = plan.cells(folder_of_maps(given))
     if given.quick:  # one with a sun, one without, and each scene once
         cells = [c for c in cells if (c.map, c.scene) in ((plan.MAPS[0], "matte"), (plan.MAPS[-1], "glossy"))]
     joint = (JOINT_QUICK if given.quick else JOINT) if given.joint is None else given.joint

@@ -112,7 +112,7 @@ def test_every_experiment_makes_its_cases(tmp_path, monkeypatch, capsys):
     ):  # fmt: skip
         (tmp_path / "puresky" / f"{name}_puresky_1k.hdr").write_text(name)
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
-    counts = {"first_edit": 12, "layers": 40, "natural": 330, "painted_edits": 18, "views": 18}
+    counts = {"first_edit": 12, "layers": 40, "levels": 24, "natural": 330, "painted_edits": 18, "views": 18}
     for name, count in counts.items():
         asked = [name, "run", "--dry-run", "--out", str(tmp_path / "out" / name)]
         assert command.main(asked) == 0

@@ -21,7 +21,8 @@ from envedit.losses import metrics
 from envedit.sweep import drive
 from experiments import harness
 from experiments.__main__ import main
-from experiments.tradeoff import analyse, experiment, levels, measured, plan, plot
+from experiments.levels import experiment as levels
+from experiments.tradeoff import analyse, experiment, measured, plan, plot
 from experiments.tradeoff.judge import Judge, loss_noise, without_noise
 
 # ---- what is run -------------------------------------------------------------------------------------------
@@ -643,7 +644,7 @@ def test_without_the_standard_preset_nothing_is_drawn(tmp_path):
 @pytest.mark.parametrize("level", budget.LEVELS, ids=lambda level: level.name)
 def test_a_level_of_the_budget_is_run_as_it_says(level, tmp_path):
     cell = plan.Cell("sky", "glossy", tmp_path / "sky.hdr")
-    found = config.from_dict(levels.settings_of(cell, level), tmp_path)
+    found = config.from_dict(levels.tables_of(cell, level), tmp_path)
     assert (found.input.width, found.scene.width) == (level.map, level.film)
     assert (found.optimizer.iterations, found.target.spp, found.output.spp) == (
         level.iterations, level.spp, level.spp,

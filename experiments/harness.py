@@ -22,6 +22,7 @@ interrupted continues, and results of another configuration or version are never
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -308,6 +309,12 @@ def make(folder: Path) -> Path:
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder") from None
     return folder
+
+
+def own_folder(out: Path, *asked: str) -> Path:
+    """Make the folder in ``out`` that belongs to what was asked and to this version of the program."""
+    said = "\n".join([sweep.program(), *asked])
+    return make(out.absolute() / hashlib.sha256(said.encode()).hexdigest()[:16])
 
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:

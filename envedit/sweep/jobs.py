@@ -51,9 +51,9 @@ class Job:
 
 @functools.cache
 def program() -> str:
-    """Return the version of envedit and 12 digits of its sources' SHA-256: ``1.0.0+0123456789ab``."""
+    """Return the version of envedit and 12 digits of its files' SHA-256: ``1.0.0+0123456789ab``."""
     package, found = Path(envedit.__file__).parent, hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted(path for path in package.rglob("*.*") if path.is_file() and path.suffix != ".pyc"):
         found.update(f"{path.relative_to(package).as_posix()}\0{_digest(path)}\n".encode())
     return f"{envedit.__version__}+{found.hexdigest()[:12]}"
 

@@ -13,7 +13,6 @@ if a trial fails.
 
 import argparse
 import csv
-import hashlib
 import json
 import os
 import re
@@ -29,8 +28,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from envedit.sweep import program
-from experiments.harness import markdown
+from experiments.harness import markdown, own_folder
 
 ROOT = Path(__file__).parents[2]
 KINDS = ("layers", "siren", "pixels", "log-pixels")
@@ -262,9 +260,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     chosen = parser.parse_args(argv)
-    asked = "\n".join([program(), *chosen.overrides])  # results of another version are not of this table
-    base = chosen.out.absolute() / hashlib.sha256(asked.encode()).hexdigest()[:16]
-    base.mkdir(parents=True, exist_ok=True)
+    base = own_folder(chosen.out, *chosen.overrides)
     rows = []
     for number in tqdm(range(chosen.kills), unit="trial"):
         kind = chosen.kinds[number % len(chosen.kinds)]

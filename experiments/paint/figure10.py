@@ -17,7 +17,7 @@ import numpy as np
 from envedit import config
 from envedit.core.color import tonemap
 from envedit.images import images
-from experiments.harness import layer
+from experiments.harness import layer, own_folder
 from experiments.paint import browser
 from experiments.painted_edits.experiment import EDITS, FOLDER, file_of
 
@@ -155,7 +155,7 @@ def main(arguments, folder):
         raise SystemExit(f"{arguments.map}: ENVEDIT_DATA has no puresky/{arguments.map}_puresky_1k.hdr")
     lines = ["| edit | strokes | in the page, s | saving, s | of the paint | reachable | change elsewhere |",
              "|---" * 7 + "|"]  # fmt: skip
-    listed, rows = [], []
+    listed, rows, folder = [], [], own_folder(folder, arguments.map)
     for edit in arguments.edits:
         done = folder / edit / "figure10.json"
         if not done.exists():

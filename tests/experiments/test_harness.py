@@ -94,6 +94,13 @@ def test_an_override_beats_the_case_and_a_target_file_its_turn():
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
 
 
+def test_a_folder_belongs_to_what_was_asked_and_to_a_version(tmp_path, monkeypatch):
+    folders = [harness.own_folder(tmp_path, *asked) for asked in ((), ("a",), ("a", "b"))]
+    assert len(set(folders)) == 3 and all(folder.is_dir() for folder in folders)
+    monkeypatch.setattr(sweep, "program", lambda: "another")
+    assert harness.own_folder(tmp_path) not in folders
+
+
 def test_numbers_tables_and_montages():
     assert [number(v) for v in (None, float("nan"), 1.25, 0)] == ["-", "-", "1.2", "0.0"]
     assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"

@@ -40,7 +40,7 @@ from envedit.config import presets
 from envedit.core import latlong
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import tonemap
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError, EnveditError, InputError
 from envedit.images import images
 
 GAP = 3
@@ -118,7 +118,7 @@ class Done:
             return original, edited, latlong.rotate(original, asked.rotate_degrees)
         try:
             true = images.load_envmap(asked.file, original.shape[1], settings.input.repair)[0]
-        except InputError:
+        except EnveditError:  # it may have been moved since
             true = None
         return original, edited, true
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 
-from envedit import config
-from envedit.core import latlong
-from envedit.core.errors import EnveditError, InputError
+from envedit.core.errors import InputError
 from envedit.images import images
-from envedit.losses import metrics
 from envedit.sweep import DONE
-from experiments.harness import layer
+from experiments.harness import Case, Done
+from experiments.painted_edits import experiment as painted_edits
 
 from .plan import Cell
 
@@ -74,35 +70,15 @@ def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:
         return {}
     if cell.fitted:
         return {name: images.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")}
-    first, last = numbers(out, cell)["active_rows"]
-    rows = slice(first, last + 1)
-    edited, original = images.read(str(folder / "edited.exr"))[0], layer(folder, "initial")
-    true = _true_map(folder, original)
-    found = {"initial_map": original[rows], "true_map": None if true is None else true[rows]}
-    found["map"] = edited[rows]
+    done = Done(Case("", {}), folder)
+    original, edited, true = done.maps
+    found = {"initial_map": original[done.rows], "true_map": None if true is None else true[done.rows]}
+    found["map"] = edited[done.rows]
     for name, file in (("initial", "initial"), ("target", "target"), ("render", "edited")):
-        found[name] = images.read(str(folder / f"render_{file}.exr"))[0]
+        found[name] = done.picture(f"render_{file}")
     return found
 
 
-def _true_map(folder: Path, original):
-    settings = config.load(folder / "config.toml")
-    if settings.target.kind != "envmap":
-        return None
-    if not settings.target.file:
-        return latlong.rotate(original, settings.target.rotate_degrees)
-    with contextlib.suppress(EnveditError):  # it may have been moved since
-        return images.load_envmap(settings.target.file, original.shape[1], settings.input.repair)[0]
-    return None
-
-
 def of_paint(out, cell: Cell) -> dict:
-    """Measure a painted edit against its original map: ``ssim`` of the two, ``sharp`` high frequencies.
-
-    ``sharp`` is the ratio of :func:`.metrics.high_frequency_energy`, NaN where the original has none.
-    """
-    shown = pictures(out, cell)
-    edited, original = shown["map"], shown["initial_map"]
-    before = metrics.high_frequency_energy(original)
-    sharp = metrics.high_frequency_energy(edited) / before if before else math.nan
-    return {"ssim": metrics.compare(edited, original)["ssim"], "sharp": sharp}
+    """Measure a painted edit as :func:`experiments.painted_edits.experiment.measure` does."""
+    return painted_edits.measure(Done(Case("", {}), cell.folder(out)))

@@ -166,7 +166,9 @@ def timeless(path: Path, *folders: Path) -> str:
     text = path.read_text()
     for folder in folders:
         text = text.replace(str(folder), "FOLDER")
-    text = re.sub(r"<tr><td>(fit|transport) (cached|seconds)</td><td>.*?</td></tr>", "", text)
+    text = re.sub(
+        r"<tr><td>(?:(?:fit|transport) seconds|(?:fit|T) taken from disk)</td><td>.*?</td></tr>", "", text
+    )
     return re.sub(r"\d{4}-\d\d-\d\dT[\d:+]+|\b[\d.]+ m?s\b|width:[\d.]+rem", "TIME", text)
 
 

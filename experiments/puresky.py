@@ -73,7 +73,17 @@ def pick(found: dict[str, Path], names: Iterable[str], option: str = "--maps") -
 def of_script(names: Iterable[str] | None = None) -> dict[str, Path]:
     """Return the maps of ENVEDIT_DATA, all or some, or end the program with one line that says why not."""
     try:
-        found = find()
-        return pick(found, names) if names else found
+        return chosen(names)
     except EnveditError as error:
         sys.exit(f"envedit: {error}")
+
+
+def chosen(names: Iterable[str] | None = None) -> dict[str, Path]:
+    """Return the maps of ENVEDIT_DATA, all or some.
+
+    Raises
+    ------
+    ConfigError, InputError
+        As :func:`find` and :func:`pick`.
+    """
+    return pick(find(), names) if names else find()

@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, paint, fit, init, doctor, cache."""
+"""The command ``envedit``: run, paint, fit, init, sweep, doctor, cache."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ COMMANDS = {
     "paint": "paint on the rendering in the browser, while the map follows",
     "fit": "fit a SIREN to a map, without an edit",
     "init": "write a commented configuration to start from",
+    "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",
     "cache": "show or delete what is kept on disk between runs",
 }

@@ -3,12 +3,12 @@
 import math
 import statistics
 
+from experiments.harness import markdown
+
 
 def table(head: str, rows) -> str:
     """Return a Markdown table; ``head`` has its columns separated by |."""
-    columns = [cell.strip() for cell in head.split("|")]
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    return markdown([cell.strip() for cell in head.split("|")], ([str(cell) for cell in row] for row in rows))
 
 
 def si(value: float | None, unit: str = "") -> str:

@@ -17,6 +17,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from envedit.core.atomic_files import write_atomically
+from experiments.harness import markdown
 
 from . import drive
 from .readers import READERS
@@ -25,13 +26,13 @@ from .readers import READERS
 def table(tallies: dict[str, drive.Tally]) -> str:
     """Lay out the outcome of all kinds as a Markdown table."""
     head = ["what", "cases", "read whole", "refused", *drive.FAULTS, "most memory beyond the declared image"]
-    rows = [head, ["---"] * len(head)]
+    rows = []
     for what, tally in tallies.items():
         kinds = ", ".join(f"{n} {kind}" for kind, n in tally.kinds.most_common()) or "0"
         counts = [str(tally.counts[fault]) for fault in drive.FAULTS]
         beyond = f"{tally.beyond / 2**20:.1f} MiB"
         rows.append([what, str(tally.counts.total()), str(tally.counts["read"]), kinds, *counts, beyond])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown(head, rows)
 
 
 def recorded(file: Path, pieces: dict[str, tuple[range, int, drive.Tally]]) -> dict[str, drive.Tally]:

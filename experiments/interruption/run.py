@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from experiments import trials
+from experiments.harness import markdown, own_folder
 
 ROOT = Path(__file__).parents[2]
 KINDS = ("layers", "siren", "pixels", "log-pixels")
@@ -166,7 +166,9 @@ def timeless(path: Path, *folders: Path) -> str:
     text = path.read_text()
     for folder in folders:
         text = text.replace(str(folder), "FOLDER")
-    text = re.sub(r"<tr><td>(fit|transport) (cached|seconds)</td><td>.*?</td></tr>", "", text)
+    text = re.sub(
+        r"<tr><td>(?:(?:fit|transport) seconds|(?:fit|T) taken from disk)</td><td>.*?</td></tr>", "", text
+    )
     return re.sub(r"\d{4}-\d\d-\d\dT[\d:+]+|\b[\d.]+ m?s\b|width:[\d.]+rem", "TIME", text)
 
 
@@ -233,7 +235,7 @@ def table(rows: list[dict]) -> str:
     """Return the table of all trials, in Markdown."""
     head = ["trial", "representation", "renderer", "killed after", "while", "checkpoint of step",
             "files / temporary / half", "result"]  # fmt: skip
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for number, row in enumerate(rows):
         kills = row["kills"]
         lines.append([
@@ -244,7 +246,7 @@ def table(rows: list[dict]) -> str:
             ", ".join(f"{k.get('files', 0)} / {k.get('temporary', 0)} / {len(k['half'])}" for k in kills),
             "the same bytes" if row["good"] else "DIFFERS: " + ", ".join(row["differs"] or ["half files"]),
         ])  # fmt: skip
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown(head, lines)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -260,8 +262,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="table.key=value")
     chosen = parser.parse_args(argv)
-    base = trials.folder(chosen.out.absolute(), chosen.overrides)
-    base.mkdir(parents=True, exist_ok=True)
+    base = own_folder(chosen.out, *chosen.overrides)
     rows = []
     for number in tqdm(range(chosen.kills), unit="trial"):
         kind = chosen.kinds[number % len(chosen.kinds)]

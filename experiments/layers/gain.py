@@ -26,7 +26,7 @@ from envedit.solve import adam_loop, light_search
 from envedit.transport.light_transport import LightTransport
 from experiments import puresky
 
-from .run import SCENES
+from .experiment import SCENES
 
 ITERATIONS = 150
 AMPLITUDE = 6.0

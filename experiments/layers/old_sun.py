@@ -23,6 +23,7 @@ from envedit.representations.layers import behind_glow as product
 from envedit.representations.layers import below_horizon, layers, separation
 from envedit.representations.layers.lights import rotation_vector
 from experiments import puresky
+from experiments.harness import markdown
 
 TURNS = 71, 143
 """Columns of 256."""
@@ -86,7 +87,7 @@ def main():
     parser.add_argument("--to", type=Path, default=Path("experiments/layers"))
     given = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    found = {(way, held): [] for way in WAYS for held in (False, True)}
+    found = {(way, held): [] for way in WAYS for held in ("others", "held out")}
     pictures = []
     for name, file in puresky.of_script().items():
         original, _ = images.load_envmap(str(file), 256)
@@ -106,7 +107,9 @@ def main():
                     raise SystemExit(f"{name}: the light went elsewhere than the map")
                 glow = made.separation.glow @ [0.2126, 0.7152, 0.0722]
                 old = 1 - np.roll(glow, -columns, axis=1) / glow > OLD
-                found[way, name in HELD].append(measured(edited, original, true, old))
+                found[way, "held out" if name in HELD else "others"].append(
+                    measured(edited, original, true, old)
+                )
             tiles.append(edited)
         if tiles:
             centre = latlong.texel_position(made.separation.lights[0].direction, height, width)[1]
@@ -115,12 +118,13 @@ def main():
             shown = [np.roll(m, width // 2 - round(float(centre)), axis=1) for m in shown]
             cut = slice(width // 4, 3 * width // 4)
             pictures.append(np.concatenate([np.clip(m[:, cut] / white, 0, 1) ** (1 / 2.2) for m in shown], 1))
-    print("| where the sun was | maps | map, dB | log radiance, up | below | seam | high frequencies |")
-    print("|---" * 7 + "|")
-    for (way, held), rows in found.items():
-        if rows:
-            means = " | ".join(f"{v:.2f}" for v in np.mean(rows, axis=0))
-            print(f"| {way} | {'held out' if held else 'others'}, {len(rows)} | {means} |")
+    lines = [
+        [way, f"{held}, {len(rows)}", *(f"{value:.2f}" for value in np.mean(rows, axis=0))]
+        for (way, held), rows in found.items()
+        if rows
+    ]
+    head = "where the sun was", "maps", "map, dB", "log radiance, up", "below", "seam", "high frequencies"
+    print(markdown(head, lines))
     pixels = (np.concatenate(pictures) * 255 + 0.5).astype(np.uint8)
     mi.Bitmap(pixels).write(str(given.to / "old_sun.jpg"), quality=88)
     print(given.to / "old_sun.jpg")

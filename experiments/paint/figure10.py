@@ -17,8 +17,9 @@ import numpy as np
 from envedit import config
 from envedit.core.color import tonemap
 from envedit.images import images
+from experiments.harness import layer, own_folder
 from experiments.paint import browser
-from experiments.painted_edits.run import EDITS, ROOT, file_of, layers
+from experiments.painted_edits.experiment import EDITS, FOLDER, file_of
 
 CORNER_S, SETTING_S = 0.4, 1.0
 REACHED = "() => document.querySelector('[data-testid=status]').textContent.includes('is reachable')"
@@ -31,7 +32,7 @@ TITLES = dict(zip(EDITS, (
 
 def configuration(edit, envmap):
     """Return an edit of scenes/edits without its target, and its strokes."""
-    given = tomllib.loads((ROOT / "scenes/edits" / f"{edit}.toml").read_text())
+    given = tomllib.loads((FOLDER / f"{edit}.toml").read_text())
     keys = given["input"] if envmap == "sunsky" else {}  # what says where its sun is
     lines = ["[input]", f"envmap = {config.quote(envmap)}"]
     lines += [f"{key} = {config.quote(value)}" for key, value in keys.items()]
@@ -125,7 +126,7 @@ def row(folder):
     """Pictures of one edit, display values: rendering and map before and after."""
     shown = [tonemap(images.read(str(folder / f"render_{n}.exr"))[0], "gamma")
              for n in ("initial", "target", "edited")]  # fmt: skip
-    edited, original = layers(folder)
+    edited, original = images.read(str(folder / "edited.exr"))[0], layer(folder, "initial")
     half = original.shape[0] // 2
     maps = [tonemap(m[:half], "gamma") for m in (original, edited)]
     side = shown[0].shape[0]
@@ -154,7 +155,7 @@ def main(arguments, folder):
         raise SystemExit(f"{arguments.map}: ENVEDIT_DATA has no puresky/{arguments.map}_puresky_1k.hdr")
     lines = ["| edit | strokes | in the page, s | saving, s | of the paint | reachable | change elsewhere |",
              "|---" * 7 + "|"]  # fmt: skip
-    listed, rows = [], []
+    listed, rows, folder = [], [], own_folder(folder, arguments.map)
     for edit in arguments.edits:
         done = folder / edit / "figure10.json"
         if not done.exists():
@@ -171,8 +172,8 @@ def main(arguments, folder):
     print(table)
     if arguments.write:
         (browser.HERE / "figure10.toml").write_text("# Strokes as the page wrote them.\n\n" + strokes + "\n")
-        (ROOT / "docs/painting_figure10.png").write_bytes(images.png(pixels))
-        browser.put(ROOT / "docs/painting_in_the_browser.md", "figure10", table)
+        (FOLDER.parents[1] / "docs/painting_figure10.png").write_bytes(images.png(pixels))
+        browser.put(FOLDER.parents[1] / "docs/painting_in_the_browser.md", "figure10", table)
     else:
         (folder / "sheet.png").write_bytes(images.png(pixels))
     return 0
@@ -197,5 +198,5 @@ def picture(arguments, folder):
         time.sleep(SETTING_S)
         page.screenshot(path=folder / "page.png")
     if arguments.write:
-        shutil.copy(folder / "page.png", ROOT / "docs/painting_in_the_browser.png")
+        shutil.copy(folder / "page.png", FOLDER.parents[1] / "docs/painting_in_the_browser.png")
     return 0

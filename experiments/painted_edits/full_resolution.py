@@ -22,7 +22,7 @@ from envedit.images import images, layered_exr
 from envedit.losses import metrics
 from envedit.scene import scene
 
-from .run import file_of
+from .experiment import file_of
 
 
 def large(file: str, width: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 r"""What the true map itself scores in Table 3: two renderings of it, as target and result are rendered.
 
-    python -m experiments.paper.ceiling [--maps DIR] [--only NAME ...] [--scene statue] [--width 128] \
+    python -m experiments.paper.ceiling [--folder DIR] [--maps NAME ...] [--scene statue] [--width 128] \
         [--angle 60] [--roughness 0 0.5 1]
 
 No edit can be expected to score more than the noise of its judge allows: one that does shows a picture that
@@ -40,8 +40,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m experiments.paper.ceiling", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--maps", metavar="DIR", help="folder of NAME_puresky_1k.hdr ($ENVEDIT_DATA/puresky)")
-    parser.add_argument("--only", nargs="+", metavar="MAP", help="some maps")
+    parser.add_argument("--folder", metavar="DIR", help="of NAME_puresky_1k.hdr ($ENVEDIT_DATA/puresky)")
+    parser.add_argument("--maps", nargs="+", metavar="MAP", help="some maps")
     parser.add_argument("--scene", default="statue")
     parser.add_argument("--width", type=int, default=128, help="pixels across")
     parser.add_argument("--angle", type=float, default=60.0, help="turn of the true map to the left, degrees")
@@ -59,8 +59,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def table(given: argparse.Namespace) -> Iterator[str]:
     """Yield PSNR and SSIM as Markdown: a line a map, a column a roughness, the averages last."""
-    found = puresky.find(given.maps, "--maps")
-    files = puresky.pick(found, given.only, "--only") if given.only else found
+    found = puresky.find(given.folder, "--folder")
+    files = puresky.pick(found, given.maps, "--maps") if given.maps else found
     variant = config.Config().variant
     doctor.ensure(variant)
     mi.set_variant(variant)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 
-from envedit import config
-from envedit.core import latlong
-from envedit.core.errors import EnveditError, InputError
+from envedit.core.errors import InputError
 from envedit.images import images
-from envedit.losses import metrics
-from experiments.painted_edits.run import layers
-from experiments.sweep.process import DONE
+from envedit.sweep import DONE
+from experiments.harness import Case, Done
+from experiments.painted_edits import experiment as painted_edits
 
 from .plan import Cell
 
@@ -36,7 +32,7 @@ def numbers(out, cell: Cell) -> dict | None:
     folder = cell.folder(out)
     if not (folder / DONE).exists():
         return None
-    path = folder / ("metrics.json" if cell.store == "edits" else "fit.json")
+    path = folder / ("fit.json" if cell.fitted else "metrics.json")
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
@@ -51,7 +47,7 @@ def seconds(out, cells: list[Cell]) -> dict[Cell, tuple[float | None, float]]:
     """
     found = {}
     for cell in done(out, cells):
-        if cell.store != "edits":
+        if cell.fitted:
             continue
         read, ended = numbers(out, cell), json.loads((cell.folder(out) / DONE).read_bytes())
         timing, about = read["timing"], read["fit"]
@@ -72,37 +68,17 @@ def pictures(out, cell: Cell) -> dict[str, np.ndarray | None]:
     folder = cell.folder(out)
     if not (folder / DONE).exists():
         return {}
-    if cell.store != "edits":
+    if cell.fitted:
         return {name: images.read(str(folder / f"{name}.exr"))[0] for name in ("original", "fitted", "noisy")}
-    first, last = numbers(out, cell)["active_rows"]
-    rows = slice(first, last + 1)
-    edited, original = layers(folder)
-    true = _true_map(folder, original)
-    found = {"initial_map": original[rows], "true_map": None if true is None else true[rows]}
-    found["map"] = edited[rows]
+    done = Done(Case("", {}), folder)
+    original, edited, true = done.maps
+    found = {"initial_map": original[done.rows], "true_map": None if true is None else true[done.rows]}
+    found["map"] = edited[done.rows]
     for name, file in (("initial", "initial"), ("target", "target"), ("render", "edited")):
-        found[name] = images.read(str(folder / f"render_{file}.exr"))[0]
+        found[name] = done.picture(f"render_{file}")
     return found
 
 
-def _true_map(folder: Path, original):
-    settings = config.load(folder / "config.toml")
-    if settings.target.kind != "envmap":
-        return None
-    if not settings.target.file:
-        return latlong.rotate(original, settings.target.rotate_degrees)
-    with contextlib.suppress(EnveditError):  # it may have been moved since
-        return images.load_envmap(settings.target.file, original.shape[1], settings.input.repair)[0]
-    return None
-
-
 def of_paint(out, cell: Cell) -> dict:
-    """Measure a painted edit against its original map: ``ssim`` of the two, ``sharp`` high frequencies.
-
-    ``sharp`` is the ratio of :func:`.metrics.high_frequency_energy`, NaN where the original has none.
-    """
-    shown = pictures(out, cell)
-    edited, original = shown["map"], shown["initial_map"]
-    before = metrics.high_frequency_energy(original)
-    sharp = metrics.high_frequency_energy(edited) / before if before else math.nan
-    return {"ssim": metrics.compare(edited, original)["ssim"], "sharp": sharp}
+    """Measure a painted edit as :func:`experiments.painted_edits.experiment.measure` does."""
+    return painted_edits.measure(Done(Case("", {}), cell.folder(out)))

@@ -8,6 +8,7 @@ its weights; active rows.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 import time
@@ -34,6 +35,11 @@ COMMAND = "{python}", "-m", "experiments.paper.network"
 def command(store: str) -> tuple[str, ...]:
     """Return what a sweep calls for a fit of one kind."""
     return (*COMMAND, store, "{folder}", "{threads}")
+
+
+def version(store: str) -> str:
+    """Return what else decides the results of :func:`command`: kind and the content of this file."""
+    return f"{store} {hashlib.sha256(Path(__file__).read_bytes()).hexdigest()}"
 
 
 def stock(

@@ -1,27 +1,24 @@
-"""What each table and figure consists of: one job for every row, map and roughness.
+"""What each table and figure consists of: one case for every row, map and roughness.
 
-The plan of a table is kept beside its runs, ``OUT/NAME.json``, so that whoever draws it knows what belongs to
-it, done or not. Runs lie under the hash of all that decides what comes out of them, so that tables share
-them: the same edit is never made twice.
+Runs lie under the hash of all that decides what comes out of them, so that tables share them: the same edit
+is never made twice.
 """
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from envedit import config
 from envedit.config import presets
-from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene
+from envedit.sweep import Job
 from experiments import puresky
-from experiments.sweep import Job, job
+from experiments.harness import Case, overridden
 
-from . import skies
+from . import network, skies
 from .kinds import KINDS
 from .methods import FITS, ONLY_OURS
 
@@ -41,32 +38,32 @@ class Cell:
         Method and map.
     roughness : float or None
         Of the scene's object, where it is varied.
-    store : str
-        Folder of the run's folder, by what is carried out: "edits", "fits", "stock", "stock-scaled".
     key : str
         Name of the run's folder.
+    fitted : bool
+        Whether it is a fit of Figures 4 and 5, not an edit.
     """
 
     settings: str
     row: str
     map: str
     roughness: float | None
-    store: str
     key: str
-
-    @property
-    def place(self) -> tuple:
-        """Where it stands in the table."""
-        return self.settings, self.row, self.map, self.roughness
+    fitted: bool = False
 
     def folder(self, out) -> Path:
         """Return the run's folder."""
-        return Path(out) / self.store / self.key
+        return Path(out) / self.key
+
+
+def cell(case: Case, job: Job) -> Cell:
+    """Return a case's place in the table."""
+    return Cell(**case.about, key=job.key)
 
 
 @dataclass(frozen=True)
 class Question:
-    """What all runs of a table have in common; runs under another question are not averaged with them."""
+    """What all runs of a table have in common; the command line gives it."""
 
     scene: str = ""
     angle: float = 60.0
@@ -83,16 +80,17 @@ def build(
     only=None,
     rows=None,
     out=".",
-) -> list[tuple[Cell, Job]]:
-    """List the runs of a table or figure.
+) -> list[Case]:
+    """List the runs of a table or figure, without the question's overrides, which :meth:`.Case.job` takes.
 
     Parameters
     ----------
     name : str
         A key of :data:`KINDS`.
     question : Question
-        Scene ("": the table's own), turn of the true map in degrees, and overrides ``table.key=value``, which
-        beat what a row sets. Of Figure 8 the name of the true map, of Figure 9 the edit.
+        Scene ("": the table's own), turn of the true map in degrees, and overrides ``table.key=value``, of
+        which only those that name weights count here. Of Figure 8 the name of the true map, of Figure 9 the
+        edit.
     settings : sequence of str
         "paper", "ours" or both.
     maps : path, optional
@@ -133,9 +131,13 @@ def build(
                     if row == "lum-l1-dists" and not _names(question, "perceptual", "vgg"):
                         continue
                     varied = "" if roughness is None else f", roughness {roughness:g}"
-                    one = job(f"{name}, {setting}: {row}, {sky}{varied}", _set(tables, question.sets))
-                    store = row if row.startswith("stock") else "fits" if kind.methods is FITS else "edits"
-                    made.append((Cell(setting, row, sky, roughness, store, one.key), one))
+                    about = {"settings": setting, "row": row, "map": sky, "roughness": roughness}
+                    fit = {}
+                    if kind.methods is FITS:
+                        recipe = row if row.startswith("stock") else "fits"
+                        command, about["fitted"] = network.command(recipe), True
+                        fit = {"command": command, "version": network.version(recipe)}
+                    made.append(Case(f"{name}, {setting}: {row}, {sky}{varied}", tables, about, **fit))
     if not made:
         raise ConfigError(
             f"{name}: nothing to run: no row of --rows {' '.join(rows or kind.rows)} has settings "
@@ -145,7 +147,7 @@ def build(
 
 
 def resolved(name: str, question: Question, maps=None, only=None) -> Question:
-    """Name the true map of Figure 8 where the question does not, so that plans know it; see :func:`build`."""
+    """Name the true map of Figure 8 where the question does not, where there is one."""
     if name == "figure8" and not question.target:
         chosen = _maps(name, KINDS[name], maps, only)
         if skies.OTHER in _known(maps) and skies.OTHER not in chosen:
@@ -154,7 +156,7 @@ def resolved(name: str, question: Question, maps=None, only=None) -> Question:
 
 
 def _known(folder):
-    return puresky.find(folder, "--maps")
+    return puresky.find(folder, "--folder")
 
 
 def _maps(name, kind, folder, only):
@@ -204,21 +206,9 @@ def read_edit(name: str) -> dict:
     return tables
 
 
-def _set(tables, overrides):
-    """Lay ``table.key=value`` over a configuration's tables."""
-    for text in overrides:
-        keys, value = config.parse_override(text)
-        for key in reversed(keys):
-            value = {key: value}
-        if keys == ("target", "file"):
-            tables = presets.overlaid(tables, {"target": {"rotate_degrees": 0.0}})
-        tables = presets.overlaid(tables, value)
-    return tables
-
-
 def _names(question, table, key):
     """Tell whether an override gives a key a value."""
-    given = _set({}, question.sets).get(table, {})
+    given = overridden({}, question.sets).get(table, {})
     return isinstance(given, dict) and bool(given.get(key))
 
 
@@ -231,54 +221,3 @@ def _check_roughness(name):
         raise InputError(f"scene {path}: cannot be read ({error})") from None
     if not re.search(r"""<default\s+name\s*=\s*["']roughness["']""", text):
         raise ConfigError(f'scene {name}: no <default name="roughness" .../> in it, which is to be varied')
-
-
-# ---- on disk -----------------------------------------------------------------------------------------------
-
-
-def save(out, name: str, question: Question, cells: list[Cell]) -> bool:
-    """Add cells to the plan of a table; a plan under another question is replaced.
-
-    Returns
-    -------
-    bool
-        True if a plan was replaced: its runs are still there, and come back with its question.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be made or written to, or holds something else under that name.
-    """
-    path, replaced, known = Path(out) / f"{name}.json", False, {}
-    if (old := load(out, name)) is not None:
-        if old[0] == question:
-            known = {cell.place: cell for cell in old[1]}
-        else:
-            replaced = True
-    known |= {cell.place: cell for cell in cells}
-    text = {"question": asdict(question), "cells": [asdict(cell) for cell in known.values()]}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be made ({error.strerror}): give another --out") from None
-    write_atomically(path, (json.dumps(text, indent=1) + "\n").encode())
-    return replaced
-
-
-def load(out, name: str) -> tuple[Question, list[Cell]] | None:
-    """Read the plan of a table; None where there is none.
-
-    Raises
-    ------
-    InputError
-        The file is not a plan.
-    """
-    path = Path(out) / f"{name}.json"
-    try:
-        found = json.loads(path.read_bytes())
-        question = found["question"] | {"sets": tuple(found["question"]["sets"])}
-        return Question(**question), [Cell(**cell) for cell in found["cells"]]
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a plan of experiments.paper ({error}); remove it") from None

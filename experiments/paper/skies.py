@@ -38,7 +38,7 @@ def choose(found: dict[str, Path], names, several: bool) -> dict[str, Path]:
         names = ["all"] if several else [DEFAULT if DEFAULT in found else next(iter(found))]
     if list(names) == ["all"]:
         return found
-    return puresky.pick(found, names, "--only")
+    return puresky.pick(found, names, "--maps")
 
 
 def turned(file: Path, degrees: float, folder) -> Path:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from experiments.harness import markdown
+
 from . import measured
 from .kinds import KINDS
 from .plan import Cell
@@ -111,7 +113,7 @@ def _methods(name, out, cells, shared, spent):
             cells_.append(own if theirs is None else f"{own} ({_show(theirs, column[1])})")
         title, times = KINDS[name].methods[row].title, _times(spent, [c for c in some if c in shared])
         lines.append([title, *cells_, *times, f"{count}/{len(some)}"])
-    return _markdown(["", *head, "fit, s", "rest, s", "maps"], lines)
+    return markdown(["", *head, "fit, s", "rest, s", "maps"], lines)
 
 
 def _unedited(out, cells, maps):
@@ -145,7 +147,7 @@ def _fits(name, out, cells, shared, spent):
             ]
         )
     head = ["", "log PSNR, dB", "peak", "mean luminance", "log PSNR with noise, dB", "s", "maps"]
-    return _markdown(head, lines)
+    return markdown(head, lines)
 
 
 def _paint(name, out, cells, shared, spent):
@@ -170,7 +172,7 @@ def _paint(name, out, cells, shared, spent):
             ]
         )
     head = ["", "towards the paint", "reachable", "change elsewhere", "map SSIM", "high frequencies"]
-    return _markdown([*head, "fit, s", "rest, s", "maps"], lines)
+    return markdown([*head, "fit, s", "rest, s", "maps"], lines)
 
 
 def _show(value, column):
@@ -186,8 +188,3 @@ def _times(spent, cells):
 
 def _seconds(values):
     return f"{np.mean(values):.0f}" if values else "-"
-
-
-def _markdown(head, lines):
-    rows = [head, ["---"] * len(head), *lines]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -206,7 +206,7 @@ def tables(results: dict) -> dict[str, str]:
     Parameters
     ----------
     results : dict
-        As ``results.json`` of :mod:`.run`.
+        As ``results.json`` of :mod:`.experiment`.
     """
     compared = ratios(results["runs"])
     rows = means(compared)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,12 @@ import numpy as np
 
 from envedit.config.presets import overlaid
 from envedit.core.errors import InputError
-from experiments.sweep import Job, job
+from envedit.sweep import Job
+from experiments.harness import Case
 
+MEASURED = Path(__file__).with_name("measured.py")
+COMMAND = ("{python}", "-S", str(MEASURED), "{folder}", "{threads}")
+"""What carries out a job; the session is added to it."""
 MAPS = ("overcast_soil", "wasteland_clouds", "kloofendal_48d_partly_cloudy")
 """Overcast, in between, and sunny: peaks of 4.5, 309 and 8,963 at 256 texels across."""
 SCENES = {
@@ -228,12 +231,12 @@ def _file(folder, name):
     raise InputError(f"{folder}: no map {name}_puresky_1k.hdr in it: give the folder with --maps")
 
 
-def job_of(cell: Cell, setting: Setting, session: str = "") -> Job:
-    """Make the job of a setting in a cell.
+def case_of(cell: Cell, setting: Setting, session: str = "", own: bool = False) -> Case:
+    """Make the case of a setting in a cell.
 
-    Fits and transports are not kept on disk, so that every run pays for its own; what they took stands in
-    its metrics. With a ``session``, the job is one of that session's and no other's: the standard preset is
-    measured anew beside whatever it is compared with.
+    Fits and transports are not kept on disk, so that every run pays for its own; its metrics hold what they
+    took. ``session`` names the call that runs it; a case that is that session's ``own`` is no other's: the
+    standard preset is measured anew beside whatever it is compared with.
     """
     base = {
         # Where the sky turned, every setting would find the same map.
@@ -244,12 +247,19 @@ def job_of(cell: Cell, setting: Setting, session: str = "") -> Job:
         "renderer": {"cache": False},
         "fit": {"cache": False},
     }
-    name = f"{cell.name}: {setting.name}"
-    made = job(f"{name} [{session}]" if session else name, overlaid(base, setting.table))
-    if not session:
-        return made
-    key = hashlib.sha256(f"{made.key} {session}".encode()).hexdigest()[:32]
-    return dataclasses.replace(made, key=key)
+    return Case(
+        f"{cell.name}: {setting.name}" + f" [{session}]" * own,
+        overlaid(base, setting.table),
+        {"cell": cell, "setting": setting},
+        (*COMMAND, session),
+        f"{hashlib.sha256(MEASURED.read_bytes()).hexdigest()} {session * own}",
+        "cost.json",
+    )
+
+
+def job_of(cell: Cell, setting: Setting, session: str = "") -> Job:
+    """Return the job of a setting in a cell, or of a session's own."""
+    return case_of(cell, setting, session, bool(session)).job()
 
 
 def references(n: int) -> Setting:

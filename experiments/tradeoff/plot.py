@@ -1,21 +1,16 @@
-"""Draw what was measured: ``python -m experiments.tradeoff.plot [--out DIR] [--to DIR]``; computes nothing.
+"""Pictures of what was measured, with matplotlib (``envedit[report]``).
 
-Writes ``tables.md``, with a table for each marker of the README, and, with matplotlib (``envedit[report]``),
 ``front.png`` (rendering and map against the time of a run, means over all cells), ``cells.png`` (a panel for
 each cell) and ``knobs.png`` (one knob at a time).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from pathlib import Path
 
-from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import EnveditError, InputError
+from envedit.core.errors import ConfigError, InputError
 
-from .analyse import TIMES, front, means, ratios, tables
+from .analyse import TIMES, front, means, ratios
 
 STYLES = {  # group: colour, marker
     "knob": ("tab:blue", "o"),
@@ -147,7 +142,7 @@ def by_knob(rows: list[dict], file: Path, kind: str = "time") -> None:
 
 
 def draw(results: dict, folder: Path) -> list[Path]:
-    """Write the tables and, with matplotlib, the pictures; returns the files.
+    """Write the pictures; returns the files.
 
     Raises
     ------
@@ -156,14 +151,12 @@ def draw(results: dict, folder: Path) -> list[Path]:
     """
     compared = ratios(results["runs"])
     if not compared:
-        raise InputError("no run of the standard preset to compare with: let experiments.tradeoff.run finish")
-    text = [f"<!-- table: {name} -->\n\n{content}" for name, content in tables(results).items()]
-    files = [folder / "tables.md"]
-    write_atomically(files[0], ("\n\n".join(text) + "\n").encode())
+        raise InputError("no run of the standard preset to compare with: run the experiment to its end")
     try:
         import matplotlib
     except ImportError:
-        return files
+        raise ConfigError("no pictures: matplotlib is missing: pip install 'envedit[report]'") from None
+    files = []
     matplotlib.use("agg")
     rows = means(compared)
     most = max(r["cells"] for r in rows)
@@ -177,32 +170,3 @@ def draw(results: dict, folder: Path) -> list[Path]:
         if (folder / name).exists():
             files.append(folder / name)
     return files
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Draw the results of an earlier run."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.tradeoff.plot", description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--out", type=Path, default=Path("runs/tradeoff"), metavar="DIR", help="of the runs")
-    parser.add_argument("--to", type=Path, metavar="DIR", help="of tables and pictures (that of the runs)")
-    given = parser.parse_args(argv)
-    try:
-        try:
-            results = json.loads((given.out / "results.json").read_text())
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(
-                f"{given.out / 'results.json'}: cannot be read ({reason}): run experiments.tradeoff.run first"
-            ) from None
-        files = draw(results, given.to or given.out)
-    except EnveditError as error:
-        print(f"tradeoff: {error}", file=sys.stderr)
-        return error.exit_code
-    for file in files:
-        print(file)
-    print(f"\n{files[0].read_text()}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -18,10 +18,11 @@ from envedit.inputs import load_map
 from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
 from experiments import puresky
-from experiments.paper import ceiling, measured, network, plan, plot, run, sheets, skies, tables
+from experiments.__main__ import main
+from experiments.paper import ceiling, measured, network, plan, sheets, skies, tables
 from experiments.paper.kinds import KINDS
 from experiments.paper.methods import METHODS
-from experiments.paper.plan import Question, build
+from experiments.paper.plan import Question
 from experiments.paper.published import COLUMNS, PUBLISHED
 
 PAPER_ROWS = ["pixels", "log-pixels", "siren-no-hdr", "siren", "r-siren", "r-siren-reg"]
@@ -35,6 +36,12 @@ def maps(tmp_path):
     for name in ("cloudy", "clear", "dusk"):
         (folder / f"{name}_puresky_1k.hdr").write_text(name)
     return folder
+
+
+def build(name, question, *given, **named):
+    """Cells of a table or figure, and their jobs."""
+    made = [(case, case.job(question.sets)) for case in plan.build(name, question, *given, **named)]
+    return [(plan.cell(*one), one[1]) for one in made]
 
 
 def settings_of(job):
@@ -85,8 +92,12 @@ def test_a_table_is_rows_by_maps_by_roughness(maps, name, paper, ours):
     made = build(name, Question(), maps=maps)
     cells = cells_of(made)
     assert [sum(cell.settings == s for cell in cells) for s in ("paper", "ours")] == [paper, ours]
-    assert len({(cell.store, cell.key) for cell in cells}) == len(made)  # no two ask the same
-    assert len({cell.place for cell in cells}) == len({job.name for _, job in made}) == len(made)
+    assert len({cell.key for cell in cells}) == len(made)  # no two ask the same
+    assert (
+        len({(c.settings, c.row, c.map, c.roughness) for c in cells})
+        == len({job.name for _, job in made})
+        == len(made)
+    )
     assert all(cell.key == job.key for cell, job in made)
 
 
@@ -159,8 +170,11 @@ def test_scene_roughness_angle_and_overrides_reach_the_runs(maps, tmp_path):
 
 
 def test_stock_networks_are_kept_apart_from_recipes(maps):
-    cells = cells_of(build("figure4", Question(), ("ours",), maps))
-    assert [cell.store for cell in cells] == ["stock", "stock-scaled", "fits", "fits", "fits"]
+    cases = plan.build("figure4", Question(), ("ours",), maps)
+    kinds = ["stock", "stock-scaled", "fits", "fits", "fits"]
+    assert [case.command for case in cases] == [network.command(kind) for kind in kinds]
+    assert [case.version for case in cases] == [network.version(kind) for kind in kinds]
+    assert {cell.fitted for cell in cells_of(build("figure4", Question(), ("ours",), maps))} == {True}
     made = {cell.row: settings_of(job).fit for cell, job in build("figure4", Question(), ("ours",), maps)}
     assert made["siren"].polish == "never" and made["siren-polished"].polish == "always"
     assert made["siren"].awp_gamma == 0 and made["siren-no-hdr"].hdr == 0
@@ -227,7 +241,7 @@ def test_figure_9_is_a_shipped_edit_and_has_dists_where_weights_are_named(maps):
         ("table3", {"scene": "statu"}, {}, "did you mean statue"),
         ("figure4", {"scene": "statue"}, {}, "figure4 has none"),
         ("table1", {}, {"rows": ["siren-reg"]}, "table1 has no row siren-reg; it has pixels,"),
-        ("table1", {}, {"only": ["dawn"]}, "--only: no map dawn; there are clear, cloudy, dusk"),
+        ("table1", {}, {"only": ["dawn"]}, "--maps: no map dawn; there are clear, cloudy, dusk"),
         ("table1", {}, {"only": ["claer"]}, "did you mean clear"),
         ("table1", {"sets": ("fit.epocs=3",)}, {}, "did you mean epochs"),
     ],
@@ -266,7 +280,7 @@ def test_without_maps_an_error_says_where_they_come_from(tmp_path, monkeypatch):
     monkeypatch.delenv("ENVEDIT_DATA", raising=False)
     with pytest.raises(ConfigError, match="^no maps: set ENVEDIT_DATA .* experiments.download_puresky"):
         puresky.find()
-    with pytest.raises(ConfigError, match="^no maps: give --maps DIR, or set ENVEDIT_DATA"):
+    with pytest.raises(ConfigError, match="^no maps: give --folder DIR, or set ENVEDIT_DATA"):
         build("table1", Question())
     with pytest.raises(SystemExit, match="^envedit: no maps: set ENVEDIT_DATA"):
         puresky.of_script()
@@ -277,90 +291,34 @@ def test_without_maps_an_error_says_where_they_come_from(tmp_path, monkeypatch):
     assert build("figure9", Question())  # needs none
 
 
-# ---- plans, and what is run of them ------------------------------------------------------------------------
-
-
-def test_a_plan_grows_under_one_question_and_is_replaced_under_another(maps, tmp_path):
-    out = tmp_path / "out"
-    assert plan.load(out, "table1") is None
-    one, two = (cells_of(build("table1", Question(), (s,), maps)) for s in ("paper", "ours"))
-    assert plan.save(out, "table1", Question(), one) is False
-    assert plan.save(out, "table1", Question(), two) is False
-    assert plan.save(out, "table1", Question(), one) is False
-    assert plan.load(out, "table1") == (Question(), one + two)
-    other = Question(angle=30, sets=("seed=1",))
-    assert plan.save(out, "table1", other, two) is True
-    assert plan.load(out, "table1") == (other, two)
-    (out / "table1.json").write_text('{"cells": []}')
-    with pytest.raises(InputError, match="not a plan"):
-        plan.load(out, "table1")
-
-
-def test_what_is_done_is_skipped_and_failures_are_told(maps, tmp_path, monkeypatch, capsys):
-    notes = tmp_path / "notes"
-    stub = (
-        "import pathlib, sys, tomllib; folder = pathlib.Path(sys.argv[1]);"
-        "kind = tomllib.loads((folder / 'job.toml').read_text())['representation']['kind'];"
-        f"open({str(notes)!r}, 'a').write(kind + chr(10));"
-        f"good = kind != 'pixels' or pathlib.Path({str(tmp_path / 'good')!r}).exists();"
-        "sys.exit(0 if good else 'no good')"
-    )
-    monkeypatch.setattr(run, "COMMAND", ("{python}", "-S", "-c", stub, "{folder}"))
-    out = tmp_path / "out"
-    ask = ["table1", "--settings", "ours", "--rows", "pixels", "layers", "--maps", str(maps)]
-    ask += ["--only", "dusk", "--out", str(out), "--workers", "1"]
-    assert run.main([*ask, "--dry-run"]) == 0 and not out.exists()
-    assert "2 jobs: 2 missing" in capsys.readouterr().out
-    assert run.main(ask) == 1
-    said = capsys.readouterr()
-    assert "exit code 1: no good" in said.out and "2 jobs: 1 failed, 1 done" in said.out
-    assert "experiments.paper.plot table1" in said.out
-    (tmp_path / "good").touch()
-    assert run.main(ask) == 0
-    assert "2 jobs: 1 done, 1 skipped" in capsys.readouterr().out
-    assert notes.read_text().split() == ["pixels", "layers", "pixels"]
-    assert len(plan.load(out, "table1")[1]) == 2
-    assert run.main([*ask, "--angle", "30", "--dry-run"]) == 0
-    assert "2 missing" in capsys.readouterr().out
-
-
-def test_every_kind_of_run_has_its_own_command_and_folder(maps, tmp_path, monkeypatch):
-    asked = []
-
-    def sweep(jobs, out, workers, scheduler, threads, command):
-        asked.append(([job.name.split(": ")[1] for job in jobs], out.name, command))
-        assert (workers, scheduler, threads) == (2, None, 3)
-        return []
-
-    monkeypatch.setattr(run, "sweep", sweep)
-    more = ["--maps", str(maps), "--only", "dusk", "--out", str(tmp_path), "--workers", "2", "--threads", "3"]
-    assert run.main(["figure4", "--settings", "paper", *more]) == 0
-    assert run.main(["table1", "--settings", "ours", "--rows", "layers", *more]) == 0
-    assert asked == [
-        (["stock, dusk"], "stock", network.command("stock")),
-        (["stock-scaled, dusk"], "stock-scaled", network.command("stock-scaled")),
-        (["siren-no-hdr, dusk", "siren, dusk"], "fits", network.command("fits")),
-        (["layers, dusk"], "edits", run.COMMAND),
-    ]
+# ---- the command line --------------------------------------------------------------------------------------
 
 
 def test_usage(maps, tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
-    assert run.main(["table1", "--maps", str(tmp_path / "no"), *out]) == 3
-    assert run.main(["table1", "--maps", str(maps), "--set", "fit.epochs", *out]) == 2
-    assert plot.main(["table1", *out]) == 3
+    ask = ["paper", "run", "table1", "--folder", str(maps), "--settings", "ours", *out]
+    assert main([*ask, "--rows", "pixels", "layers", "--dry-run"]) == 0 and not (tmp_path / "out").exists()
+    assert "2 jobs: 2 missing" in capsys.readouterr().out
+    assert main(["paper", "table", *ask[2:]]) == 0
+    kept = (tmp_path / "out" / "table1.md").read_text()
+    assert capsys.readouterr().out == kept and kept.startswith("## Table 1") and "0/1" in kept
     (tmp_path / "file").touch()
-    assert run.main(["table1", "--maps", str(maps), "--out", str(tmp_path / "file" / "out")]) == 3
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 4 and all(line.startswith("paper: ") for line in said)
-    assert "no plan of table1" in said[2] and "experiments.paper.run table1" in said[2]
+    for wrong, code in (
+        (["--folder", str(tmp_path / "no")], 3),
+        (["--set", "fit.epochs"], 2),
+        (["--maps", "dsk"], 2),
+        (["--out", str(tmp_path / "file" / "out")], 3),
+    ):
+        assert main([*ask, *wrong]) == code
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 1 and said[0].startswith("paper: ")
     for wrong in (
         ["table4"],
         ["table1", "--workers", "0"],
         ["table1", "--workers", "2", "--scheduler", "a:1"],
     ):
         with pytest.raises(SystemExit) as info:
-            run.main(wrong)
+            main(["paper", "run", *wrong])
         assert info.value.code == 2
 
 
@@ -532,7 +490,6 @@ def test_every_table_and_figure_is_drawn_and_printed(maps, tmp_path, capsys):
     out = tmp_path / "out"
     for name in KINDS:
         made = build(name, Question(), ("ours",), maps, None if name == "figure9" else ["dusk"])
-        plan.save(out, name, Question(), cells_of(made))
         if name in ("figure4", "figure5"):
             for cell, _ in made[:-1]:
                 folder = cell.folder(out)
@@ -546,12 +503,24 @@ def test_every_table_and_figure_is_drawn_and_printed(maps, tmp_path, capsys):
             for cell, _ in made[:-1]:
                 finish(out, made, cell.row, roughness=cell.roughness, color=YELLOW)
         capsys.readouterr()
-        assert plot.main([name, "--out", str(out), "--to", str(tmp_path / "to")]) == 0
-        said = capsys.readouterr().out
+        ask = [
+            name,
+            "--settings",
+            "ours",
+            "--folder",
+            str(maps),
+            "--out",
+            str(out),
+            "--to",
+            str(tmp_path / "to"),
+        ]
+        ask += [] if name == "figure9" else ["--maps", "dusk"]
+        assert main(["paper", "table", *ask]) == 0
         kept = (tmp_path / "to" / f"{name}.md").read_text()
-        assert said.startswith(kept) and kept.startswith(f"## {KINDS[name].title}\n")
+        assert capsys.readouterr().out == kept and kept.startswith(f"## {KINDS[name].title}\n")
         assert "0/1" in kept and "1/1" in kept and "| nan" not in kept
-        files = [line.rsplit("/", 1)[1] for line in said[len(kept) :].splitlines()]
+        assert main(["paper", "sheet", *ask]) == 0
+        files = [line.rsplit("/", 1)[1] for line in capsys.readouterr().out.splitlines()]
         parts = [f"-roughness{r}" for r in ("0", "0.5", "1")] + ["-bars"] if name == "table3" else [""]
         assert files == [f"{name}-ours{part}.png" for part in parts]
         for file in files[:1]:
@@ -608,7 +577,7 @@ def test_a_fit_leaves_its_numbers_and_pictures(maps, tmp_path, monkeypatch):
         folder = cell.folder(tmp_path)
         folder.mkdir(parents=True)
         (folder / "job.toml").write_text(job.toml)
-        assert network.main([cell.store, str(folder), str(dr.thread_count())]) == 0
+        assert network.main(["fits", str(folder), str(dr.thread_count())]) == 0
         found = json.loads((folder / "fit.json").read_text())
         assert found["epochs"] == 3 and len(found["noisy"]) == network.NOISE_SEEDS
         original, fitted, noisy = (
@@ -653,8 +622,8 @@ def test_the_ceiling_is_the_noise_of_two_renderings(tmp_path, capsys):
     sun[2, 5] = 2000.0
     for name, content in (("clear", sun), ("grey", np.full((8, 16, 3), 0.4, np.float32)), ("night", 0 * sun)):
         images.write_exr(tmp_path / f"{name}_puresky_1k.exr", content)
-    few = ["--maps", str(tmp_path), "--width", "16", "--roughness", "0", "1"]
-    assert ceiling.main([*few, "--only", "clear", "grey"]) == 0
+    few = ["--folder", str(tmp_path), "--width", "16", "--roughness", "0", "1"]
+    assert ceiling.main([*few, "--maps", "clear", "grey"]) == 0
     head, _, clear, grey, mean = capsys.readouterr().out.splitlines()
     assert head == "| map | roughness 0 | roughness 1 |" and mean.startswith("| **mean of 2** |")
     psnr = {
@@ -663,7 +632,7 @@ def test_the_ceiling_is_the_noise_of_two_renderings(tmp_path, capsys):
     assert all(20 < value < 80 for values in psnr.values() for value in values)
     assert psnr[clear][0] < psnr[grey][0]  # caustics of the sun
     np.testing.assert_allclose(psnr[mean], np.mean([psnr[clear], psnr[grey]], axis=0), atol=0.011)
-    assert ceiling.main([*few, "--only", "night"]) == 0
+    assert ceiling.main([*few, "--maps", "night"]) == 0
     assert "| night | 200.00 / 1.000 | 200.00 / 1.000 |" in capsys.readouterr().out
-    assert ceiling.main([*few, "--only", "claer"]) == 2
-    assert capsys.readouterr().err == "envedit: --only: no map claer; did you mean clear?\n"
+    assert ceiling.main([*few, "--maps", "claer"]) == 2
+    assert capsys.readouterr().err == "envedit: --maps: no map claer; did you mean clear?\n"

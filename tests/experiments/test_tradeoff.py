@@ -1,6 +1,6 @@
 """The trade of speed for accuracy: what is run, how it is measured and judged, what tables make of it."""
 
-import builtins
+import argparse
 import json
 import re
 import resource
@@ -15,11 +15,14 @@ import pytest
 from envedit import config
 from envedit.cli import budget
 from envedit.core import latlong
-from envedit.core.errors import InputError
+from envedit.core.errors import ConfigError, InputError
 from envedit.images import images
 from envedit.losses import metrics
-from experiments.sweep import drive
-from experiments.tradeoff import analyse, levels, measured, plan, plot, run
+from envedit.sweep import drive
+from experiments import harness
+from experiments.__main__ import main
+from experiments.levels import experiment as levels
+from experiments.tradeoff import analyse, experiment, measured, plan, plot
 from experiments.tradeoff.judge import Judge, loss_noise, without_noise
 
 # ---- what is run -------------------------------------------------------------------------------------------
@@ -35,12 +38,19 @@ def folder(tmp_path):
     return tmp_path
 
 
+def asked(folder, *more):
+    return ["--maps", str(folder), "--out", str(folder / "out"), *more]
+
+
 def arguments(folder, *more):
-    return run.parse(["--maps", str(folder), "--out", str(folder / "out"), *more])
+    parser = argparse.ArgumentParser()
+    experiment.options(parser)
+    harness.add_options(parser, folder)
+    return parser.parse_args(asked(folder, *more))
 
 
 def test_every_run_is_a_job_of_its_own(folder):
-    pairs = run.pairs(arguments(folder, "--joint", "5"))
+    pairs = experiment.pairs(arguments(folder, "--joint", "5"))
     jobs = [plan.job_of(cell, setting) for cell, setting in pairs]
     assert len({job.key for job in jobs}) == len({job.name for job in jobs}) == len(jobs)
     names = [s.name for s in plan.settings(5)]
@@ -49,7 +59,8 @@ def test_every_run_is_a_job_of_its_own(folder):
     # A fit takes longest: SIRENs in one scene, the paper's preset in one cell, unless asked for.
     assert {cell.scene for cell, s in pairs if s.group == "siren"} == {"glossy"}
     assert [cell.name for cell, s in pairs if s.group == "paper"] == [f"{plan.MAPS[-1]}, glossy"]
-    more = run.pairs(arguments(folder, "--paper", "all", "--siren-scenes", "matte", "glossy", "--joint", "0"))
+    given = arguments(folder, "--paper", "all", "--siren-scenes", "matte", "glossy", "--joint", "0")
+    more = experiment.pairs(given)
     assert len([1 for _, s in more if s.group == "paper"]) == 6
     assert {cell.scene for cell, s in more if s.group == "siren"} == set(plan.SCENES)
     assert not any(s.name.startswith("joint") for _, s in more)
@@ -122,36 +133,38 @@ def test_all_settings_are_configurations(folder):
 def test_the_standard_preset_runs_before_amid_and_after(folder):
     cells = plan.cells(folder, plan.MAPS[:2], ["matte"])
     todo = [(cell, s) for s in plan.knobs()[:3] for cell in cells]
-    work = run.session_jobs(todo, "monday")
-    groups = [setting.group for _, setting, _ in work]
+
+    def settings(work):
+        return [case.about["setting"] for case in work]
+
+    work = experiment.session_cases(todo, "monday")
+    groups = [setting.group for setting in settings(work)]
     assert groups == ["standard"] * 2 + ["knob"] * 3 + ["standard"] * 2 + ["knob"] * 3 + ["standard"] * 2
-    assert [(cell, s) for cell, s, _ in work if s.group == "knob"] == todo
-    keys = [job.key for *_, job in work]
+    assert [tuple(c.about.values()) for c in work if c.about["setting"].group == "knob"] == todo
+    keys = [case.job().key for case in work]
     assert len(set(keys)) == len(keys)
-    later = run.session_jobs(todo, "tuesday")
-    same = [a[2].key == b[2].key for a, b in zip(work, later, strict=True)]
+    later = [case.job().key for case in experiment.session_cases(todo, "tuesday")]
+    same = [a == b for a, b in zip(keys, later, strict=True)]
     assert same == [group == "knob" for group in groups]  # the standard preset is measured anew
     # One run alone has all three beside it.
-    assert [s.group for _, s, _ in run.session_jobs(todo[:1], "x")] == [
-        "standard",
-        "standard",
-        "knob",
-        "standard",
-    ]
+    alone = settings(experiment.session_cases(todo[:1], "x"))
+    assert [setting.group for setting in alone] == ["standard", "standard", "knob", "standard"]
 
 
 def test_maps_that_are_missing_are_named(folder, capsys, monkeypatch):
     assert {c.file.suffix for c in plan.cells(folder)} == {".exr"}
     (folder / f"{plan.MAPS[0]}_puresky_1k.hdr").write_bytes(b"")  # PolyHaven's name comes first
     assert plan.cells(folder)[0].file.suffix == ".hdr"
-    assert run.main(["--maps", str(folder / "nowhere")]) == 3
+    out = ["--out", str(folder / "out")]
+    assert main(["tradeoff", "run", "--maps", str(folder / "nowhere"), *out]) == 3
     assert f"no map {plan.MAPS[0]}_puresky_1k.hdr" in capsys.readouterr().err
     monkeypatch.delenv("ENVEDIT_DATA", raising=False)
-    assert run.main([]) == 3
+    assert main(["tradeoff", "run", *out]) == 3
     assert "--maps" in capsys.readouterr().err
-    for wrong in (["--workers", "0"], ["--joint", "-1"], ["--paper", "two"]):
+    assert main(["tradeoff", "run", *asked(folder, "--joint", "-1")]) == 2
+    for wrong in (["--workers", "0"], ["--paper", "two"]):
         with pytest.raises(SystemExit) as stop:
-            run.main(wrong)
+            main(["tradeoff", "run", *wrong])
         assert stop.value.code == 2
 
 
@@ -293,52 +306,53 @@ def stub(folder, monkeypatch):
     few = [plan.DRAFT, *[s for s in plan.knobs() if s.name in ("samples of T: 16", "map width: 64")]]
     monkeypatch.setattr(plan, "settings", lambda count, quick: few)
     (folder / "stub.py").write_text(STUB)
-    return "{python}", "-S", str(folder / "stub.py"), "{folder}", "{threads}"
+    monkeypatch.setattr(plan, "COMMAND", ("{python}", "-S", str(folder / "stub.py"), "{folder}", "{threads}"))
+    monkeypatch.setattr(experiment, "judge_of", lambda given, out: FakeJudge())
 
 
 @pytest.mark.slow
 def test_what_is_done_is_skipped_and_what_failed_is_tried_again(folder, stub, monkeypatch, capsys):
-    monkeypatch.setattr(run.time, "strftime", lambda *_: "first")
-    given = arguments(folder, "--quick", "--paper", "none")
+    monkeypatch.setattr(experiment.time, "strftime", lambda *_: "first")
+    ask = asked(folder, "--quick", "--paper", "none")
 
     def done():
         return (folder / "notes").read_text().split() if (folder / "notes").exists() else []
 
-    given.plan = True
-    assert run.carry_out(given, stub) == 0 and not done()
+    def results():
+        return json.loads((folder / "out" / "results.json").read_text())
+
+    assert main(["tradeoff", "run", "--dry-run", *ask]) == 0 and not done()
     assert "overcast_soil, matte: draft" in capsys.readouterr().out
-    given.plan = False
     (folder / "fail").touch()
-    assert run.carry_out(given, stub) == 2  # a setting in two cells
+    assert main(["tradeoff", "run", *ask]) == 1
+    assert capsys.readouterr().err.count("exit code 5: broken (") == 2  # a setting in two cells
     ran = done()
     assert len(ran) == len(set(ran)) == 3 * 2 + 3 * 2  # three settings, three standard runs, two cells
-    found = run.collect(given, FakeJudge())
+    found = results()
     assert len(found["runs"]) == 10 and len(found["cells"]) == 2
     assert {r["session"] for r in found["runs"]} == {"first"}
     # Again: what failed alone, with standard runs of its own.
-    monkeypatch.setattr(run.time, "strftime", lambda *_: "second")
+    monkeypatch.setattr(experiment.time, "strftime", lambda *_: "second")
     (folder / "fail").unlink()
-    assert run.carry_out(given, stub) == 0
+    assert main(["tradeoff", "run", *ask]) == 0
     assert len(done()) == 12 + 2 + 6
-    found = run.collect(given, FakeJudge())
+    found = results()
     assert len(found["runs"]) == 18
     sessions = [r["session"] for r in found["runs"] if r["setting"] == "samples of T: 16"]
     assert sessions == ["second"] * 2
     # And nothing at all: neither runs nor standard runs.
-    assert run.carry_out(given, stub) == 0 and len(done()) == 20
-    written = json.loads((given.out / "results.json").read_text())
-    assert written["runs"] == found["runs"] and written["about"]["versions"]["mitsuba"]
+    assert main(["tradeoff", "run", *ask]) == 0 and len(done()) == 20
+    assert results()["runs"] == found["runs"] and found["about"]["versions"]["mitsuba"]
     one = next(r for r in found["runs"] if r["setting"] == "map width: 64")
     assert one["time"] == 2.0 and one["again"] == 1.25 and one["memory"] == 10**9 and one["psnr"] == 31.0
-
-
-def test_a_map_that_cannot_be_judged_is_told_and_left_out(folder, stub, capsys):
-    given = arguments(folder, "--quick")
-    assert run.carry_out(given, stub) == 0
-    cell, setting = run.pairs(given)[0]
-    (plan.job_of(cell, setting).folder(given.out) / "unusable").touch()
-    assert len(run.collect(given, FakeJudge())["runs"]) == 11
-    assert f"{cell.name}: draft: not judged: edited.exr: cannot be read" in capsys.readouterr().err
+    # One that cannot be judged is reported and left out.
+    (folder / "out" / one["folder"] / "unusable").touch()
+    capsys.readouterr()
+    assert main(["tradeoff", "table", *ask]) == 0 and len(results()["runs"]) == 17
+    assert ": map width: 64: not judged: edited.exr: cannot be read" in capsys.readouterr().err
+    # Nor are results of another version.
+    monkeypatch.setattr("envedit.sweep.jobs.program", lambda: "another")
+    assert main(["tradeoff", "table", *ask]) == 0 and capsys.readouterr().out == "no run is done\n"
 
 
 # ---- how good a map is -------------------------------------------------------------------------------------
@@ -601,32 +615,20 @@ def made_up():
 
 
 @pytest.mark.slow
-def test_tables_and_pictures_are_drawn_from_results_alone(tmp_path, monkeypatch, capsys):
+def test_tables_and_pictures_are_made_of_results(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
-    (tmp_path / "results.json").write_text(json.dumps(made_up()))
-    to = tmp_path / "drawn"
-    to.mkdir()
-    assert plot.main(["--out", str(tmp_path), "--to", str(to)]) == 0
-    assert sorted(p.name for p in to.iterdir()) == ["cells.png", "front.png", "knobs.png", "tables.md"]
-    assert all(p.stat().st_size > 20_000 for p in to.glob("*.png"))
-    text = (to / "tables.md").read_text()
-    assert set(re.findall(r"<!-- table: ([\w-]+) -->", text)) == set(analyse.tables(made_up()))
+    files = plot.draw(made_up(), tmp_path)
+    assert [p.name for p in files] == ["front.png", "cells.png", "knobs.png"]
+    assert all(p.stat().st_size > 20_000 for p in files)
+    found = analyse.tables(made_up())
+    text = "\n".join(found.values())
     assert "| overcast_soil, matte | draft | 6.0 | 3.0 |" in text and "| paper |" in text
     assert "standard deviation" in text.lower() and "joint 6: T " in text
-    # Halving is told of what ran in both cells: not of SIRENs or the paper's preset.
-    halving = text.split("<!-- table: halving-again -->")[0]
-    assert "siren" not in halving and "paper" not in halving
-    capsys.readouterr()
-
-    real = builtins.__import__
-    monkeypatch.setattr(
-        builtins,
-        "__import__",
-        lambda name, *a, **k: (
-            (_ for _ in ()).throw(ImportError(name)) if name.startswith("matplotlib") else real(name, *a, **k)
-        ),
-    )
-    assert plot.draw(made_up(), tmp_path) == [tmp_path / "tables.md"]
+    # Halving is of what ran in both cells: not of SIRENs or the paper's preset.
+    assert "siren" not in found["halving-time"] and "paper" not in found["halving-time"]
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ConfigError, match="pip install"):
+        plot.draw(made_up(), tmp_path)
 
 
 def test_the_readme_has_a_place_for_every_table():
@@ -634,18 +636,15 @@ def test_the_readme_has_a_place_for_every_table():
     assert set(re.findall(r"<!-- table: ([\w-]+) -->", text)) == set(analyse.tables(made_up()))
 
 
-def test_nothing_to_draw_is_told(tmp_path, capsys):
-    assert plot.main(["--out", str(tmp_path)]) == 3
-    assert "results.json: cannot be read" in capsys.readouterr().err
-    (tmp_path / "results.json").write_text(json.dumps({"runs": [one("x", "knob", 1, 1)], "cells": []}))
-    assert plot.main(["--out", str(tmp_path)]) == 3
-    assert "no run of the standard preset" in capsys.readouterr().err
+def test_without_the_standard_preset_nothing_is_drawn(tmp_path):
+    with pytest.raises(InputError, match="no run of the standard preset"):
+        plot.draw({"runs": [one("x", "knob", 1, 1)], "cells": []}, tmp_path)
 
 
 @pytest.mark.parametrize("level", budget.LEVELS, ids=lambda level: level.name)
 def test_a_level_of_the_budget_is_run_as_it_says(level, tmp_path):
     cell = plan.Cell("sky", "glossy", tmp_path / "sky.hdr")
-    found = config.from_dict(levels.settings_of(cell, level), tmp_path)
+    found = config.from_dict(levels.tables_of(cell, level), tmp_path)
     assert (found.input.width, found.scene.width) == (level.map, level.film)
     assert (found.optimizer.iterations, found.target.spp, found.output.spp) == (
         level.iterations, level.spp, level.spp,

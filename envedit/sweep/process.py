@@ -21,7 +21,7 @@ import envedit
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import InputError
 
-from .jobs import Job
+from .jobs import Job, program
 from .locks import Lock
 
 DONE, FAILED, CONFIG, LOG, CHECKPOINT = "done.json", "failed.json", "job.toml", "log.txt", "checkpoint.npz"
@@ -29,6 +29,8 @@ POLL = 0.1
 """Seconds between looks at a process."""
 GRACE = 15.0
 """Seconds that an interrupted job has for its checkpoint."""
+STOPPED: set[str] = set()
+"""Names of the sweeps of this process whose jobs are to end."""
 LONGEST = 300
 """Characters of an error that is reported."""
 _USELESS = "the checkpoint cannot be read", "belongs to another configuration"
@@ -90,9 +92,9 @@ def cores() -> int:
 def run_job(
     job: Job,
     out,
-    command: Sequence[str] = COMMAND,
+    command: Sequence[str] = (),
     threads: int | None = None,
-    stop=None,
+    stop: str = "",
     waited: bool = False,
 ) -> Outcome:
     """Carry out a job unless it is done: in this thread, by a process of its own.
@@ -104,12 +106,14 @@ def run_job(
     out : path
         Folder of all jobs.
     command : sequence of str
-        What to call, as :data:`COMMAND`. Exit code 0: done. 3 with a line that says so, after it was started
-        with a checkpoint: that is damaged or belongs to something else, and is removed for a second try.
+        What to call in place of the job's own command, as :data:`COMMAND`. Exit code 0: done. 3 with a line
+        that says so, after it was started with a checkpoint: that is damaged or belongs to something else,
+        and is removed for a second try.
     threads : int, optional
         Threads of the job; None: the cores of this machine over the jobs at a time of this Dask worker.
-    stop : threading.Event, optional
-        When set, the job is interrupted as by Ctrl-C and gets some seconds for its checkpoint.
+    stop : str
+        Name of the sweep: when it is in :data:`STOPPED`, the job is interrupted as by Ctrl-C and gets some
+        seconds for its checkpoint.
     waited : bool
         It was held when last looked at: if whoever held it left a failure, that is the outcome.
 
@@ -121,6 +125,11 @@ def run_job(
     folder = job.folder(out)
     if (folder / DONE).exists():
         return Outcome(job, "skipped")
+    if stop in STOPPED:
+        return Outcome(job, "stopped")
+    if job.program != program():
+        here = f"{socket.gethostname()} has envedit {program()}, expected {job.program}"
+        return Outcome(job, "failed", error=f"{here}; install the same on every machine")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -133,6 +142,7 @@ def run_job(
         if waited and (folder / FAILED).exists():
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 return Outcome(job, "failed", error=json.loads((folder / FAILED).read_bytes())["error"])
+        command = command or job.command or COMMAND
         return _run(job, folder, command, threads or max(1, cores() // _jobs_at_a_time()), stop, lock)
 
 
@@ -208,7 +218,7 @@ def _watch(process, log, stop, lock):
                     process.wait(0 if reading else POLL)
                 if process.returncode is not None:
                     return (process.returncode if until == math.inf else "stopped"), tail
-            if until == math.inf and stop is not None and stop.is_set():
+            if until == math.inf and stop in STOPPED:
                 until = time.monotonic() + GRACE
                 _signal(process, signal.SIGINT)
             if time.monotonic() > until:

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,19 +31,34 @@ class Job:
     toml : str
         The configuration, every key spelled out, paths absolute, without an output folder.
     key : str
-        32 hexadecimal digits of the SHA-256 of the configuration and of the files it names.
+        32 hexadecimal digits of the SHA-256 of the configuration, of the files it names and of the program.
+    program : str
+        :func:`program` where the job was made.
+    command : tuple of str
+        What carries it out, as :data:`.process.COMMAND`; empty: that.
     """
 
     name: str
     toml: str
     key: str
+    program: str
+    command: tuple[str, ...] = ()
 
     def folder(self, out) -> Path:
         """Return the job's folder under ``out``."""
         return Path(out) / self.key
 
 
-def job(name: str, toml: str | dict, base=".") -> Job:
+@functools.cache
+def program() -> str:
+    """Return the version of envedit and 12 digits of its files' SHA-256: ``1.0.0+0123456789ab``."""
+    package, found = Path(envedit.__file__).parent, hashlib.sha256()
+    for path in sorted(path for path in package.rglob("*.*") if path.is_file() and path.suffix != ".pyc"):
+        found.update(f"{path.relative_to(package).as_posix()}\0{_digest(path)}\n".encode())
+    return f"{envedit.__version__}+{found.hexdigest()[:12]}"
+
+
+def job(name: str, toml: str | dict, base=".", version: str = "", command: Sequence[str] = ()) -> Job:
     """Make a job of a configuration.
 
     Parameters
@@ -53,6 +69,10 @@ def job(name: str, toml: str | dict, base=".") -> Job:
         The TOML text, or its tables.
     base : path
         Folder that relative paths start from.
+    version : str
+        Whatever else decides what comes out, such as the code of ``command``.
+    command : sequence of str
+        What carries it out in place of ``envedit run``; no part of the key.
 
     Raises
     ------
@@ -62,7 +82,7 @@ def job(name: str, toml: str | dict, base=".") -> Job:
         A file that it names cannot be read. One that does not exist is left to the run to report.
     """
     if not name or not name.isprintable():
-        raise ConfigError(f"job {name!r}: wanted a printable name")
+        raise ConfigError(f"job {name!r}: got no printable text, expected a name")
     base = Path(base).absolute()
     make = config.loads if isinstance(toml, str) else config.from_dict
     settings = make(toml, base, f"job {name}")
@@ -80,8 +100,9 @@ def job(name: str, toml: str | dict, base=".") -> Job:
     )
     content = _with_contents(dataclasses.asdict(settings))
     content["scene"] |= {"file": _scene_digest(scene.file), "parameters": given | files}
+    content["program"] = [program(), version]
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
-    return Job(name, config.to_toml(settings), key)
+    return Job(name, config.to_toml(settings), key, program(), tuple(command))
 
 
 def read_jobs(path) -> list[Job]:
@@ -107,9 +128,9 @@ def read_jobs(path) -> list[Job]:
     if tables:
         raise ConfigError(f"{path}: unknown table or key {next(iter(tables))}; known: common, jobs.NAME")
     if not isinstance(jobs, dict) or not jobs:
-        raise ConfigError(f"{path}: no job in it, wanted a table [jobs.NAME] for each")
+        raise ConfigError(f"{path}: no job in it, expected a table [jobs.NAME] for each")
     if wrong := [name for name, table in ({"common": common} | jobs).items() if not isinstance(table, dict)]:
-        raise ConfigError(f"{path}: {wrong[0]}: wanted a table")
+        raise ConfigError(f"{path}: {wrong[0]}: expected a table")
     return [job(name, presets.overlaid(common, table), path.parent) for name, table in jobs.items()]
 
 

@@ -19,14 +19,12 @@ class Board:
         Jobs that are to run.
     slots : int or None
         How many run at a time; None: nobody knows, and the end is estimated from the rate so far.
-    quiet : bool
-        Tell nothing.
-    stream : file
-        Where to.
+    stream : file or None
+        Where to; None: nowhere.
     """
 
-    def __init__(self, total: int, slots: int | None, quiet: bool, stream):
-        self._total, self._slots, self._quiet, self._stream = total, slots, quiet, stream
+    def __init__(self, total: int, slots: int | None, stream):
+        self._total, self._slots, self._stream = total, slots, stream
         self._done, self._failed, self._seconds = 0, 0, []
         self._begun, self._refreshed = time.monotonic(), 0.0
         self._bar, self._said = None, set()
@@ -34,7 +32,7 @@ class Board:
     def begin(self, line: str) -> None:
         """Say what is going to happen."""
         self._say(line)
-        if not self._quiet and self._stream.isatty():
+        if self._stream is not None and self._stream.isatty():
             form = "{n_fmt}/{total_fmt} |{bar}| {elapsed}{postfix}"
             self._bar = tqdm(total=self._total, file=self._stream, bar_format=form, dynamic_ncols=True)
 
@@ -91,7 +89,7 @@ class Board:
         return ", ".join(parts)
 
     def _say(self, line):
-        if not self._quiet:
+        if self._stream is not None:
             tqdm.write(line, file=self._stream)
             self._stream.flush()
 

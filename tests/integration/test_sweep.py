@@ -16,13 +16,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import envedit
 from envedit import config
+from envedit.cli.sweep import main
 from envedit.core.errors import ConfigError, InputError
 from envedit.solve import adam_loop, checkpoint
-from experiments.sweep import COMMAND, drive, job, locks, process, read_jobs, run_job, sweep, table
-from experiments.sweep.__main__ import main
-from experiments.sweep.board import Board
-from experiments.sweep.process import Outcome
+from envedit.sweep import (
+    COMMAND,
+    Outcome,
+    drive,
+    job,
+    locks,
+    process,
+    program,
+    read_jobs,
+    run_job,
+    sweep,
+    table,
+)
+from envedit.sweep.board import Board
 from tests.oracles import ROOT
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 
@@ -111,7 +123,7 @@ class Stub:
         text = (
             # A shell starts what runs in its background with Ctrl-C ignored, and that is inherited.
             "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-            "import sys; from experiments.sweep import drive; from experiments.sweep.__main__ import main;"
+            "import sys; from envedit.sweep import drive; from envedit.cli.sweep import main;"
             "drive.CONNECT = 1;"
             f"sys.exit(main(sys.argv[1:], command={self.command!r}))"
         )
@@ -146,6 +158,8 @@ def dead(pid):
     return locks._started(pid) is None
 
 
+DASK = importlib.util.find_spec("distributed") is not None
+dask = pytest.mark.skipif(not DASK, reason="dask.distributed is missing: pip install '.[cluster]'")
 linux = pytest.mark.skipif(sys.platform != "linux", reason="only on Linux do jobs die with their driver")
 
 
@@ -174,22 +188,23 @@ def test_jobs_are_done_once_and_leave_their_folders(stub):
 
 @pytest.mark.slow
 @linux
-def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub):
-    stub.block("hold", 1, 2)
-    driver = stub.driver(5, "--workers", "2")
-    until(lambda: {seed for seed, _ in stub.noted("begin")} == {0, 1, 2} and stub.noted("end"))
+@pytest.mark.parametrize("held", [(1,), pytest.param((1, 2), marks=dask)])
+def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub, held):
+    stub.block("hold", *held)
+    driver = stub.driver(5, "--workers", str(len(held)))
+    until(lambda: {seed for seed, _ in stub.noted("begin")} == {0, *held} and stub.noted("end"))
     jobs = stub.jobs(5)
     until((jobs[0].folder(stub.out) / "done.json").exists)
     driver.send_signal(signal.SIGKILL)
     driver.communicate()
-    flying = [pid for seed, pid in stub.noted("begin") if seed in (1, 2)]
+    flying = [pid for seed, pid in stub.noted("begin") if seed in held]
     until(lambda: all(dead(pid) for pid in flying))
     assert list((jobs[1].folder(stub.out)).glob("lock-*"))  # nobody was left to remove it
     stub.free()
     again = stub.driver(5)
     said, _ = again.communicate()
     assert again.returncode == 0, said
-    assert stub.counts("begin", 5) == [1, 2, 2, 1, 1]
+    assert stub.counts("begin", 5) == [1 + (seed in held) for seed in range(5)]
     assert stub.counts("end", 5) == [1] * 5
     assert "5 jobs: 1 skipped, 4 done" in said
     assert files(jobs[1].folder(stub.out)) == ["done.json", "job.toml", "log.txt", "result"]
@@ -236,21 +251,25 @@ def test_a_failed_job_is_reported_by_its_last_words_and_does_not_stop_the_others
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, number):
-    stub.block("hold", 0)
-    driver = stub.driver(2)
-    until(lambda: stub.noted("begin"))
+@pytest.mark.parametrize(
+    ("number", "workers"),
+    [(signal.SIGINT, 1), (signal.SIGTERM, 1), pytest.param(signal.SIGINT, 2, marks=dask)],
+)
+def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, number, workers):
+    stub.block("hold", *range(workers))
+    driver = stub.driver(3, "--workers", str(workers))
+    until(lambda: len(stub.noted("begin")) == workers)
     time.sleep(0.1)
     driver.send_signal(number)
     said, _ = driver.communicate()
     assert driver.returncode == 130 and "run again to continue" in said and "Traceback" not in said
-    assert stub.counts("interrupted", 2) == [1, 0] and stub.counts("begin", 2) == [1, 0]
-    folder = stub.jobs(2)[0].folder(stub.out)
+    expected = [int(seed < workers) for seed in range(3)]
+    assert stub.counts("interrupted", 3) == stub.counts("begin", 3) == expected
+    folder = stub.jobs(3)[0].folder(stub.out)
     assert files(folder) == ["checkpoint.npz", "job.toml", "log.txt"]
     stub.free()
-    assert stub.run(2)[0] == ["done", "done"]
-    assert stub.counts("checkpoint", 2) == [1, 0]
+    assert stub.run(3)[0] == ["done"] * 3
+    assert stub.counts("checkpoint", 3) == expected
     assert json.loads((folder / "done.json").read_text())["resumed"] is True
 
 
@@ -355,44 +374,23 @@ def test_a_command_that_does_not_exist_is_a_failure(stub):
 # ---- threads -----------------------------------------------------------------------------------------------
 
 
-def test_cores_are_divided_among_the_jobs(stub, monkeypatch):
+@pytest.mark.parametrize("workers", [1, pytest.param(3, marks=dask)])
+def test_cores_are_divided_among_the_jobs(stub, monkeypatch, workers):
     monkeypatch.setattr(drive, "cores", lambda: 11)
-    stub.command = (
-        "{python}",
-        "-S",
-        "-c",
-        "import os, sys; print(*sys.argv[1:], os.environ['OMP_NUM_THREADS'])",
-    )
-    stub.command += ("{threads}",)
-    together = threading.Barrier(3)
-    took = []
-
-    def run(one, threads, stop, waited):
-        together.wait(20)
-        took.append(threads)
-        return run_job(one, stub.out, stub.command, threads, stop, waited)
-
-    engine = drive.Processes(run, 3, None)
+    show = "import os, sys; print(*sys.argv[1:], os.environ['OMP_NUM_THREADS'])"
+    stub.command = ("{python}", "-S", "-c", show, "{threads}")
     jobs = stub.jobs(3)
-    try:
-        outcomes = [engine.outcome(one, f) for one, f in [(one, engine.submit(one)) for one in jobs]]
-    finally:
-        engine.close()
-    assert [one.state for one in outcomes] == ["done"] * 3
-    assert sorted(took) == [3, 4, 4]
-    said = [(one.folder(stub.out) / "log.txt").read_text().splitlines()[-1] for one in jobs]
-    assert sorted(said) == ["3 3", "4 4", "4 4"]
+    states, said = stub.run(jobs=jobs, workers=workers)
+    assert states == ["done"] * 3 and f"to run: {workers} at a time, {11 // workers} threads" in said
+    shown = {(one.folder(stub.out) / "log.txt").read_text().splitlines()[-1] for one in jobs}
+    assert shown == {f"{11 // workers} {11 // workers}"}
 
 
-def test_the_default_is_a_job_for_every_four_cores(stub, monkeypatch):
-    for number, said in (
-        (1, "1 at a time, 1 threads"),
-        (3, "1 at a time, 3 threads"),
-        (13, "3 at a time, 4.33"),
-    ):
+def test_the_default_is_a_job_for_every_four_cores_where_dask_is_there(stub, monkeypatch):
+    for number, most in ((1, 1), (3, 1), (13, 3 if DASK else 1)):
         monkeypatch.setattr(drive, "cores", lambda number=number: number)
         seeds = [job(f"{number} {i}", f"seed = {100 * number + i}") for i in range(4)]
-        assert said in stub.run(jobs=seeds)[1]
+        assert f"{most} at a time, {number // most} threads" in stub.run(jobs=seeds)[1]
 
 
 def test_drjit_takes_the_number_of_threads(stub):
@@ -431,6 +429,18 @@ def test_the_key_is_that_of_content_and_not_of_names_or_places(tmp_path):
     # A map that is not there is not known by its content, and one of another name is another one.
     gone = [job("x", f'[input]\nenvmap = "{name}"', tmp_path).key for name in ("p.exr", "q.exr")]
     assert gone[0] != gone[1]
+
+
+def test_results_of_another_version_are_not_used(stub, monkeypatch):
+    old = stub.jobs(1)[0]
+    assert stub.run(jobs=[old])[0] == ["done"]
+    assert re.fullmatch(rf"{re.escape(envedit.__version__)}\+[0-9a-f]{{12}}", program())
+    monkeypatch.setattr("envedit.sweep.jobs.program", lambda: "another")
+    new = stub.jobs(1)[0]
+    assert new.key != old.key and job("x", "", version="1").key != job("x", "").key
+    outcome = run_job(new, stub.out, stub.command, 1)  # as on a worker that has the old one
+    assert outcome.state == "failed" and program() in outcome.error and "install the same" in outcome.error
+    assert not new.folder(stub.out).exists() and stub.counts("begin", 1) == [1]
 
 
 def test_files_that_a_scene_names_count(tmp_path):
@@ -483,8 +493,8 @@ def test_jobs_are_read_from_a_file_and_from_a_folder(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no job in it"), ("jobs = 3", "no job in it"), ("[jobs]\na = 1", "a: wanted a table"),
-        ("common = 1\n[jobs.a]", "common: wanted a table"), ("[job.a]", "unknown table or key job"),
+        ("", "no job in it"), ("jobs = 3", "no job in it"), ("[jobs]\na = 1", "a: expected a table"),
+        ("common = 1\n[jobs.a]", "common: expected a table"), ("[job.a]", "unknown table or key job"),
         ("[jobs.a]\nsede = 1", "job a: unknown table or key sede; did you mean seed?"), ("[[", "not TOML"),
         ("[jobs.a.fit]\nepochs = -1", "epochs"), ('[jobs."a\\n"]', "printable"), ('[jobs.""]', "printable"),
     ],
@@ -616,10 +626,10 @@ def test_of_many_who_ask_at_once_at_most_one_gets_the_lock(tmp_path):
 
 
 def test_lines_tell_how_far_it_has_come_and_when_it_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.sweep.board.time.time", lambda: 1e9)
+    monkeypatch.setattr("envedit.sweep.board.time.time", lambda: 1e9)
     made = [job(f"j{i}", f"seed = {i}") for i in range(6)]
     said = io.StringIO()
-    board = Board(6, 2, False, said)
+    board = Board(6, 2, said)
     board.begin("6 jobs")
     clock = time.strftime("%H:%M", time.localtime(1e9 + 2.5 * 40))
     board.tell(Outcome(made[0], "done", 40.0), tmp_path)
@@ -638,9 +648,9 @@ def test_lines_tell_how_far_it_has_come_and_when_it_ends(tmp_path, monkeypatch):
 
 def test_without_known_slots_the_end_is_estimated_from_the_rate(tmp_path, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("experiments.sweep.board.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("envedit.sweep.board.time.monotonic", lambda: now[0])
     said = io.StringIO()
-    board = Board(10, None, False, said)
+    board = Board(10, None, said)
     now[0] = 50.0
     for i in range(5):
         board.tell(Outcome(job(f"j{i}", f"seed = {i}"), "done", 40.0), tmp_path)
@@ -649,7 +659,7 @@ def test_without_known_slots_the_end_is_estimated_from_the_rate(tmp_path, monkey
 
 def test_that_the_scheduler_is_gone_is_said_once(tmp_path):
     said = io.StringIO()
-    board = Board(3, None, False, said)
+    board = Board(3, None, said)
     for i in range(3):
         board.tell(Outcome(job(f"j{i}", f"seed = {i}"), "lost", error="the scheduler went away"), tmp_path)
     assert said.getvalue() == "the scheduler went away: run again to complete the table\n"
@@ -661,7 +671,7 @@ def test_a_terminal_gets_a_bar_and_quiet_nothing(tmp_path):
             return True
 
     said = Terminal()
-    board = Board(2, 1, False, said)
+    board = Board(2, 1, said)
     board.begin("2 jobs")
     board.tell(Outcome(job("a", ""), "done", 40.0), tmp_path)
     board.tell(Outcome(job("b", ""), "failed", 1.0, "why"), tmp_path)
@@ -670,7 +680,7 @@ def test_a_terminal_gets_a_bar_and_quiet_nothing(tmp_path):
     assert "2/2 |" in said.getvalue() and "about 40 s left" in said.getvalue()
     assert "b: failed, 1 s: why" in said.getvalue() and "a: done" not in said.getvalue()
     quiet = Terminal()
-    board = Board(1, 1, True, quiet)
+    board = Board(1, 1, None)
     board.begin("1 job")
     board.tell(Outcome(job("a", ""), "failed", 1.0), tmp_path)
     board.close()
@@ -712,28 +722,30 @@ def test_a_real_run_is_made(tmp_path):
 
 # ---- on a Dask cluster -------------------------------------------------------------------------------------
 
-dask = pytest.mark.skipif(
-    importlib.util.find_spec("distributed") is None,
-    reason="dask.distributed is missing: pip install .[cluster]",
-)
 
-
-@pytest.mark.skipif(importlib.util.find_spec("distributed") is not None, reason="dask.distributed is there")
-def test_without_dask_the_option_says_what_to_install(stub, capsys):
-    ask = [str(stub.written(1)), "--out", str(stub.out), "--scheduler", "tcp://127.0.0.1:1"]
-    assert main(ask, stub.command) == 2
+@pytest.mark.skipif(DASK, reason="dask.distributed is there")
+@pytest.mark.parametrize("where", [["--scheduler", "tcp://127.0.0.1:1"], ["--workers", "2"]])
+def test_without_dask_the_option_says_what_to_install(where, stub, capsys):
+    assert main([str(stub.written(2)), "--out", str(stub.out), *where], stub.command) == 2
     assert "pip install 'envedit[cluster]'" in capsys.readouterr().err
 
 
 @pytest.fixture
 def cluster(stub):
-    """A scheduler and a way to start workers, real processes; ended with the test."""
+    """A scheduler and a way to start workers, by the commands of docs/cluster.md; ended with the test.
+
+    They run in a folder of their own: envedit is found because it is installed.
+    """
+    show = [sys.executable, "-c", "import envedit; print(envedit.__file__)"]
+    found = subprocess.run(show, cwd=stub.folder, capture_output=True, text=True).stdout.strip()
+    if found != envedit.__file__:
+        pytest.skip(f"envedit is not installed in the environment of dask: got {found or 'nothing'}")
     started = []
 
     def start(*arguments):
         log = open(stub.folder / f"dask-{len(started)}.log", "wb")  # noqa: SIM115
-        command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
-        started.append(subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log))
+        command = [str(Path(sys.executable).with_name("dask")), *arguments]
+        started.append(subprocess.Popen(command, cwd=stub.folder, stdout=log, stderr=log))
         log.close()
         return started[-1]
 
@@ -819,4 +831,4 @@ def test_a_cluster_reports_failures_and_an_address_where_nobody_is(stub, cluster
     assert driver.returncode == 2 and "no scheduler there" in said, said
     driver = stub.driver(3, "--scheduler", "nonsense://x:1")
     said, _ = driver.communicate(timeout=60)
-    assert driver.returncode == 2 and "wanted HOST:PORT" in said, said
+    assert driver.returncode == 2 and "expected HOST:PORT" in said, said

@@ -1,0 +1,373 @@
+"""How experiments are carried out: ``python -m experiments NAME run|table|sheet``.
+
+An experiment is its cases, what is measured of each, the columns of its table and the panels of its sheets.
+A case is a job of :mod:`envedit.sweep`: its folder ``OUT/<hash>`` belongs to one configuration, with the
+content of the files it names, and to one version of the program. What is done is skipped, what was
+interrupted continues, and results of another configuration or version are never taken for it.
+
+.. code-block:: python
+
+   EXPERIMENT = Experiment(
+       "turned",
+       "Turn maps by 60 degrees.",
+       cases=lambda given: [
+           Case(name, {"input": {"envmap": str(file)}, "target": {"rotate_degrees": 60}}, {"map": name})
+           for name, file in puresky.chosen(given).items()
+       ],
+       measure=lambda done: {"psnr": done.metrics["render"]["psnr"]},
+       columns={"map": "{map}", "rendering, dB": "{psnr:.1f}"},
+   )
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+
+from envedit import config, sweep
+from envedit.cli import sweep as options
+from envedit.config import presets
+from envedit.core import latlong
+from envedit.core.atomic_files import write_atomically
+from envedit.core.color import tonemap
+from envedit.core.errors import ConfigError, EnveditError, InputError
+from envedit.images import images
+
+GAP = 3
+"""Pixels between the rows of a sheet."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of an experiment.
+
+    Attributes
+    ----------
+    name : str
+        Unique in the experiment; what ``--only`` looks at.
+    tables : dict
+        Configuration.
+    about : dict
+        What the columns and groups show of it.
+    command : sequence of str
+        What carries it out, as :data:`envedit.sweep.COMMAND`.
+    version : str
+        Whatever else decides what comes out, such as the code of another command.
+    result : str
+        The file with its numbers.
+    """
+
+    name: str
+    tables: dict
+    about: dict = field(default_factory=dict)
+    command: Sequence[str] = sweep.COMMAND
+    version: str = ""
+    result: str = "metrics.json"
+
+    def job(self, overrides: Iterable[str] = ()) -> sweep.Job:
+        """Return its job under overrides ``table.key=value``."""
+        how = {"version": self.version, "command": self.command}
+        return sweep.job(self.name, overridden(self.tables, overrides), **how)
+
+
+@dataclass(frozen=True)
+class Done:
+    """A case that is done, and the folder of its results."""
+
+    case: Case
+    folder: Path
+
+    @cached_property
+    def metrics(self) -> dict:
+        """Numbers of its result.
+
+        Raises
+        ------
+        InputError
+            The file cannot be read.
+        """
+        path = self.folder / self.case.result
+        try:
+            return json.loads(path.read_bytes())
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); remove its folder and run again") from None
+
+    def picture(self, name: str) -> np.ndarray:
+        """Read ``NAME.exr``, linear radiance (H, W, 3)."""
+        return images.read(str(self.folder / f"{name}.exr"))[0]
+
+    @cached_property
+    def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Original, edited and true map; None for a target without one, or where its file is gone."""
+        original, edited = layer(self.folder, "initial"), self.picture("edited")
+        settings = config.load(self.folder / "config.toml")
+        asked = settings.target
+        if asked.kind != "envmap":
+            return original, edited, None
+        if not asked.file:
+            return original, edited, latlong.rotate(original, asked.rotate_degrees)
+        try:
+            true = images.load_envmap(asked.file, original.shape[1], settings.input.repair)[0]
+        except EnveditError:  # it may have been moved since
+            true = None
+        return original, edited, true
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the map that were edited."""
+        first, last = self.metrics["active_rows"]
+        return slice(first, last + 1)
+
+
+def layer(folder: Path, name: str) -> np.ndarray:
+    """Read a layer of ``edited_layers.exr``: (H, W, 3), or (H, W) of one that has luminance only."""
+    channels = OpenEXR.File(str(folder / "edited_layers.exr"), separate_channels=True).channels()
+    if f"{name}.Y" in channels:
+        return channels[f"{name}.Y"].pixels
+    return np.stack([channels[f"{name}.{c}"].pixels for c in "RGB"], axis=2).astype(np.float32)
+
+
+def edit_panels(done: Done) -> list[np.ndarray]:
+    """Return original, true and edited map, target and edited rendering as display values."""
+    original, edited, true = done.maps
+    shown = [original, np.zeros_like(original) if true is None else true, edited]
+    shown += [done.picture("render_target"), done.picture("render_edited")]
+    return [tonemap(one, "gamma") for one in shown]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is run, measured and shown.
+
+    Attributes
+    ----------
+    name, description : str
+        Of its command; a line.
+    cases : callable
+        Parsed command line -> list of Case.
+    measure : callable
+        Done -> dict, of which, with the case's ``about``, the columns are made.
+    columns : dict
+        Heading -> format string, or callable of the row's dict that returns the text.
+    group : callable
+        Row -> heading of the part of the table that it belongs to; "" for one table.
+    summary : callable, optional
+        All rows -> Markdown that precedes the table.
+    panels : callable
+        Done -> pictures of display values, of any size; a row of the sheet.
+    sheet : callable
+        Case -> name of the sheet, without ending.
+    options : callable
+        Adds the experiment's own options to the parser.
+    tabulate, draw : callable, optional
+        In place of columns and panels: (all cases with their jobs, folder of the runs, command line) ->
+        Markdown, or, with the folder of the sheets before the command line, -> files.
+    file : callable
+        Command line -> name of the table's file, without ending.
+    """
+
+    name: str
+    description: str
+    cases: Callable[[argparse.Namespace], list[Case]]
+    measure: Callable[[Done], dict] = lambda done: done.metrics
+    columns: dict[str, str | Callable[[dict], str]] = field(default_factory=dict)
+    group: Callable[[dict], str] = lambda row: ""
+    summary: Callable[[list[dict]], str] | None = None
+    panels: Callable[[Done], list[np.ndarray]] = edit_panels
+    sheet: Callable[[Case], str] = lambda case: "sheet"
+    options: Callable[[argparse.ArgumentParser], None] = lambda parser: None
+    tabulate: Callable[[list, Path, argparse.Namespace], str] | None = None
+    draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
+    file: Callable[[argparse.Namespace], str] = lambda given: "table"
+
+
+def overridden(tables: dict, overrides: Iterable[str]) -> dict:
+    """Lay ``table.key=value`` over a configuration's tables."""
+    for text in overrides:
+        keys, value = config.parse_override(text)
+        for key in reversed(keys):
+            value = {key: value}
+        if keys == ("target", "file"):
+            tables = presets.overlaid(tables, {"target": {"rotate_degrees": 0.0}})
+        tables = presets.overlaid(tables, value)
+    return tables
+
+
+# ---- running -----------------------------------------------------------------------------------------------
+
+
+def done_of(cases: Iterable[tuple[Case, sweep.Job]], out: Path) -> list[Done]:
+    """Return the cases that are done, in their order."""
+    return [Done(case, job.folder(out)) for case, job in cases if (job.folder(out) / sweep.DONE).exists()]
+
+
+def carry_out(cases, out: Path, given, stream=None) -> list[sweep.Outcome]:
+    """Run what is not done; with ``--dry-run`` only say what is.
+
+    Parameters
+    ----------
+    cases : list of (Case, Job)
+        In the order in which they are begun.
+    given : namespace
+        Options of :func:`parser`.
+    """
+    if given.dry_run:
+        states = ["done" if (job.folder(out) / sweep.DONE).exists() else "missing" for _, job in cases]
+        return [sweep.Outcome(job, state) for (_, job), state in zip(cases, states, strict=True)]
+    jobs = [job for _, job in cases]
+    return sweep.sweep(jobs, out, given.workers, given.scheduler, given.threads, stream=stream)
+
+
+# ---- tables and sheets -------------------------------------------------------------------------------------
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
+
+
+def number(value: float | None, form: str = ".1f") -> str:
+    """Format a number; a dash for None and NaN."""
+    return "-" if value is None or value != value else format(value, form)
+
+
+def table(experiment: Experiment, done: Iterable[Done]) -> str:
+    """Return the summary and a table for each group."""
+    rows = [one.case.about | experiment.measure(one) for one in done]
+    if not rows:
+        return "no case is done by this version of the program; run computes them"
+    parts = [experiment.summary(rows)] if experiment.summary else []
+    for heading in dict.fromkeys(map(experiment.group, rows)):
+        some = [row for row in rows if experiment.group(row) == heading]
+        forms = [form.format_map if isinstance(form, str) else form for form in experiment.columns.values()]
+        lines = [[form(row) for form in forms] for row in some]
+        parts += [f"{heading}:"] * bool(heading) + [markdown(list(experiment.columns), lines)]
+    return "\n\n".join(parts)
+
+
+def montage(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+    """Put pictures of display values side by side in rows; smaller ones are enlarged by whole factors.
+
+    Returns
+    -------
+    ndarray (H, W, 3) of uint8
+    """
+    height = max(len(picture) for row in rows for picture in row)
+    strips = []
+    for row in rows:
+        factors = [max(1, height // len(picture)) for picture in row]
+        tiles = [np.kron(p[..., :3], np.ones((f, f, 1))) for p, f in zip(row, factors, strict=True)]
+        tiles = [np.pad(t, ((0, height - len(t) + GAP), (0, GAP), (0, 0))) for t in tiles]
+        strips.append(np.concatenate(tiles, axis=1))
+    width = max(strip.shape[1] for strip in strips)
+    padded = [np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0))) for strip in strips]
+    return (np.clip(np.concatenate(padded), 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def sheets(experiment: Experiment, done: Sequence[Done], folder: Path) -> list[Path]:
+    """Draw every sheet of which a case is done; returns the files."""
+    files = []
+    for name in dict.fromkeys(experiment.sheet(one.case) for one in done):
+        some = [one for one in done if experiment.sheet(one.case) == name]
+        files.append(folder / f"{name}.png")
+        write_atomically(files[-1], images.png(montage([experiment.panels(one) for one in some])))
+    return files
+
+
+# ---- command line ------------------------------------------------------------------------------------------
+
+
+def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
+    """Add the options that every experiment has."""
+    parser.add_argument("--out", type=Path, default=out, metavar="DIR", help="of the runs (%(default)s)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="names of cases, or parts")
+    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
+    parser.add_argument("--dry-run", action="store_true", help="list the cases; compute nothing")
+    options.add_options(parser)
+
+
+def make(folder: Path) -> Path:
+    """Make a folder, and return it.
+
+    Raises
+    ------
+    InputError
+        It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder") from None
+    return folder
+
+
+def own_folder(out: Path, *asked: str) -> Path:
+    """Make the folder in ``out`` that belongs to what was asked and to this version of the program."""
+    said = "\n".join([sweep.program(), *asked])
+    return make(out.absolute() / hashlib.sha256(said.encode()).hexdigest()[:16])
+
+
+def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
+    """Run the command line of an experiment.
+
+    Returns
+    -------
+    int
+        0; 1 if a case is not done; 2, 3 as ``envedit run``; 130 interrupted.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m experiments {experiment.name}", description=experiment.description
+    )
+    parser.add_argument(
+        "action",
+        choices=("run", "table", "sheet"),
+        help="compute what is missing and print the table; print the table; draw the contact sheets",
+    )
+    add_options(parser, Path("runs") / experiment.name)
+    parser.add_argument("--to", type=Path, metavar="DIR", help="of table.md and sheets (that of the runs)")
+    experiment.options(parser)
+    given = parser.parse_args(argv)
+    options.check_options(parser, given)
+    return options.exit_code(experiment.name, lambda: _act(experiment, given))
+
+
+def _act(experiment, given):
+    mi.set_variant(config.Config().variant)
+    out = given.out.absolute()
+    chosen = [
+        case
+        for case in experiment.cases(given)
+        if not given.only or any(text in case.name for text in given.only)
+    ]
+    if not chosen:
+        got = f"--only {' '.join(given.only)}: " if given.only else ""
+        raise ConfigError(f"{got}no case of {experiment.name} is left; give other options")
+    cases, missing = [(case, case.job(given.sets)) for case in chosen], []
+    if given.action == "run":
+        outcomes = carry_out(cases, out, given, sys.stderr)
+        missing = [one for one in outcomes if one.state not in ("done", "skipped")]
+        if given.dry_run:
+            print(sweep.table(outcomes))
+            return 0
+        if missing:
+            print(sweep.table(missing), file=sys.stderr)
+    done, to = done_of(cases, out), make(given.to or out)
+    if given.action == "sheet":
+        draw = experiment.draw
+        print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
+    else:
+        tabulate = experiment.tabulate
+        text = tabulate(cases, out, given) if tabulate else table(experiment, done)
+        write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
+        print(text)
+    return 1 if missing else 0

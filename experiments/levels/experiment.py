@@ -1,0 +1,89 @@
+"""Measure the levels of ``--budget``: what each costs and loses, for the table in ``envedit/cli/budget.py``.
+
+Three maps in two scenes, every level once, the transport traced anew; a run that compiled kernels is made
+again. Seconds are of the run's own stages; what is lost is judged alike for all
+(``experiments/tradeoff/judge.py``). Nothing else should run on the machine.
+"""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from envedit.cli import budget
+from experiments.harness import Case, Experiment, done_of, markdown
+from experiments.tradeoff import plan
+from experiments.tradeoff.experiment import folder_of_maps
+
+
+def options(parser):
+    parser.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps ($ENVEDIT_DATA/puresky)")
+    parser.set_defaults(workers=1)
+
+
+def tables_of(cell, level) -> dict:
+    """Return the configuration of a cell's run at a level."""
+    return {
+        "input": {"envmap": str(cell.file), "width": level.map},
+        "scene": {**plan.SCENES[cell.scene], "width": level.film},
+        "target": {"rotate_degrees": plan.ANGLE, "spp": level.spp},
+        "optimizer": {"iterations": level.iterations},
+        "output": {"spp": level.spp, "report": True},
+        "renderer": {"cache": False},
+    }
+
+
+def cases(given):
+    command, version = (*plan.COMMAND, "levels"), hashlib.sha256(plan.MEASURED.read_bytes()).hexdigest()
+    return [
+        Case(
+            f"{cell.name}: {level.name}",
+            tables_of(cell, level),
+            {"cell": cell, "level": level.name},
+            command,
+            version,
+        )
+        for level in budget.LEVELS
+        for cell in plan.cells(folder_of_maps(given))
+    ]
+
+
+def parts(timing: dict) -> dict:
+    """Seconds of rendering, of tracing and search, and of all else, as :class:`.budget.Level` has."""
+    return {
+        "rendering": timing["target_s"] + timing["judge_s"],
+        "tracing": timing["transport_s"] + timing["start_s"],
+        "numbers": timing["fit_s"] + timing["edit_s"] + timing["report_s"],
+    }
+
+
+def tabulate(made, out, given) -> str:
+    """Return a line for each level: seconds, mean to most of the cells, and mean losses."""
+    from experiments.tradeoff.judge import Judge
+
+    judge, judged, seconds = Judge(out, spp=512, true_spp=2048), {}, {}
+    done = done_of(made, out)
+    for one in done:
+        level, cell = one.case.about["level"], one.case.about["cell"]
+        found, timing = judge(cell, one.folder), one.metrics["timing"]
+        judged[level, cell] = found["render"]["psnr_without_noise"], found["map"]["psnr"]
+        seconds.setdefault(level, []).append([*parts(timing).values(), timing["total_s"]])
+    lines = []
+    for level in seconds:
+        told = [f"{column.mean():.1f} to {column.max():.1f}" for column in np.transpose(seconds[level])]
+        cells = [cell for name, cell in judged if name == level and ("standard", cell) in judged]
+        lost = [np.subtract(judged["standard", cell], judged[level, cell]) for cell in cells]
+        loss = [f"{value:.1f}" for value in np.mean(lost, axis=0)] if lost else ["-", "-"]
+        lines.append([f"{level}, {len(seconds[level])} runs", *told, *loss])
+    return markdown(
+        ["level", "rendering s", "tracing s", "numbers s", "total s", "rendering dB", "map dB"], lines
+    )
+
+
+EXPERIMENT = Experiment(
+    "levels",
+    "Measure the levels of --budget: what each costs and loses.",
+    cases,
+    options=options,
+    tabulate=tabulate,
+)

@@ -1,0 +1,139 @@
+"""Experiments: cases that are run once, tables and sheets of what is done, the shared command line."""
+
+import argparse
+import json
+
+import numpy as np
+import pytest
+
+import experiments.__main__ as command
+from envedit import sweep
+from envedit.core.errors import ConfigError, InputError
+from experiments import harness
+from experiments.harness import Case, Done, Experiment, markdown, montage, number, overridden
+
+STUB = (
+    "import json, pathlib, sys, tomllib; folder = pathlib.Path(sys.argv[1]);"
+    "seed = tomllib.loads((folder / 'job.toml').read_text())['seed'];"
+    "seed == 13 and sys.exit('unlucky');"
+    "(folder / 'metrics.json').write_text(json.dumps({'twice': 2 * seed}))"
+)
+COMMAND = ("{python}", "-S", "-c", STUB, "{folder}")
+
+
+def experiment(seeds=(3, 4), version=""):
+    def panels(done):
+        return [np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))]
+
+    return Experiment(
+        "twice",
+        "Double seeds.",
+        lambda given: [Case(f"seed-{s}", {"seed": s}, {"seed": s}, COMMAND, version) for s in seeds],
+        lambda done: done.metrics,
+        {"seed": "{seed}", "twice": lambda row: number(row["twice"], ".1f")},
+        group=lambda row: "odd" if row["seed"] % 2 else "even",
+        summary=lambda rows: f"{len(rows)} rows",
+        panels=panels,
+        sheet=lambda case: "all",
+    )
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    def call(*words, **made):
+        code = harness.main(experiment(**made), [*words, "--out", str(tmp_path / "out"), "--workers", "1"])
+        return code, capsys.readouterr()
+
+    return call
+
+
+def test_cases_are_run_once_and_shown(run, tmp_path):
+    assert run("run", "--dry-run")[1].out.endswith("2 jobs: 2 missing\n") and not (tmp_path / "out").exists()
+    code, said = run("run")
+    assert code == 0 and "2 jobs, 0 done before, 2 to run" in said.err
+    expected = "2 rows\n\nodd:\n\n| seed | twice |\n| --- | --- |\n| 3 | 6.0 |\n\neven:\n\n"
+    assert said.out == expected + "| seed | twice |\n| --- | --- |\n| 4 | 8.0 |\n"
+    assert (tmp_path / "out" / "table.md").read_text() == said.out
+    code, again = run("run")
+    assert again == (said.out, "") and run("table")[1].out == said.out
+    code, sheet = run("sheet", "--to", str(tmp_path / "sheets"))
+    assert sheet.out == f"{tmp_path / 'sheets' / 'all.png'}\n" and (tmp_path / "sheets" / "all.png").exists()
+
+
+def test_results_of_another_configuration_or_version_are_not_reused(run, monkeypatch):
+    run("run", "--only", "seed-3")
+    assert "| 3 | 6.0 |" in run("table")[1].out
+    assert "no case is done" in run("table", "--set", "fit.epochs=7")[1].out
+    assert "no case is done" in run("table", version="of the command")[1].out
+    monkeypatch.setattr("envedit.sweep.jobs.program", lambda: "another")
+    assert "no case is done" in run("table")[1].out
+
+
+def test_a_case_that_fails_does_not_stop_the_others(run):
+    code, said = run("run", seeds=(13, 4))
+    assert code == 1 and "| 4 | 8.0 |" in said.out
+    assert "seed-13  failed" in said.err and "exit code 1: unlucky" in said.err
+
+
+def test_user_errors_are_one_line(run, tmp_path):
+    code, said = run("run", "--only", "nothing")
+    assert code == 2 and said.err == "twice: --only nothing: no case of twice is left; give other options\n"
+    (tmp_path / "file").touch()
+    code, said = run("table", "--to", str(tmp_path / "file" / "x"))
+    assert code == 3 and "cannot be made" in said.err
+    with pytest.raises(InputError, match="remove its folder and run again"):
+        Done(Case("x", {}), tmp_path).metrics  # noqa: B018
+    with pytest.raises(ConfigError):
+        overridden({}, ["seed"])
+
+
+def test_an_override_beats_the_case_and_a_target_file_its_turn():
+    tables = {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
+    found = overridden(tables, ["seed=2", "target.file=b.exr"])
+    assert found == {"seed": 2, "target": {"rotate_degrees": 0.0, "spp": 8, "file": "b.exr"}}
+    assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
+
+
+def test_a_folder_belongs_to_what_was_asked_and_to_a_version(tmp_path, monkeypatch):
+    folders = [harness.own_folder(tmp_path, *asked) for asked in ((), ("a",), ("a", "b"))]
+    assert len(set(folders)) == 3 and all(folder.is_dir() for folder in folders)
+    monkeypatch.setattr(sweep, "program", lambda: "another")
+    assert harness.own_folder(tmp_path) not in folders
+
+
+def test_numbers_tables_and_montages():
+    assert [number(v) for v in (None, float("nan"), 1.25, 0)] == ["-", "-", "1.2", "0.0"]
+    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    gap = harness.GAP
+    made = montage([[np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))], [np.full((4, 1, 3), 2.0)]])
+    assert made.shape == (2 * (4 + gap), 6 + 4 + 2 * gap, 3) and made.dtype == np.uint8
+    assert (made[:4, :6] == 128).all() and (made[:4, 6 + gap : 10 + gap] == 255).all()
+    assert (made[4 + gap : 8 + gap, :1] == 255).all() and not made[4 + gap :, 1:].any()
+
+
+def test_every_experiment_makes_its_cases(tmp_path, monkeypatch, capsys):
+    for kind in ("puresky", "hdri"):
+        (tmp_path / kind).mkdir()
+    for name in (
+        "kloofendal_48d_partly_cloudy", "autumn_field", "wasteland_clouds", "overcast_soil", "sunflowers"
+    ):  # fmt: skip
+        (tmp_path / "puresky" / f"{name}_puresky_1k.hdr").write_text(name)
+    monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
+    counts = {"first_edit": 12, "layers": 40, "levels": 24, "natural": 330, "painted_edits": 18, "views": 18}
+    for name, count in counts.items():
+        asked = [name, "run", "--dry-run", "--out", str(tmp_path / "out" / name)]
+        assert command.main(asked) == 0
+        assert capsys.readouterr().out.endswith(f"{count} jobs: {count} missing\n")
+    assert command.main(["layer"]) == 2
+    assert "expected one of first_edit, layers" in capsys.readouterr().err
+
+
+def test_the_same_options_everywhere():
+    parser = argparse.ArgumentParser()
+    harness.add_options(parser, harness.Path("runs/x"))
+    given = parser.parse_args(["--set", "a.b=1", "--set", "c=2", "--only", "x", "y", "--scheduler", "h:1"])
+    assert (given.sets, given.only, given.scheduler) == (["a.b=1", "c=2"], ["x", "y"], "h:1")
+    assert json.dumps(sorted(vars(given))) == json.dumps(
+        ["dry_run", "only", "out", "scheduler", "sets", "threads", "workers"]
+    )
+    assert Case("x", {}).command == sweep.COMMAND

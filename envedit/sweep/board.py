@@ -11,7 +11,7 @@ from .process import LOG, Outcome
 
 
 class Board:
-    """Tell of jobs as they end.
+    """Report jobs as they end.
 
     Parameters
     ----------

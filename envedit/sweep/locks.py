@@ -26,8 +26,8 @@ class Lock:
                return f"{lock.holder} is at it"
            ...
 
-    Everybody who wants it writes a file with a name of its own, and then looks for others. Of two who do so
-    at the same time at least one sees the other and steps back; and a file that nobody but its owner ever
+    Every process that asks for it writes a file with a name of its own, then looks for others. Of two that do
+    so at the same time at least one sees the other and steps back; a file that nobody but its owner ever
     writes can be removed without asking once its owner is dead. Whether it is: on the same machine by its
     processes, on another one by the age of the file, which its owner touches now and then.
 

@@ -246,11 +246,20 @@ class Table:
 
     given: ClassVar[frozenset[str]] = frozenset()
 
-    def __new__(cls, *values, **named):
-        """Note which fields are given."""
-        table = super().__new__(cls)
-        by_position = (f.name for f, _ in zip(fields(cls), values, strict=False))
-        object.__setattr__(table, "given", frozenset([*by_position, *named]))
+    def __new__(cls, *values: Any, **named: Any) -> Table:
+        """Note which fields are given; ConfigError for one that there is not."""
+        table, known = super().__new__(cls), [f.name for f in fields(cls)]
+        where = "" if cls.__name__ == "Config" else f"{cls.__name__.lower()}."
+        if len(values) > len(known):
+            raise ConfigError(f"{cls.__name__}: got {len(values)} values, expected at most {len(known)}")
+        for name in named:
+            if name not in known:
+                close = difflib.get_close_matches(name[:60], known, 1)
+                hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
+                raise ConfigError(f"{where}{name}: unknown key; {hint}")
+        if twice := [name for name in known[: len(values)] if name in named]:
+            raise ConfigError(f"{where}{twice[0]}: got two values, expected one")
+        object.__setattr__(table, "given", frozenset([*known[: len(values)], *named]))
         return table
 
     def with_defaults(self, values: dict[str, Any]) -> Table:
@@ -276,6 +285,8 @@ class Table:
 def checked(f: Any, name: str, value: Any) -> Any:
     """Check the value of a field, or of a table inside a table; raise ConfigError with the key's name."""
     if "table" in f.metadata:
+        if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+            return f.metadata["table"](**value)
         if not isinstance(value, f.metadata["table"]):
             raise ConfigError(f"{name}: got {show(value)}, expected a table")
         return value

@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import config, pipeline, representations, results
+from envedit import config, pipeline, representations
 from envedit.core.errors import NumericalError
+from envedit.export import file_resolution
 from envedit.losses import losses, optimizer
 from envedit.report import manifest
 from envedit.scene import scene
@@ -394,7 +395,7 @@ def test_a_full_map_that_is_not_finite_does_not_cost_the_result(tmp_path, rng, m
     def fails(*arguments):
         raise NumericalError("the carried map is not finite at row 3, column 4")
 
-    monkeypatch.setattr(results, "at_full_resolution", fails)
+    monkeypatch.setattr(file_resolution, "at_full_resolution", fails)
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     said = capsys.readouterr().err

@@ -116,6 +116,7 @@ def run(
         height, width, _ = original.shape
         first, last = inputs.active_rows(settings.input.rows, height)
         if settings.target.kind == "none":
+            warnings += config.unused(settings)
             found = _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
             return replace(found, memory=memory, base=base)
         renderers.check(settings, lit, (height, width))
@@ -143,9 +144,7 @@ def run(
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, notes = job.renderer, notes + edit.notes
     traced = renderer.transport
-    if job.newton and (unused := _unused(settings)):
-        asked = ", ".join(unused)
-        warnings.append(f'{asked}: not used by Gauss-Newton steps; [optimizer] kind = "adam" uses them')
+    warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
     with clock("edit_s"), _in_file_units(given):
         watch.stage("editing")
         params, state = job.optimise(edit.params, edit.crop, resume)
@@ -281,18 +280,6 @@ def _in_file_units(given):
     except (Interrupted, Stopped) as stop:
         stop.envmap = given.as_stored(stop.envmap)
         raise
-
-
-def _unused(settings):
-    """Name the keys that a user gave and only Adam reads."""
-    only = {
-        "loss": settings.loss.given,
-        "optimizer": {"lr", "beta2", "schedule"},
-        "renderer": {"refresh", "influence_threshold"},
-    }
-    return sorted(
-        f"{name}.{key}" for name, keys in only.items() for key in keys & getattr(settings, name).given
-    )
 
 
 def _as_seen(traced, original, wanted):

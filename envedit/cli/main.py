@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, paint, fit, init, doctor, cache."""
+"""The command ``envedit``: run, paint, fit, init, doctor, schema, cache."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ COMMANDS = {
     "fit": "fit a SIREN to a map, without an edit",
     "init": "write a commented configuration to start from",
     "doctor": "check whether this machine can run envedit",
+    "schema": "print every key of the configuration, as JSON Schema or as a page",
     "cache": "show or delete what is kept on disk between runs",
 }
 

@@ -71,8 +71,8 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     """Make the environment of a built scene replaceable.
 
     The ``scale`` of its ``envmap`` becomes 1, as that of every :class:`.Scene`; the former one is in ``own``.
-    Light transport and renderings of such a scene are not found on disk by another run: nothing in it tells
-    all that it is made of.
+    Light transport and renderings of such a scene are not found on disk by another run: what it is
+    made of cannot be read from it.
 
     Parameters
     ----------

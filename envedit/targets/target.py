@@ -240,8 +240,8 @@ def _rendered(settings, scene, envmap, other):
         true = inputs.scaled(true, scene.own.scale, str(chosen.file))
         source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
     else:
-        true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
-        source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
+        true, warnings = latlong.rotate(envmap, chosen.degrees), ()
+        source = f"rendered under the map turned by {chosen.degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
     picture, spp, noise = rendered(scene, true, chosen.spp, settings.seed + SEED, settings.renderer.cache)
     weight = np.ones((*picture.shape[:2], 1), np.float32) if chosen.masks else None

@@ -90,7 +90,7 @@ def _true_map(folder: Path, original):
     if settings.target.kind != "envmap":
         return None
     if not settings.target.file:
-        return latlong.rotate(original, settings.target.rotate_degrees)
+        return latlong.rotate(original, settings.target.degrees)
     with contextlib.suppress(EnveditError):  # it may have been moved since
         return images.load_envmap(settings.target.file, original.shape[1], settings.input.repair)[0]
     return None

@@ -10,6 +10,7 @@ files exist is not looked at here: the modules that read them say so. The file i
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, fields
 from typing import Any
@@ -69,7 +70,16 @@ class Output(Table):
 
 @dataclass(frozen=True)
 class Config(Table):
-    """Everything a run depends on."""
+    """Everything a run depends on: ``Config(preset="draft", scene={"width": 64})``.
+
+    Tables may be given as dicts. :func:`envedit.edit` takes nested dicts with the tables and keys of a TOML
+    file, whose paths it resolves. Every key with its range and unit: docs/configuration.md.
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown, or its value is of another type or out of its range; the message names it.
+    """
 
     preset: str = key("standard", Choice(*presets.PRESETS), "named set of defaults")
     seed: int = key(0, Integer(0, 2**32 - 1), "base of every random number")
@@ -121,7 +131,7 @@ def _document(cls: type[Table], keys: Mapping[str, Field[Any]]) -> None:
     for name, f in keys.items():
         unit = f", {f.metadata['unit']}" if f.metadata["unit"] else ""
         lines.append(f"{name} : {f.type}\n    {f.metadata['doc']}{unit}.")
-    cls.__doc__ = f"{cls.__doc__}\n\nAttributes\n----------\n" + "\n".join(lines)
+    cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nAttributes\n----------\n" + "\n".join(lines)
 
 
 for _name, _fields in FIELDS.items():

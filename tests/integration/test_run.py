@@ -499,6 +499,7 @@ def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, c
     before = content(out)
     named = Path(config.load(path).input.envmap)
     images.write_exr(named, 2 * images.read(named)[0])
+    capsys.readouterr()
     assert call(path, "--resume", *changed(optimizer__iterations=1)) == 3
     said = capsys.readouterr().err
     assert said.startswith(f"envedit: {named}: has changed since") and len(said.splitlines()) == 1

@@ -358,6 +358,7 @@ def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
 def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+    capsys.readouterr()
 
     def fails(*arguments, **keys):
         raise NumericalError(f"{stage}: not finite at row 1, column 2")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -18,7 +18,8 @@ from envedit.config.validators import show
 from envedit.core.errors import ConfigError, InputError
 from envedit.images import analytic_sky, images
 from envedit.pipeline import Watch, run
-from envedit.representations.siren.fit import fit
+from envedit.representations.siren import fit as siren
+from envedit.representations.siren.fit import Fitted
 from envedit.results import Result
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
@@ -110,6 +111,61 @@ def edit(
         arguments = (given.get(name) for name in ("envmap", "target_map", "target", "mask"))
         memory = inputs.Given(lit, *arguments)
         return run(_of_arrays(chosen, given), base=base or found, watch=watch, memory=memory)
+
+
+def fit(
+    image: ArrayLike,
+    network: config.Representation | Mapping[str, Any] | None = None,
+    settings: config.Fit | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    rows: tuple[int, int] | None = None,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> Fitted:
+    """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
+
+    Parameters
+    ----------
+    image : array (H, W, 3)
+        Linear radiance, finite and not negative.
+    network : Representation or dict, optional
+        Width, depth and frequency, keys of ``[representation]``; the standard preset's by default.
+    settings : Fit or dict, optional
+        The recipe, keys of ``[fit]``; the standard preset's by default.
+    seed : int
+        Seed of the initial weights.
+    rows : (int, int), optional
+        First row of the image in its map, and the rows of that map; None: the image is a whole map.
+    folder : Path, optional
+        Where fits are kept under a hash of image and settings, half-made ones too; None: nowhere.
+    progress : callable, optional
+        Called with (epoch, epochs, loss) now and then.
+
+    Returns
+    -------
+    Fitted
+        ``params``, ``normalisation``, ``log_psnr`` (dB), ``peak_ratio`` (of the brightest texel).
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown, or its value cannot be used.
+    InputError
+        The image has another shape, or a texel is not finite or is negative.
+    NumericalError
+        Too many steps were not finite.
+    """
+    pixels = _array("image", image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise InputError(f"image: got an array of shape {pixels.shape}, expected (H, W, 3)")
+    if isinstance(network, Mapping):
+        network = config.Representation(**{"kind": "siren", **network})
+    if isinstance(settings, Mapping):
+        settings = config.Fit(**settings)
+    if mi.variant() is None:
+        mi.set_variant(config.Config().variant)
+    return siren.fit(pixels, network, settings, seed, rows, folder=folder, progress=progress)
 
 
 def load_scene(

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -175,9 +176,10 @@ class LightTransport:
         latlong.check_envmap_size(height, width)
         memory_gb = allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
-            if value != "auto" and not value >= 1:
+            whole = isinstance(value, Integral) and not isinstance(value, bool)
+            if value != "auto" and not (whole and value >= 1):
                 raise ConfigError(
-                    f"renderer.{name}: got {value}, expected a whole number of at least 1, or auto"
+                    f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
                 )
         cache = DiskCache(folder)
         origin = {

@@ -165,6 +165,36 @@ def test_tables_made_in_python_name_the_key(make, text):
     assert text in str(info.value)
 
 
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: envedit.fit(np.ones((8, 16))), "image: got an array of shape (8, 16), expected (H, W, 3)"),
+        (lambda: envedit.fit("sky.exr"), "image: got 'sky.exr', expected an array"),
+        (lambda: envedit.fit(np.ones((8, 16, 3)), {"hiden": 3}), "hiden: unknown key; did you mean hidden?"),
+        (lambda: envedit.fit(np.ones((8, 16, 3)), settings={"epochs": -1}), "fit.epochs: got -1, expected"),
+        (lambda: envedit.fit(-np.ones((8, 16, 3))), "row 0, column 0 is not finite or is negative"),
+        (lambda: envedit.load_scene("sphere", width="a"), "scene.width: got 'a', expected an integer"),
+        (lambda: envedit.load_scene("sphere", parameters={"a": []}), "scene.parameters: got {'a': []}"),
+        (lambda: envedit.load_scene("shpere"), "did you mean sphere?"),
+        (lambda: envedit.load_map("none.exr"), "none.exr"),
+        (lambda: envedit.sunsky(63), "input.width: got 63, expected an even integer"),
+        (lambda: envedit.LightTransport.build("sphere", spp="many"), "renderer.spp: got 'many', expected"),
+        (lambda: envedit.LightTransport.build("sphere", max_depth=0), "renderer.max_depth: got 0, expected"),
+        (lambda: envedit.LightTransport.build(3), "scene: got int, expected a file, a dict"),
+    ],
+)
+def test_other_functions_refuse_by_name_as_well(make, text):
+    with pytest.raises(envedit.EnveditError) as info:
+        make()
+    assert text in str(info.value)
+
+
+def test_a_fit_takes_dicts():
+    sky = envedit.sunsky(16)
+    fitted = envedit.fit(sky, {"hidden": 8, "depth": 1}, {"epochs": 2, "cache": False})
+    assert fitted.epochs == 2 and all(np.isfinite(values).all() for values in fitted.params.values())
+
+
 def test_a_dict_makes_a_table():
     assert config.Config(scene={"width": 9}) == config.Config(scene=config.Scene(width=9))
 

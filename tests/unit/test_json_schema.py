@@ -176,6 +176,19 @@ def test_the_schema_refuses_what_a_configuration_refuses(table):
         config.from_dict(table)
 
 
+def test_it_is_a_json_schema_to_another_program_as_well():
+    jsonschema = pytest.importorskip("jsonschema", reason="comes with the extra envedit[docs]")
+    jsonschema.Draft7Validator.check_schema(SCHEMA)
+    program = jsonschema.Draft7Validator(SCHEMA)
+    assert program.is_valid(tomllib.loads(config.to_toml(config.loads("", preset="paper"))))
+    for name, check in CHECKS.items():
+        table, _, key = name.rpartition(".")
+        keys = SCHEMA["properties"][table]["properties"] if table else SCHEMA["properties"]
+        for value in edges(check):
+            given = {table: {key: value}} if table else {key: value}
+            assert program.is_valid(given) == accepts(keys[key], value), (name, value)
+
+
 def test_checks_can_be_inspected():
     assert FIELDS["input"]["width"].metadata["check"] == Integer(6, 16384, even=True)
     assert FIELDS["target"]["kind"].metadata["check"].names == ("envmap", "image", "strokes", "none")

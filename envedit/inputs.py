@@ -230,7 +230,7 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
 
 
 def _read(source, width, repair, scale):
-    stored, info = images.load_envmap(source, width, repair, convert=False)
+    stored, info = images.load_envmap(source, width, repair, convert=False, name="envmap")
     about = scale, info["size"], list(info["warnings"]), info["chromaticities"]
     array = source if isinstance(source, np.ndarray) else None
     found = InputMap(source if array is None else images.ARRAY, stored, *about, array=array)

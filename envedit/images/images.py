@@ -138,7 +138,7 @@ def _decode(path, stored):
 
 
 def load_envmap(
-    path, width: int | None = None, repair: bool = False, convert: bool = True
+    path, width: int | None = None, repair: bool = False, convert: bool = True, name: str = ARRAY
 ) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
@@ -152,6 +152,8 @@ def load_envmap(
         Replace NaN and infinite texels instead of refusing them.
     convert : bool
         To Rec. 709; otherwise colours are those of the file, ``info["chromaticities"]``.
+    name : str
+        What errors call an array.
 
     Returns
     -------
@@ -171,7 +173,7 @@ def load_envmap(
     if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
         raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
     if isinstance(path, np.ndarray):
-        image, info = _of_array(path)
+        image, info = _of_array(path, name)
     else:
         image, info = read(path) if convert else _decode(path, stored=False)
     name, warnings = info["path"], info["warnings"]
@@ -215,15 +217,15 @@ def load_envmap(
     return image, info
 
 
-def _of_array(values: np.ndarray) -> tuple[np.ndarray, dict]:
+def _of_array(values: np.ndarray, name: str) -> tuple[np.ndarray, dict]:
     """Take a map from an array as :func:`read` takes one from a file."""
     if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fiu":
         what = f"shape {values.shape} of {values.dtype}"
-        raise InputError(f"environment map: got an array of {what}, expected (H, 2 H, 3) numbers")
+        raise InputError(f"{name}: got an array of {what}, expected (H, 2 H, 3) numbers")
     with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is named as such
         image = np.array(values, np.float32)
     size = image.shape[1], image.shape[0]
-    info = {"path": ARRAY, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
+    info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
     return image, info | {"chromaticities": None}
 
 

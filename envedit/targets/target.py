@@ -235,7 +235,7 @@ def _rendered(settings, scene, envmap, other):
     chosen = settings.target
     if chosen.file:
         file = chosen.file if other is None else other
-        true, info = images.load_envmap(file, envmap.shape[1], settings.input.repair)
+        true, info = images.load_envmap(file, envmap.shape[1], settings.input.repair, name="target_map")
         require_radiance(true, str(chosen.file), brightest=BRIGHTEST)
         true = inputs.scaled(true, scene.own.scale, str(chosen.file))
         source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])

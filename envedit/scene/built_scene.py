@@ -25,7 +25,16 @@ from envedit.scene.scene import Scene
 from envedit.scene.supported import OwnMap
 
 _CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
-_INTEGRATORS = ("PathIntegrator", "PRBIntegrator", "PRBBasicIntegrator", "DirectIntegrator")
+# Names of classes, of which an integrator written in Python has another in Python than in C++.
+_PATHS = {
+    "PathIntegrator",
+    "PRBIntegrator",
+    "BasicPRBIntegrator",
+    "PathProjectiveIntegrator",
+    "ParticleTracerIntegrator",
+}
+_DIRECT = {"DirectIntegrator", "DirectProjectiveIntegrator"}
+_VOLUMES = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
 UNKNOWN = "built "
 """How the digest of a built scene begins: it says nothing of what the scene consists of."""
 _ANY_DEPTH = 2**32 - 1  # as Mitsuba prints a depth of -1
@@ -86,7 +95,8 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     ConfigError
         It is no scene of the present variant, or some of several sensors are asked for.
     InputError
-        Its environment is no ``envmap``, or stands askew, or a sensor is of a kind that makes no picture.
+        Its environment is no ``envmap``, or stands askew, a sensor is of a kind that makes no picture, or
+        there is a medium that its integrator would render.
     """
     if not is_built(given):
         what = type(given).__name__
@@ -116,7 +126,7 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     params[f"{stem}scale"] = 1.0
     params.update()
     width, views = scenes.views_of(given, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
-    depth, hide, notes = _integrator(given.integrator())
+    depth, hide, notes = _integrator(given)
     unique = UNKNOWN + uuid.uuid4().hex
     own = OwnMap(None, scale)
     rows = views[-1].rows.stop
@@ -161,15 +171,21 @@ def _rotation(transform: Any) -> np.ndarray:
     return found
 
 
-def _integrator(given: Any) -> tuple[int, bool, tuple[str, ...]]:
-    """Return path depth, whether emitters are hidden, and notes."""
-    if given is None:
-        return -1, False, ()
-    name, hide = given.class_name(), bool(getattr(given, "hide_emitters", False))
-    if name not in _INTEGRATORS:
-        return -1, hide, (f"integrator {name} is not used: rendered by path, with paths of any length",)
-    if name == "DirectIntegrator":
-        return 2, hide, ()
+def _integrator(scene: Any) -> tuple[int, bool, tuple[str, ...]]:
+    """Return path depth, whether emitters are hidden, and notes, as :func:`.supported.take_integrator`."""
+    given, media = scene.integrator(), any(shape.is_medium_transition() for shape in scene.shapes())
+    names = {given.class_name(), type(given).__name__} if given is not None else {"PathIntegrator"}
+    hide, notes = bool(getattr(given, "hide_emitters", False)), []
+    if media and names & _VOLUMES:
+        raise InputError("scene: participating medium: envedit renders surfaces only; remove the medium")
+    if media:
+        notes.append("the scene's medium is not rendered, as its integrator has no media")
+    if names & _DIRECT:
+        return 2, hide, tuple(notes)
+    if not names & (_PATHS | _VOLUMES):
+        kind = given.class_name()
+        notes.append(f"integrator {kind} is not used: rendered by path, with paths of any length")
+        return -1, hide, tuple(notes)
     found = re.search(r"max_depth = (\d+)", str(given))
-    depth = int(found[1]) if found else getattr(given, "max_depth", _ANY_DEPTH)
-    return (-1 if depth >= _ANY_DEPTH else int(depth)), hide, ()
+    depth = int(found[1]) if found else int(getattr(given, "max_depth", _ANY_DEPTH))
+    return (-1 if depth >= _ANY_DEPTH else depth), hide, tuple(notes)

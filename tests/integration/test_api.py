@@ -116,6 +116,34 @@ def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
     assert np.allclose(first.adjoint(ones).numpy().mean(axis=2), first.influence, rtol=1e-4)
 
 
+@pytest.mark.parametrize("integrator", [
+    {"type": "path"}, {"type": "path", "max_depth": 6}, {"type": "direct"}, {"type": "prb", "max_depth": 4},
+    {"type": "prb", "max_depth": -1}, {"type": "direct_projective"}, {"type": "volpath", "max_depth": 3}, {"type": "depth"},
+    {"type": "ptracer", "max_depth": 5},
+])  # fmt: skip
+def test_a_built_scene_s_integrator_asks_for_the_same_as_a_dict_s(integrator):
+    made = ball(np.ones((4, 8, 3), np.float32)) | {"integrator": integrator}
+    built, parsed = (envedit.load_scene(scene) for scene in (mi.load_dict(made), made))
+    assert (built.max_depth, built.hide_emitters) == (parsed.max_depth, parsed.hide_emitters)
+    assert len(built.notes) == len(parsed.notes)
+
+
+def test_a_built_scene_that_cannot_be_used_is_refused():
+    made = ball(np.ones((4, 8, 3), np.float32))
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    fog = {"ball": {"type": "sphere", "interior": {"type": "homogeneous"}}, "integrator": {"type": "volpath"}}
+    for change, text in (
+        (fog, "participating medium"),
+        ({"sky": {"type": "constant"}}, "got environment ConstantBackgroundEmitter, expected an emitter"),
+        ({"camera": {"type": "radiancemeter", "film": film}}, "sensor RadianceMeter makes no picture"),
+        ({"other": made["camera"]}, "for a built scene with 2 sensors"),
+        ({"sky": made["sky"] | {"scale": 0.0}}, "scale of the environment map is 0.0"),
+        ({"sky": made["sky"] | {"to_world": mi.ScalarTransform4f().scale([1, 2, 1])}}, "is no rotation"),
+    ):
+        with pytest.raises(envedit.EnveditError, match=text):
+            envedit.load_scene(mi.load_dict(made | change))
+
+
 @pytest.mark.parametrize(
     ("given", "kind", "parts"),
     [

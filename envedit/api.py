@@ -301,14 +301,15 @@ def _settings(given: object) -> tuple[config.Config, Path | None]:
 
 
 def _array(name: str, value: ArrayLike) -> np.ndarray:
-    """Return an argument as an array of numbers; its shape and values are checked where it is used."""
+    """Return an argument as float32, as which it is saved; shape and values are checked where it is used."""
     try:
         found = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths
         found = np.asarray(None)
     if found.dtype.kind not in "fiu":
         raise InputError(f"{name}: got {show(value)}, expected an array of numbers")
-    return found
+    with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is refused as such
+        return found.astype(np.float32)
 
 
 def _of_arrays(settings: config.Config, given: Mapping[str, np.ndarray]) -> config.Config:

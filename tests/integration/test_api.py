@@ -49,7 +49,7 @@ def ball(texels, scale=2.0):
 # ---- the example of the documentation ----------------------------------------------------------------------
 
 
-def test_the_example_runs_and_what_it_saves_runs_to_the_same_map(tmp_path, monkeypatch, capsys):
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
@@ -64,14 +64,25 @@ def test_the_example_runs_and_what_it_saves_runs_to_the_same_map(tmp_path, monke
     rendered = found["scene"].render(found["sky"], spp=64)
     assert np.abs(found["initial"] - rendered).mean() < 0.05 * rendered.mean()
 
-    saved = tmp_path / "edit"
-    assert np.array_equal(images.read(saved / "edited.exr")[0], result.envmap)
-    again = pipeline.run(config.load(saved / "config.toml"))
-    assert np.array_equal(again.envmap, result.envmap)
-    before = result.metrics["timing"]["total_s"]
+    assert np.array_equal(images.read(tmp_path / "edit" / "edited.exr")[0], result.envmap)
+
+
+def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path, own_cache):
+    sky = np.random.default_rng(5).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
+    picture = np.random.default_rng(6).uniform(0, 1, (16, 16, 3))
+    given = {"scene": envedit.load_scene("sphere", 16, parameters={"roughness": 0.4}), "envmap": sky}
+    mask = picture[..., 0]
+    result = envedit.edit(TINY, target=picture, mask=mask, **given)
+    saved = tmp_path / "out"
+    result.save(saved)
+    found = config.load(saved / "config.toml")
+    assert found.scene.parameters == {"roughness": 0.4} and found.target.kind == "image"
+    again = pipeline.run(found)
+    assert np.array_equal(again.envmap, result.envmap) and again.given.size == (32, 16)
+    before = result.metrics["timing"]["total_s"], list(result.warnings)
     result.save(saved)  # a second time: the first is moved aside, and the result is as it was
-    assert (saved / "earlier-1" / "given_envmap.exr").exists()
-    assert result.metrics["timing"]["total_s"] == before
+    assert (saved / "earlier-1" / "given_envmap.exr").exists() and (saved / "given_mask.exr").exists()
+    assert (result.metrics["timing"]["total_s"], result.warnings) == before
 
 
 def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
@@ -118,8 +129,8 @@ def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
 
 @pytest.mark.parametrize("integrator", [
     {"type": "path"}, {"type": "path", "max_depth": 6}, {"type": "direct"}, {"type": "prb", "max_depth": 4},
-    {"type": "prb", "max_depth": -1}, {"type": "direct_projective"}, {"type": "volpath", "max_depth": 3}, {"type": "depth"},
-    {"type": "ptracer", "max_depth": 5},
+    {"type": "prb", "max_depth": -1}, {"type": "direct_projective"}, {"type": "volpath", "max_depth": 3},
+    {"type": "depth"}, {"type": "ptracer", "max_depth": 5},
 ])  # fmt: skip
 def test_a_built_scene_s_integrator_asks_for_the_same_as_a_dict_s(integrator):
     made = ball(np.ones((4, 8, 3), np.float32)) | {"integrator": integrator}

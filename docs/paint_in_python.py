@@ -26,8 +26,6 @@ settings = config.loads(
     spp = 64
     [output]
     spp = 64
-    [loss]
-    change = 0.01            # hold the sky where the paint leaves it free
     """
 )
 

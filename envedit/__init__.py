@@ -1,23 +1,47 @@
 """envedit: edit HDR environment maps by inverse rendering, natively in Dr.Jit.
 
 ``envedit.edit(config)`` carries out an edit, ``envedit.fit(image, ...)`` fits a SIREN,
-``envedit.LightTransport.build(scene, ...)`` traces a light transport. They are imported on first use, so
-that ``import envedit`` is quick and works without LLVM.
+``envedit.LightTransport.build(scene)`` traces a light transport; ``load_scene``, ``load_map`` and ``sunsky``
+make what they take. Errors that a user can mend are ``EnveditError``s. All are imported on first use, so that
+``import envedit`` is quick and works without LLVM.
 """
 
 __version__ = "0.1.0"
-__all__ = ["Config", "LightTransport", "Result", "edit", "fit"]
-
 _PUBLIC = {
     "Config": "envedit.config",
+    "ConfigError": "envedit.core.errors",
+    "EnveditError": "envedit.core.errors",
+    "InputError": "envedit.core.errors",
     "LightTransport": "envedit.transport.light_transport",
+    "MachineError": "envedit.core.errors",
+    "NumericalError": "envedit.core.errors",
     "Result": "envedit.results",
+    "Scene": "envedit.scene.scene",
     "edit": "envedit.api",
     "fit": "envedit.api",
+    "load_map": "envedit.api",
+    "load_scene": "envedit.api",
+    "sunsky": "envedit.api",
 }
+__all__ = [
+    "Config",
+    "ConfigError",
+    "EnveditError",
+    "InputError",
+    "LightTransport",
+    "MachineError",
+    "NumericalError",
+    "Result",
+    "Scene",
+    "edit",
+    "fit",
+    "load_map",
+    "load_scene",
+    "sunsky",
+]
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> object:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
@@ -25,5 +49,5 @@ def __getattr__(name):
     return getattr(import_module(_PUBLIC[name]), name)
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])

@@ -2,40 +2,70 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
-from envedit import config
-from envedit.core.errors import ConfigError
+from envedit import config, inputs
+from envedit.config.validators import show
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import analytic_sky, images
 from envedit.pipeline import Watch, run
-from envedit.representations.siren.fit import fit
+from envedit.representations.siren import fit as siren
+from envedit.representations.siren.fit import Fitted
 from envedit.results import Result
+from envedit.scene import built_scene
+from envedit.scene.scene import Scene
 
-__all__ = ["edit", "fit"]
+__all__ = ["edit", "fit", "load_map", "load_scene", "sunsky"]
+
+GIVEN = "given"
+"""What a scene without a file is called."""
 
 
 def edit(
-    settings: config.Config | str | PathLike,
+    settings: config.Config | Mapping[str, Any] | str | PathLike[str] | None = None,
     *,
-    target: np.ndarray | None = None,
-    mask: np.ndarray | None = None,
+    envmap: ArrayLike | None = None,
+    target: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    target_map: ArrayLike | None = None,
+    scene: Scene | mi.Scene | Mapping[str, Any] | str | PathLike[str] | None = None,
     base: Path | None = None,
     watch: Watch | None = None,
 ) -> Result:
-    """Carry out an edit without writing files: ``envedit.edit(config)``.
+    """Carry out an edit without writing files.
+
+    Every array takes the place of what the configuration names; without any, ``envedit.edit("config.toml")``
+    is the run of the command line.
 
     Parameters
     ----------
-    settings : config.Config or path
-        A configuration, or the TOML file of one.
-    target : ndarray (h, w, 3), optional
-        A painted picture in linear radiance, in place of the configuration's target: what
-        :func:`envedit.targets.painted_image.initial` rendered, with something painted over it.
-    mask : ndarray (h, w), optional
-        Where it was painted, in [0, 1]; by default where it differs from the initial rendering.
+    settings : Config, dict or path, optional
+        A configuration; nested dicts with its tables and keys, ``{"scene": {"file": "mirror"}}``, whose
+        relative paths start from the working folder; or the TOML file of one. By default all defaults.
+    envmap : array (H, 2 H, 3), optional
+        The map to edit: linear radiance, finite, Rec. 709, +Y up, the zenith in row 0. The ``scale`` of the
+        scene's emitter multiplies it, as it does a file.
+    target : array (h, w, 3), optional
+        The rendering as it should look, linear radiance: a rendering, or one with something painted over it.
+        Several views are below each other. Where it differs from the initial rendering it is asked for; all
+        else is to stay.
+    mask : array (h, w), optional
+        How much each pixel of ``target`` is asked for, in [0, 1], in place of comparing.
+    target_map : array (H, 2 H, 3), optional
+        The scene shall look as under this map, radiance as of ``envmap``; in place of ``target``.
+    scene : Scene, mitsuba.Scene, dict, or path, optional
+        What the map lights: what :func:`load_scene` returned; a scene that Mitsuba has built, lit by an
+        ``envmap``, rendered at the size of its film, with its own map again when this returns; a dict of
+        ``mi.load_dict``; or a file. Without ``envmap``, a built scene's own map is edited.
     base : Path, optional
         Folder that file names in scene parameters are relative to; by default the configuration's.
     watch : Watch, optional
@@ -44,17 +74,251 @@ def edit(
     Returns
     -------
     Result
-        ``envmap``, ``render``, ``metrics``, ``history``.
+        ``envmap``, ``render``, ``metrics``, ``history``; ``save(folder)`` writes what a run leaves.
 
     Raises
     ------
+    ConfigError
+        The configuration has an unknown key or an unusable value, which the message names, or arguments do
+        not go together.
+    InputError
+        A file or an array cannot be used: missing, of another shape, not finite.
     EnveditError
-        As :func:`envedit.pipeline.run`; ConfigError if there is a mask without a target.
+        As :func:`envedit.pipeline.run`.
+
+    Examples
+    --------
+    >>> result = envedit.edit({"preset": "draft"}, envmap=sky, target=picture)  # doctest: +SKIP
     """
+    arrays = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
     if mask is not None and target is None:
-        raise ConfigError("mask: given without a target; it says where that was painted")
-    if not isinstance(settings, config.Config):
-        base = base or Path(settings).absolute().parent
-        settings = config.load(settings)
-    mi.set_variant(settings.variant)
-    return run(settings, base=base, watch=watch, picture=target, mask=mask)
+        raise ConfigError("mask: got one without a target; expected both: it says where that was painted")
+    if target is not None and target_map is not None:
+        raise ConfigError("target, target_map: got both, expected one: a picture, or a map to render under")
+    chosen, found = _settings(settings)
+    given = {name: _array(name, value) for name, value in arrays.items() if value is not None}
+    mi.set_variant(chosen.variant)
+    with contextlib.ExitStack() as stack:
+        lit = None
+        if scene is not None:
+            if built_scene.is_built(scene):
+                own = chosen.input.envmap in (inputs.AUTO, inputs.SCENE)
+                if own and envmap is None:
+                    given["envmap"] = built_scene.own_map(scene)
+                stack.enter_context(built_scene.kept(scene))
+            lit = _lit(scene, chosen.scene, base or found)
+            chosen = _of_scene(chosen, lit)
+        arguments = (given.get(name) for name in ("envmap", "target_map", "target", "mask"))
+        memory = inputs.Given(lit, *arguments)
+        return run(_of_arrays(chosen, given), base=base or found, watch=watch, memory=memory)
+
+
+def fit(
+    image: ArrayLike,
+    network: config.Representation | Mapping[str, Any] | None = None,
+    settings: config.Fit | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    rows: tuple[int, int] | None = None,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> Fitted:
+    """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
+
+    Parameters
+    ----------
+    image : array (H, W, 3)
+        Linear radiance, finite and not negative.
+    network : Representation or dict, optional
+        Width, depth and frequency, keys of ``[representation]``; the standard preset's by default.
+    settings : Fit or dict, optional
+        The recipe, keys of ``[fit]``; the standard preset's by default.
+    seed : int
+        Seed of the initial weights.
+    rows : (int, int), optional
+        First row of the image in its map, and the rows of that map; None: the image is a whole map.
+    folder : Path, optional
+        Where fits are kept under a hash of image and settings, half-made ones too; None: nowhere.
+    progress : callable, optional
+        Called with (epoch, epochs, loss) now and then.
+
+    Returns
+    -------
+    Fitted
+        ``params``, ``normalisation``, ``log_psnr`` (dB), ``peak_ratio`` (of the brightest texel).
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown, or its value cannot be used.
+    InputError
+        The image has another shape, or a texel is not finite or is negative.
+    NumericalError
+        Too many steps were not finite.
+    """
+    pixels = _array("image", image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise InputError(f"image: got an array of shape {pixels.shape}, expected (H, W, 3)")
+    if isinstance(network, Mapping):
+        network = config.Representation(**{"kind": "siren", **network})
+    if isinstance(settings, Mapping):
+        settings = config.Fit(**settings)
+    if mi.variant() is None:
+        mi.set_variant(config.Config().variant)
+    return siren.fit(pixels, network, settings, seed, rows, folder=folder, progress=progress)
+
+
+def load_scene(
+    scene: mi.Scene | Mapping[str, Any] | str | PathLike[str],
+    width: int = 128,
+    height: int = 0,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    sensors: str | Sequence[int | str] = (0,),
+    base: Path | None = None,
+) -> Scene:
+    """Load a scene for :class:`LightTransport`, :func:`edit`, and to render under any map.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene, dict or path
+        A Mitsuba XML file, the name of a shipped scene, such as "sphere", a dict of ``mi.load_dict``, or a
+        scene that Mitsuba has built, whose environment map is replaced when it is rendered.
+    width, height : int
+        Size of the rendering, pixels; height 0: by the scene's aspect. A built scene has its film's.
+    parameters : dict, optional
+        Values for the defaults, ``$name``, of the XML.
+    sensors : "all" or sequence of int and str
+        Sensors whose pictures a rendering consists of, below each other.
+    base : Path, optional
+        Folder that file names in ``parameters`` are relative to; by default the working folder.
+
+    Returns
+    -------
+    Scene
+        ``render(envmap, spp, seed)`` returns linear radiance (h, w, 3) float32.
+
+    Raises
+    ------
+    ConfigError
+        A parameter, a sensor or the size cannot be used.
+    InputError
+        A file is missing or damaged, or the scene is not lit by exactly one environment emitter.
+    """
+    if mi.variant() is None:
+        mi.set_variant(config.Config().variant)
+    given = config.Scene(width=width, height=height, parameters=dict(parameters or {}), sensors=sensors)
+    return _lit(scene, given, base)
+
+
+def load_map(file: str | PathLike[str], width: int | None = None) -> np.ndarray:
+    """Read an environment map.
+
+    Parameters
+    ----------
+    file : path
+        OpenEXR or Radiance HDR, lat-long 2:1, at least 6 x 3.
+    width : int, optional
+        Texels across, even: resampled with the flux kept; by default the file's.
+
+    Returns
+    -------
+    ndarray (width / 2, width, 3) float32
+        Linear radiance in Rec. 709, finite and not negative; row 0 is the zenith.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is no 2:1, or has a texel that is not finite.
+    ConfigError
+        ``width`` is odd or out of range.
+    """
+    return images.load_envmap(file, width)[0]
+
+
+def sunsky(
+    width: int = 256, azimuth: float = 90.0, elevation: float = 35.0, turbidity: float = 3.0
+) -> np.ndarray:
+    """Make an analytic sky with a sun: Hosek and Wilkie 2012, 2013, by Mitsuba's ``sunsky``.
+
+    Parameters
+    ----------
+    width : int
+        Texels across, even, from 6 to 16384.
+    azimuth, elevation : float
+        Of the sun, degrees: along the columns, and above the horizon (0 to 90).
+    turbidity : float
+        Haziness of the air, 1 (pure) to 10.
+
+    Returns
+    -------
+    ndarray (width / 2, width, 3) float32
+        Linear radiance; grey ground below the horizon.
+
+    Raises
+    ------
+    ConfigError
+        A value is out of its range.
+    """
+    given = config.Input(width=width, azimuth=azimuth, elevation=elevation, turbidity=turbidity)
+    if mi.variant() is None:
+        mi.set_variant(config.Config().variant)
+    return analytic_sky.sunsky(given.width, given.azimuth, given.elevation, given.turbidity)
+
+
+def _lit(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
+    """Load a scene in any form."""
+    size = settings.width, settings.height
+    scene = dict(scene) if isinstance(scene, Mapping) else scene
+    return built_scene.load(scene, *size, settings.parameters, base, settings.sensors)
+
+
+def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
+    """Describe a scene in a configuration as far as that is possible; a built one is not kept on disk."""
+    heights = {rows.stop - rows.start for rows in lit.rows}
+    given = {"width": lit.width, "height": heights.pop() if len(heights) == 1 else 0}
+    if lit.path is None:
+        if lit.digest.startswith(built_scene.UNKNOWN):
+            settings = replace(settings, renderer=replace(settings.renderer, cache=False))
+        return replace(settings, scene=config.Scene(file=GIVEN, **given))
+    kept = {"sensors": settings.scene.sensors} if len(lit.views) == 1 else {"sensors": "all"}
+    given |= {"parameters": lit.parameters} | kept
+    return replace(settings, scene=config.Scene(file=str(lit.path), **given))
+
+
+def _settings(given: object) -> tuple[config.Config, Path | None]:
+    """Return a configuration, and the folder that its files are relative to."""
+    if given is None:
+        return config.from_dict({}), None
+    if isinstance(given, config.Config):
+        return given, None
+    if isinstance(given, Mapping):
+        return config.from_dict(dict(given), name="settings"), None
+    if isinstance(given, str | PathLike):
+        return config.load(given), Path(given).absolute().parent
+    wanted = "a Config, a dict of tables, or the path of a TOML file"
+    raise ConfigError(f"settings: got {show(given)}, expected {wanted}")
+
+
+def _array(name: str, value: ArrayLike) -> np.ndarray:
+    """Return an argument as float32, as which it is saved; shape and values are checked where it is used."""
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError):  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind not in "fiu":
+        raise InputError(f"{name}: got {show(value)}, expected an array of numbers")
+    with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is refused as such
+        return found.astype(np.float32)
+
+
+def _of_arrays(settings: config.Config, given: Mapping[str, np.ndarray]) -> config.Config:
+    """Say in a configuration what comes as an array, so that presets and reports know."""
+    if "envmap" in given:
+        settings = replace(settings, input=replace(settings.input, envmap=images.ARRAY))
+    if "target" in given or "target_map" in given:
+        table = settings.target
+        kept = {key: getattr(table, key) for key in table.given & {"tonemap", "paint", "hold", "spp"}}
+        kind = "image" if "target" in given else "envmap"
+        settings = replace(settings, target=config.Target(kind=kind, file=images.ARRAY, **kept))
+    return settings

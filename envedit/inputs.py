@@ -24,6 +24,31 @@ _ROUNDING = 1e-6  # of a texel's largest channel
 
 
 @dataclass(frozen=True)
+class Given:
+    """Arrays and objects that take the place of a configuration's files.
+
+    Attributes
+    ----------
+    scene : scene.Scene, optional
+        The scene.
+    envmap : ndarray (H, 2 H, 3), optional
+        The map to edit, linear radiance in the units of a file: the scene's ``scale`` multiplies it.
+    target_map : ndarray (H, 2 H, 3), optional
+        The map under which the target is rendered; likewise.
+    picture : ndarray (h, w, 3), optional
+        A painted picture, linear radiance.
+    mask : ndarray (h, w), optional
+        Where it was painted, in [0, 1]; None: where it differs from the initial rendering.
+    """
+
+    scene: scene.Scene | None = None
+    envmap: np.ndarray | None = None
+    target_map: np.ndarray | None = None
+    picture: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
 class InputMap:
     """The map that is edited, as its file holds it and as it reaches the scene.
 
@@ -46,6 +71,8 @@ class InputMap:
         Colour space of the file (:mod:`.primaries`); None: Rec. 709.
     placed : PlacedLights, optional
         The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed.
+    array : ndarray (H, W, 3), optional
+        The whole map, where it came as an array and not from a file.
     """
 
     source: str
@@ -55,6 +82,7 @@ class InputMap:
     warnings: list[str]
     chromaticities: Chromaticities | None = None
     placed: PlacedLights | None = None
+    array: np.ndarray | None = None
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -88,7 +116,7 @@ class InputMap:
         """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
-        return _read(self.source, None, repair, self.scale)
+        return _read(self.source if self.array is None else self.array, None, repair, self.scale)
 
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
@@ -151,7 +179,12 @@ def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
     return str(own)
 
 
-def read_map(settings: config.Input, lit: scene.Scene | None, width: int | None = None) -> InputMap:
+def read_map(
+    settings: config.Input,
+    lit: scene.Scene | None,
+    width: int | None = None,
+    array: np.ndarray | None = None,
+) -> InputMap:
     """Read the map of a configuration.
 
     Parameters
@@ -162,13 +195,18 @@ def read_map(settings: config.Input, lit: scene.Scene | None, width: int | None 
         Whose own map and scale; None: none, and 1.
     width : int, optional
         Texels across; None: as many as the file has (of the analytic sky: the working width).
+    array : ndarray (H, 2 H, 3), optional
+        The map itself, in place of the one that the configuration names.
 
     Raises
     ------
     ConfigError, InputError
         As of :func:`source_of` and :func:`.images.load_envmap`.
     """
-    source, scale = source_of(settings, lit), 1.0 if lit is None else lit.own.scale
+    scale = 1.0 if lit is None else lit.own.scale
+    if array is not None:
+        return by_hand(settings, _read(array, width, settings.repair, scale))
+    source = source_of(settings, lit)
     if source == SUNSKY:
         width = width or settings.width
         sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
@@ -192,9 +230,10 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
 
 
 def _read(source, width, repair, scale):
-    stored, info = images.load_envmap(source, width, repair, convert=False)
-    given = scale, info["size"], list(info["warnings"]), info["chromaticities"]
-    found = InputMap(source, stored, *given)
+    stored, info = images.load_envmap(source, width, repair, convert=False, name="envmap")
+    about = scale, info["size"], list(info["warnings"]), info["chromaticities"]
+    array = source if isinstance(source, np.ndarray) else None
+    found = InputMap(source if array is None else images.ARRAY, stored, *about, array=array)
     if found.outside > 0:
         space = primaries.name_of(found.chromaticities)
         share = f"{100 * found.outside:.2g} % of its texels have colours of {space} outside Rec. 709"
@@ -230,7 +269,8 @@ def load_map(settings: config.Input, lit: scene.Scene | None = None) -> tuple[np
 
 def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = None) -> list[str]:
     """Say which map a run took and what the scene's file has that is used otherwise."""
-    said, source, own = list(lit.notes), source_of(settings, lit), lit.own
+    said, own = list(lit.notes), lit.own
+    source = source_of(settings, lit) if given is None else given.source
     if settings.envmap == AUTO and source != SUNSKY:
         said.insert(0, f"map: the scene's own, {source}")
     if given is not None and given.chromaticities is not None:

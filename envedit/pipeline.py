@@ -16,11 +16,12 @@ import numpy as np
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
 from envedit.export import adjustments, light_list
+from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
 from envedit.representations.layers.separation import separate
-from envedit.results import Found, Result
+from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
 from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
@@ -70,8 +71,7 @@ def run(
     resume: bool = False,
     base: Path | None = None,
     watch: Watch | None = None,
-    picture: np.ndarray | None = None,
-    mask: np.ndarray | None = None,
+    memory: inputs.Given | None = None,
 ) -> Result:
     """Carry out an edit.
 
@@ -87,10 +87,8 @@ def run(
         Folder that file names in scene parameters are relative to.
     watch : Watch, optional
         Receives progress.
-    picture : ndarray (h, w, 3), optional
-        A painted picture, linear radiance, in place of the configuration's target.
-    mask : ndarray (h, w), optional
-        Where it was painted, in [0, 1]; None: where it differs from the initial rendering.
+    memory : inputs.Given, optional
+        Arrays and a scene in place of the configuration's files.
 
     Raises
     ------
@@ -102,6 +100,7 @@ def run(
         If the optimisation cannot go on.
     """
     watch, clock, begun = watch or Watch(), _Clock(), time.perf_counter()
+    memory = memory or inputs.Given()
     warnings: list[str] = []
     dists, lpips = _perceptual(settings)
     if settings.loss.dists and dists is None:
@@ -110,17 +109,19 @@ def run(
         )
     with clock("target_s"):
         watch.stage("loading")
-        lit = inputs.load_scene(settings.scene, base)
-        given = inputs.read_map(settings.input, lit, settings.input.width)
+        lit = memory.scene or inputs.load_scene(settings.scene, base)
+        given = inputs.read_map(settings.input, lit, settings.input.width, memory.envmap)
         original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
         height, width, _ = original.shape
         first, last = inputs.active_rows(settings.input.rows, height)
-        if settings.target.kind == "none" and picture is None:
-            return _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
+        if settings.target.kind == "none":
+            warnings += config.unused(settings)
+            found = _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
+            return replace(found, memory=memory, base=base)
         renderers.check(settings, lit, (height, width))
         watch.stage("rendering the target")
-        wanted = target.make(settings, lit, original, picture, mask)
+        wanted = target.make(settings, lit, original, memory.picture, memory.mask, memory.target_map)
         warnings += wanted.warnings
         few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
         initial = wanted.initial
@@ -143,9 +144,7 @@ def run(
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, notes = job.renderer, notes + edit.notes
     traced = renderer.transport
-    if job.newton and (unused := _unused(settings)):
-        asked = ", ".join(unused)
-        warnings.append(f'{asked}: not used by Gauss-Newton steps; [optimizer] kind = "adam" uses them')
+    warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
     with clock("edit_s"), _in_file_units(given):
         watch.stage("editing")
         params, state = job.optimise(edit.params, edit.crop, resume)
@@ -222,6 +221,9 @@ def run(
         reach=within,
         found=Found(representation, params, first, job.free, edit.degrees, found_map),
         posterior=job.posterior,
+        settings=settings,
+        memory=memory,
+        base=base,
     )
 
 
@@ -259,6 +261,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         "choices": notes,
     }
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
+    more |= {"settings": settings}
     return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
 
 
@@ -277,18 +280,6 @@ def _in_file_units(given):
     except (Interrupted, Stopped) as stop:
         stop.envmap = given.as_stored(stop.envmap)
         raise
-
-
-def _unused(settings):
-    """Name the keys that a user gave and only Adam reads."""
-    only = {
-        "loss": settings.loss.given,
-        "optimizer": {"lr", "beta2", "schedule"},
-        "renderer": {"refresh", "influence_threshold"},
-    }
-    return sorted(
-        f"{name}.{key}" for name, keys in only.items() for key in keys & getattr(settings, name).given
-    )
 
 
 def _as_seen(traced, original, wanted):

@@ -1,24 +1,31 @@
-"""What a run found: maps, renderings, figures, and what the map was decoded from."""
+"""What a run found: maps, renderings and figures; to look at and to write."""
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core import latlong
-from envedit.export import adjustments, full_resolution
-from envedit.representations import Representation
-from envedit.representations.layers import placed_lights
+from envedit.core.errors import MachineError
+from envedit.export import file_resolution
+from envedit.images import images
+from envedit.losses import metrics
+from envedit.report import preview
 from envedit.representations.layers.separation import Separation
 from envedit.scene.scene import View
 from envedit.solve.feasibility import Reach
 from envedit.solve.map_problem import Posterior
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-@dataclass
+
+@dataclass(repr=False)
 class Result:
     """What a run found.
 
@@ -62,8 +69,14 @@ class Result:
         Rotation from the map's frame to the scene's.
     alpha : ndarray (h, w), optional
         Share of each pixel that sees a surface, where the scene hides what lights it.
-    found : Found, optional
-        What the map was decoded from, for :func:`at_full_resolution`.
+    found : file_resolution.Found, optional
+        What the map was decoded from, for :func:`.file_resolution.at_full_resolution`.
+    settings : config.Config, optional
+        What was carried out; None: nothing but defaults.
+    memory : inputs.Given, optional
+        What was given as an array or object and not as a file.
+    base : Path, optional
+        Folder that file names in scene parameters are relative to.
     """
 
     envmap: np.ndarray
@@ -84,67 +97,103 @@ class Result:
     given: inputs.InputMap | None = None
     to_world: np.ndarray | None = None
     alpha: np.ndarray | None = None
-    found: Found | None = None
+    found: file_resolution.Found | None = None
     posterior: Posterior | None = None
+    settings: config.Config | None = None
+    memory: inputs.Given | None = None
+    base: Path | None = None
 
     @property
     def render(self) -> np.ndarray:
         """The rendering under the edited map, by Mitsuba with fresh samples."""
         return self.renders["edited"]
 
+    def __repr__(self) -> str:
+        """Say in one line what was found: sizes, and how far the rendering is from the target."""
+        height, width, _ = self.envmap.shape
+        rows, columns, _ = self.render.shape
+        parts = [f"map {width}x{height}", f"rendering {columns}x{rows}"]
+        before, after = (self.metrics[name] for name in ("initial", "render"))
+        if self.metrics["iterations"]:
+            first, last = (metrics.score(one, (before, after)) for one in (before, after))
+            parts.append(f"{first} before, {last} after {self.metrics['iterations']} steps")
+        if self.warnings:
+            parts.append(f"{len(self.warnings)} warning{'s' if len(self.warnings) > 1 else ''}")
+        return f"Result({', '.join(parts)})"
 
-@dataclass(frozen=True)
-class Found:
-    """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`.
+    def _repr_png_(self) -> bytes:
+        """Show the renderings over their maps in a notebook."""
+        views = [view.rows for view in self.views]
+        return images.png(preview.drawn(self.renders, self.maps, self._settings.output.tonemap, views=views))
 
-    ``turn_degrees`` is by how much the map was turned before (:func:`.latlong.rotate`), ``edited`` the edited
-    map before its adjustments.
-    """
+    @property
+    def _settings(self) -> config.Config:
+        return self.settings or config.Config()
 
-    representation: Representation
-    params: dict
-    first_row: int
-    free: np.ndarray | None
-    turn_degrees: float = 0.0
-    edited: np.ndarray | None = None
+    def plot(self) -> Figure:
+        """Draw renderings and maps: initial, target and edited; maps over azimuth and elevation, degrees.
 
+        Display values under ``[output] tonemap``. Needs matplotlib: ``pip install 'envedit[report]'``.
 
-def at_full_resolution(settings: config.Config, result: Result) -> np.ndarray | None:
-    """Carry a result to the resolution of its input's file, in its units; None where that has no more texels.
+        Returns
+        -------
+        matplotlib.figure.Figure
+            ``savefig(file)`` writes it; a notebook shows it.
 
-    Raises
-    ------
-    InputError, NumericalError
-        If the file cannot be read any more, or the carried map is not finite.
-    """
-    if result.given.size[0] <= settings.input.width:
-        return None
-    full, found = _by_hand(settings.input, result.given), result.found
-    adjusted = settings.lights, settings.output, full.scale
-    if found is None:
-        return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
-    before = latlong.rotate(result.maps["initial"], found.turn_degrees)
-    source = latlong.rotate(full.radiance, found.turn_degrees)
-    first, last = inputs.active_rows(settings.input.rows, before.shape[0])
-    rows = first, last - first + 1
-    edited = found.edited
-    carried = full_resolution.carry(
-        found.representation, found.params, before, edited, source, rows, found.free
-    )
-    return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)
+        Raises
+        ------
+        MachineError
+            matplotlib is not installed.
+        """
+        try:
+            from matplotlib.figure import Figure
+        except ImportError:
+            how = "pip install 'envedit[report]'"
+            raise MachineError(f"Result.plot: needs matplotlib, which is not installed: {how}") from None
+        figure, curve = Figure(figsize=(12, 6.5), layout="constrained"), self._settings.output.tonemap
+        axes = figure.subplots(2, 3, squeeze=False)
+        for column, name in enumerate(("initial", "target", "edited")):
+            for axis, picture, extent in (
+                (axes[0, column], self.renders[name], None),
+                (axes[1, column], self.maps[name], (0, 360, -90, 90)),
+            ):
+                if picture is None:
+                    axis.axis("off")
+                    continue
+                axis.imshow(preview.display(picture, *picture.shape[:2], curve), extent=extent)
+                if extent is None:
+                    axis.set(title=name, xticks=[], yticks=[])
+                else:
+                    axis.set(xlabel="azimuth, degrees", ylabel="elevation, degrees")
+        return figure
 
+    def save(self, folder: str | PathLike[str]) -> list[str]:
+        """Write what a run leaves: maps, renderings, metrics, report, and the configuration to run again.
 
-def _by_hand(settings, given):
-    """Read a map at its file's size, and place and turn its lights as it was done at working size."""
-    full = given.at_file_size(settings.repair)
-    if given.placed is not None:
-        own = given.placed
-        before, rows = own.envmap, (0, len(own.envmap))
-        moved = full.radiance
-        if any("light" in light for light in settings.lights):
-            moved = full_resolution.carry(
-                own.layers, own.params(settings.lights), before, before, moved, rows
-            )
-        moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
-        full = replace(full, stored=full.as_stored(moved))
-    return replace(full, stored=latlong.rotate(full.stored, settings.rotate_degrees))
+        Arrays that the edit was given are written too, ``given_*.exr``, and ``config.toml`` names them.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it is not there; what an earlier run left in it is moved to ``earlier-N``.
+
+        Returns
+        -------
+        list of str
+            Warnings.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be used, or a file cannot be written.
+        """
+        from envedit.report import output_folder, run_folder
+
+        folder = Path(folder).absolute()
+        settings = replace(self._settings, output=replace(self._settings.output, dir=str(folder)))
+        own = replace(self, metrics=copy.deepcopy(self.metrics), warnings=[*self.warnings])
+        with output_folder.alone(folder):
+            named = settings.input.envmap, settings.scene.file, *settings.target.files, *settings.target.masks
+            output_folder.prepare_folder(folder, output_folder.names(folder), filter(None, named))
+            settings = run_folder.write_given(settings, folder, self.memory, own.warnings)
+            return run_folder.write(settings, folder, own, 0.0, self.base)

@@ -115,7 +115,7 @@ class Done:
         if asked.kind != "envmap":
             return original, edited, None
         if not asked.file:
-            return original, edited, latlong.rotate(original, asked.rotate_degrees)
+            return original, edited, latlong.rotate(original, asked.degrees)
         try:
             true = images.load_envmap(asked.file, original.shape[1], settings.input.repair)[0]
         except EnveditError:  # it may have been moved since
@@ -198,7 +198,7 @@ def overridden(tables: dict, overrides: Iterable[str]) -> dict:
         for key in reversed(keys):
             value = {key: value}
         if keys == ("target", "file"):
-            tables = presets.overlaid(tables, {"target": {"rotate_degrees": 0.0}})
+            tables = presets.overlaid(tables, {"target": {"rotate_degrees": "auto"}})
         tables = presets.overlaid(tables, value)
     return tables
 

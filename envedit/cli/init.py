@@ -14,7 +14,7 @@ from envedit.core import shipped
 # Lines of "setting  # comment"; the comments are aligned when the settings are known.
 TEMPLATE = """\
 # envedit run {name}
-# All keys with their meaning: envedit/config/schema.py. Paths are relative to this file.
+# All keys with their meaning: envedit schema --markdown. Paths are relative to this file.
 preset = "standard"  # or "draft", a third of the time; "paper", the method of the paper, minutes
 
 [input]

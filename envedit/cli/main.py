@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, paint, fit, init, sweep, doctor, cache."""
+"""The command ``envedit``: run, paint, fit, init, sweep, doctor, schema, cache."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ COMMANDS = {
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",
+    "schema": "print every key of the configuration, as JSON Schema or as a page",
     "cache": "show or delete what is kept on disk between runs",
 }
 

@@ -1,5 +1,6 @@
 """Configuration: TOML to frozen dataclasses, with presets, checks and errors that name the key."""
 
+from envedit.config.reading import from_dict, load, loads, parse_override, preset_names
 from envedit.config.schema import (
     Config,
     Fit,
@@ -13,14 +14,9 @@ from envedit.config.schema import (
     Representation,
     Scene,
     Target,
-    from_dict,
-    load,
-    loads,
-    parse_override,
-    preset_names,
-    quote,
-    to_toml,
 )
+from envedit.config.toml import quote, to_toml
+from envedit.config.unused import unused
 
 __all__ = [
     "Config",
@@ -42,4 +38,5 @@ __all__ = [
     "preset_names",
     "quote",
     "to_toml",
+    "unused",
 ]

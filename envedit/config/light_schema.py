@@ -5,51 +5,76 @@ What they do is :mod:`envedit.representations.layers.placed_lights`'s.
 
 from __future__ import annotations
 
-import difflib
+from dataclasses import dataclass
 from typing import Any
 
-from envedit.config.validators import WantedError, integer, named, number, numbers, show
+from envedit.config.validators import Check, Integer, Number, Numbers, Schema, WantedError, meant, named, show
 from envedit.core.errors import ConfigError
 
 MOST_PLACED = 64
 """Entries of ``[[input.lights]]``."""
 _BRIGHTEST = 1e6
-_FLUX = numbers(*3 * [number(0, _BRIGHTEST)])
-_PLACE = {"azimuth": number(-360, 720), "elevation": number(-90, 90)}
-OWN = {"light": integer(1, 8), **_PLACE, "flux": _FLUX, "size": number(0.01, 20)}
+_FLUX = Numbers(*3 * [Number(0, _BRIGHTEST)])
+_PLACE: dict[str, Check] = {"azimuth": Number(-360, 720), "elevation": Number(-90, 90)}
+OWN: dict[str, Check] = {"light": Integer(1, 8), **_PLACE, "flux": _FLUX, "size": Number(0.01, 20)}
 """Of a light of the map: its number, those with most flux first; where it goes; factors on flux and size."""
-ADDED = {**_PLACE, "flux": _FLUX, "size": number(0.01, 90)}
+ADDED: dict[str, Check] = {**_PLACE, "flux": _FLUX, "size": Number(0.01, 90)}
 """Of a light that is added: where; its flux, radiance times steradian; its radius in degrees."""
+MEANINGS = {
+    "light": "number of a light of the map, those with most flux first; without it a light is added",
+    "azimuth": "where it goes, degrees along the columns; needed for a light that is added",
+    "elevation": "likewise, degrees above the horizon",
+    "flux": "of the map's light: factors on its; of an added one: radiance times steradian; needed",
+    "size": "of the map's light: factor on its size, to 20; of an added one: radius in degrees",
+}
+"""What each key is, for the reference."""
 SIZE = 0.5
 """Radius in degrees of an added light where none is given."""
 
 
-def light_list(value: Any) -> tuple[dict, ...]:
-    """Accept a list of lights; every entry has all keys that it can have.
+@dataclass(frozen=True)
+class LightList(Check):
+    """A list of lights; every entry has all keys that it can have.
 
-    Raises
-    ------
-    WantedError
-        It is no list of tables, or too long.
-    ConfigError
-        An entry has an unknown key or an unusable value; the message names ``input.lights[2].flux``.
+    Calling it raises ConfigError, which names ``input.lights[2].flux``, where an entry has an unknown key or
+    an unusable value; WantedError if it is no list of tables, or too long.
     """
-    if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-        raise WantedError("a list of tables")
-    if len(value) > MOST_PLACED:
-        raise WantedError(f"at most {MOST_PLACED} lights")
-    found = tuple(_light(f"input.lights[{i}]", v) for i, v in enumerate(value))
-    own = [light["light"] for light in found if "light" in light]
-    if twice := sorted({n for n in own if own.count(n) > 1}):
-        raise ConfigError(f"input.lights: got light {twice[0]} more than once, expected one entry a light")
-    return found
+
+    kind = "list of tables"
+
+    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
+        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
+            raise WantedError(str(self))
+        if len(value) > MOST_PLACED:
+            raise WantedError(f"at most {MOST_PLACED} lights")
+        found = tuple(_light(f"input.lights[{i}]", v) for i, v in enumerate(value))
+        own = [light["light"] for light in found if "light" in light]
+        if twice := sorted({n for n in own if own.count(n) > 1}):
+            raise ConfigError(
+                f"input.lights: got light {twice[0]} more than once, expected one entry a light"
+            )
+        return found
+
+    def __str__(self) -> str:
+        return "a list of tables"
+
+    @property
+    def range(self) -> str:
+        """How many."""
+        return f"at most {MOST_PLACED}"
+
+    def _schema(self) -> Schema:
+        keys = {key: {**(OWN | ADDED)[key].schema(), "description": MEANINGS[key]} for key in OWN}
+        light: Schema = {"type": "object", "properties": keys, "additionalProperties": False}
+        light["dependencies"] = {"azimuth": ["elevation"], "elevation": ["azimuth"]}
+        return {"type": "array", "items": light, "maxItems": MOST_PLACED}
 
 
-def _light(name: str, light: dict) -> dict:
+def _light(name: str, light: dict[str, Any]) -> dict[str, Any]:
     keys = OWN if "light" in light else ADDED
     for unknown in (k for k in light if k not in keys):
-        close = difflib.get_close_matches(str(unknown)[:60], keys, 1)
-        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(OWN)}"
+        hint = meant(str(unknown), keys)
+        hint = hint if hint.startswith("did") else f"known: {', '.join(OWN)}"
         raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
     found = {key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light}
     if ("azimuth" in found) != ("elevation" in found):

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from envedit.config.validators import checked, show
+from envedit.config.tables import checked
+from envedit.config.validators import show
 from envedit.core.errors import ConfigError
 
 Fields = dict[str, Any]
@@ -129,21 +131,22 @@ def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
     return chosen
 
 
-def one_target(merged: dict[str, Any], sources: dict[str, dict]) -> dict[str, Any]:
-    """Settle ``target.file`` against ``rotate_degrees``: a source gives one of them, the last source wins."""
-    target = dict(merged.get("target", {}))
-    if target.get("kind", "envmap") == "envmap":
-        for where, source in sources.items():
-            given = source.get("target", {})
-            if given.get("file") and given.get("rotate_degrees"):
-                raise ConfigError(
-                    f"{where}: target.file and target.rotate_degrees: got both, expected one: "
-                    "the other map, or the input turned"
-                )
-            if given.get("rotate_degrees"):
-                target["file"] = ""
-            elif "file" in given:
-                target["file"] = given["file"]
+def one_target(merged: dict[str, Any], sources: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Return the target of all sources; of ``file`` and ``rotate_degrees`` a later source replaces the other.
+
+    Who overrides the other map by a turn, or a turn by another map, need not take the first one back. A turn
+    of 0 is no turn, and takes nothing back.
+    """
+    if merged.get("target", {}).get("kind", "envmap") != "envmap":
+        return dict(merged.get("target", {}))
+    target: dict[str, Any] = {}
+    for source in sources:
+        given = source.get("target", {})
+        if given.get("file"):
+            target.pop("rotate_degrees", None)
+        elif given.get("rotate_degrees", "auto") not in ("auto", 0):
+            target.pop("file", None)
+        target |= given
     return target
 
 

@@ -5,63 +5,129 @@ What a stroke does is :mod:`envedit.targets.strokes`'s.
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from envedit.config.validators import WantedError, choice, named, number, numbers, show, view
+from envedit.config.key_validators import View
+from envedit.config.validators import Check, Choice, Number, Numbers, Schema, WantedError, meant, named, show
 from envedit.core.color import srgb_to_linear
 from envedit.core.errors import ConfigError
 
 _FURTHEST = 1e6
-_coordinate = number(-_FURTHEST, _FURTHEST)
-_length = number(0, _FURTHEST, positive=True)
-_point = numbers(_coordinate, _coordinate)
-_linear_color = numbers(*3 * [number(0, 1e6)])
+_COORDINATE = Number(-_FURTHEST, _FURTHEST)
+_LENGTH = Number(0, _FURTHEST, positive=True)
+_POINT = Numbers(_COORDINATE, _COORDINATE)
+_LINEAR = Numbers(*3 * [Number(0, 1e6)])
 
 
-def _color(value: Any) -> list[float]:
-    """Accept [r, g, b], factors on linear radiance, or the sRGB colour "#rrggbb", which becomes them."""
-    if isinstance(value, str):
-        if not re.fullmatch("#[0-9a-fA-F]{6}", value):
-            raise WantedError('[r, g, b], or a colour such as "#ffd9a6"')
-        return [
-            float(round(c, 4))
-            for c in srgb_to_linear(np.frombuffer(bytes.fromhex(value[1:]), np.uint8) / 255)
-        ]
-    return _linear_color(value)
+@dataclass(frozen=True)
+class Color(Check):
+    """[r, g, b], factors on linear radiance, or the sRGB colour "#rrggbb", which becomes them."""
+
+    kind = "list or string"
+    range = '3 numbers, 0 to 1e+06; or "#rrggbb"'
+
+    def _take(self, value: Any) -> list[float]:
+        if isinstance(value, str):
+            if not re.fullmatch("#[0-9a-fA-F]{6}", value):
+                raise WantedError(str(self))
+            codes = np.frombuffer(bytes.fromhex(value[1:]), np.uint8)
+            return [float(round(c, 4)) for c in srgb_to_linear(codes / 255)]
+        return _LINEAR(value)
+
+    def __str__(self) -> str:
+        return '[r, g, b], or a colour such as "#ffd9a6"'
+
+    def _schema(self) -> Schema:
+        return {"anyOf": [_LINEAR.schema(), {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"}]}
 
 
-def _ellipse(value: Any) -> list[float]:
-    fields = (_coordinate, _coordinate, _length, _length, number(-360, 360))
-    if not isinstance(value, list | tuple) or len(value) not in (4, 5):
-        raise WantedError("[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]")
-    return numbers(*fields[: len(value)])(value)
+@dataclass(frozen=True)
+class Ellipse(Check):
+    """Centre, radii and, if it is turned, degrees."""
+
+    kind = "list"
+    range = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
+
+    def _take(self, value: Any) -> list[float]:
+        if not isinstance(value, list | tuple) or len(value) not in (4, 5):
+            raise WantedError(str(self))
+        return Numbers(*self._parts()[: len(value)])(value)
+
+    def __str__(self) -> str:
+        return self.range
+
+    def _parts(self) -> tuple[Check, ...]:
+        return _COORDINATE, _COORDINATE, _LENGTH, _LENGTH, Number(-360, 360)
+
+    def _schema(self) -> Schema:
+        return Numbers(*self._parts()).schema() | {"minItems": 4}
 
 
-def _rectangle(value: Any) -> list[float]:
-    wanted = "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
-    if not isinstance(value, list | tuple) or len(value) != 4:
-        raise WantedError(wanted)
-    x0, y0, x1, y1 = numbers(*4 * [_coordinate])(value)
-    if x1 <= x0 or y1 <= y0:
-        raise WantedError(wanted)
-    return [x0, y0, x1, y1]
+@dataclass(frozen=True)
+class Rectangle(Check):
+    """Upper left and lower right corner."""
+
+    kind = "list"
+    range = "[x0, y0, x1, y1]"
+
+    def _take(self, value: Any) -> list[float]:
+        if not isinstance(value, list | tuple) or len(value) != 4:
+            raise WantedError(str(self))
+        x0, y0, x1, y1 = Numbers(*4 * [_COORDINATE])(value)
+        if x1 <= x0 or y1 <= y0:
+            raise WantedError(str(self))
+        return [x0, y0, x1, y1]
+
+    def __str__(self) -> str:
+        return "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
+
+    def _schema(self) -> Schema:
+        return Numbers(*4 * [_COORDINATE]).schema()
 
 
-SHAPES: dict[str, int | Callable] = {"points": 1, "polygon": 3, "ellipse": _ellipse, "rectangle": _rectangle}
-"""Where a stroke is: the least number of points, or the check of the list."""
+@dataclass(frozen=True)
+class Points(Check):
+    """Points, of which there are at least so many."""
 
-STROKES: dict[str, dict[str, tuple[Any, Callable]]] = {
-    "shadow": {"amount": (0.6, number(0, 1)), "color": ([1.0, 1.0, 1.0], _color)},
-    "light": {"amount": (0.5, number(0, 1e6)), "color": ([1.0, 1.0, 1.0], _color)},
+    least: int
+    kind = "list"
+
+    def _take(self, value: Any) -> list[list[float]]:
+        if not isinstance(value, list | tuple) or len(value) < self.least:
+            raise WantedError(str(self))
+        return [_POINT(v) for v in value]
+
+    def __str__(self) -> str:
+        return f"[[x, y], ...], at least {self.least}"
+
+    @property
+    def range(self) -> str:
+        """Their form and number."""
+        return str(self)
+
+    def _schema(self) -> Schema:
+        return {"type": "array", "items": _POINT.schema(), "minItems": self.least}
+
+
+SHAPES: dict[str, Check] = {
+    "points": Points(1),
+    "polygon": Points(3),
+    "ellipse": Ellipse(),
+    "rectangle": Rectangle(),
+}
+"""Where a stroke is."""
+
+STROKES: dict[str, dict[str, tuple[Any, Check]]] = {
+    "shadow": {"amount": (0.6, Number(0, 1)), "color": ([1.0, 1.0, 1.0], Color())},
+    "light": {"amount": (0.5, Number(0, 1e6)), "color": ([1.0, 1.0, 1.0], Color())},
     "erase-shadow": {},
-    "temperature": {"kelvin": (None, number(2000, 25000))},
-    "contrast": {"amount": (1.5, number(0, 100))},
-    "blur": {"radius": (None, _length)},
+    "temperature": {"kelvin": (None, Number(2000, 25000))},
+    "contrast": {"amount": (1.5, Number(0, 100))},
+    "blur": {"radius": (None, _LENGTH)},
     "hold": {},
 }
 """What a stroke does, and the keys that belong to it: default (None: it must be given) and check."""
@@ -69,39 +135,78 @@ STROKES: dict[str, dict[str, tuple[Any, Callable]]] = {
 WHOLE_IMAGE = ("temperature", "contrast", "blur")
 """What may be done to the whole image, without a shape."""
 
-_ANY_STROKE: dict[str, tuple[Any, Callable]] = {
-    "units": ("fraction", choice("fraction", "pixels")),
-    "softness": (0.0, number(0, _FURTHEST)),
-    "opacity": (1.0, number(0, 1)),
+ANY_STROKE: dict[str, tuple[Any, Check]] = {
+    "units": ("fraction", Choice("fraction", "pixels")),
+    "softness": (0.0, Number(0, _FURTHEST)),
+    "opacity": (1.0, Number(0, 1)),
 }
+"""Keys of every stroke, likewise."""
+
+MEANINGS = {
+    "type": "what it does to the rendering",
+    "points": "middle line of a brush, x to the right and y downwards from the upper left corner",
+    "width": "of the brush; only with points, and needed there",
+    "polygon": "corners of a region",
+    "ellipse": "centre, radii and turn of a region",
+    "rectangle": "corners of a region",
+    "view": "view that it is painted on: index or id",
+    "amount": "shadow: share of the light taken; light: radiance added; contrast: factor",
+    "color": "factors on linear radiance, or a display colour",
+    "kelvin": "temperature: of the light in place of 6500 K",
+    "radius": "blur: standard deviation of the Gaussian",
+    "units": "of all lengths: shares of the picture's width and height, or pixels",
+    "softness": "width over which the border fades",
+    "opacity": "share of the change that is painted",
+}
+"""What each key is, for the reference."""
 
 
-def stroke_list(value: Any) -> tuple[dict, ...]:
-    """Accept a list of strokes, each with all of its keys spelled out; see :mod:`envedit.targets.strokes`.
+@dataclass(frozen=True)
+class StrokeList(Check):
+    """A list of strokes, each with all of its keys spelled out; see :mod:`envedit.targets.strokes`.
 
-    Raises
-    ------
-    WantedError
-        It is no list of tables.
-    ConfigError
-        A stroke has an unknown key or an unusable value; the message names ``target.strokes[2].width``.
+    Calling it raises ConfigError, which names ``target.strokes[2].width``, where a stroke has an unknown key
+    or an unusable value; WantedError if it is no list of tables.
     """
-    if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-        raise WantedError("a list of tables")
-    return tuple(_stroke(f"target.strokes[{i}]", v) for i, v in enumerate(value))
+
+    kind = "list of tables"
+
+    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
+        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
+            raise WantedError(str(self))
+        return tuple(_stroke(f"target.strokes[{i}]", v) for i, v in enumerate(value))
+
+    def __str__(self) -> str:
+        return "a list of tables"
+
+    def _schema(self) -> Schema:
+        properties: Schema = {}
+        for key, checks in stroke_keys().items():
+            each = [check.schema() for check in dict.fromkeys(checks)]
+            properties[key] = each[0] if len(each) == 1 else {"anyOf": each}
+            properties[key] = {**properties[key], "description": MEANINGS[key]}
+        stroke = {"type": "object", "properties": properties, "required": ["type"]}
+        return {"type": "array", "items": stroke | {"additionalProperties": False}}
 
 
-def _stroke(name: str, stroke: dict) -> dict:
+def stroke_keys() -> dict[str, list[Check]]:
+    """Return every key that a stroke may have, with its check in each type that has it."""
+    found: dict[str, list[Check]] = {"type": [Choice(*STROKES)], **{k: [c] for k, c in SHAPES.items()}}
+    found |= {"width": [_LENGTH], "view": [View()]}
+    for keys in (*STROKES.values(), ANY_STROKE):
+        for key, (_, check) in keys.items():
+            found.setdefault(key, []).append(check)
+    return found
+
+
+def _stroke(name: str, stroke: dict[str, Any]) -> dict[str, Any]:
     if "type" not in stroke:
         raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
-    kind = named(f"{name}.type", choice(*STROKES), stroke["type"])
-    keys = STROKES[kind] | _ANY_STROKE
+    kind = named(f"{name}.type", Choice(*STROKES), stroke["type"])
+    keys = STROKES[kind] | ANY_STROKE
     known = ["type", *SHAPES, "width", "view", *keys]
     for unknown in (k for k in stroke if k not in known):
-        text = unknown[:60] if isinstance(unknown, str) else ""
-        close = difflib.get_close_matches(text, known, 1)
-        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
-        raise ConfigError(f"{name}, type {kind}, has no key {show(unknown)}; {hint}")
+        raise ConfigError(f"{name}, type {kind}, has no key {show(unknown)}; {meant(unknown, known)}")
 
     found: dict[str, Any] = {"type": kind}
     shapes = [shape for shape in SHAPES if shape in stroke]
@@ -110,27 +215,21 @@ def _stroke(name: str, stroke: dict) -> dict:
     if not shapes and kind not in WHOLE_IMAGE:
         raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
     for shape in shapes:
-        check = SHAPES[shape]
-        if callable(check):
-            found[shape] = named(f"{name}.{shape}", check, stroke[shape])
-        else:
-            found[shape] = _points(f"{name}.{shape}", stroke[shape], check)
+        check, place, value = SHAPES[shape], f"{name}.{shape}", stroke[shape]
+        if isinstance(check, Points) and isinstance(value, list | tuple):
+            for i, point in enumerate(value):
+                named(f"{place}[{i}]", _POINT, point)
+        found[shape] = named(place, check, value)
     if "points" in stroke:
         if "width" not in stroke:
             raise ConfigError(f"{name}.width: got none, expected the width of the brush, as points are given")
-        found["width"] = named(f"{name}.width", _length, stroke["width"])
+        found["width"] = named(f"{name}.width", _LENGTH, stroke["width"])
     elif "width" in stroke:
         raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
     if "view" in stroke:
-        found["view"] = named(f"{name}.view", view, stroke["view"])
+        found["view"] = named(f"{name}.view", View(), stroke["view"])
     for key, (default, check) in keys.items():
         if key not in stroke and default is None:
             raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
         found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
     return found
-
-
-def _points(name: str, value: Any, least: int) -> list[list[float]]:
-    if not isinstance(value, list | tuple) or len(value) < least:
-        raise ConfigError(f"{name}: got {show(value)}, expected [[x, y], ...], at least {least}")
-    return [named(f"{name}[{i}]", _point, v) for i, v in enumerate(value)]

@@ -1,27 +1,27 @@
-"""Checks of configuration values: each returns a value normalised, or says what is wanted instead.
+"""Checks of configuration values: objects that say what they accept, and normalise a value or refuse it.
 
-A check is a function ``value -> value`` that raises :class:`WantedError`. A :class:`Table` is a frozen
-dataclass whose fields carry their check; it adds the key's name and what came, and raises ``ConfigError``.
-Numbers must fit single precision, in which everything is computed.
+A check is called with a value and returns it normalised, or raises :class:`WantedError`. ``str(check)`` is
+what an error says it expected, ``check.schema()`` the same as JSON Schema, ``check.kind`` and ``check.range``
+are for the reference of the configuration (:mod:`envedit.config.reference`). Numbers must fit single
+precision, in which everything is computed.
+
+>>> Integer(1, 8)(3), str(Integer(1, 8)), Integer(1, 8).schema()
+(3, 'an integer from 1 to 8', {'type': 'integer', 'minimum': 1, 'maximum': 8})
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable
-from dataclasses import field, fields
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from numbers import Integral, Real
 from os import PathLike, fspath
-from typing import Any, ClassVar
+from typing import Any
 
 from envedit.core.errors import ConfigError
 
-Ramp = float | tuple[float, float]
-"""A constant weight, or the two ends of a geometric ramp."""
-
-MOST_DIM = 16384
-"""Texels or pixels along an axis."""
+Schema = dict[str, Any]
 
 _FLOAT32_TINY, _FLOAT32_MAX = 2.0**-126, (2 - 2.0**-23) * 2.0**127
 
@@ -30,58 +30,153 @@ class WantedError(Exception):
     """A value is refused; the text says what is wanted instead."""
 
 
-def string(value: Any) -> str:
-    """Accept text or a path, as text."""
-    if isinstance(value, PathLike):
-        value = fspath(value)
-    if not isinstance(value, str):
-        raise WantedError("a string")
-    # A NUL cannot be in a path, a lone surrogate (an argument that is not UTF-8) cannot be written to a file.
-    if "\0" in value or any("\ud800" <= c <= "\udfff" for c in value):
-        raise WantedError("a string of valid characters, without NUL")
-    return str(value)
+class Check(ABC):
+    """What a key may be."""
+
+    @property
+    def kind(self) -> str:
+        """Its type in a word or two."""
+        return ""
+
+    @property
+    def range(self) -> str:
+        """Which values of that type; "" for all."""
+        return ""
+
+    def __call__(self, value: Any) -> Any:
+        """Return a value normalised; WantedError if it is refused."""
+        return self._take(value)
+
+    def schema(self) -> Schema:
+        """Return what is accepted as JSON Schema; where that cannot say all, it accepts more."""
+        return self._schema()
+
+    @abstractmethod
+    def __str__(self) -> str:
+        """Say what is accepted, as the end of a sentence."""
+
+    @abstractmethod
+    def _take(self, value: Any) -> Any: ...
+
+    @abstractmethod
+    def _schema(self) -> Schema: ...
 
 
-def boolean(value: Any) -> bool:
-    """Accept true or false."""
-    if not isinstance(value, bool):
-        raise WantedError("true or false")
-    return value
+# ---- words -------------------------------------------------------------------------------------------------
 
 
-def choice(*names: str) -> Callable:
-    """Make a check that accepts one of some names."""
+@dataclass(frozen=True)
+class String(Check):
+    """Text or a path, as text."""
 
-    def check(value: Any) -> str:
-        if isinstance(value, str) and value in names:
+    kind = "string"
+
+    def _take(self, value: Any) -> str:
+        if isinstance(value, PathLike):
+            value = fspath(value)
+        if not isinstance(value, str):
+            raise WantedError(str(self))
+        # A NUL cannot be in a path, a lone surrogate (an argument that is not UTF-8) cannot be written.
+        if "\0" in value or any("\ud800" <= c <= "\udfff" for c in value):
+            raise WantedError("a string of valid characters, without NUL")
+        return str(value)
+
+    def __str__(self) -> str:
+        return "a string"
+
+    def _schema(self) -> Schema:
+        return {"type": "string"}
+
+
+@dataclass(frozen=True)
+class Boolean(Check):
+    """True or false."""
+
+    kind = "boolean"
+
+    def _take(self, value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise WantedError(str(self))
+        return value
+
+    def __str__(self) -> str:
+        return "true or false"
+
+    def _schema(self) -> Schema:
+        return {"type": "boolean"}
+
+
+@dataclass(frozen=True, init=False)
+class Choice(Check):
+    """One of some names."""
+
+    names: tuple[str, ...]
+    kind = "string"
+
+    def __init__(self, *names: str) -> None:
+        object.__setattr__(self, "names", names)
+
+    def _take(self, value: Any) -> str:
+        if isinstance(value, str) and value in self.names:
             return value
-        close = difflib.get_close_matches(value[:60], names, 1) if isinstance(value, str) else ()
-        hint = f"; did you mean {close[0]}?" if close else ""
-        raise WantedError(f"one of {', '.join(names)}{hint}")
+        close = difflib.get_close_matches(value[:60], self.names, 1) if isinstance(value, str) else ()
+        raise WantedError(f"{self}{f'; did you mean {close[0]}?' if close else ''}")
 
-    return check
+    def __str__(self) -> str:
+        return f"one of {', '.join(self.names)}"
+
+    @property
+    def range(self) -> str:
+        """The names."""
+        return ", ".join(f'"{name}"' for name in self.names)
+
+    def _schema(self) -> Schema:
+        return {"enum": list(self.names)}
 
 
-def integer(low: int, high: int, even: bool = False) -> Callable:
-    """Make a check that accepts a whole number in [low, high]."""
+# ---- numbers -----------------------------------------------------------------------------------------------
 
-    def check(value: Any) -> int:
+
+@dataclass(frozen=True)
+class Integer(Check):
+    """A whole number in [low, high]."""
+
+    low: int
+    high: int
+    even: bool = False
+    kind = "integer"
+
+    def _take(self, value: Any) -> int:
         whole = isinstance(value, Integral) and not isinstance(value, bool)
-        if not whole or not low <= value <= high or (even and value % 2):
-            raise WantedError(f"an {'even ' if even else ''}integer from {low} to {high}")
+        if not whole or not self.low <= value <= self.high or (self.even and value % 2):
+            raise WantedError(str(self))
         return int(value)
 
-    return check
+    def __str__(self) -> str:
+        return f"an {'even ' if self.even else ''}integer from {self.low} to {self.high}"
+
+    @property
+    def range(self) -> str:
+        """First and last."""
+        return f"{'even, ' if self.even else ''}{self.low} to {self.high}"
+
+    def _schema(self) -> Schema:
+        limits: Schema = {"type": "integer", "minimum": self.low, "maximum": self.high}
+        return limits | ({"multipleOf": 2} if self.even else {})
 
 
-def number(low: float, high: float = math.inf, positive: bool = False) -> Callable:
-    """Accept a finite number in [low, high] that single precision can hold."""
-    text = f"a number above {low:g}" if positive else f"a number of at least {low:g}"
-    text = text if math.isinf(high) else f"{text} and at most {high:g}"
+@dataclass(frozen=True)
+class Number(Check):
+    """A finite number in [low, high], or (low, high], that single precision can hold."""
 
-    def check(value: Any) -> float:
+    low: float
+    high: float = math.inf
+    positive: bool = False
+    kind = "number"
+
+    def _take(self, value: Any) -> float:
         if not isinstance(value, Real) or isinstance(value, bool):
-            raise WantedError(text)
+            raise WantedError(str(self))
         try:
             number = float(value)
         except (OverflowError, ValueError):
@@ -90,196 +185,124 @@ def number(low: float, high: float = math.inf, positive: bool = False) -> Callab
             raise WantedError("a finite number")
         if abs(number) > _FLOAT32_MAX or 0 < abs(number) < _FLOAT32_TINY:
             raise WantedError("a number that single precision can hold")
-        if not low <= number <= high or (positive and number == low):
-            raise WantedError(text)
+        if not self.low <= number <= self.high or (self.positive and number == self.low):
+            raise WantedError(str(self))
         return number
 
-    return check
+    def __str__(self) -> str:
+        text = f"a number {'above' if self.positive else 'of at least'} {self.low:g}"
+        return text if math.isinf(self.high) else f"{text} and at most {self.high:g}"
+
+    @property
+    def range(self) -> str:
+        """Least and most."""
+        if math.isinf(self.high):
+            return "" if math.isinf(self.low) else f"{'above' if self.positive else 'at least'} {self.low:g}"
+        return f"{'above ' if self.positive else ''}{self.low:g} to {self.high:g}"
+
+    def _schema(self) -> Schema:
+        limits: Schema = {"type": "number"}
+        if not math.isinf(self.low):
+            limits["exclusiveMinimum" if self.positive else "minimum"] = self.low
+        return limits | ({} if math.isinf(self.high) else {"maximum": self.high})
 
 
-def numbers(*checks: Callable) -> Callable:
-    """Make a check that accepts a list with one value for each of some checks."""
+@dataclass(frozen=True, init=False)
+class Numbers(Check):
+    """A list with one value for each of some checks."""
 
-    def check(value: Any) -> list[float]:
-        if not isinstance(value, list | tuple) or len(value) != len(checks):
-            raise WantedError(f"a list of {len(checks)} numbers")
-        return [check(v) for check, v in zip(checks, value, strict=True)]
+    checks: tuple[Check, ...]
+    kind = "list"
 
-    return check
+    def __init__(self, *checks: Check) -> None:
+        object.__setattr__(self, "checks", checks)
+
+    def _take(self, value: Any) -> list[float]:
+        if not isinstance(value, list | tuple) or len(value) != len(self.checks):
+            raise WantedError(str(self))
+        return [check(v) for check, v in zip(self.checks, value, strict=True)]
+
+    def __str__(self) -> str:
+        return f"a list of {len(self.checks)} numbers"
+
+    @property
+    def range(self) -> str:
+        """How many, and each one's range where all have the same."""
+        same = len({check.range for check in self.checks}) == 1 and self.checks[0].range
+        return f"{len(self.checks)} numbers{f', each {same}' if same else ''}"
+
+    def _schema(self) -> Schema:
+        items = [check.schema() for check in self.checks]
+        return {"type": "array", "items": items, "minItems": len(items), "maxItems": len(items)}
 
 
-def kelvin(value: Any) -> float:
-    """Accept a colour temperature for which there are chromaticities, or 0."""
-    try:
-        found = number(0, 25000)(value)
-    except WantedError:
-        found = -1.0
-    if found and not 2000 <= found <= 25000:
-        raise WantedError("0, or kelvin from 2000 to 25000")
-    return found
+# ---- what another check accepts, and more ------------------------------------------------------------------
 
 
-def or_auto(check: Callable) -> Callable:
-    """Make a check that accepts "auto" beside what another check accepts."""
+@dataclass(frozen=True)
+class OrAuto(Check):
+    """The word "auto" beside what another check accepts."""
 
-    def check_auto(value: Any) -> Any:
+    check: Check
+
+    def _take(self, value: Any) -> Any:
         try:
-            return value if isinstance(value, str) and value == "auto" else check(value)
+            return value if isinstance(value, str) and value == "auto" else self.check(value)
         except WantedError as error:
             raise WantedError(f'{error}, or "auto"') from None
 
-    return check_auto
+    def __str__(self) -> str:
+        return f'{self.check}, or "auto"'
+
+    @property
+    def kind(self) -> str:
+        """Of the other check."""
+        return self.check.kind
+
+    @property
+    def range(self) -> str:
+        """Of the other check, and "auto"."""
+        return f'{self.check.range or self.check}; or "auto"'
+
+    def _schema(self) -> Schema:
+        return {"anyOf": [{"const": "auto"}, self.check.schema()]}
 
 
-def weight(value: Any) -> Ramp:
-    """Accept a constant weight, or the two ends of a geometric ramp."""
-    wanted = "a number of at least 0, or [start, end], both above 0"
-    try:
-        if isinstance(value, list | tuple):
-            start, end = value
-            return number(0, positive=True)(start), number(0, positive=True)(end)
-        return number(0)(value)
-    except (ValueError, WantedError):
-        raise WantedError(wanted) from None
+@dataclass(frozen=True)
+class OneOrMore(Check):
+    """A value, or a list of values, as a tuple."""
 
+    check: Check
 
-def row_range(value: Any) -> str | tuple[int, int]:
-    """Accept the rows that an edit may change: a name, or the first and last of them."""
-    try:
-        if isinstance(value, list | tuple):
-            first, last = map(integer(0, MOST_DIM), value)
-            if first <= last:
-                return first, last
-        elif isinstance(value, str):
-            return choice("upper", "all")(value)
-    except (ValueError, WantedError):
-        pass
-    raise WantedError('"upper", "all" or [first, last], rows from 0 at the zenith, last included')
-
-
-def view_list(value: Any) -> str | tuple[int | str, ...]:
-    """Accept sensors of a scene: "all", or a list of ids and of indices from 0, none of them twice."""
-    if isinstance(value, str) and value == "all":
-        return value
-    try:
-        if isinstance(value, list | tuple) and value and len({*value}) == len(value):
-            return tuple(view(v) for v in value)
-    except (TypeError, WantedError):
-        pass
-    raise WantedError('"all", or a list of ids of sensors or of indices from 0, each once')
-
-
-def view(value: Any) -> int | str:
-    """Accept a view: the id of its sensor, or its index."""
-    try:
-        if (found := string(value) if isinstance(value, str) else integer(0, MOST_DIM)(value)) != "":
-            return found
-    except WantedError:
-        pass
-    raise WantedError("the id of a sensor, or the index of a view from 0")
-
-
-def one_or_more(check: Callable) -> Callable:
-    """Make a check that accepts a value, or a list of values, as a tuple."""
-
-    def check_each(value: Any) -> Any:
+    def _take(self, value: Any) -> Any:
         try:
-            return tuple(check(v) for v in value) if isinstance(value, list | tuple) else check(value)
+            if isinstance(value, list | tuple):
+                return tuple(self.check(v) for v in value)
+            return self.check(value)
         except WantedError as error:
             raise WantedError(f"{error}, or a list of them") from None
 
-    return check_each
+    def __str__(self) -> str:
+        return f"{self.check}, or a list of them"
+
+    @property
+    def kind(self) -> str:
+        """Of one, or a list."""
+        return f"{self.check.kind} or list"
+
+    def _schema(self) -> Schema:
+        return {"anyOf": [self.check.schema(), {"type": "array", "items": self.check.schema()}]}
 
 
-def plain(value: Any, depth: int = 8) -> Any:
-    """Accept what :func:`.schema.quote` can write: strings, numbers, booleans, lists and tables of them."""
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        return string(value)
-    if isinstance(value, Integral):
-        return integer(-(2**63), 2**63 - 1)(value)
-    if isinstance(value, Real):
-        return number(-math.inf)(value)
-    if depth and isinstance(value, list | tuple):
-        return [plain(v, depth - 1) for v in value]
-    if depth and isinstance(value, dict):
-        return {string(k): plain(v, depth - 1) for k, v in value.items()}
-    raise WantedError("strings, finite numbers, true or false, and not too deep lists and tables of them")
+# ---- words for errors --------------------------------------------------------------------------------------
 
 
-def parameter_table(value: Any) -> dict[str, str | float | bool]:
-    """Accept a flat table of strings, numbers and booleans."""
-    if not isinstance(value, dict) or any(isinstance(v, dict | list | tuple) for v in value.values()):
-        raise WantedError("a table of strings, numbers and booleans")
-    return plain(value)
-
-
-def named(name: str, check: Callable, value: Any) -> Any:
+def named(name: str, check: Check, value: Any) -> Any:
     """Check a value inside another; raise ConfigError with its name."""
     try:
         return check(value)
     except WantedError as error:
         raise ConfigError(f"{name}: got {show(value)}, expected {error}") from None
-
-
-# ---- tables of checked values ----------------------------------------------------------------------------
-
-
-def key(default: Any, check: Callable, doc: str) -> Any:
-    """Make a field of a :class:`Table`: its default, its check, and one line on its meaning."""
-    metadata = {"check": check, "doc": doc}
-    if isinstance(default, dict):
-        return field(default_factory=default.copy, metadata=metadata)
-    return field(default=default, metadata=metadata)
-
-
-class Table:
-    """Checks and normalises every field on construction, so also in ``dataclasses.replace``.
-
-    Attributes
-    ----------
-    given : frozenset of str
-        Names of the fields that were passed to the constructor; the others have their defaults, in whose
-        place a preset may put its own (:meth:`with_defaults`).
-    """
-
-    given: ClassVar[frozenset[str]] = frozenset()
-
-    def __new__(cls, *values, **named):
-        """Note which fields are given."""
-        table = super().__new__(cls)
-        by_position = (f.name for f, _ in zip(fields(cls), values, strict=False))
-        object.__setattr__(table, "given", frozenset([*by_position, *named]))
-        return table
-
-    def with_defaults(self, values: dict[str, Any]) -> Table:
-        """Return the table with other defaults; what was given stays."""
-        own = {name: getattr(self, name) for name in self.given}
-        table = type(self)(**(values | own))
-        object.__setattr__(table, "given", self.given)
-        return table
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            object.__setattr__(self, f.name, checked(f, self._name(f.name), getattr(self, f.name)))
-        self._check_together()
-
-    def _name(self, key: str) -> str:
-        """Name a key in errors."""
-        return f"{type(self).__name__.lower()}.{key}"
-
-    def _check_together(self) -> None:
-        """Check what depends on several keys of this table."""
-
-
-def checked(f: Any, name: str, value: Any) -> Any:
-    """Check the value of a field, or of a table inside a table; raise ConfigError with the key's name."""
-    if "table" in f.metadata:
-        if not isinstance(value, f.metadata["table"]):
-            raise ConfigError(f"{name}: got {show(value)}, expected a table")
-        return value
-    return named(name, f.metadata["check"], value)
 
 
 def show(value: Any) -> str:
@@ -291,3 +314,10 @@ def show(value: Any) -> str:
     text = {"True": "true", "False": "false"}.get(text, text)
     text = " ".join(text.split())
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def meant(key: Any, known: Any) -> str:
+    """Say which of some names is meant, or which there are."""
+    text = key[:60] if isinstance(key, str) else ""
+    close = difflib.get_close_matches(text, list(known), 1)
+    return f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"

@@ -25,6 +25,8 @@ FORMATS = (
     ("jpeg", b"\xff\xd8\xff", ldr.read),
 )
 """Kind, first bytes and decoder of every format."""
+ARRAY = "array"
+"""What a map that came as an array is called, where others have the name of their file."""
 
 __all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_hdr", "write_png"]
 
@@ -136,20 +138,22 @@ def _decode(path, stored):
 
 
 def load_envmap(
-    path, width: int | None = None, repair: bool = False, convert: bool = True
+    path, width: int | None = None, repair: bool = False, convert: bool = True, name: str = ARRAY
 ) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
     Parameters
     ----------
-    path : path-like
-        An image of 2:1.
+    path : path-like or ndarray (H, 2 H, 3)
+        An image of 2:1, or its linear radiance.
     width : int, optional
         Working width in texels, even and at least 6; the height is half of it. Without, the file's own size.
     repair : bool
         Replace NaN and infinite texels instead of refusing them.
     convert : bool
         To Rec. 709; otherwise colours are those of the file, ``info["chromaticities"]``.
+    name : str
+        What errors call an array.
 
     Returns
     -------
@@ -168,7 +172,10 @@ def load_envmap(
     """
     if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
         raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
-    image, info = read(path) if convert else _decode(path, stored=False)
+    if isinstance(path, np.ndarray):
+        image, info = _of_array(path, name)
+    else:
+        image, info = read(path) if convert else _decode(path, stored=False)
     name, warnings = info["path"], info["warnings"]
     rows, columns = image.shape[:2]
     if columns != 2 * rows:
@@ -208,6 +215,18 @@ def load_envmap(
             warnings.append(f"enlarged from {columns} to {width} texels across: no detail is added")
         image = latlong.resize(image, width // 2, width)
     return image, info
+
+
+def _of_array(values: np.ndarray, name: str) -> tuple[np.ndarray, dict]:
+    """Take a map from an array as :func:`read` takes one from a file."""
+    if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fiu":
+        what = f"shape {values.shape} of {values.dtype}"
+        raise InputError(f"{name}: got an array of {what}, expected (H, 2 H, 3) numbers")
+    with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is named as such
+        image = np.array(values, np.float32)
+    size = image.shape[1], image.shape[0]
+    info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
+    return image, info | {"chromaticities": None}
 
 
 # ----------------------------------------------------------------------------------------------------------

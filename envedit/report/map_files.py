@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envedit import config, inputs, results
+from envedit import config, inputs
 from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
 from envedit.core.radiance import HALF_MAX
@@ -14,6 +15,9 @@ from envedit.export import light_list
 from envedit.images import images, layered_exr
 from envedit.report import manifest
 from envedit.scene import scene
+
+if TYPE_CHECKING:
+    from envedit import results
 
 
 def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: inputs.InputMap) -> list[str]:

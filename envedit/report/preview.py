@@ -106,12 +106,15 @@ def _text(label, width, scale):
 
 
 def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -> None:
-    """Draw ``preview.png``: a row of renderings and under each its environment map.
+    """Write ``preview.png``: what :func:`drawn` draws; errors as there, or that it cannot be written."""
+    write_atomically(path, png(drawn(renders, maps, tonemap, labels, exposure, views)))
+
+
+def drawn(renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -> np.ndarray:
+    """Draw a row of renderings and under each its environment map.
 
     Parameters
     ----------
-    path : path
-        File to write.
     renders, maps : dict of str to array or None
         Linear radiance, ``(H, W, 3)``, in the order of the columns, usually ``initial``, ``target``,
         ``edited``. A map stands under the rendering of the same name; one that is missing or None (the true
@@ -125,10 +128,14 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0, vie
     views : sequence of slice
         Rows of each view, where renderings are of several: they are drawn below each other.
 
+    Returns
+    -------
+    array (h, w, 3) uint8
+
     Raises
     ------
     InputError
-        If a picture is not ``(H, W, 3)``, there is none, or the file cannot be written.
+        If a picture is not ``(H, W, 3)``, or there is none.
     ConfigError
         If there is no such tonemap.
     """
@@ -163,7 +170,7 @@ def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0, vie
         canvas[rows, column] = PLACEHOLDER
         if name in maps:
             canvas[rows, column] = display(maps[name], width // 2, width, tonemap, exposure)
-    write_atomically(path, png(canvas))
+    return canvas
 
 
 def _height(image, width):

@@ -5,14 +5,22 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from envedit import config, results
+import numpy as np
+
+from envedit import config, inputs
 from envedit.core import atomic_files
 from envedit.core.errors import InputError, NumericalError
+from envedit.export import file_resolution
 from envedit.images import images, layered_exr
 from envedit.report import html_report, manifest, map_files, output_folder, preview
 from envedit.solve import checkpoint, feasibility
+
+if TYPE_CHECKING:
+    from envedit import results
 
 
 def write(
@@ -94,6 +102,36 @@ def write(
     return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
 
 
+def write_given(
+    settings: config.Config, folder: Path, memory: inputs.Given | None, warnings: list[str]
+) -> config.Config:
+    """Write the arrays that a run was given, and return the configuration that names their files.
+
+    A scene that has no file is named in a warning.
+    """
+    memory = memory or inputs.Given()
+    if memory.scene is not None and memory.scene.path is None:
+        warnings.append(
+            "config.toml: the scene was given as an object: name a file in [scene] file to run it again; "
+            "edited.xml is not written"
+        )
+        settings = replace(settings, output=replace(settings.output, scene=False))
+    arrays = {"envmap": memory.envmap, "target_map": memory.target_map}
+    arrays |= {"target": memory.picture, "mask": memory.mask}
+    files = {name: folder / f"given_{name}.exr" for name, array in arrays.items() if array is not None}
+    for name, file in files.items():
+        array = np.asarray(arrays[name], np.float32)
+        array = array if name != "mask" else array.reshape(*array.shape[:2], 1).repeat(3, axis=2)
+        images.write_exr(file, array, panorama=name in ("envmap", "target_map"))
+    if "envmap" in files:
+        settings = replace(settings, input=replace(settings.input, envmap=str(files["envmap"])))
+    if {"target", "target_map"} & files.keys():
+        file, mask = files.get("target") or files["target_map"], files.get("mask")
+        target = replace(settings.target, file=str(file), mask=str(mask) if mask else "")
+        settings = replace(settings, target=target)
+    return settings
+
+
 def _ramps(settings):
     """Return first and last weight of each loss, and the iterations between them."""
     weights = {key: value for key, value in dataclasses.asdict(settings.loss).items() if value}
@@ -133,7 +171,7 @@ def _maps(settings, folder, result):
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
     if settings.output.full:
         try:
-            full = results.at_full_resolution(settings, result)
+            full = file_resolution.at_full_resolution(settings, result)
             if full is not None:
                 asked = settings.output, folder / "edited_full", full, given
                 result.warnings += map_files.write_map(*asked)

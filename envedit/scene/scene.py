@@ -25,7 +25,8 @@ import difflib
 import functools
 import hashlib
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import drjit as dr
@@ -93,6 +94,8 @@ class Scene:
         The camera sees neither the environment nor shapes that are lamps.
     notes : tuple of str
         What of the file is not used, or used otherwise.
+    parameters : dict
+        Values that were filled in for the ``$names`` of the XML.
     """
 
     mi: mi.Scene
@@ -108,6 +111,7 @@ class Scene:
     max_depth: int = -1
     hide_emitters: bool = False
     notes: tuple[str, ...] = ()
+    parameters: dict[str, str | float | bool] = field(default_factory=dict)
 
     @functools.cached_property
     def alpha(self) -> np.ndarray | None:
@@ -369,14 +373,14 @@ def load(
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
-    columns, views = _views(scene, names)
+    columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    told = views, own, asked.max_depth, asked.hide_emitters, notes
+    told = views, own, asked.max_depth, asked.hide_emitters, notes, dict(parameters or {})
     return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told)
 
 
-def _views(scene, names):
-    """Return the width that all views have, and the rows of each."""
+def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
+    """Return the width that all views have, and name and rows of each; ConfigError if widths differ."""
     views, sizes, first = [], [[int(n) for n in s.film().crop_size()] for s in scene.sensors()], 0
     for name, (width, height) in zip(names, sizes, strict=True):
         if width != sizes[0][0]:

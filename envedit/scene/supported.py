@@ -112,6 +112,9 @@ def take_integrator(state, where: str) -> Integrator:
         The scene has a participating medium and an integrator that would render it, or ``max_depth`` gives
         no picture.
     """
+    for n in state.nodes:  # of a dict, the parser does not know the type of a plugin written in Python
+        if n.type == mi.ObjectType.Unknown and n.props.plugin_name() in PATHS + DIRECT + VOLUMES:
+            n.type = mi.ObjectType.Integrator
     nodes = [n for n in state.nodes if n.type == mi.ObjectType.Integrator]
     node = next(iter(nodes), None)
     while node is not None and node.props.plugin_name() in WRAPPERS:

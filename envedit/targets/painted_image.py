@@ -298,7 +298,7 @@ def read_mask(file, shape) -> np.ndarray:
     if values.shape[2] in (2, 4):
         alpha = 1 if info["hdr"] else values[..., -1:]  # OpenEXR is premultiplied
         values = values[..., :-1] * alpha
-    weight = np.clip(values.mean(axis=2, keepdims=True), 0, 1)
+    weight = np.clip(values.mean(axis=2, keepdims=True, dtype=np.float64), 0, 1)  # exact where all are equal
     if info["format"] == "jpeg":  # its black and white are not quite
         weight = np.clip((weight - 0.02) / 0.96, 0, 1)
     if not weight.any():

@@ -39,7 +39,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envedit.config.stroke_schema import stroke_list
+from envedit.config.stroke_schema import StrokeList
 from envedit.core.color import inverse_tonemap, luminance, tonemap
 from envedit.core.errors import InputError, place_of
 
@@ -95,7 +95,7 @@ def paint(picture, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
     result = image.astype(np.float64)
     bare = np.ones((height, width, 1))
     warnings = []
-    for i, stroke in enumerate(stroke_list(strokes)):
+    for i, stroke in enumerate(StrokeList()(strokes)):
         name = f"target.strokes[{i}] ({stroke['type']})"
         if not stroke["opacity"]:
             warnings.append(f"{name}: opacity 0, nothing was painted")
@@ -174,7 +174,7 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
     Parameters
     ----------
     stroke : dict
-        With every key, as :func:`envedit.config.stroke_schema.stroke_list` returns it.
+        With every key, as :func:`envedit.config.stroke_schema.StrokeList` returns it.
     height, width : int
         Size of the picture in pixels.
     """

@@ -85,6 +85,7 @@ def make(
     envmap: np.ndarray,
     picture: np.ndarray | None = None,
     mask: np.ndarray | None = None,
+    other: np.ndarray | None = None,
 ) -> Target:
     """Make the target of a configuration.
 
@@ -100,6 +101,8 @@ def make(
         A painted picture, linear radiance, in place of what the configuration names.
     mask : ndarray (h, w), optional
         How much each pixel of it was painted, in [0, 1]; None: seen by comparing with the initial rendering.
+    other : ndarray (H, 2 H, 3), optional
+        The map to render under, in place of ``file``, in the units of a file.
 
     Raises
     ------
@@ -110,7 +113,7 @@ def make(
     chosen, alpha = settings.target, scene.alpha
     hidden = None if alpha is None else alpha == 0
     if picture is None and chosen.kind == "envmap":
-        return _seen(_rendered(settings, scene, envmap), hidden)
+        return _seen(_rendered(settings, scene, envmap, other), hidden)
     shape = scene.height, scene.width
     initial, asked = painted_image.initial(scene, envmap, settings), ()
     if picture is not None:
@@ -227,17 +230,18 @@ def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
     return (weight / weight.mean()).astype(np.float32)
 
 
-def _rendered(settings, scene, envmap):
+def _rendered(settings, scene, envmap, other):
     """Render the scene under another map."""
     chosen = settings.target
     if chosen.file:
-        true, info = images.load_envmap(chosen.file, envmap.shape[1], settings.input.repair)
+        file = chosen.file if other is None else other
+        true, info = images.load_envmap(file, envmap.shape[1], settings.input.repair, name="target_map")
         require_radiance(true, str(chosen.file), brightest=BRIGHTEST)
         true = inputs.scaled(true, scene.own.scale, str(chosen.file))
         source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
     else:
-        true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
-        source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
+        true, warnings = latlong.rotate(envmap, chosen.degrees), ()
+        source = f"rendered under the map turned by {chosen.degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
     picture, spp, noise = rendered(scene, true, chosen.spp, settings.seed + SEED, settings.renderer.cache)
     weight = np.ones((*picture.shape[:2], 1), np.float32) if chosen.masks else None

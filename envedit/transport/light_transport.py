@@ -19,7 +19,11 @@ grid.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Mapping
+from numbers import Integral
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,8 +31,11 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.array_cache import DiskCache, holds
+from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_radiance
+from envedit.scene import built_scene
+from envedit.scene.scene import Scene
 from envedit.transport import block_transport as overviews
 from envedit.transport import bright_texels
 from envedit.transport.exact_columns import ExactColumns
@@ -70,7 +77,9 @@ _RECORDING = 1  # raise when the same scene, grid and seed give another recordin
 
 
 class LightTransport:
-    """T for one scene, camera and texel grid; built by :meth:`build`.
+    """T for one scene, camera and texel grid, I = T E + I_0; built by :meth:`build`.
+
+    What it is and how it is measured is said in docs/light_transport.md.
 
     Attributes
     ----------
@@ -107,27 +116,28 @@ class LightTransport:
     @classmethod
     def build(
         cls,
-        scene,
-        height: int,
-        width: int,
+        scene: Scene | mi.Scene | Mapping[str, Any] | str | PathLike[str],
+        height: int = 128,
+        width: int = 256,
         *,
-        spp="auto",
-        max_depth="auto",
+        spp: int | str = "auto",
+        max_depth: int | str = "auto",
         seed: int = 0,
-        memory_gb=2.0,
+        memory_gb: float | str = 2.0,
         refresh: int = 0,
         few: bool = False,
         folder: Path | None = None,
-        progress=None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> LightTransport:
         """Trace T.
 
         Parameters
         ----------
-        scene : envedit.scene.Scene
-            Scene, camera and film.
+        scene : Scene, mitsuba.Scene, dict or path
+            Scene, camera and film, of :func:`envedit.load_scene`; or what that takes, for a rendering 128
+            pixels wide.
         height, width : int
-            Texel grid of the maps that T will be applied to.
+            Texel grid of the maps that T will be applied to: 128 x 256, the standard preset's.
         spp : int or "auto"
             Texel samples a pixel of the coarse tier.
         max_depth : int or "auto"
@@ -150,17 +160,26 @@ class LightTransport:
         Raises
         ------
         ConfigError
-            ``spp`` or ``max_depth`` is below 1.
+            ``spp`` or ``max_depth`` is below 1, or the scene's parameters or sensors cannot be used.
         InputError
-            No pixel receives light from the environment, T does not fit into ``memory_gb``, or the grid is
-            smaller than Mitsuba takes.
+            The scene cannot be loaded, no pixel receives light from the environment, T does not fit into
+            ``memory_gb``, or the grid is smaller than Mitsuba takes.
+
+        Examples
+        --------
+        >>> transport = LightTransport.build("sphere")  # doctest: +SKIP
+        >>> picture = transport.apply(envedit.sunsky(256)).numpy()  # doctest: +SKIP
         """
+        if mi.variant() is None:
+            mi.set_variant("llvm_ad_rgb")
+        scene = built_scene.load(scene, 0 if isinstance(scene, Scene) else 128)
         latlong.check_envmap_size(height, width)
         memory_gb = allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
-            if value != "auto" and not value >= 1:
+            whole = isinstance(value, Integral) and not isinstance(value, bool)
+            if value != "auto" and not (whole and value >= 1):
                 raise ConfigError(
-                    f"renderer.{name}: got {value}, expected a whole number of at least 1, or auto"
+                    f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
                 )
         cache = DiskCache(folder)
         origin = {
@@ -330,8 +349,28 @@ class LightTransport:
         """Itself: what a renderer renders through, where that is a stored T."""
         return self
 
-    def apply(self, envmap: mi.TensorXf) -> mi.TensorXf:
-        """Render: (H, W, 3) linear radiance to (h, w, 3), differentiable, T E + I_0."""
+    def apply(self, envmap: mi.TensorXf | np.ndarray) -> mi.TensorXf:
+        """Render a map: I = T E + I_0, differentiable in a tensor.
+
+        What a texel lights is exact to Monte Carlo noise where the map is smooth; for one with a sun call
+        :meth:`resolve` before.
+
+        Parameters
+        ----------
+        envmap : TensorXf or ndarray (H, W, 3)
+            Linear radiance as it reaches the scene, of the size that T was built for.
+
+        Returns
+        -------
+        TensorXf (h, w, 3)
+            Linear radiance.
+
+        Raises
+        ------
+        ValueError
+            The map has another shape.
+        """
+        envmap = tensor(envmap) if isinstance(envmap, np.ndarray) else envmap
         _check(envmap, (self.grid.height, self.grid.width, 3), "map")
         return dr.custom(_Apply, self, envmap)
 
@@ -382,8 +421,9 @@ class LightTransport:
         if len(todo):
             exact.trace(todo, self.paths[0], self.seed, keep)
 
-    def adjoint(self, image: mi.TensorXf) -> mi.TensorXf:
-        """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3)."""
+    def adjoint(self, image: mi.TensorXf | np.ndarray) -> mi.TensorXf:
+        """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3); ValueError for another shape."""
+        image = tensor(image) if isinstance(image, np.ndarray) else image
         _check(image, (*self.shape, 3), "picture")
         return self._adjoint(image)
 

@@ -90,7 +90,7 @@ def test_user_errors_are_one_line(run, tmp_path):
 def test_an_override_beats_the_case_and_a_target_file_its_turn():
     tables = {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
     found = overridden(tables, ["seed=2", "target.file=b.exr"])
-    assert found == {"seed": 2, "target": {"rotate_degrees": 0.0, "spp": 8, "file": "b.exr"}}
+    assert found == {"seed": 2, "target": {"rotate_degrees": "auto", "spp": 8, "file": "b.exr"}}
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
 
 

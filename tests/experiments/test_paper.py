@@ -203,7 +203,7 @@ def test_figure_8_has_another_map_for_its_target_turned_where_there_is_one(maps,
     assert plan.resolved("table1", Question(), maps) == Question()
     found = target(target="dawn", angle=90)
     assert found.file == str(tmp_path / "maps" / f"dawn_puresky_1k-turned-90-{content('dawn')}.exr")
-    assert found.rotate_degrees == 0
+    assert found.rotate_degrees == "auto"
     np.testing.assert_array_equal(images.read(found.file)[0], np.roll(sky, -4, axis=1))
     with pytest.raises(ConfigError, match="--target: no map dusky; did you mean dusk"):
         target(target="dusky")

@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import config, pipeline, representations, results
+from envedit import config, pipeline, representations
 from envedit.core.errors import NumericalError
+from envedit.export import file_resolution
 from envedit.losses import losses, optimizer
 from envedit.report import manifest
 from envedit.scene import scene
@@ -357,6 +358,7 @@ def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
 def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+    capsys.readouterr()
 
     def fails(*arguments, **keys):
         raise NumericalError(f"{stage}: not finite at row 1, column 2")
@@ -394,7 +396,7 @@ def test_a_full_map_that_is_not_finite_does_not_cost_the_result(tmp_path, rng, m
     def fails(*arguments):
         raise NumericalError("the carried map is not finite at row 3, column 4")
 
-    monkeypatch.setattr(results, "at_full_resolution", fails)
+    monkeypatch.setattr(file_resolution, "at_full_resolution", fails)
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     said = capsys.readouterr().err

@@ -7,9 +7,10 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from envedit import config, results
+from envedit import config
 from envedit.cli import doctor, run
 from envedit.core import latlong
+from envedit.export import file_resolution
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 from tests.oracles.tiers import slow_but
@@ -84,20 +85,20 @@ def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monk
     def out_of_memory(*arguments):
         raise MemoryError
 
-    monkeypatch.setattr(results, "at_full_resolution", out_of_memory)
+    monkeypatch.setattr(file_resolution, "at_full_resolution", out_of_memory)
     out = carried_out(tmp_path, source(rng))
     assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
     assert "not enough memory" in capsys.readouterr().err
 
 
 def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
-    full = results.at_full_resolution
+    full = file_resolution.at_full_resolution
 
     def gone(*arguments):
         (tmp_path / "map.exr").unlink()
         return full(*arguments)
 
-    monkeypatch.setattr(results, "at_full_resolution", gone)
+    monkeypatch.setattr(file_resolution, "at_full_resolution", gone)
     out = carried_out(tmp_path, source(rng))
     assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
     said = capsys.readouterr().err

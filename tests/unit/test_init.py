@@ -21,7 +21,8 @@ def test_the_file_loads_to_the_defaults_that_it_spells_out(here, capsys):
     assert init.main([]) == 0
     assert capsys.readouterr().out == "edit.toml: written; edit it, then: envedit run edit.toml\n"
     written = config.load("edit.toml")
-    assert written == config.from_dict({}, here, "edit.toml")
+    assert written == config.from_dict({"target": {"rotate_degrees": 60}}, here, "edit.toml")
+    assert written.target.degrees == config.Target().degrees
     assert set(tomllib.loads((here / "edit.toml").read_text())) == {
         "preset", "input", "scene", "target", "representation",
     }  # fmt: skip

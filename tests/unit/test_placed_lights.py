@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from envedit import config, inputs, pipeline, results
+from envedit import config, inputs, pipeline
 from envedit.core import latlong
 from envedit.core.errors import ConfigError
+from envedit.export import file_resolution
 from envedit.images import images
 from envedit.representations.layers.placed_lights import PlacedLights, add, angles, direction, missing
 
@@ -106,7 +107,7 @@ def test_the_full_map_has_the_same_lights(tmp_path):
     """
     settings = config.loads(text, tmp_path)
     result = pipeline.run(settings)
-    full = results.at_full_resolution(settings, result)
+    full = file_resolution.at_full_resolution(settings, result)
     assert full.shape == (64, 128, 3)
     small = latlong.resize(full, 32, 64)
     assert np.allclose(flux(full), flux(result.envmap), rtol=0.05)

@@ -142,19 +142,35 @@ def test_a_kind_that_is_none_is_refused_by_its_own_key():
 # ---- targets -----------------------------------------------------------------------------------------------
 
 
-def test_a_target_file_means_no_rotation_and_the_last_source_wins():
-    assert cfg.loads("").target.rotate_degrees == 60
-    assert cfg.loads("[target]\nfile = 'b.exr'").target.rotate_degrees == 0
+def test_a_target_file_changes_no_other_key():
+    for config in (cfg.loads(""), cfg.loads("[target]\nfile = 'b.exr'")):
+        assert config.target.rotate_degrees == "auto"
+    assert cfg.Target().degrees == 60 and cfg.Target(rotate_degrees=5).degrees == 5
+    file = cfg.Target(file="/b.exr", rotate_degrees=0)  # no turn, as in configurations of earlier versions
+    assert (file.file, file.rotate_degrees) == ("/b.exr", 0)
+    with pytest.raises(ConfigError, match=r"target.file and target.rotate_degrees: got both, expected one"):
+        cfg.Target(file="/b.exr", rotate_degrees=5)
+    with pytest.raises(ConfigError, match="got both"):
+        dataclasses.replace(cfg.Target(rotate_degrees=5), file="/b.exr")
+    painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5")
+    assert painted.target.file == "/b.exr" and painted.target.rotate_degrees == 5
+    assert cfg.unused(painted) == [
+        'target.rotate_degrees: not used, as target.kind is "image"; it is where that is "envmap"'
+    ]
+
+
+def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
     turned = cfg.loads("[target]\nfile = 'b.exr'", overrides=["target.rotate_degrees=5"]).target
     assert turned.file == "" and turned.rotate_degrees == 5
+    for still in ("0", "auto"):
+        same = cfg.loads("[target]\nfile = '/b.exr'", overrides=[f"target.rotate_degrees={still}"]).target
+        assert same.file == "/b.exr"
     other = cfg.loads("[target]\nrotate_degrees = 5", base_dir="/d", overrides=["target.file=b.exr"]).target
-    assert other.file == "/d/b.exr" and other.rotate_degrees == 0
+    assert other.file == "/d/b.exr" and other.rotate_degrees == "auto"
     for kind in ("envmap", "image"):
         text = f"[target]\nkind = '{kind}'\nfile = 'b.exr'"
         cleared = cfg.loads(text, overrides=["target.kind=envmap", "target.file="]).target
-        assert cleared.file == "" and cleared.rotate_degrees == 60
-    painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5").target
-    assert painted.file == "/b.exr"
+        assert cleared.file == "" and cleared.rotate_degrees == "auto"
 
 
 # ---- files and paths ---------------------------------------------------------------------------------------

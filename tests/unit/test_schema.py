@@ -249,7 +249,7 @@ def test_any_configuration_comes_back_equal(table):
 # ---- junk --------------------------------------------------------------------------------------------------
 
 known = [f.name for f in dataclasses.fields(cfg.Config)]
-keys = st.sampled_from(known + [k for t in schema._TABLES.values() for k in t]) | st.text(max_size=5)
+keys = st.sampled_from(known + [k for t in schema.FIELDS.values() for k in t]) | st.text(max_size=5)
 anything = st.recursive(
     st.none()
     | st.booleans()
@@ -283,9 +283,9 @@ def test_junk_tables_raise_nothing_but_config_errors(table):
 
 
 @quick
-@given(st.sampled_from(list(schema._TABLES)), st.data())
+@given(st.sampled_from(list(schema.FIELDS)), st.data())
 def test_junk_values_raise_nothing_but_config_errors(table, data):
-    key = data.draw(st.sampled_from(list(schema._TABLES[table])))
+    key = data.draw(st.sampled_from(list(schema.FIELDS[table])))
     only_config_errors(lambda: cfg.from_dict({table: {key: data.draw(anything)}}))
 
 

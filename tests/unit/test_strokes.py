@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import config as cfg
-from envedit.config.stroke_schema import STROKES, stroke_list
+from envedit.config.stroke_schema import STROKES, StrokeList
 from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.targets import strokes
@@ -28,7 +28,7 @@ ALL = [
 
 def covered(height, across=None, **stroke):
     """Coverage (height, across) of one stroke; of a square without ``across``."""
-    (full,) = stroke_list([{"type": "shadow"} | stroke])
+    (full,) = StrokeList()([{"type": "shadow"} | stroke])
     return strokes.coverage(full, height, across or height)[..., 0]
 
 
@@ -164,9 +164,9 @@ def test_what_no_stroke_covers_is_the_same_bit_for_bit(stroke, name, rng):
 
 
 def test_a_colour_is_given_as_numbers_or_as_on_a_display():
-    (stroke,) = stroke_list([{"type": "light", "points": [[0.5, 0.5]], "width": 0.1, "color": "#FFd9a6"}])
+    (stroke,) = StrokeList()([{"type": "light", "points": [[0.5, 0.5]], "width": 0.1, "color": "#FFd9a6"}])
     assert stroke["color"] == [1.0, 0.6939, 0.3813]  # the sRGB curve of 255, 217, 166
-    assert stroke_list([stroke]) == (stroke,)
+    assert StrokeList()([stroke]) == (stroke,)
 
 
 def test_a_shadow_is_a_factor_on_radiance_by_coverage_and_opacity():
@@ -496,7 +496,7 @@ def test_strokes_and_the_kind_of_target_go_together():
 def test_strokes_come_back_from_toml_equal_and_paint_the_same(rng):
     config = cfg.from_dict({"target": {"kind": "strokes", "strokes": ALL, "tonemap": "srgb"}})
     again = cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="other.toml")
-    assert again.target == config.target and stroke_list(config.target.strokes) == config.target.strokes
+    assert again.target == config.target and StrokeList()(config.target.strokes) == config.target.strokes
     assert {s["type"] for s in config.target.strokes} == STROKES.keys()
     picture = rng.random((32, 32, 3)).astype(np.float32)
     np.testing.assert_array_equal(

@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from envedit import config as cfg
-from envedit.config import validators
+from envedit.config.key_validators import plain as nested_value
+from envedit.config.validators import WantedError
 from envedit.core.errors import ConfigError
 from tests.oracles.builders import refused
 
@@ -81,7 +82,7 @@ plain = st.recursive(
 @given(st.dictionaries(words, plain, max_size=3))
 def test_nested_values_are_written_and_come_back(table):
     """TOML's own parser reads what is written."""
-    found = validators.plain(table)
+    found = nested_value(table)
     assert tomllib.loads(f"a = {cfg.quote(found)}")["a"] == found == table
 
 
@@ -89,5 +90,5 @@ def test_too_deep_a_value_is_refused():
     deep = []
     for _ in range(20):
         deep = [deep]
-    with pytest.raises(validators.WantedError, match="not too deep"):
-        validators.plain(deep)
+    with pytest.raises(WantedError, match="not too deep"):
+        nested_value(deep)

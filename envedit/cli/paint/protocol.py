@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from envedit.config.light_schema import light_list
-from envedit.config.stroke_schema import stroke_list
-from envedit.config.validators import WantedError, kelvin, number, show, string
+from envedit.config.key_validators import Kelvin
+from envedit.config.light_schema import LightList
+from envedit.config.stroke_schema import StrokeList
+from envedit.config.validators import Number, String, WantedError, show
 from envedit.core.errors import ConfigError
 
 MOST_BYTES = 1 << 20
@@ -66,11 +67,11 @@ class Document:
 
 
 _CHECKS = {
-    "strokes": stroke_list,
-    "lights": light_list,
-    "rotate_degrees": number(-360, 360),
-    "exposure": number(-20, 20),
-    "white_balance": kelvin,
+    "strokes": StrokeList(),
+    "lights": LightList(),
+    "rotate_degrees": Number(-360, 360),
+    "exposure": Number(-20, 20),
+    "white_balance": Kelvin(),
 }
 
 
@@ -157,12 +158,12 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
                 raise BadMessageError(f"phase: got {show(phase)[:80]}, expected one of {', '.join(PHASES)}")
             return Edit(document(found.get("document")), phase, client, _count(found.get("number", 0)))
         if kind == "pick":
-            at = (number(0, 1)(found.get(name)) for name in "xy")
-            light = int(number(-1, 100)(found.get("light", -1)))
+            at = (Number(0, 1)(found.get(name)) for name in "xy")
+            light = int(Number(-1, 100)(found.get("light", -1)))
             view = _count(found.get("view", 0))
             return Pick(*at, light, _count(found.get("number", 0)), client, view)
         if kind == "open":
-            name, envmap = string(found.get("name")), string(found.get("envmap", ""))
+            name, envmap = String()(found.get("name")), String()(found.get("envmap", ""))
             if not name:
                 raise BadMessageError("open: got no name, expected a scene or a configuration")
             return Open(name, envmap)

@@ -47,7 +47,7 @@ class PlacedLights:
         self.lights = self.layers.separation.lights
 
     def params(self, placed: Sequence[dict]) -> dict:
-        """Return the layers' parameters of entries of :func:`.light_schema.light_list`; others are left out.
+        """Return the layers' parameters of entries of :func:`.light_schema.LightList`; others are left out.
 
         An entry of a light that the map does not have does nothing.
         """

@@ -101,7 +101,7 @@ def fit(
     folder: Path | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Fitted:
-    """Fit a SIREN to an image.
+    """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
 
     Parameters
     ----------

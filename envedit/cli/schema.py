@@ -1,0 +1,34 @@
+"""``envedit schema``: print the configuration's JSON Schema, or its reference."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from envedit.cli.streams import steady
+
+
+@steady
+def main(argv: list[str] | None = None) -> int:
+    """Print the schema; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="envedit schema",
+        description="Print every key of the configuration: as JSON Schema, by which editors complete and\n"
+        "check TOML files, or as the page docs/configuration.md.",
+        epilog="examples:\n  envedit schema > envedit.schema.json\n"
+        "  (then, as the first line of a TOML file:  #:schema envedit.schema.json)\n"
+        "  envedit schema --markdown",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--markdown", action="store_true", help="print the reference")
+    arguments = parser.parse_args(argv)
+    from envedit.config.json_schema import json_schema
+    from envedit.config.reference import markdown
+
+    print(markdown().rstrip() if arguments.markdown else json.dumps(json_schema(), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,197 @@
+"""The tables of what is edited, lit and asked for: ``[input]``, ``[scene]``, ``[target]``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from envedit.config.key_validators import MOST_DIM, Parameters, RowRange, View, ViewList
+from envedit.config.light_schema import LightList
+from envedit.config.stroke_schema import StrokeList
+from envedit.config.tables import EDITED, LAYERS, Table, key
+from envedit.config.validators import Boolean, Choice, Integer, Number, OneOrMore, OrAuto, String, show
+from envedit.core.color import TONEMAPS
+from envedit.core.errors import ConfigError
+
+TURN_DEGREES = 60.0
+"""Turn of the target's map where neither a map nor a turn is given."""
+_PAINTED = {"target.kind": ("image", "strokes")}
+_SUNSKY = {"input.envmap": ("sunsky", "auto")}
+
+
+@dataclass(frozen=True)
+class Input(Table):
+    """The environment map to edit."""
+
+    envmap: str = key(
+        "auto",
+        String(),
+        'HDR lat-long image; "scene": the one that the scene names; "sunsky": Mitsuba\'s analytic sky; '
+        '"auto": the scene\'s if it names one, else the analytic sky',
+    )
+    width: int = key(256, Integer(6, MOST_DIM, even=True), "working width; height is half", "texels")
+    rows: str | tuple[int, int] = key(
+        "all",
+        RowRange(),
+        'rows the edit may change: "all", the "upper" half, or first and last, both included',
+        "texels",
+    )
+    horizon: str = key(
+        "auto",
+        Choice("auto", "mirror", "keep", "free"),
+        'rows below the horizon follow the sky as its blurred "mirror", "keep" but for a fade, or are "free" '
+        'as the sky is; "auto" detects which',
+        when=LAYERS | {"input.rows": ("all",)},
+    )
+    azimuth: float = key(90.0, Number(-360, 360), "sunsky: azimuth of the sun", "degrees", _SUNSKY)
+    elevation: float = key(
+        35.0, Number(0, 90), "sunsky: elevation of the sun above the horizon", "degrees", _SUNSKY
+    )
+    turbidity: float = key(3.0, Number(1, 10), "sunsky: haziness of the air, 1 is pure", when=_SUNSKY)
+    rotate_degrees: float = key(
+        0.0,
+        Number(-360, 360),
+        "turn of the map about the vertical before the edit, as target.rotate_degrees",
+        "degrees",
+    )
+    lights: tuple[dict, ...] = key(
+        (), LightList(), "lights moved, changed or added by hand, before turn and edit"
+    )
+    repair: bool = key(False, Boolean(), "replace NaN and Inf by their neighbours, and do not refuse the map")
+
+    def _check_together(self) -> None:
+        if not self.envmap:
+            raise ConfigError('input.envmap: got "", expected an image file, "scene", "sunsky" or "auto"')
+        if not isinstance(self.rows, str) and self.rows[1] >= self.width // 2:
+            raise ConfigError(
+                f"input.rows: got {list(self.rows)}, expected rows below {self.width // 2}: "
+                f"a map {self.width} wide has {self.width // 2} rows"
+            )
+
+
+@dataclass(frozen=True)
+class Scene(Table):
+    """What the map lights."""
+
+    file: str = key(
+        "sphere", String(), "Mitsuba XML, or one shipped: sphere, mirror, matte, statue, pair, mesh"
+    )
+    width: int = key(128, Integer(4, MOST_DIM), "width of the rendering while editing", "pixels")
+    height: int = key(0, Integer(0, MOST_DIM), "height of the rendering; 0: by the scene's aspect", "pixels")
+    sensors: str | tuple[int | str, ...] = key(
+        (0,), ViewList(), 'views that one map explains: a list of sensors, by id or index from 0, or "all"'
+    )
+    parameters: dict[str, str | float | bool] = key({}, Parameters(), "values for the scene's `<default>`s")
+
+    def _check_together(self) -> None:
+        if not self.file:
+            raise ConfigError('scene.file: got "", expected a Mitsuba XML file or a shipped scene')
+
+
+@dataclass(frozen=True)
+class Target(Table):
+    """What the rendering should look like."""
+
+    kind: str = key(
+        "envmap",
+        Choice("envmap", "image", "strokes", "none"),
+        'given by: another map, a painted image, or strokes; "none": only [lights], exposure, white balance',
+    )
+    file: str | tuple[str, ...] = key(
+        "",
+        OneOrMore(String()),
+        "kind envmap: the other map, which is not turned; kind image: the painted rendering, or a list",
+    )
+    rotate_degrees: float | str = key(
+        "auto",
+        OrAuto(Number(-360, 360)),
+        f"kind envmap: turn of the input about the vertical; auto: {TURN_DEGREES:g}, or none with a file",
+        "degrees",
+        {"target.kind": ("envmap",)},
+    )
+    mask: str | tuple[str, ...] = key(
+        "",
+        OneOrMore(String()),
+        "image that is white where the target counts, or a list; kind image: where it was painted",
+    )
+    view: int | str | tuple[int | str, ...] = key(
+        (),
+        OneOrMore(View()),
+        "view that each file, or mask, belongs to: index or id; []: the first, the second, ...",
+    )
+    tonemap: str = key(
+        "gamma", Choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted", when=_PAINTED
+    )
+    strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
+    paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
+    hold: float = key(1.0, Number(0), "weight of all pixels that were not painted", when=_PAINTED)
+    spp: int | str = key(
+        "auto",
+        OrAuto(Integer(1, 1 << 20)),
+        "samples of the target's rendering; auto: until quiet",
+        "per pixel",
+        EDITED,
+    )
+
+    @property
+    def degrees(self) -> float:
+        """Turn of the input that is the target's map, where :attr:`file` names no other."""
+        return TURN_DEGREES if isinstance(self.rotate_degrees, str) else self.rotate_degrees
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files of :attr:`file`."""
+        return _each(self.file)
+
+    @property
+    def masks(self) -> tuple[str, ...]:
+        """The files of :attr:`mask`."""
+        return _each(self.mask)
+
+    @property
+    def views(self) -> tuple[int | str, ...]:
+        """The view of each painted file, or of each mask."""
+        given = self.view if isinstance(self.view, tuple) else (self.view,)
+        count = len(self.files) if self.kind == "image" else len(self.masks)
+        return given or tuple(range(count))
+
+    def _check_together(self) -> None:
+        if self.kind == "envmap" and isinstance(self.file, tuple):
+            raise ConfigError('target.file: got a list, expected one map, as target.kind is "envmap"')
+        if self.view != () and self.kind == "strokes":
+            raise ConfigError("target.view: got one, expected none: each stroke has a view of its own")
+        named = len(self.files) if self.kind == "image" else len(self.masks)
+        if self.view != () and len(self.views) != named:
+            raise ConfigError(f"target.view: got {len(self.views)} views, expected {named}, one a file")
+        if len({*self.views}) != len(self.views):
+            raise ConfigError("target.view: got a view twice, expected each once")
+        if self.kind == "image" and self.mask and len(self.masks) != named:
+            raise ConfigError(f"target.mask: got {len(self.masks)} masks, expected {named}, one a file")
+        if self.kind == "envmap" and self.file and self.rotate_degrees not in ("auto", 0):
+            raise ConfigError(
+                "target.file and target.rotate_degrees: got both, expected one: the other map, or the input "
+                'turned; remove one, or set rotate_degrees = "auto"'
+            )
+        if self.kind == "image" and not self.file:
+            raise ConfigError('target.file: got "", expected the painted image, as target.kind is "image"')
+        if self.kind == "strokes" and not self.strokes:
+            raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
+        if self.kind == "none" and (self.file or self.mask):
+            raise ConfigError('target.file, target.mask: got one, expected none, as target.kind is "none"')
+        if self.kind == "strokes" and self.file:
+            raise ConfigError(
+                f"target.file: got {show(self.file)}, expected none: strokes go on the initial rendering"
+            )
+        if self.kind == "strokes" and self.mask:
+            raise ConfigError(f"target.mask: got {show(self.mask)}, expected none: strokes have a place")
+        if self.kind in ("image", "strokes") and not self.paint + self.hold:
+            raise ConfigError("target.paint, target.hold: got 0 for both, expected one above 0")
+        if self.kind != "strokes" and self.strokes:
+            raise ConfigError(
+                f'target.strokes: got {len(self.strokes)}, expected none, as target.kind is "{self.kind}": '
+                'set target.kind = "strokes"'
+            )
+
+
+def _each(files: str | tuple[str, ...]) -> tuple[str, ...]:
+    """List the files of a key that takes one or several."""
+    return files if isinstance(files, tuple) else (files,) if files else ()

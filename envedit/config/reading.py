@@ -1,0 +1,188 @@
+r"""From TOML to a configuration; with :mod:`envedit.config.toml` the only module that knows TOML.
+
+A value comes from the last of these that gives it: the dataclass default, the preset, what the preset has for
+the kinds of representation and target, the file, a ``--set table.key=value`` override. Each layer is checked
+by itself, so that an error names the place the value came from.
+
+>>> config = loads("[fit]\nepochs = 100", preset="draft", overrides=["seed=3"])
+>>> config.fit.epochs, config.representation.hidden, config.seed
+(100, 64, 3)
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from envedit.config import presets
+from envedit.config.schema import FIELDS, TOP, Config
+from envedit.config.tables import checked
+from envedit.config.validators import show
+from envedit.core.atomic_files import opened
+from envedit.core.errors import ConfigError
+
+_MOST_BYTES = 1 << 20  # more than any configuration; an EXR given by mistake is not read to its end
+# a.b.c...: tomllib takes time and memory with the square of the parts, gigabytes for a file of 100 kB.
+_LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){100}""", re.ASCII)
+
+
+def preset_names() -> tuple[str, ...]:
+    """Name the presets, the quickest first."""
+    return tuple(presets.PRESETS)
+
+
+def load(path: str | PathLike[str], preset: str | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Read a configuration file.
+
+    Parameters
+    ----------
+    path : path
+        TOML file, UTF-8. Relative paths in it, and in overrides, are relative to its folder.
+    preset : str, optional
+        Beats the preset that the file or an override names.
+    overrides : iterable of str
+        ``"table.key=value"``, later ones beat earlier ones. The value is TOML; what is not TOML is a string.
+
+    Returns
+    -------
+    Config
+        Resolved: every path absolute, ``output.dir`` filled in.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, is not TOML, or holds an unknown key or an unusable value.
+    """
+    try:
+        with opened(path) as file:
+            data = file.read(_MOST_BYTES + 1)
+    except IsADirectoryError:
+        raise ConfigError(f"{path}: a folder, expected a TOML file") from None
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such configuration file") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{str(path)!r}: cannot be read: {reason}") from None
+    if len(data) > _MOST_BYTES:
+        raise ConfigError(f"{path}: more than {_MOST_BYTES >> 20} MiB, expected a TOML file")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = data.count(b"\n", 0, error.start) + 1
+        raise ConfigError(f"{path}: not UTF-8 text at line {row}; expected a TOML file") from None
+    path = Path(path)
+    return loads(text, path.absolute().parent, str(path), preset, overrides)
+
+
+def loads(
+    text: str,
+    base_dir: str | PathLike[str] = ".",
+    name: str = "config.toml",
+    preset: str | None = None,
+    overrides: Iterable[str] = (),
+) -> Config:
+    """Read a configuration from TOML text; see `load`.
+
+    Parameters
+    ----------
+    text : str
+        The TOML document.
+    base_dir : path
+        Folder that relative paths start from.
+    name : str
+        What errors call the document; its stem names the output folder.
+    preset, overrides
+        As in `load`.
+
+    Raises
+    ------
+    ConfigError
+        The text is not TOML, or holds an unknown key or an unusable value.
+    """
+    try:
+        table = _parsed(text)
+    except RecursionError:
+        raise ConfigError(f"{name}: not TOML: nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
+        row, column = text.count("\n") + 1, len(text) - (text.rfind("\n") + 1) + 1
+        end = f"at line {row}, column {column}: end of document"
+        reason = str(error).replace("at end of document", end)
+        if len(reason) > 200:  # it may hold a key of any length; its end says where
+            reason = f"{reason[:120]} ... {reason[-60:]}"
+        raise ConfigError(f"{name}: not TOML: {reason}") from None
+    return from_dict(table, base_dir, name, preset, overrides)
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    if found := _LONG_KEY.search(text):
+        row = text.count("\n", 0, found.start()) + 1
+        raise ValueError(f"a key of more than 100 parts (at line {row})")
+    return tomllib.loads(text)
+
+
+def from_dict(
+    table: dict[str, Any],
+    base_dir: str | PathLike[str] = ".",
+    name: str = "config.toml",
+    preset: str | None = None,
+    overrides: Iterable[str] = (),
+) -> Config:
+    """Build a configuration from nested dicts with the tables and keys of the TOML file; see `loads`.
+
+    Raises
+    ------
+    ConfigError
+        An unknown key or an unusable value.
+    """
+    file = presets.checked_layer(table, name, TOP, FIELDS)
+    assigned: dict[str, Any] = {}
+    for text in overrides:
+        keys, value = parse_override(text)
+        layer: Any = value
+        for key in reversed(keys):
+            layer = {key: layer}
+        layer = presets.checked_layer(layer, f"--set {show(text)}", TOP, FIELDS)
+        assigned = presets.overlaid(assigned, layer)
+
+    chosen = assigned.get("preset", file.get("preset", "standard"))
+    if preset is not None:
+        chosen = checked(TOP["preset"], "preset", preset)
+    given = presets.overlaid(file, assigned)
+    merged = given | {"preset": chosen}
+    merged["target"] = presets.one_target(merged, (file, assigned))
+    try:
+        presets.resolve_paths(merged, Path(base_dir).absolute(), Path(name).stem or "config")
+        tables = {key: TOP[key].metadata["table"](**merged.pop(key, {})) for key in FIELDS}
+        return Config(**merged, **tables)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+
+
+def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
+    """Split ``"table.key=value"`` into the key's parts and the value.
+
+    The value is parsed as TOML; what is not TOML is taken as a string, so words and paths need no quotes.
+
+    >>> parse_override("fit.epochs=10"), parse_override("input.envmap=maps/sky.exr")
+    ((('fit', 'epochs'), 10), (('input', 'envmap'), 'maps/sky.exr'))
+
+    Raises
+    ------
+    ConfigError
+        There is no ``=``, or a part of the key is empty.
+    """
+    key, equals, raw = text.partition("=") if isinstance(text, str) else ("", "", "")
+    keys = tuple(part.strip() for part in key.split("."))
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {show(text)}: expected table.key=value, such as fit.epochs=100")
+    raw = raw.strip()
+    try:
+        parsed = _parsed(f"value = {raw}")
+    except (ValueError, RecursionError):
+        return keys, raw
+    # A value with a line break could smuggle in a second key.
+    return keys, parsed["value"] if parsed.keys() == {"value"} else raw

@@ -1,0 +1,89 @@
+"""Keys that were given and have no meaning in the company of the others, so that a run can name them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from envedit.config import presets
+from envedit.config.schema import FIELDS, TOP, Config
+from envedit.config.tables import When
+from envedit.config.toml import quote
+from envedit.config.validators import Choice, String
+
+GAUSS_NEWTON, ADAM = "gauss-newton", "adam"
+
+
+def unused(config: Config, solver: str | None = None) -> list[str]:
+    """Name the keys that were given, differ from their default, and change nothing.
+
+    A key that has its default's value is not named: a resolved configuration, which has every key, is as
+    quiet as the one that it came from. Neither is what is switched off.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+    solver : str, optional
+        :data:`GAUSS_NEWTON` or :data:`ADAM`, the steps that are made; None: not known, and not looked at.
+
+    Returns
+    -------
+    list of str
+        A sentence for each reason, with all keys that it concerns.
+    """
+    tables = {name: getattr(config, name) for name in FIELDS}
+    given = {name: {key: getattr(table, key) for key in table.given} for name, table in tables.items()}
+    chosen = presets.defaults(config.preset, given)
+    found: dict[str, list[str]] = {}
+    for name in FIELDS:
+        default = type(tables[name])(**chosen.get(name, {}))
+        for key in sorted(given[name]):
+            if given[name][key] is False or given[name][key] == getattr(default, key):
+                continue
+            if reason := _reason(config, conditions(name, key), solver):
+                found.setdefault(reason, []).append(f"{name}.{key}")
+    if config.input.lights:  # they are placed by the horizon whatever the representation is
+        found = {reason: [key for key in keys if key != "input.horizon"] for reason, keys in found.items()}
+    return [f"{', '.join(keys)}: {reason}" for reason, keys in found.items() if keys]
+
+
+def _reason(config: Config, when: When, solver: str | None) -> str:
+    """Say why a key has no meaning; "" if it has one."""
+    for other, values in when.items():
+        if other == "solver":
+            if solver is not None and solver not in values:
+                return 'not used by Gauss-Newton steps; [optimizer] kind = "adam" uses them'
+            continue
+        table, _, key = other.partition(".")
+        value = getattr(getattr(config, table), key)
+        if value in values if values else value:
+            continue
+        return f"not used, as {other} is {quote(value)}; it is where that is {_values(other, values)}"
+    return ""
+
+
+def _values(other: str, values: tuple[Any, ...]) -> str:
+    """Write the values that a key has, or the only one that it has not."""
+    table, _, key = other.partition(".")
+    check = FIELDS[table][key].metadata["check"]
+    if not values:
+        return "given" if isinstance(check, String) else "not 0"
+    names = check.names if isinstance(check, Choice) else ()
+    rest = [name for name in names if name not in values]
+    return f"other than {quote(rest[0])}" if len(rest) == 1 < len(values) else " or ".join(map(quote, values))
+
+
+def condition(when: When) -> str:
+    """Say where a key has a meaning; "" for everywhere."""
+    parts = []
+    for other, values in when.items():
+        if other == "solver":
+            parts.append("the steps are Adam's")
+        else:
+            parts.append(f"`{other}` is {_values(other, values)}")
+    return f"only where {' and '.join(parts)}" if parts else ""
+
+
+def conditions(table: str, key: str) -> When:
+    """Return where a key of a table has a meaning: what is said of the table and of the key."""
+    return {**TOP[table].metadata["when"], **FIELDS[table][key].metadata["when"]}

@@ -1,0 +1,74 @@
+"""The edit of a run, carried from working resolution to that of its input's file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from envedit import config, inputs
+from envedit.core import latlong
+from envedit.export import adjustments, full_resolution
+from envedit.representations import Representation
+from envedit.representations.layers import placed_lights
+
+if TYPE_CHECKING:
+    from envedit import results
+
+
+@dataclass(frozen=True)
+class Found:
+    """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`.
+
+    ``turn_degrees`` is by how much the map was turned before (:func:`.latlong.rotate`), ``edited`` the edited
+    map before its adjustments.
+    """
+
+    representation: Representation
+    params: dict[str, Any]
+    first_row: int
+    free: np.ndarray | None
+    turn_degrees: float = 0.0
+    edited: np.ndarray | None = None
+
+
+def at_full_resolution(settings: config.Config, result: results.Result) -> np.ndarray | None:
+    """Carry a result to the resolution of its input's file, in its units; None where that has no more texels.
+
+    Raises
+    ------
+    InputError, NumericalError
+        If the file cannot be read any more, or the carried map is not finite.
+    """
+    if result.given.size[0] <= settings.input.width:
+        return None
+    full, found = _by_hand(settings.input, result.given), result.found
+    adjusted = settings.lights, settings.output, full.scale
+    if found is None:
+        return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
+    before = latlong.rotate(result.maps["initial"], found.turn_degrees)
+    source = latlong.rotate(full.radiance, found.turn_degrees)
+    first, last = inputs.active_rows(settings.input.rows, before.shape[0])
+    rows = first, last - first + 1
+    edited = found.edited
+    carried = full_resolution.carry(
+        found.representation, found.params, before, edited, source, rows, found.free
+    )
+    return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)
+
+
+def _by_hand(settings: config.Input, given: inputs.InputMap) -> inputs.InputMap:
+    """Read a map at its file's size, and place and turn its lights as it was done at working size."""
+    full = given.at_file_size(settings.repair)
+    if given.placed is not None:
+        own = given.placed
+        before, rows = own.envmap, (0, len(own.envmap))
+        moved = full.radiance
+        if any("light" in light for light in settings.lights):
+            moved = full_resolution.carry(
+                own.layers, own.params(settings.lights), before, before, moved, rows
+            )
+        moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
+        full = replace(full, stored=full.as_stored(moved))
+    return replace(full, stored=latlong.rotate(full.stored, settings.rotate_degrees))

@@ -1,0 +1,191 @@
+"""Scenes that somebody has built: a ``mitsuba.Scene`` in the place of a file.
+
+What :func:`.scene.load` changes in a scene's nodes is fixed in a built scene, so that it must be fit for use:
+lit by an ``envmap``, its film as large as the rendering. Its texels are set by :meth:`.Scene.set_envmap` as
+always; :func:`kept` puts them back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError
+from envedit.scene import scene as scenes
+from envedit.scene.scene import Scene
+from envedit.scene.supported import OwnMap
+
+_CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
+# Names of classes, of which an integrator written in Python has another in Python than in C++.
+_PATHS = {
+    "PathIntegrator",
+    "PRBIntegrator",
+    "BasicPRBIntegrator",
+    "PathProjectiveIntegrator",
+    "ParticleTracerIntegrator",
+}
+_DIRECT = {"DirectIntegrator", "DirectProjectiveIntegrator"}
+_VOLUMES = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
+UNKNOWN = "built "
+"""How the digest of a built scene begins: it says nothing of what the scene consists of."""
+_ANY_DEPTH = 2**32 - 1  # as Mitsuba prints a depth of -1
+
+
+def load(
+    given: object,
+    width: int = 0,
+    height: int = 0,
+    parameters: Mapping[str, Any] | None = None,
+    base: Path | None = None,
+    sensors: str | Sequence[int | str] = (0,),
+) -> Scene:
+    """Take a scene in any form.
+
+    Parameters
+    ----------
+    given : path, str, dict, mitsuba.Scene or Scene
+        A file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, or a built scene, for which
+        all but ``sensors`` is fixed.
+    width, height, parameters, base, sensors
+        As of :func:`.scene.load`.
+
+    Raises
+    ------
+    ConfigError, InputError
+        As of :func:`.scene.load` and :func:`wrapped`, or if it is none of these.
+    """
+    if isinstance(given, Scene):
+        return given
+    if isinstance(given, str | os.PathLike | dict):
+        filled = dict(parameters or {})
+        return scenes.load(given, width, height, filled, base, sensors=sensors)
+    return wrapped(given, sensors)
+
+
+def is_built(given: object) -> bool:
+    """Return whether this is a ``mitsuba.Scene``, of any variant."""
+    return type(given).__name__ == "Scene" and hasattr(given, "environment")
+
+
+def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
+    """Make the environment of a built scene replaceable.
+
+    The ``scale`` of its ``envmap`` becomes 1, as that of every :class:`.Scene`; the former one is in ``own``.
+    Light transport and renderings of such a scene are not found on disk by another run: what it is
+    made of cannot be read from it.
+
+    Parameters
+    ----------
+    given : mitsuba.Scene
+        Of the present variant.
+    sensors : "all" or sequence of int and str
+        "all", or [0] where the scene has one sensor.
+
+    Raises
+    ------
+    ConfigError
+        It is no scene of the present variant, or some of several sensors are asked for.
+    InputError
+        Its environment is no ``envmap``, or stands askew, a sensor is of a kind that makes no picture, or
+        there is a medium that its integrator would render.
+    """
+    if not is_built(given):
+        what = type(given).__name__
+        raise ConfigError(f"scene: got {what}, expected a file, a dict, or a mitsuba.Scene")
+    if given.variant_name() != mi.variant():
+        raise ConfigError(
+            f"scene: got one of variant {given.variant_name()}, expected {mi.variant()}: build it after "
+            f'mi.set_variant("{mi.variant()}"), or set variant in the configuration'
+        )
+    cameras = given.sensors()
+    if sensors != "all" and len(cameras) > 1:
+        raise ConfigError(
+            f"scene.sensors: got {list(sensors)} for a built scene with {len(cameras)} sensors, expected "
+            '"all": build it with the sensors to use'
+        )
+    for camera in cameras:
+        if camera.class_name() not in _CAMERAS:
+            kind = camera.class_name()
+            raise InputError(f"scene: sensor {kind} makes no picture; expected {', '.join(_CAMERAS)}")
+    if not cameras:
+        raise InputError("scene: got no sensor, expected at least one")
+    params, key = mi.traverse(given), _texels(given)
+    stem = key.removesuffix("data")
+    to_world, scale = _rotation(params[f"{stem}to_world"]), float(np.array(params[f"{stem}scale"]).item())
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"scene: scale of the environment map is {scale}, expected a number above 0")
+    params[f"{stem}scale"] = 1.0
+    params.update()
+    width, views = scenes.views_of(given, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
+    depth, hide, notes = _integrator(given)
+    unique = UNKNOWN + uuid.uuid4().hex
+    own = OwnMap(None, scale)
+    rows = views[-1].rows.stop
+    return Scene(given, None, width, rows, key, to_world, unique, params, views, own, depth, hide, notes)
+
+
+def own_map(given: Any) -> np.ndarray:
+    """Return the texels of a built scene's ``envmap``, (H, W, 3) float32, without its scale."""
+    return latlong.from_envmap_data(mi.traverse(given)[_texels(given)])
+
+
+@contextlib.contextmanager
+def kept(given: Any) -> Iterator[None]:
+    """Put the texels and the scale of a built scene's ``envmap`` back in the end."""
+    params, key = mi.traverse(given), _texels(given)
+    scale = f"{key.removesuffix('data')}scale"
+    before = type(params[key])(params[key]), type(params[scale])(params[scale])
+    try:
+        yield
+    finally:
+        params[key], params[scale] = before
+        params.update()
+
+
+def _texels(given: Any) -> str:
+    """Return the name of the texels among the parameters of a scene."""
+    light = given.environment()
+    if light is None or light.class_name() != "EnvironmentMapEmitter":
+        kind = "none" if light is None else light.class_name()
+        raise InputError(f"scene: got environment {kind}, expected an emitter of type envmap")
+    ending = f"{light.id()}.data"
+    return next(k for k, _ in mi.traverse(given) if k == ending or k.endswith(f".{ending}"))
+
+
+def _rotation(transform: Any) -> np.ndarray:
+    """Return the rotation (3, 3) of a transformation."""
+    found = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
+    if not np.isfinite(found).all() or np.abs(found @ found.T - np.eye(3)).max() > 1e-4:
+        raise InputError("scene: to_world of the environment map is no rotation; scale the scene instead")
+    if np.linalg.det(found) < 0:
+        raise InputError("scene: to_world of the environment map mirrors; expected a rotation")
+    return found
+
+
+def _integrator(scene: Any) -> tuple[int, bool, tuple[str, ...]]:
+    """Return path depth, whether emitters are hidden, and notes, as :func:`.supported.take_integrator`."""
+    given, media = scene.integrator(), any(shape.is_medium_transition() for shape in scene.shapes())
+    names = {given.class_name(), type(given).__name__} if given is not None else {"PathIntegrator"}
+    hide, notes = bool(getattr(given, "hide_emitters", False)), []
+    if media and names & _VOLUMES:
+        raise InputError("scene: participating medium: envedit renders surfaces only; remove the medium")
+    if media:
+        notes.append("the scene's medium is not rendered, as its integrator has no media")
+    if names & _DIRECT:
+        return 2, hide, tuple(notes)
+    if not names & (_PATHS | _VOLUMES):
+        kind = given.class_name()
+        notes.append(f"integrator {kind} is not used: rendered by path, with paths of any length")
+        return -1, hide, tuple(notes)
+    found = re.search(r"max_depth = (\d+)", str(given))
+    depth = int(found[1]) if found else int(getattr(given, "max_depth", _ANY_DEPTH))
+    return (-1 if depth >= _ANY_DEPTH else depth), hide, tuple(notes)

@@ -1,0 +1,266 @@
+"""envedit from Python: arrays, dicts and built scenes in, a result that shows and saves itself out."""
+
+import inspect
+import runpy
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import envedit
+from envedit import config, pipeline
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, InputError
+from envedit.images import images
+from envedit.scene import built_scene
+from tests.oracles import ROOT
+
+TINY = {
+    "preset": "draft",
+    "input": {"width": 16},
+    "target": {"spp": 16},
+    "output": {"spp": 16, "report": False},
+    "renderer": {"spp": 16, "max_depth": 2},
+    "optimizer": {"iterations": 2},
+}
+
+
+def ball(texels, scale=2.0):
+    """Return the dict of a scene: a sphere under a map of its own."""
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 30)
+    look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3, "hide_emitters": True},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(texels), "scale": scale, "to_world": turned},
+        "camera": {
+            "type": "perspective",
+            "to_world": look,
+            "fov": 40,
+            "film": {"type": "hdrfilm", "width": 12, "height": 8},
+            "sampler": {"type": "multijitter"},
+        },
+        "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+    }
+
+
+# ---- the example of the documentation ----------------------------------------------------------------------
+
+
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    found = runpy.run_path(str(ROOT / "docs" / "edit_in_python.py"))
+    result = found["result"]
+    assert result.metrics["render"]["psnr"] > result.metrics["initial"]["psnr"] + 10
+    assert repr(result) in capsys.readouterr().out and len(repr(result)) < 100
+    assert (tmp_path / "edit.png").stat().st_size > 10_000
+    shown = result._repr_png_()
+    assert shown.startswith(b"\x89PNG") and shown == (tmp_path / "edit" / "preview.png").read_bytes()
+    # T E for a resolved sky is the rendering that Mitsuba makes of it, to the noise of both.
+    rendered = found["scene"].render(found["sky"], spp=64)
+    assert np.abs(found["initial"] - rendered).mean() < 0.05 * rendered.mean()
+
+    assert np.array_equal(images.read(tmp_path / "edit" / "edited.exr")[0], result.envmap)
+
+
+def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path, own_cache):
+    sky = np.random.default_rng(5).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
+    picture = np.random.default_rng(6).uniform(0, 1, (16, 16, 3))
+    given = {"scene": envedit.load_scene("sphere", 16, parameters={"roughness": 0.4}), "envmap": sky}
+    mask = picture[..., 0]
+    result = envedit.edit(TINY, target=picture, mask=mask, **given)
+    saved = tmp_path / "out"
+    result.save(saved)
+    found = config.load(saved / "config.toml")
+    assert found.scene.parameters == {"roughness": 0.4} and found.target.kind == "image"
+    again = pipeline.run(found)
+    assert np.array_equal(again.envmap, result.envmap) and again.given.size == (32, 16)
+    before = result.metrics["timing"]["total_s"], list(result.warnings)
+    result.save(saved)  # a second time: the first is moved aside, and the result is as it was
+    assert (saved / "earlier-1" / "given_envmap.exr").exists() and (saved / "given_mask.exr").exists()
+    assert (result.metrics["timing"]["total_s"], result.warnings) == before
+
+
+def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(envedit.MachineError, match=r"pip install 'envedit\[report\]'"):
+        envedit.Result.plot(object())
+
+
+# ---- what an edit takes ------------------------------------------------------------------------------------
+
+
+def test_a_built_scene_is_edited_and_has_its_own_map_again(tmp_path):
+    own = np.full((8, 16, 3), 0.5, np.float32)
+    own[2, 3] = 20
+    scene = mi.load_dict(ball(own))
+    other = latlong.rotate(own, 90)
+    result = envedit.edit(TINY, scene=scene, target_map=other)
+    assert np.array_equal(built_scene.own_map(scene), own)
+    assert float(np.array(mi.traverse(scene)["sky.scale"]).item()) == 2
+    # The map is in the units of the scene's own, which scale multiplies.
+    assert np.array_equal(result.given.stored, own) and np.array_equal(result.maps["initial"], 2 * own)
+    assert np.allclose(result.maps["target"], 2 * other) and result.render.shape == (8, 12, 3)
+    warned = result.save(tmp_path / "out")
+    assert any("the scene was given as an object" in line for line in warned)
+    assert not (tmp_path / "out" / "edited.xml").exists()
+    assert config.load(tmp_path / "out" / "config.toml").target.file.endswith("given_target_map.exr")
+
+
+def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
+    own = np.random.default_rng(3).uniform(0.1, 2, (8, 16, 3)).astype(np.float32)
+    built, parsed = envedit.load_scene(mi.load_dict(ball(own))), envedit.load_scene(ball(own), 12, 8)
+    for scene in (built, parsed):
+        assert (scene.width, scene.height, scene.max_depth, scene.hide_emitters) == (12, 8, 3, True)
+        assert scene.own.scale == 2
+    # The same samples: what differs is that a built scene has its rotation in single precision.
+    assert np.allclose(built.to_world, parsed.to_world, atol=1e-7)
+    assert np.array_equal(built.alpha, parsed.alpha)
+    assert np.allclose(built.render(own, spp=16), parsed.render(own, spp=16), rtol=1e-4)
+    first, second = (envedit.LightTransport.build(scene, 8, 16, spp=16) for scene in (built, parsed))
+    assert np.allclose(first.apply(own).numpy(), second.apply(own).numpy(), rtol=1e-3)
+    ones = np.ones((8, 12, 3), np.float32)
+    assert np.allclose(first.adjoint(ones).numpy().mean(axis=2), first.influence, rtol=1e-4)
+
+
+@pytest.mark.parametrize("integrator", [
+    {"type": "path"}, {"type": "path", "max_depth": 6}, {"type": "direct"}, {"type": "prb", "max_depth": 4},
+    {"type": "prb", "max_depth": -1}, {"type": "direct_projective"}, {"type": "volpath", "max_depth": 3},
+    {"type": "depth"}, {"type": "ptracer", "max_depth": 5},
+])  # fmt: skip
+def test_a_built_scene_s_integrator_asks_for_the_same_as_a_dict_s(integrator):
+    made = ball(np.ones((4, 8, 3), np.float32)) | {"integrator": integrator}
+    built, parsed = (envedit.load_scene(scene) for scene in (mi.load_dict(made), made))
+    assert (built.max_depth, built.hide_emitters) == (parsed.max_depth, parsed.hide_emitters)
+    assert len(built.notes) == len(parsed.notes)
+
+
+def test_a_built_scene_that_cannot_be_used_is_refused():
+    made = ball(np.ones((4, 8, 3), np.float32))
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    fog = {"ball": {"type": "sphere", "interior": {"type": "homogeneous"}}, "integrator": {"type": "volpath"}}
+    for change, text in (
+        (fog, "participating medium"),
+        ({"sky": {"type": "constant"}}, "got environment ConstantBackgroundEmitter, expected an emitter"),
+        ({"camera": {"type": "radiancemeter", "film": film}}, "sensor RadianceMeter makes no picture"),
+        ({"other": made["camera"]}, "for a built scene with 2 sensors"),
+        ({"sky": made["sky"] | {"scale": 0.0}}, "scale of the environment map is 0.0"),
+        ({"sky": made["sky"] | {"to_world": mi.ScalarTransform4f().scale([1, 2, 1])}}, "is no rotation"),
+    ):
+        with pytest.raises(envedit.EnveditError, match=text):
+            envedit.load_scene(mi.load_dict(made | change))
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "parts"),
+    [
+        (lambda: {"settings": 3}, ConfigError, ["settings: got 3, expected a Config, a dict of tables"]),
+        (lambda: {"settings": {"scene": {"fil": "a"}}}, ConfigError, ["no key fil", "did you mean file?"]),
+        (lambda: {"settings": {"scene": {"width": "a"}}}, ConfigError, ["settings: scene.width: got 'a'"]),
+        (lambda: {"settings": {"scene": 3}}, ConfigError, ["scene: got 3, expected a table"]),
+        (lambda: {"settings": {3: {}}}, ConfigError, ["unknown table or key 3"]),
+        (lambda: {"mask": np.ones((4, 4))}, ConfigError, ["mask: got one without a target"]),
+        (lambda: {"target": np.ones(3), "target_map": np.ones(3)}, ConfigError, ["got both, expected one"]),
+        (lambda: {"envmap": "sky.exr"}, InputError, ["envmap: got 'sky.exr', expected an array"]),
+        (lambda: {"envmap": [[1], [1, 2]]}, InputError, ["envmap: got [[1], [1, 2]], expected an array"]),
+        (lambda: {"envmap": np.ones((8, 16))}, InputError, ["shape (8, 16)", "expected (H, 2 H, 3)"]),
+        (lambda: {"envmap": np.ones((8, 8, 3))}, InputError, ["envmap: a lat-long map is 2:1"]),
+        (lambda: {"envmap": np.full((8, 16, 3), np.nan)}, InputError, ["envmap: 128 texels are NaN"]),
+        (lambda: {"envmap": np.full((8, 16, 3), 1e39)}, InputError, ["envmap: 128 texels are NaN or"]),
+        (lambda: {"target_map": np.full((8, 16, 3), -np.inf)}, InputError, ["target_map: 128 texels are"]),
+        (lambda: {"target": np.full((64, 64, 3), np.nan)}, InputError, ["target: pixel at row 0, column 0"]),
+        (lambda: {"target": np.ones((4, 4, 3))}, InputError, ["the picture has shape (4, 4, 3)"]),
+        (lambda: {"scene": 3}, ConfigError, ["scene: got int, expected a file, a dict"]),
+        (lambda: {"scene": "no_such.xml"}, InputError, ["no_such.xml: no such file"]),
+        (lambda: {"scene": mi.load_dict({"type": "scene"})}, InputError, ["got environment none"]),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_refused_by_name(given, kind, parts):
+    arguments = {"settings": TINY} | given()
+    with pytest.raises(kind) as info:
+        envedit.edit(arguments.pop("settings"), **arguments)
+    assert all(part in str(info.value) for part in parts), str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: config.Config(scen={}), "scen: unknown key; did you mean scene?"),
+        (lambda: config.Config(scene={"widht": 3}), "scene.widht: unknown key; did you mean width?"),
+        (lambda: config.Config(scene={"width": "a"}), "scene.width: got 'a'"),
+        (lambda: config.Config(scene={3: 4}), "scene: got {3: 4}, expected a table"),
+        (lambda: config.Scene(size=3), "scene.size: unknown key; known: file, width"),
+        (lambda: config.Scene("a", file="b"), "scene.file: got two values, expected one"),
+        (lambda: config.Lights(1, 2, 3), "Lights: got 3 values, expected at most 2"),
+        (lambda: config.Config({"seed": 3}), "preset: got {'seed': 3}"),
+        (lambda: config.from_dict(3), "config.toml: got 3, expected a table of tables"),
+    ],
+)
+def test_tables_made_in_python_name_the_key(make, text):
+    with pytest.raises(ConfigError) as info:
+        make()
+    assert text in str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: envedit.fit(np.ones((8, 16))), "image: got an array of shape (8, 16), expected (H, W, 3)"),
+        (lambda: envedit.fit("sky.exr"), "image: got 'sky.exr', expected an array"),
+        (lambda: envedit.fit(np.ones((8, 16, 3)), {"hiden": 3}), "hiden: unknown key; did you mean hidden?"),
+        (lambda: envedit.fit(np.ones((8, 16, 3)), settings={"epochs": -1}), "fit.epochs: got -1, expected"),
+        (lambda: envedit.fit(-np.ones((8, 16, 3))), "row 0, column 0 is not finite or is negative"),
+        (lambda: envedit.load_scene("sphere", width="a"), "scene.width: got 'a', expected an integer"),
+        (lambda: envedit.load_scene("sphere", parameters={"a": []}), "scene.parameters: got {'a': []}"),
+        (lambda: envedit.load_scene("shpere"), "did you mean sphere?"),
+        (lambda: envedit.load_map("none.exr"), "none.exr"),
+        (lambda: envedit.sunsky(63), "input.width: got 63, expected an even integer"),
+        (lambda: envedit.LightTransport.build("sphere", spp="many"), "renderer.spp: got 'many', expected"),
+        (lambda: envedit.LightTransport.build("sphere", max_depth=0), "renderer.max_depth: got 0, expected"),
+        (lambda: envedit.LightTransport.build(3), "scene: got int, expected a file, a dict"),
+    ],
+)
+def test_other_functions_refuse_by_name_as_well(make, text):
+    with pytest.raises(envedit.EnveditError) as info:
+        make()
+    assert text in str(info.value)
+
+
+def test_a_fit_takes_dicts():
+    sky = envedit.sunsky(16)
+    fitted = envedit.fit(sky, {"hidden": 8, "depth": 1}, {"epochs": 2, "cache": False})
+    assert fitted.epochs == 2 and all(np.isfinite(values).all() for values in fitted.params.values())
+
+
+def test_a_dict_makes_a_table():
+    assert config.Config(scene={"width": 9}) == config.Config(scene=config.Scene(width=9))
+
+
+# ---- the public surface ------------------------------------------------------------------------------------
+
+
+def test_the_public_names_are_what_dir_shows_and_explain_themselves():
+    assert dir(envedit) == sorted([*envedit.__all__, "__version__"])
+    for name in envedit.__all__:
+        public = getattr(envedit, name)
+        text = inspect.getdoc(public)
+        assert text and not text.startswith(f"{name}("), name
+        if inspect.isfunction(public):
+            sections = ("Parameters\n---", "Returns\n---", "Raises\n---")
+            assert all(section in text for section in sections), name
+            arguments = inspect.signature(public).parameters
+            assert all(argument in text for argument in arguments), name
+        elif not issubclass(public, Exception):
+            assert "Attributes\n---" in text, name
+            for member, found in inspect.getmembers(public, inspect.isroutine):
+                if not member.startswith("_"):
+                    assert inspect.getdoc(found), (name, member)
+
+
+def test_importing_envedit_imports_no_mitsuba():
+    code = "import sys, envedit; dir(envedit); assert 'mitsuba' not in sys.modules; envedit.Config()"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

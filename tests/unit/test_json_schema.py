@@ -1,0 +1,275 @@
+"""The configuration explains itself: JSON Schema, the page of all keys, and keys that change nothing."""
+
+import dataclasses
+import json
+import math
+import re
+import tomllib
+
+import pytest
+
+from envedit import config
+from envedit.cli import schema as command
+from envedit.config import light_schema, stroke_schema
+from envedit.config.json_schema import json_schema
+from envedit.config.reference import markdown
+from envedit.config.schema import FIELDS, TOP
+from envedit.config.validators import Check, Choice, Integer, Number, WantedError
+from envedit.core import shipped
+from envedit.core.errors import ConfigError
+from tests.oracles import ROOT
+
+# ---- JSON Schema, draft 7: the words that ours uses --------------------------------------------------------
+
+WORDS = {
+    "$schema", "title", "description", "default", "type", "enum", "const", "anyOf", "minimum", "maximum",
+    "exclusiveMinimum", "multipleOf", "items", "minItems", "maxItems", "uniqueItems", "minLength", "pattern",
+    "properties", "additionalProperties", "required", "dependencies",
+}  # fmt: skip
+TYPES = {
+    "string": lambda v: isinstance(v, str),
+    "boolean": lambda v: isinstance(v, bool),
+    "number": lambda v: isinstance(v, int | float) and not isinstance(v, bool),
+    "integer": lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v == v // 1,
+    "array": lambda v: isinstance(v, list),
+    "object": lambda v: isinstance(v, dict),
+}  # fmt: skip
+
+
+def accepts(schema, value):
+    """Say whether a JSON Schema accepts a value, by the standard's words."""
+    assert schema.keys() <= WORDS, schema.keys() - WORDS
+    types = schema.get("type", [])
+    types = [types] if isinstance(types, str) else types
+    same = [v for v in (*schema.get("enum", ()), *([schema["const"]] if "const" in schema else ()))]
+    if types and not any(TYPES[name](value) for name in types):
+        return False
+    if same and not any(v == value and isinstance(v, bool) == isinstance(value, bool) for v in same):
+        return False
+    if "anyOf" in schema and not any(accepts(one, value) for one in schema["anyOf"]):
+        return False
+    if TYPES["number"](value):
+        low, above = schema.get("minimum", -math.inf), schema.get("exclusiveMinimum", -math.inf)
+        if not (low <= value <= schema.get("maximum", math.inf) and (value > above or above == -math.inf)):
+            return False
+        return "multipleOf" not in schema or value % schema["multipleOf"] == 0
+    if isinstance(value, str):
+        fits = re.search(schema.get("pattern", ""), value)
+        return bool(fits) and len(value) >= schema.get("minLength", 0)
+    if isinstance(value, list):
+        if not schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", math.inf):
+            return False
+        if schema.get("uniqueItems") and any(v in value[:i] for i, v in enumerate(value)):
+            return False
+        items = schema.get("items", {})
+        each = zip(items, value, strict=False) if isinstance(items, list) else ((items, v) for v in value)
+        return all(accepts(item, v) for item, v in each)
+    if isinstance(value, dict):
+        known, rest = schema.get("properties", {}), schema.get("additionalProperties", True)
+        if not set(schema.get("required", ())) <= value.keys():
+            return False
+        if any(
+            k in value and not set(more) <= value.keys() for k, more in schema.get("dependencies", {}).items()
+        ):
+            return False
+        return all(
+            accepts(known[k], v) if k in known else rest and (rest is True or accepts(rest, v))
+            for k, v in value.items()
+        )
+    return True
+
+
+SCHEMA = json_schema()
+CHECKS = {f"{table}.{key}": f.metadata["check"] for table, keys in FIELDS.items() for key, f in keys.items()}
+CHECKS |= {key: f.metadata["check"] for key, f in TOP.items() if key not in FIELDS}
+
+
+def edges(check):
+    """Yield values at the ends of what a check accepts, and beyond."""
+    yield from (
+        None,
+        True,
+        "",
+        "auto",
+        "all",
+        "upper",
+        "none such",
+        -1,
+        0,
+        1,
+        2,
+        7,
+        0.5,
+        1e-3,
+        -0.25,
+        1e30,
+        [],
+        {},
+    )
+    yield from ([0], [0, 1], [1, 0], [3, 5.5], [0.5, 0.5], [-1, 2], [1, 2, 3], ["a"], ["a", "a"], [""], [[1]])
+    yield from ({"a": 1}, {"a": "b", "c": True}, {"a": [1]}, 2000, 1999.5, 25000, 25001, "#ffd9a6", "#ffd9")
+    while hasattr(check, "check"):
+        check = check.check
+    if isinstance(check, Choice):
+        yield from check.names
+    if isinstance(check, Integer):
+        yield from (check.low - 1, check.low, check.low + 1, check.high - 1, check.high, check.high + 1)
+    if isinstance(check, Number):
+        for end in (check.low, check.high):
+            if math.isfinite(end):
+                yield from (end, end + 1e-3, end - 1e-3)
+
+
+# What JSON Schema cannot say of a value by itself: rows in order, 1.0 being no integer, and what is refused
+# with the name of a key inside.
+LOOSER = {"input.rows", "input.lights", "target.strokes"}
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_schema_and_check_of_a_key_accept_the_same(name):
+    check = CHECKS[name]
+    table, _, key = name.rpartition(".")
+    keys = SCHEMA["properties"][table]["properties"] if table else SCHEMA["properties"]
+    taken = refused = 0
+    for value in edges(check):
+        try:
+            check(value)
+        except (WantedError, ConfigError):
+            refused += 1
+            assert name in LOOSER or not accepts(keys[key], value), value
+        else:
+            taken += 1
+            assert accepts(keys[key], value), value
+    assert taken and refused
+    assert accepts(keys[key], keys[key]["default"]) and keys[key]["description"]
+
+
+def test_shipped_configurations_and_resolved_ones_fit_the_schema():
+    files = [*shipped.folder().glob("**/*.toml")]
+    assert len(files) > 5
+    for file in files:
+        assert accepts(SCHEMA, tomllib.loads(file.read_text())), file
+    strokes = [{"type": "light", "polygon": [[0, 0], [1, 0], [0, 1]], "color": "#ffd9a6", "view": "left"}]
+    lights = [{"light": 2, "azimuth": 3, "elevation": 4}, {"azimuth": 1, "elevation": 2, "flux": [1, 2, 3]}]
+    made = {"target": {"kind": "strokes", "strokes": strokes}, "input": {"lights": lights, "rows": [2, 9]}}
+    for preset in config.preset_names():
+        assert accepts(SCHEMA, tomllib.loads(config.to_toml(config.from_dict(made, preset=preset))))
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"inptu": {}},
+        {"input": {"widht": 64}},
+        {"input": 3},
+        {"input": {"lights": [{"azimuth": 3}]}},
+        {"input": {"lights": [{"light": 9}]}},
+        {"target": {"strokes": [{"amount": 1}]}},
+        {"target": {"strokes": [{"type": "shado"}]}},
+        {"target": {"strokes": [{"type": "light", "colour": [1, 1, 1]}]}},
+        {"target": {"strokes": [{"type": "light", "polygon": [[0, 0], [1, 1]]}]}},
+    ],
+)
+def test_the_schema_refuses_what_a_configuration_refuses(table):
+    assert not accepts(SCHEMA, table)
+    with pytest.raises(ConfigError):
+        config.from_dict(table)
+
+
+def test_it_is_a_json_schema_to_another_program_as_well():
+    jsonschema = pytest.importorskip("jsonschema", reason="comes with the extra envedit[docs]")
+    jsonschema.Draft7Validator.check_schema(SCHEMA)
+    program = jsonschema.Draft7Validator(SCHEMA)
+    assert program.is_valid(tomllib.loads(config.to_toml(config.loads("", preset="paper"))))
+    for name, check in CHECKS.items():
+        table, _, key = name.rpartition(".")
+        keys = SCHEMA["properties"][table]["properties"] if table else SCHEMA["properties"]
+        for value in edges(check):
+            given = {table: {key: value}} if table else {key: value}
+            assert program.is_valid(given) == accepts(keys[key], value), (name, value)
+
+
+def test_checks_can_be_inspected():
+    assert FIELDS["input"]["width"].metadata["check"] == Integer(6, 16384, even=True)
+    assert FIELDS["target"]["kind"].metadata["check"].names == ("envmap", "image", "strokes", "none")
+    for check in CHECKS.values():
+        assert isinstance(check, Check) and check.kind and str(check) and "object at" not in repr(check)
+
+
+# ---- the page of all keys ----------------------------------------------------------------------------------
+
+
+def test_the_page_is_what_is_generated(capsys):
+    assert command.main(["--markdown"]) == 0
+    printed = capsys.readouterr().out
+    message = "run: envedit schema --markdown > docs/configuration.md"
+    assert (ROOT / "docs" / "configuration.md").read_text() == printed == markdown(), message
+    for keys in FIELDS.values():
+        assert all(f"| `{key}` | " in printed for key in keys)
+    assert set(light_schema.MEANINGS) == {*light_schema.OWN, *light_schema.ADDED}
+    assert set(stroke_schema.MEANINGS) == set(stroke_schema.stroke_keys())
+    assert command.main([]) == 0 and json.loads(capsys.readouterr().out) == SCHEMA
+
+
+def test_the_page_has_each_preset_s_default():
+    rows = {line.split(" | ")[0][2:]: line.split(" | ") for line in markdown().splitlines() if "| `" in line}
+    assert rows["`epochs`"][2:6] == ["steps", "`500`", "`1200`", "`1500`"]
+    assert rows["`hidden`"][3:6] == ["`64`", "`128`", "`256`"]
+
+
+# ---- keys that change nothing ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tables", "solver", "named"),
+    [
+        ({"representation": {"hidden": 64, "depth": 2}}, None, ["depth, representation.hidden: not used"]),
+        ({"representation": {"hidden": 64, "kind": "siren"}}, "adam", []),
+        ({"representation": {"kind": "siren", "cycles": 3}}, "adam", ['as representation.kind is "siren"']),
+        ({"fit": {"lr": 1}}, None, ["fit.lr: not used, as representation.kind"]),
+        ({"fit": {"restart_period": 7}, "representation": {"kind": "siren"}}, "adam", ["as fit.schedule is"]),
+        ({"fit": {"awp_lr": 1, "awp_gamma": 0}, "representation": {"kind": "siren"}}, None, ["fit.awp_lr"]),
+        ({"optimizer": {"lr": 0.1, "schedule": "constant"}, "loss": {"ssim": 1}}, "adam", []),
+        (
+            {
+                "optimizer": {"lr": 0.1, "schedule": "constant"},
+                "loss": {"ssim": 1},
+                "renderer": {"refresh": 5},
+            },
+            "gauss-newton",
+            ["loss.ssim, optimizer.lr, optimizer.schedule, renderer.refresh: not used by"],
+        ),
+        ({"loss": {"ssim": 0.1}, "optimizer": {"lr": "auto"}}, "gauss-newton", []),  # the defaults
+        ({"renderer": {"kind": "path", "memory_gb": 3}}, "adam", ['as renderer.kind is "path"']),
+        ({"input": {"envmap": "a.exr", "azimuth": 3}}, None, ["input.azimuth: not used, as input.envmap is"]),
+        ({"input": {"azimuth": 3}}, None, []),
+        ({"input": {"rows": "upper", "horizon": "keep"}}, None, ["input.horizon: not used, as input.rows"]),
+        ({"target": {"paint": 2}}, None, ["target.paint: not used, as target.kind"]),
+        ({"perceptual": {"vgg": "a", "dists": "b"}}, None, ["perceptual.dists, perceptual.vgg: not used"]),
+        ({"target": {"kind": "none"}, "optimizer": {"iterations": 3}}, None, ['other than "none"']),
+        ({"target": {"kind": "none"}, "renderer": {"cache": False}, "output": {"spp": 3}}, None, []),
+    ],
+)  # fmt: skip
+def test_keys_that_do_not_apply_are_named_with_the_reason(tables, solver, named):
+    made = config.from_dict(tables, "/")
+    said = config.unused(made, solver)
+    assert len(said) == len(named) and all(map(lambda part, line: part in line, named, said)), said
+    # A resolved configuration has every key, and is as quiet.
+    assert config.unused(config.loads(config.to_toml(made)), solver) == said
+
+
+@pytest.mark.parametrize("preset", config.preset_names())
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels"])
+def test_what_a_preset_gives_is_never_named(preset, kind):
+    made = config.from_dict({"representation": {"kind": kind}}, preset=preset)
+    for solver in ("adam", "gauss-newton"):
+        assert config.unused(made, solver) == []
+        assert config.unused(config.loads(config.to_toml(made)), solver) == []
+    assert config.unused(dataclasses.replace(made, seed=3), "adam") == []
+
+
+def test_lights_that_are_placed_use_the_horizon():
+    lights = [{"azimuth": 1, "elevation": 2, "flux": [1, 2, 3]}]
+    table = {"horizon": "keep", "rows": "upper", "azimuth": 3.0, "envmap": "a.exr"}
+    (said,) = config.unused(config.from_dict({"input": table | {"lights": lights}}))
+    assert said.startswith("input.azimuth:")

@@ -5,6 +5,8 @@
 that ``import envedit`` is quick and works without LLVM.
 """
 
+from __future__ import annotations
+
 __version__ = "0.1.0"
 __all__ = ["Config", "LightTransport", "Result", "edit", "fit"]
 
@@ -17,7 +19,7 @@ _PUBLIC = {
 }
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> object:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
@@ -25,5 +27,5 @@ def __getattr__(name):
     return getattr(import_module(_PUBLIC[name]), name)
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])

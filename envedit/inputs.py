@@ -242,7 +242,7 @@ def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = Non
     return said
 
 
-def active_rows(rows, height: int) -> tuple[int, int]:
+def active_rows(rows: str | tuple[int, int], height: int) -> tuple[int, int]:
     """Return the first and last row that may change; "upper": above the horizon (paper, Sec. 5.1)."""
     if rows == "upper":
         return 0, (height + 1) // 2 - 1

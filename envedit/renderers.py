@@ -9,6 +9,7 @@ import mitsuba as mi
 from envedit import config
 from envedit.core import array_cache
 from envedit.core.errors import ConfigError
+from envedit.core.types import Progress
 from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
 from envedit.transport import recording
@@ -39,7 +40,9 @@ class Renderer(Protocol):
         """Continue from :meth:`state`."""
 
 
-def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Renderer:
+def make(
+    settings: config.Config, lit: scene.Scene, shape: tuple[int, int], progress: Progress | None = None
+) -> Renderer:
     """Build the renderer of a configuration for maps of the given (H, W).
 
     Parameters
@@ -59,7 +62,7 @@ def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Ren
     return trace(settings, lit, shape, progress)
 
 
-def check(settings: config.Config, lit: scene.Scene, shape) -> None:
+def check(settings: config.Config, lit: scene.Scene, shape: tuple[int, int]) -> None:
     """Refuse, before anything is rendered, what :func:`make` will refuse.
 
     Raises
@@ -79,7 +82,9 @@ def check(settings: config.Config, lit: scene.Scene, shape) -> None:
         recording.choose_samples(lit, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
 
 
-def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> LightTransport:
+def trace(
+    settings: config.Config, lit: scene.Scene, shape: tuple[int, int], progress: Progress | None = None
+) -> LightTransport:
     """Trace the light transport of a configuration, or take it from disk; arguments as :func:`make`."""
     chosen = settings.renderer
     return LightTransport.build(

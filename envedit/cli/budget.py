@@ -124,7 +124,9 @@ class Calibration:
     quiet_spp: int
 
 
-def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Path | None = None):
+def apply(
+    settings: config.Config, budget: float, elapsed: float = 0.0, base: Path | None = None
+) -> tuple[config.Config, str]:
     """Choose the level for a budget.
 
     Parameters

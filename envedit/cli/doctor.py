@@ -12,6 +12,8 @@ it died, and its last words, are the diagnosis.
 LLVM library changes, so that later runs pay a millisecond.
 """
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 import glob
@@ -295,7 +297,7 @@ def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
 
 
 @steady
-def main(arguments=None) -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
     parser = argparse.ArgumentParser(
         prog="envedit doctor",

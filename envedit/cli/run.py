@@ -13,11 +13,16 @@ import os
 import re
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from envedit.cli.streams import steady
 from envedit.core import shipped
+
+if TYPE_CHECKING:
+    from envedit import config
 
 
 @steady
@@ -69,7 +74,7 @@ def _progress(arguments):
     return JsonProgress() if wanted else Progress(quiet=arguments.quiet)
 
 
-def load(name, preset, overrides):
+def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[config.Config, Path | None, Path]:
     """Read a configuration, given as a path or as the name of a shipped one.
 
     Returns

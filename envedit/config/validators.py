@@ -246,7 +246,7 @@ class Table:
 
     given: ClassVar[frozenset[str]] = frozenset()
 
-    def __new__(cls, *values, **named):
+    def __new__(cls, *values: Any, **named: Any) -> Table:
         """Note which fields are given."""
         table = super().__new__(cls)
         by_position = (f.name for f, _ in zip(fields(cls), values, strict=False))

@@ -1,5 +1,7 @@
 """What is wrong with an image: texels not finite, negative or cut; counted, named, mended, refused."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 
@@ -7,6 +9,7 @@ import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.errors import InputError
+from envedit.core.types import ArrayLike
 
 HALF_MAX = 65504.0
 """The largest half: where many programs cut the sun."""
@@ -57,7 +60,7 @@ class Health:
         return f"{self.texels} texels, {spread}; {', '.join(found) or 'nothing unusual'}"
 
 
-def health(image) -> Health:
+def health(image: ArrayLike) -> Health:
     """Count the NaN, infinite, negative and half-saturated texels of an image; see :class:`Health`."""
     image = np.asarray(image)
     finite = np.isfinite(image)
@@ -88,12 +91,12 @@ def health(image) -> Health:
     )
 
 
-def any_channel(mask):
+def any_channel(mask: np.ndarray) -> np.ndarray:
     """Return where any channel of (H, W, 3) is set; numpy's own ``any(2)`` takes five times as long."""
     return mask[..., 0] | mask[..., 1] | mask[..., 2]
 
 
-def require_radiance(image, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
+def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
     """Refuse an image that holds anything but radiance: finite, not negative and at most ``brightest``.
 
     Parameters
@@ -125,7 +128,7 @@ def require_radiance(image, what: str, first_row: int = 0, brightest: float = ma
             raise InputError(f"{what}: {texels.sum()} texels are {how}, {where}: {cure}")
 
 
-def repair(image) -> tuple[np.ndarray, int]:
+def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
     """Replace every non-finite texel by the mean of its finite neighbours.
 
     The eight neighbours, columns periodic; holes are filled from their rim inwards. A texel with one bad

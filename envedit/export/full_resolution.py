@@ -18,6 +18,7 @@ from envedit.core.arrays import flat
 from envedit.core.errors import NumericalError, place_of
 from envedit.export.ratio_transfer import Ratio
 from envedit.export.texel_maps import Places, as_image
+from envedit.representations.base import Representation
 from envedit.representations.layers import lights
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.layers import Layers, gone_of, unseen_kept
@@ -28,7 +29,7 @@ POINTS_AT_ONCE = 1 << 20
 
 
 def carry(
-    representation,
+    representation: Representation,
     params: dict,
     original_working: np.ndarray,
     edited_working: np.ndarray,

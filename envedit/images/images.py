@@ -5,6 +5,8 @@ mend raise ``InputError`` with the file's name; what is merely odd goes to ``inf
 sentences.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 import zlib
@@ -15,6 +17,7 @@ from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import replacing, write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.types import ArrayLike, FilePath
 from envedit.images import exr, ldr, rgbe
 from envedit.images.headers import MAX_SIDE, damaged, head_of
 
@@ -33,7 +36,7 @@ __all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_hdr", "writ
 # Reading
 
 
-def read(path) -> tuple[np.ndarray, dict]:
+def read(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as linear radiance.
 
     The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; layers; the
@@ -65,7 +68,7 @@ def read(path) -> tuple[np.ndarray, dict]:
     return _in_rec709(image, info), info
 
 
-def read_stored(path) -> tuple[np.ndarray, dict]:
+def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as it was painted: with alpha, and without undoing any display curve.
 
     Parameters
@@ -136,7 +139,7 @@ def _decode(path, stored):
 
 
 def load_envmap(
-    path, width: int | None = None, repair: bool = False, convert: bool = True
+    path: FilePath, width: int | None = None, repair: bool = False, convert: bool = True
 ) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
@@ -215,11 +218,11 @@ def load_envmap(
 
 
 def write_exr(
-    path,
-    image,
+    path: FilePath,
+    image: ArrayLike,
     metadata: dict | None = None,
     panorama: bool = True,
-    alpha=None,
+    alpha: ArrayLike | None = None,
     half: bool = False,
     chromaticities: primaries.Chromaticities | None = None,
 ) -> None:
@@ -279,7 +282,7 @@ def write_exr(
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
 
 
-def write_hdr(path, image) -> None:
+def write_hdr(path: FilePath, image: ArrayLike) -> None:
     """Write an image as a Radiance file (:func:`.rgbe.encode`), whole or not at all.
 
     Parameters
@@ -298,7 +301,7 @@ def write_hdr(path, image) -> None:
     write_atomically(name, rgbe.encode(np.maximum(_checked(name, image), 0)))
 
 
-def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
+def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:
     """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel, whole or not at all.
 
     Parameters
@@ -327,7 +330,7 @@ def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
     write_atomically(name, data[:_PNG_HEADER] + texts + data[_PNG_HEADER:])
 
 
-def png(codes) -> bytes:
+def png(codes: np.ndarray) -> bytes:
     """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG.
 
     In memory: Mitsuba does not report that the last bytes of a file did not fit on the disk.

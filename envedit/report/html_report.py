@@ -4,14 +4,18 @@ Pictures come in as linear radiance, ``(H, W, 3)``, and are tonemapped for displ
 ``run_folder.py`` imports this module.
 """
 
+from __future__ import annotations
+
 import base64
 import json
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.latlong import solid_angles
+from envedit.core.types import FilePath
 from envedit.images.images import png
 from envedit.losses.metrics import saturated, score, worse
 from envedit.report.curves import curves_svg, escape, normalised, number
@@ -26,6 +30,8 @@ from envedit.report.preview import (
     influence_image,
     share_image,
 )
+from envedit.representations.layers.separation import Separation
+from envedit.scene.scene import View
 
 _STYLE = """
 :root { --ink: #22223b; --soft: #6b6b7b; --line: #e4e4ea; --alarm: #a63d2f; }
@@ -259,25 +265,25 @@ def _verdict(metrics):
 
 
 def write_report(
-    path,
+    path: FilePath,
     *,
-    title,
-    config_toml,
-    metrics,
-    manifest,
-    history,
-    renders,
-    maps,
-    influence=None,
-    frozen=None,
-    identified=None,
-    separation=None,
-    unreachable=None,
-    warnings=(),
-    notes=(),
-    tonemap="gamma",
-    views=(),
-    ramps=None,
+    title: str,
+    config_toml: str,
+    metrics: dict,
+    manifest: dict,
+    history: list[dict],
+    renders: Mapping[str, np.ndarray | None],
+    maps: Mapping[str, np.ndarray | None],
+    influence: np.ndarray | None = None,
+    frozen: np.ndarray | None = None,
+    identified: np.ndarray | None = None,
+    separation: Separation | None = None,
+    unreachable: np.ndarray | None = None,
+    warnings: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    tonemap: str = "gamma",
+    views: Sequence[View] = (),
+    ramps: tuple[dict[str, tuple[float, float]], int] | None = None,
 ) -> None:
     """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
 

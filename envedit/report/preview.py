@@ -3,12 +3,17 @@
 For display only; nothing here feeds back into an edit.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+
 import numpy as np
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import InputError
+from envedit.core.types import ArrayLike, FilePath, Views
 from envedit.images.images import png
 from envedit.report.curves import round_up
 from envedit.transport.influence import per_solid_angle
@@ -40,7 +45,7 @@ _FONT = {
 # Scaling, display and labels
 
 
-def checked(image, name):
+def checked(image: ArrayLike, name: str) -> np.ndarray:
     """Return a picture as an array, refusing what is not ``(H, W, 3)``."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
@@ -72,7 +77,7 @@ def _fit(image, height, width):
     return image
 
 
-def fit_finite(image, height, width):
+def fit_finite(image: ArrayLike, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Scale what is finite, and return the (height, width) mask of pixels that hold a NaN or Inf as well."""
     finite = np.isfinite(image).all(axis=2, keepdims=True)
     if finite.all():
@@ -80,7 +85,9 @@ def fit_finite(image, height, width):
     return _fit(np.where(finite, image, 0), height, width), _fit(~finite, height, width)[..., 0] > 0
 
 
-def display(image, height, width, tonemap="gamma", exposure=0.0):
+def display(
+    image: ArrayLike, height: int, width: int, tonemap: str = "gamma", exposure: float = 0.0
+) -> np.ndarray:
     """Scale, expose and tonemap linear radiance to 8 bits; whatever holds a NaN or Inf is magenta."""
     scaled, bad = fit_finite(image, height, width)
     shown = apply_tonemap(scaled.astype(np.float64) * 2.0**exposure, tonemap)
@@ -105,7 +112,15 @@ def _text(label, width, scale):
 # The preview
 
 
-def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -> None:
+def preview(
+    path: FilePath,
+    renders: Mapping[str, np.ndarray | None],
+    maps: Mapping[str, np.ndarray | None],
+    tonemap: str = "gamma",
+    labels: bool = True,
+    exposure: float = 0.0,
+    views: Views = (),
+) -> None:
     """Draw ``preview.png``: a row of renderings and under each its environment map.
 
     Parameters
@@ -178,7 +193,9 @@ def _height(image, width):
 _DIVERGING = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]])
 
 
-def difference_image(a, b, kind="tonemapped", tonemap="gamma", scale=None):
+def difference_image(
+    a: ArrayLike, b: ArrayLike, kind: str = "tonemapped", tonemap: str = "gamma", scale: float | None = None
+) -> tuple[np.ndarray, float]:
     """Draw the difference a - b in luminance: red where a is brighter, blue where it is darker.
 
     Parameters
@@ -247,7 +264,7 @@ def _rising(share):
     return np.rint(np.stack(colours, axis=-1)).astype(np.uint8)
 
 
-def influence_image(influence, frozen=None):
+def influence_image(influence: np.ndarray, frozen: np.ndarray | None = None) -> np.ndarray:
     """Draw the influence of texels per solid angle, as shares of its mean over the sphere, logarithmically.
 
     Parameters
@@ -270,12 +287,12 @@ def influence_image(influence, frozen=None):
     return pixels
 
 
-def share_image(share):
+def share_image(share: np.ndarray) -> np.ndarray:
     """Draw shares from 0 to 1, (H, W), in the colours of :func:`influence_image`: (H, W, 3) uint8."""
     return _rising(np.asarray(share, np.float64))
 
 
-def influence(path, values, frozen=None) -> None:
+def influence(path: FilePath, values: np.ndarray, frozen: np.ndarray | None = None) -> None:
     """Draw ``influence.png``: :func:`influence_image` at 512 pixels or more, over its scale.
 
     Raises

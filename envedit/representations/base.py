@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Protocol
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.types import Params
+
 if TYPE_CHECKING:
     from envedit.representations.layers.separation import Separation
     from envedit.representations.siren.fit import Fitted
 
 EPSILON = 0.01
 """Added to radiance inside a logarithm (paper, below Eq. 3)."""
-Params = dict[str, "mi.TensorXf"]
-"""What the optimiser owns: tensors by name."""
 
 
 class Representation(Protocol):

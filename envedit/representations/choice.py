@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 from envedit import config
 from envedit.representations.base import Representation
 from envedit.representations.layers.gain import CYCLES
@@ -12,7 +15,11 @@ from envedit.representations.siren.siren import Siren
 
 
 def make(
-    settings: config.Config, folder=None, progress=None, rows=None, horizon: str = "free"
+    settings: config.Config,
+    folder: Path = None,
+    progress: Callable[[int, int, float], None] = None,
+    rows: tuple[int, int] = None,
+    horizon: str = "free",
 ) -> Representation:
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
 

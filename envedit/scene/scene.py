@@ -25,6 +25,7 @@ import difflib
 import functools
 import hashlib
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +36,7 @@ import numpy as np
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
+from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_text, supported
 
 __all__ = ["Scene", "load"]
@@ -134,7 +136,7 @@ class Scene:
         names = [view.name for view in self.views]
         return supported.index_of(asked, names, names, f"{key}: got view", "; see [scene] sensors")
 
-    def set_envmap(self, image) -> None:
+    def set_envmap(self, image: ArrayLike) -> None:
         """Light the scene by a map.
 
         Parameters
@@ -165,7 +167,9 @@ class Scene:
         self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
         self.params.update()
 
-    def render(self, image, spp: int = 64, seed: int = 0, max_depth: int | None = None) -> np.ndarray:
+    def render(
+        self, image: ArrayLike, spp: int = 64, seed: int = 0, max_depth: int | None = None
+    ) -> np.ndarray:
         """Render the scene under a map by Mitsuba's ``path`` integrator, with fresh samples.
 
         The samples are split into passes of at most 2^22, each with its own seed derived from ``seed``, and
@@ -206,7 +210,9 @@ class Scene:
             total += count / spp * self._pass(count, seed, i, max_depth)
         return self._checked(total)
 
-    def sampled(self, image, spp: int | str = "auto", seed: int = 0, exactly: int | None = None):
+    def sampled(
+        self, image: ArrayLike, spp: int | str = "auto", seed: int = 0, exactly: int | None = None
+    ) -> tuple[np.ndarray, int, np.ndarray | None]:
         """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
 
         Passes of 64 samples a pixel are added until the error of their mean, estimated from how much their
@@ -302,7 +308,13 @@ def _two_threads():
 
 
 def load(
-    file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter", sensors=(0,)
+    file: FilePath | dict,
+    width: int | None = None,
+    height: int | None = None,
+    parameters: Mapping[str, object] | None = None,
+    base: FilePath | None = None,
+    sampler: str = "multijitter",
+    sensors: str | Sequence[int | str] = (0,),
 ) -> Scene:
     """Load a scene and make its environment emitter replaceable.
 
@@ -418,7 +430,9 @@ def _parsed(file, parameters, base):
     return config, state, path, where, folders
 
 
-def relit(file, envmap: str, parameters=None, base=None) -> str:
+def relit(
+    file: FilePath, envmap: str, parameters: Mapping[str, object] | None = None, base: FilePath | None = None
+) -> str:
     """Return the XML of a scene that is lit by another map and otherwise as its author has it.
 
     Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
@@ -455,7 +469,7 @@ def relit(file, envmap: str, parameters=None, base=None) -> str:
 # Files and parameters
 
 
-def find(file) -> Path:
+def find(file: FilePath) -> Path:
     """Return the XML file meant by a path or by the bare name of a shipped scene."""
     path = Path(file)
     if os.path.isfile(path):  # False, and no error, in a folder that may not be entered

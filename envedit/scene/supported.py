@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +51,7 @@ class OwnMap:
     notes: tuple[str, ...] = ()
 
 
-def own_map(state, where: str, folders) -> OwnMap:
+def own_map(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -> OwnMap:
     """Read the file and the ``scale`` of the scene's ``envmap`` emitter, before it is replaced.
 
     Raises
@@ -103,7 +104,7 @@ class Integrator:
     notes: tuple[str, ...]
 
 
-def take_integrator(state, where: str) -> Integrator:
+def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     """Read what the integrator asks for and put ``path`` in its place, so that it is never built.
 
     Raises
@@ -142,7 +143,7 @@ def take_integrator(state, where: str) -> Integrator:
     return Integrator(depth, hide, tuple(notes))
 
 
-def ensure_integrator(state) -> None:
+def ensure_integrator(state: mi.parser.ParserState) -> None:
     """Give a scene without an integrator ``path``.
 
     May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
@@ -170,7 +171,9 @@ def _check_media(state, where, integrator, notes):
     notes.append(f"medium {kind} is not rendered, as the scene's integrator ({integrator}) has no media")
 
 
-def take_sensors(state, where: str, asked="all") -> tuple[list[int], list[str], tuple[str, ...]]:
+def take_sensors(
+    state: mi.parser.ParserState, where: str, asked: str | Sequence[int | str] = "all"
+) -> tuple[list[int], list[str], tuple[str, ...]]:
     """Choose the sensors whose pictures are edited, in the order asked for; the scene has no others then.
 
     Parameters

@@ -8,12 +8,14 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.representations.layers.layers import Layers
+from envedit.transport.light_transport import LightTransport
 
 
 class BlockJacobian:
     """The block transport with the gain's hats in its cells."""
 
-    def __init__(self, layers, transport, shape):
+    def __init__(self, layers: Layers, transport: LightTransport, shape: tuple[int, int]):
         overview = transport.overview()
         self.block_of, self.count = overview.block_of, len(overview.matrix[0])
         active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])

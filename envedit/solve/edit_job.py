@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 from envedit import config
 from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError, place_of
+from envedit.core.types import Params
 from envedit.losses import display_curve, optimizer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.layers import unseen_kept
@@ -126,7 +127,7 @@ class Job:
         chosen = self.settings.optimizer.lr
         return not self.newton and chosen != "auto" and chosen > self.representation.lr
 
-    def decode(self, params) -> np.ndarray:
+    def decode(self, params: Params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
         rows = slice(self.first, self.first + crop.shape[0])
@@ -148,7 +149,7 @@ class Job:
                 adam.take_back()
         return self.original.copy()
 
-    def best(self, starts, crop):
+    def best(self, starts: list[tuple[Params, list[str]]], crop: np.ndarray) -> tuple[Params, list[str]]:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         if len(starts) == 1:
             return starts[0]
@@ -179,7 +180,7 @@ class Job:
         """Say whether one start is so much better than the usual one that it is to be taken."""
         return loss < usual - LIKELIER if self.newton else loss < (1 - TRIAL_GAIN) * usual
 
-    def tried(self, params, crop) -> float:
+    def tried(self, params: Params, crop: np.ndarray) -> float:
         """Return the loss after a few steps from a start."""
         steps = self.trials
         if self.newton:
@@ -191,7 +192,7 @@ class Job:
         objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists, self.lit.rows)
         return self._loop(params, objective, few)[1].history[-1]["loss"]
 
-    def optimise(self, params, crop, resume):
+    def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
         """Optimise from the start, or from the checkpoint; returns parameters and state."""
         if self.newton:
             return self._solve(params, resume)
@@ -339,7 +340,7 @@ class Job:
 
 
 @contextlib.contextmanager
-def keeping(envmap: np.ndarray):
+def keeping(envmap: np.ndarray) -> Iterator[None]:
     """Let numbers that fail after the loop carry the map that it found: Stopped for NumericalError."""
     try:
         yield
@@ -348,7 +349,7 @@ def keeping(envmap: np.ndarray):
 
 
 @contextlib.contextmanager
-def ctrl_c():
+def ctrl_c() -> Iterator[threading.Event]:
     """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():

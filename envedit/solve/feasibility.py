@@ -32,6 +32,7 @@ from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.errors import InputError, place_of
 from envedit.solve import light_search, matching_pursuit
+from envedit.transport.light_transport import LightTransport
 
 CELLS = 64
 """Cells around the horizon."""
@@ -129,7 +130,7 @@ def unreachable(reach: Reach) -> np.ndarray:
 
 
 def reachable(
-    transport,
+    transport: LightTransport,
     original: np.ndarray,
     target: np.ndarray,
     weight: np.ndarray | None = None,

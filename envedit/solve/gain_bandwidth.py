@@ -21,6 +21,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.losses import display_curve
 from envedit.representations.layers.gain import Octave, grid_size, tents
+from envedit.transport.light_transport import LightTransport
 
 PROBES = 12
 """Random z; what is averaged over them, three patterns and the nodes of a patch is within a third."""
@@ -35,7 +36,15 @@ FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
 further one: what a glossy object determines of half of the sky is not worth a third of a run's time."""
 
 
-def octaves(transport, second, background, rows, picture, weight, coarsest: int) -> list[Octave]:
+def octaves(
+    transport: LightTransport,
+    second: LightTransport,
+    background: np.ndarray,
+    rows: tuple[int, int],
+    picture: np.ndarray,
+    weight: np.ndarray | None,
+    coarsest: int,
+) -> list[Octave]:
     """Measure the octaves of detail that a picture determines.
 
     Parameters

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, renderers
+from envedit.core.types import Progress
 from envedit.representations.layers.gain import CYCLES, Octave
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
@@ -76,11 +77,11 @@ class Starts:
 def recordings(
     settings: config.Config,
     lit: scene.Scene,
-    shape,
+    shape: tuple[int, int],
     layers: Layers,
     wanted: Target,
     traced: LightTransport | None,
-    progress=None,
+    progress: Progress | None = None,
 ) -> Recordings:
     """Trace what :func:`find` looks through: T, and a second recording where detail is asked about.
 

@@ -12,16 +12,20 @@ What comes out is most of the way.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.core.types import Params
 from envedit.representations.layers.gain import LEVELS, VEIL
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE, Lights, rotation_vector
 from envedit.representations.layers.separation import glow_at
 from envedit.solve.matching_pursuit import GAIN_ORDER, Given, Place, place, products, relative
+from envedit.transport.block_transport import Overview
 from envedit.transport.light_transport import LightTransport
 
 KEPT_FLUX = 3.0
@@ -148,7 +152,15 @@ class Question:
         What is to be explained in place of the picture less the light of what is fixed.
     """
 
-    def __init__(self, layers, transport, picture, weight, envmap, wanted=None):
+    def __init__(
+        self,
+        layers: Layers,
+        transport: LightTransport,
+        picture: np.ndarray,
+        weight: np.ndarray | None,
+        envmap: np.ndarray,
+        wanted: np.ndarray | None = None,
+    ):
         self.layers, self.transport, self.weight = layers, transport, weight
         first, _ = layers.rows
         height, width = layers.shape
@@ -184,11 +196,17 @@ class Question:
         rest = self.background, self.omega, self.active, self.start, self.cells
         return Given(self.transport.overview(), self.weight, self.known, *rest)
 
-    def render(self, values):
+    def render(self, values: np.ndarray) -> np.ndarray:
         """Picture (h, w, 3) of a map (H * W, 3) alone, without other lamps' light."""
         return self.transport.linear(tensor(values.reshape(self.shape))).numpy()
 
-    def refine(self, direction, flux, glow, others=()):
+    def refine(
+        self,
+        direction: np.ndarray,
+        flux: np.ndarray,
+        glow: np.ndarray | None,
+        others: Sequence[np.ndarray] = (),
+    ) -> tuple[np.ndarray, float]:
         """Find the direction of a light, and its flux as a factor; ``others``' pictures may be mixed in."""
         if self._gains is None:
             gains = products(self.directions.reshape(-1, 3), GAIN_ORDER)
@@ -207,17 +225,17 @@ class Question:
         kept = 1 / KEPT_FLUX < factor < KEPT_FLUX
         return direction, 1.0 if kept else float(np.clip(factor, LEAST, MOST))
 
-    def parameters(self, places):
+    def parameters(self, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
         """Rotation vectors and log fluxes of lights as they are placed."""
         return rotations(self.layers.lights, places)
 
-    def placed(self, places):
+    def placed(self, places: Sequence[Place]) -> Params:
         """Parameters of lights as they are placed."""
         turn, flux = self.parameters(places)
         scales = self.layers.scales
         return {"turn": tensor(turn / scales["turn"]), "flux": tensor(flux / scales["flux"])}
 
-    def light(self, i, found):
+    def light(self, i: int, found: Place) -> np.ndarray:
         """Picture of one light as it is placed, through exact columns."""
         dark = [Place(None, np.zeros(3))] * self.layers.lights.count
         dark[i] = found
@@ -230,7 +248,7 @@ class Question:
         self.transport.resolve(core + self.background.reshape(self.shape))
         return self.render(core)
 
-    def hats(self, level):
+    def hats(self, level: int) -> np.ndarray:
         """Radiance of what a gain adds, times each hat of a grid, in cells: (3, cells, nodes)."""
         overview = self.transport.overview()
         base = self.background[self.gained]
@@ -244,7 +262,7 @@ class Question:
         total = np.bincount(overview.cell_of, self.omega, cells)
         return hats.reshape(3, cells, nodes) / np.maximum(total, 1e-30)[None, :, None]
 
-    def in_cells(self, level, gain):
+    def in_cells(self, level: int, gain: np.ndarray) -> np.ndarray:
         """Mean of a gain (nodes, 3) over each cell, by its logarithm: (cells, 3)."""
         cell, omega = self._cells()
         cells = len(self.transport.overview().omega)
@@ -262,7 +280,7 @@ class Question:
         return self.transport.overview().cell_of[self.gained], self.omega[self.gained]
 
 
-def rotations(lights, places):
+def rotations(lights: Lights, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
     """Return rotation vectors and log fluxes, (count, 3) each, of lights as they are placed."""
     turn, flux = np.zeros((lights.count, 3)), np.full((lights.count, 3), DARK)
     for i, found in enumerate(places):
@@ -272,7 +290,14 @@ def rotations(lights, places):
     return turn, flux
 
 
-def spread(overview, wanted, weight, known, hats, lights):
+def spread(
+    overview: Overview,
+    wanted: np.ndarray,
+    weight: np.ndarray | None,
+    known: np.ndarray,
+    hats: np.ndarray,
+    lights: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Find strengths, not negative, of overlapping hats of background and of lights that make a picture.
 
     Multiplicative updates (Richardson 1972, Lucy 1974), a <- a * H'(w I / H a) / H' w, from a = 1: they stay
@@ -313,7 +338,17 @@ def spread(overview, wanted, weight, known, hats, lights):
     return found[:n], found[n:]
 
 
-def refine(transport, wanted, known, weight, gains, direction, flux, first, last):
+def refine(
+    transport: LightTransport,
+    wanted: np.ndarray,
+    known: np.ndarray,
+    weight: np.ndarray | None,
+    gains: np.ndarray,
+    direction: np.ndarray,
+    flux: np.ndarray,
+    first: int,
+    last: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Find the place of a light to a fraction of a texel, by exact columns around a first guess.
 
     Parameters

@@ -18,6 +18,7 @@ pictures of lights are exact.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -30,6 +31,7 @@ from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 from envedit.solve.block_jacobian import BlockJacobian
+from envedit.transport.light_transport import LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
@@ -74,7 +76,7 @@ class Prior:
     size: float = 0.3
     added_size: float = 1.0
 
-    def gain_precisions(self, sizes) -> np.ndarray:
+    def gain_precisions(self, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
         """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n)."""
         fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
         return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
@@ -193,7 +195,16 @@ class Problem:
         How far a sky changes.
     """
 
-    def __init__(self, layers: Layers, transport, envmap, picture, weight=None, free=None, prior=None):
+    def __init__(
+        self,
+        layers: Layers,
+        transport: LightTransport,
+        envmap: np.ndarray,
+        picture: np.ndarray,
+        weight: np.ndarray | None = None,
+        free: np.ndarray = None,
+        prior: Prior = None,
+    ):
         self.layers, self.transport, self.envmap, self.free = layers, transport, envmap, free
         self.prior = prior or Prior()
         self.rows = layers.active

@@ -80,7 +80,9 @@ def find(
     return Turn(360 * texels / width, error(texels), error(0.0))
 
 
-def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
+def residual(
+    transport: LightTransport, envmap: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None
+) -> float:
     """Return a map's display residual, RMS over channels and mean over pixels; inf if it is not finite.
 
     Parameters are those of :func:`find`.
@@ -89,7 +91,7 @@ def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
     return apart(transport.apply(tensor(envmap)).numpy(), picture, weight)
 
 
-def apart(rendering, picture, weight=None) -> float:
+def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Return the display residual of a rendering (h, w, 3), likewise."""
     off = np.float64(display_curve.to_display(tensor(rendering)).numpy())
     off -= display_curve.to_display(tensor(picture)).numpy()

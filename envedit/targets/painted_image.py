@@ -16,6 +16,7 @@ import numpy as np
 from envedit import config
 from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.core.types import FilePath, Shape
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
@@ -63,7 +64,7 @@ def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarr
     return picture
 
 
-def check_export(file) -> None:
+def check_export(file: FilePath) -> None:
     """Refuse a file that :func:`export` should not write.
 
     Raises
@@ -82,7 +83,7 @@ def check_export(file) -> None:
         raise InputError(f"{file}: cannot be written (its folder does not exist)")
 
 
-def export_tonemap(file, picture: np.ndarray, settings: config.Config) -> str:
+def export_tonemap(file: FilePath, picture: np.ndarray, settings: config.Config) -> str:
     """Return the tonemap of an exported picture (h, w, 3): "linear" for OpenEXR, or that of the PNG.
 
     That is [target] tonemap where it clips less than :data:`CLIPPED` of the pixels, which have no information
@@ -99,7 +100,9 @@ def _clipped(shown):
     return float((shown >= 1 - 0.5 / 65535).any(axis=2).mean())
 
 
-def export(file, picture: np.ndarray, settings: config.Config, name: str | None = None) -> list[str]:
+def export(
+    file: FilePath, picture: np.ndarray, settings: config.Config, name: str | None = None
+) -> list[str]:
     """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG.
 
     The file says which tonemap it is under, and what it was rendered from.
@@ -153,7 +156,9 @@ def export(file, picture: np.ndarray, settings: config.Config, name: str | None 
 # The picture that comes back
 
 
-def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask="") -> Painted:
+def read(
+    file: FilePath, shape: Shape, tonemap_name: str, initial: np.ndarray | None = None, mask: FilePath = ""
+) -> Painted:
     """Read a painted picture.
 
     - Float files are linear radiance. Others are undone by the tonemap that they were painted under; the one
@@ -234,7 +239,7 @@ def read(file, shape, tonemap_name: str, initial: np.ndarray | None = None, mask
     return Painted(picture, coverage[..., None].astype(np.float32), excluded, tuple(warnings))
 
 
-def given(picture, shape, initial: np.ndarray, mask: np.ndarray | None = None) -> Painted:
+def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarray | None = None) -> Painted:
     """Take a painted picture from arrays.
 
     Parameters
@@ -275,7 +280,7 @@ def given(picture, shape, initial: np.ndarray, mask: np.ndarray | None = None) -
     )
 
 
-def read_mask(file, shape) -> np.ndarray:
+def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
     """Read a mask as the weight of each pixel: white counts, black does not, greys in between.
 
     Half grey is meant as a half, whatever curve the file has; transparent is black; float values are cut to

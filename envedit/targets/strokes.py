@@ -70,7 +70,7 @@ class Painted:
     warnings: tuple[str, ...] = ()
 
 
-def paint(picture, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
+def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
     """Paint strokes on a picture, each on the result of those before it.
 
     Parameters

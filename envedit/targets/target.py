@@ -208,7 +208,7 @@ def _seen(target, hidden):
     return replace(target, weight=weight, source=f"{target.source}; {share}")
 
 
-def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
+def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:
     """Share the weights of paint and rest among their pixels: (h, w, 1) float32, 1 on average.
 
     weight = paint c / sum(c) + hold (1 - c) / sum(1 - c), where c is coverage, over the pixels that are not

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.scene.scene import Scene
 from envedit.transport import path_vertices
 from envedit.transport.sparse_matrix import SLICE, merge
 from envedit.transport.texel_sampling import Grid
@@ -52,7 +53,7 @@ class ExactColumns:
         0 for texels with a column, 1 for others: what is left to the coarse tier.
     """
 
-    def __init__(self, scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
+    def __init__(self, scene: Scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
         self.scene, self.grid, self.bounces, self.capacity = scene, grid, bounces, capacity
         self.pixels = scene.width * scene.height
         self.texels = np.zeros(0, np.int64)
@@ -88,7 +89,14 @@ class ExactColumns:
 
     # ------------------------------------------------------------------ tracing
 
-    def trace(self, texels: np.ndarray, count: int, seed: int, keep: np.ndarray | None = None, blocks=None):
+    def trace(
+        self,
+        texels: np.ndarray,
+        count: int,
+        seed: int,
+        keep: np.ndarray | None = None,
+        blocks: int | None = None,
+    ) -> None:
         """Trace columns; one that was there is replaced.
 
         Parameters

@@ -29,6 +29,8 @@ from envedit.core import latlong
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_radiance
+from envedit.core.types import ArrayLike, Progress
+from envedit.scene.scene import Scene
 from envedit.transport import block_transport as overviews
 from envedit.transport import bright_texels
 from envedit.transport.exact_columns import ExactColumns
@@ -91,7 +93,18 @@ class LightTransport:
         Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
     """
 
-    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices, paths_bytes=0):
+    def __init__(
+        self,
+        scene: Scene,
+        grid: Grid,
+        spp: int,
+        bounces: int,
+        seed: int,
+        capacity: int,
+        refresh: int,
+        choices: list[str],
+        paths_bytes: int = 0,
+    ):
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
         self.spp, self.bounces, self.capacity, self.refresh = spp, bounces, capacity, refresh
         self.epoch, self._base_seed, self._choices, self._lost = 0, seed, choices, 0
@@ -107,18 +120,18 @@ class LightTransport:
     @classmethod
     def build(
         cls,
-        scene,
+        scene: Scene,
         height: int,
         width: int,
         *,
-        spp="auto",
-        max_depth="auto",
+        spp: int | str = "auto",
+        max_depth: int | str = "auto",
         seed: int = 0,
-        memory_gb=2.0,
+        memory_gb: float | str = 2.0,
         refresh: int = 0,
         few: bool = False,
         folder: Path | None = None,
-        progress=None,
+        progress: Progress | None = None,
     ) -> LightTransport:
         """Trace T.
 
@@ -476,7 +489,7 @@ class LightTransport:
 
     def resolve(
         self,
-        envmap,
+        envmap: ArrayLike,
         tolerance: float | None = None,
         limit: int | None = None,
         lasting: np.ndarray | None = None,
@@ -525,7 +538,7 @@ class LightTransport:
         total = light.sum()
         return light / total if total > 0 else np.zeros_like(light)
 
-    def coarse_error(self, envmap) -> float:
+    def coarse_error(self, envmap: ArrayLike) -> float:
         """Predict the relative error of the coarse tier for a map, beside the columns that there are.
 
         Raises

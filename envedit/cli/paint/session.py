@@ -23,6 +23,7 @@ from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, NumericalError
+from envedit.core.types import Views
 from envedit.export import adjustments
 from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
@@ -56,7 +57,7 @@ class SupersededError(Exception):
 class Tell:
     """What a session reports; :class:`.server.Hub` sends it to the pages."""
 
-    def frame(self, kind: str, source: str, image: np.ndarray, rows=(slice(None),)) -> None:
+    def frame(self, kind: str, source: str, image: np.ndarray, rows: Views = (slice(None),)) -> None:
         """Show an image (h, w, 3), with the rows of each view in it."""
 
     def say(self, message: dict) -> None:

@@ -39,7 +39,7 @@ class Worker(threading.Thread):
         self._over = self._owed = False
         self.faults: list[Exception] = []  # of ours, no user's mistakes
 
-    def post(self, request) -> None:
+    def post(self, request: object) -> None:
         """Let a request wait, in the place of an earlier one of its kind."""
         with self._lock:
             self._waiting[type(request)] = request

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -10,6 +11,7 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import DrArray, FilePath, Tensor
 from envedit.losses.perceptual import convolution, weights
 
 # --------------------------------------------------------------------------------------------------------
@@ -135,7 +137,7 @@ class Backbone:
         ]
 
     @classmethod
-    def load(cls, kind: str, file) -> Backbone:
+    def load(cls, kind: str, file: FilePath) -> Backbone:
         """Read the weights from a ``safetensors`` or ``npz`` file that holds torchvision's state dict.
 
         Further tensors, such as those of the classifier, are ignored.
@@ -221,7 +223,14 @@ def _as_matrix(layer, tensors):
 class Stack:
     """A feature stack for images of one size; made by :meth:`Backbone.stack`."""
 
-    def __init__(self, layers, matrices, rows, columns, pooling):
+    def __init__(
+        self,
+        layers: Sequence[Conv | Pool],
+        matrices: Sequence[tuple[Tensor, DrArray]],
+        rows: Sequence[int],
+        columns: Sequence[int],
+        pooling: str,
+    ):
         self._steps, self._tapped, self.channels = [], [], []
         channels = 3
         for i, layer in enumerate(layers):
@@ -239,7 +248,7 @@ class Stack:
                 step = convolution.MaxPool(layer.kernel, layer.stride, before, (*after, channels))
             self._steps.append(step)
 
-    def forward(self, x) -> list:
+    def forward(self, x: DrArray) -> list:
         """Evaluate all layers.
 
         Parameters
@@ -257,11 +266,11 @@ class Stack:
             tape.append(step.forward(tape[-1][0]))
         return tape
 
-    def taps(self, tape) -> list:
+    def taps(self, tape: list) -> list:
         """Pick the tapped features: a list of (N * C numbers, N, C), N pixels of C channels."""
         return [(tape[i][0], pixels, channels) for i, pixels, channels in self._tapped]
 
-    def backward(self, tape, gradients):
+    def backward(self, tape: list, gradients: list) -> DrArray:
         """Pull gradients of the taps back to the image.
 
         Parameters

@@ -13,11 +13,15 @@ Weights are not part of the package: see `features.Backbone.load`, `DISTS_SOURCE
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.core.types import DrArray, FilePath, Tensor
 from envedit.losses.perceptual import weights
 from envedit.losses.perceptual.backbones import Backbone, title
 from envedit.losses.perceptual.convolution import Divisor
@@ -104,7 +108,7 @@ class Dists:
         If the file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
     """
 
-    def __init__(self, backbone: Backbone, weights_file):
+    def __init__(self, backbone: Backbone, weights_file: FilePath):
         if backbone.kind != "vgg":
             raise ConfigError(f"DISTS needs the features of VGG16, not those of {backbone.title}")
         self.backbone = backbone
@@ -123,7 +127,7 @@ class Dists:
             for a, b in zip(np.split(alpha / mass, ends), np.split(beta / mass, ends), strict=True)
         ]
 
-    def against(self, reference):
+    def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
         """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``.
 
         Raises
@@ -133,7 +137,7 @@ class Dists:
         """
         return _DistsTo(self, reference)
 
-    def __call__(self, x, reference):
+    def __call__(self, x: Tensor, reference: Tensor) -> DrArray:
         """Return the distance of two images ``(H, W, 3)`` as a size-1 array, differentiable in ``x``.
 
         Raises
@@ -279,7 +283,7 @@ class Lpips:
         If a file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
     """
 
-    def __init__(self, kind: str, backbone_file, heads_file):
+    def __init__(self, kind: str, backbone_file: FilePath | Backbone, heads_file: FilePath):
         words = title(kind)
         given = isinstance(backbone_file, Backbone)
         self.kind, self.backbone = kind, backbone_file if given else Backbone.load(kind, backbone_file)
@@ -291,7 +295,7 @@ class Lpips:
         read = weights.read(heads_file, wanted, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
         self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in wanted]
 
-    def against(self, reference):
+    def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
         """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``.
 
         Raises
@@ -301,7 +305,7 @@ class Lpips:
         """
         return _LpipsTo(self, reference)
 
-    def __call__(self, a, b) -> float:
+    def __call__(self, a: Any, b: Any) -> float:
         """Compare two images ``(H, W, 3)``, arrays or tensors, in single precision.
 
         Raises

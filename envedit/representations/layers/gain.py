@@ -8,6 +8,7 @@ from the picture.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -15,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.arrays import tensor
+from envedit.core.types import Shape
 
 MOST = 12.0
 """Largest log factor: e^12 is more than any sky needs, and leaves float32 room."""
@@ -41,7 +43,7 @@ def grid_size(cycles: float, share: float) -> tuple[int, int]:
     return max(2, round(columns / 2 * share) + 1), columns
 
 
-def tents(size, shape) -> tuple[np.ndarray, np.ndarray]:
+def tents(size: tuple[int, int], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of a grid's rows (height, rows) and columns (width, columns) at texel centres."""
     (rows, columns), (height, width) = size, shape
     y = (np.arange(height) + 0.5) / height * (rows - 1)
@@ -90,7 +92,7 @@ class GridGain:
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
         self._units = [0.5**level for level in range(LEVELS)]
 
-    def refine(self, octaves) -> None:
+    def refine(self, octaves: Sequence[Octave]) -> None:
         """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
         for octave in octaves:
             self.sizes.append(octave.size)
@@ -104,7 +106,7 @@ class GridGain:
         """Return what a unit of each parameter is: a number, or an array (rows, columns, 3)."""
         return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
 
-    def hats(self, level: int, shape) -> list[tuple[np.ndarray, np.ndarray]]:
+    def hats(self, level: int, shape: Shape) -> list[tuple[np.ndarray, np.ndarray]]:
         """List the four nodes around every texel of an image (rows, W): (index of the node, bilinear weight).
 
         Each is an array (rows * W,); the same map as :func:`tents` as matrices.
@@ -123,7 +125,7 @@ class GridGain:
                 taps.append((node.ravel(), weight.ravel()))
         return taps
 
-    def prepare(self, shape, rows=None) -> list:
+    def prepare(self, shape: Shape, rows: object = None) -> list:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
         found = []
         for size in self.sizes:
@@ -132,7 +134,7 @@ class GridGain:
             found.append([tensor(m) for m in (down, across)])
         return found
 
-    def evaluate(self, params: dict, prepared) -> mi.Color3f:
+    def evaluate(self, params: dict, prepared: Sequence) -> mi.Color3f:
         """Return the log gain at every texel.
 
         Products of matrices and not gathers, whose adjoint adds in the order in which threads come.

@@ -244,9 +244,9 @@ def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = Non
 
 def active_rows(rows: str | tuple[int, int], height: int) -> tuple[int, int]:
     """Return the first and last row that may change; "upper": above the horizon (paper, Sec. 5.1)."""
-    if rows == "upper":
-        return 0, (height + 1) // 2 - 1
-    return (0, height - 1) if rows == "all" else (rows[0], rows[1])
+    if isinstance(rows, str):
+        return 0, (height + 1) // 2 - 1 if rows == "upper" else height - 1
+    return rows[0], rows[1]
 
 
 def load_scene(settings: config.Scene, base: Path | None = None) -> scene.Scene:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -41,14 +42,14 @@ class _Clock:
     seconds: dict = field(default_factory=dict)
 
     @contextlib.contextmanager
-    def __call__(self, name):
+    def __call__(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         try:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
-    def table(self, history, total) -> dict:
+    def table(self, history: list[dict], total: float) -> dict:
         """Return the timing of the metrics, but for what the command line adds."""
         parts = ("target", "fit", "transport", "reach", "start", "edit", "judge")
         steps = [row["step_ms"] for row in history]
@@ -174,10 +175,10 @@ def run(
         measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit)
         predicted = traced.coarse_error(edited) if traced else None
     rate = "; lower optimizer.lr" if job.raised_rate else ""
-    judged = [measured[name] for name in ("render", "initial")]
-    measured["worse"] = wanted.coverage is None and metrics.worse(*judged)
+    pair = [measured[name] for name in ("render", "initial")]
+    measured["worse"] = wanted.coverage is None and metrics.worse(*pair)
     if measured["worse"]:
-        after, before = (metrics.score(one, judged, 2) for one in judged)
+        after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
             f"the result is farther from the target than the input: {after}, {before} before{rate}"
         )

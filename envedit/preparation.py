@@ -6,6 +6,8 @@ or a network is fitted, and it is found out where the edit starts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import numpy as np
 from envedit import config, renderers, representations
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
-from envedit.representations import Representation
+from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
 from envedit.scene import scene
@@ -97,8 +99,8 @@ class Preparation:
     rows: slice
     folder: Path | None
     watch: Watch
-    dists: object
-    clock: object
+    dists: distances.Dists | None
+    clock: Callable[[str], AbstractContextManager]
     renderer: renderers.Renderer | None = None
     _recordings: initialization.Recordings | None = None
 
@@ -238,7 +240,7 @@ class Preparation:
             notes += found
         return Edit(job, params, crop, degrees, frozen, notes)
 
-    def _recorded(self, representation: Representation, wanted):
+    def _recorded(self, representation, wanted):
         """Return what is looked through for where layers start; None for what is fitted."""
         if not representation.models_edit:
             return None

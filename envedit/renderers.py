@@ -17,18 +17,15 @@ from envedit.transport.light_transport import LightTransport
 
 
 class Renderer(Protocol):
-    """What the edit loop renders with.
+    """What the edit loop renders with."""
 
-    Attributes
-    ----------
-    choices : list of str
-        What was chosen automatically.
-    transport : LightTransport or None
-        The stored T that it renders through, where there is one.
-    """
+    @property
+    def choices(self) -> list[str]:
+        """What was chosen automatically."""
 
-    choices: list[str]
-    transport: LightTransport | None
+    @property
+    def transport(self) -> LightTransport | None:
+        """The stored T that it renders through, where there is one."""
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
         """Render (H, W, 3) linear radiance to (h, w, 3), differentiable in the map."""
@@ -94,7 +91,7 @@ def trace(
         max_depth=chosen.max_depth,
         seed=settings.seed,
         memory_gb=chosen.memory_gb,
-        refresh=0 if chosen.refresh == "auto" else chosen.refresh,
+        refresh=0 if isinstance(chosen.refresh, str) else chosen.refresh,
         few=settings.representation.kind == "layers",
         folder=array_cache.cache_folder("transport") if chosen.cache else None,
         progress=progress,

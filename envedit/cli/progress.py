@@ -25,8 +25,9 @@ class Progress:
 
     def __init__(self, quiet: bool = False, stream: TextIO | None = None):
         self.quiet, self.stream = quiet, stream or sys.stderr
-        self._bar = None
-        self._stage, self._first, self._last_line = "", None, 0.0
+        self._bar: tqdm | None = None
+        self._first: tuple[int, float] | None = None
+        self._stage, self._last_line = "", 0.0
         self._terminal = self.stream.isatty()
 
     def __enter__(self) -> Progress:

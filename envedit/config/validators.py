@@ -249,7 +249,7 @@ class Table:
     def __new__(cls, *values: Any, **named: Any) -> Table:
         """Note which fields are given."""
         table = super().__new__(cls)
-        by_position = (f.name for f, _ in zip(fields(cls), values, strict=False))
+        by_position = (f.name for f, _ in zip(fields(cls), values, strict=False))  # type: ignore[arg-type]
         object.__setattr__(table, "given", frozenset([*by_position, *named]))
         return table
 
@@ -261,7 +261,7 @@ class Table:
         return table
 
     def __post_init__(self) -> None:
-        for f in fields(self):
+        for f in fields(self):  # type: ignore[arg-type]  # every table is a dataclass
             object.__setattr__(self, f.name, checked(f, self._name(f.name), getattr(self, f.name)))
         self._check_together()
 

@@ -60,7 +60,7 @@ def unwrapped() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        cause = error
+        cause: BaseException | None = error
         while cause and not isinstance(cause, (EnveditError, KeyboardInterrupt)):
             cause = cause.__cause__
         if cause is None:

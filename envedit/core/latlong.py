@@ -16,6 +16,7 @@ and the second h^2 / 6.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -210,7 +211,7 @@ def resize(image: ArrayLike, height: int, width: int) -> np.ndarray:
     return result
 
 
-def _row_weights(old: int, new: int):
+def _row_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.ndarray]]:
     """Yield (source rows, weights) for each new row."""
     if new == old:
         yield from (([i], np.ones(1)) for i in range(new))
@@ -224,7 +225,7 @@ def _row_weights(old: int, new: int):
             yield [first, min(first + 1, old - 1)], np.array([1 - (p - first), p - first])
 
 
-def _column_weights(old: int, new: int):
+def _column_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.ndarray]]:
     """Yield (source columns, weights) for each new column."""
     if new == old:
         yield from (([i], np.ones(1)) for i in range(new))

@@ -18,7 +18,8 @@ def quiet_libraries() -> Iterator[list[str]]:
     OpenEXR and libjpeg write to file descriptor 2 and to ``sys.stdout``, OpenEXR's decoder of JPEG 2000 to
     file descriptor 1, and carry on.
     """
-    said, text = [], io.StringIO()
+    said: list[str] = []
+    text = io.StringIO()
     with contextlib.ExitStack() as stack:
         _flush_c()
         kept = {}

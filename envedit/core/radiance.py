@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class Health:
             (self.negative, "negative", self.first_negative),
             (self.saturated, "at the largest half (65504)", self.first_saturated),
         )
-        found = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if n]
+        found = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if p]
         stops = math.log2(self.dynamic_range) if self.dynamic_range > 0 else 0.0
         spread = f"{self.minimum:.4g} to {self.maximum:.4g}, median {self.median:.4g}, {stops:.1f} stops"
         return f"{self.texels} texels, {spread}; {', '.join(found) or 'nothing unusual'}"
@@ -73,11 +74,11 @@ def health(image: ArrayLike) -> Health:
     clean = bool(finite.all())  # then nothing has to be copied
     if not clean:
         masks["negative"] &= ~any_channel(~finite)
-    fields = {}
+    found: dict[str, Any] = {}
     for kind, mask in masks.items():
-        fields[kind] = int(mask.sum())
+        found[kind] = int(mask.sum())
         first = np.unravel_index(mask.argmax(), mask.shape)
-        fields[f"first_{kind}"] = (int(first[0]), int(first[1])) if fields[kind] else None
+        found[f"first_{kind}"] = (int(first[0]), int(first[1])) if found[kind] else None
     values = image if clean else image[finite]
     y = luminance(image if clean else image[~any_channel(~finite)])
     positive = y[y > 0]
@@ -87,7 +88,7 @@ def health(image: ArrayLike) -> Health:
         maximum=float(values.max()) if values.size else 0.0,
         median=float(np.median(y)) if y.size else 0.0,
         dynamic_range=float(positive.max() / positive.min()) if positive.size else 0.0,
-        **fields,
+        **found,
     )
 
 
@@ -175,7 +176,7 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
         image[row, column] = total[rim] / weight[rim, None]
         good[row, column] = True
         # Only neighbours of what was just filled can be next.
-        texel = [np.clip(row + i, 0, height - 1) * width + (column + j) % width for i, j in steps]
-        texel = np.unique(np.concatenate(texel))
+        beside = [np.clip(row + i, 0, height - 1) * width + (column + j) % width for i, j in steps]
+        texel = np.unique(np.concatenate(beside))
         row, column = np.divmod(texel[~good.ravel()[texel]], width)
     return image, count

@@ -96,7 +96,8 @@ def carry(
         )
     first, count = rows_working
     grid = Places(source.shape[:2], (first, count, height, width))
-    if representation.models_edit:
+    work: _LayersAt | Ratio
+    if isinstance(representation, Layers):
         work = _LayersAt(representation, params, grid)
         work.collect(source)
     else:

@@ -191,14 +191,14 @@ def load_envmap(
         except InputError as e:
             raise InputError(f"{name}: {e}") from None
         warnings.append(f"{where}: replaced from their neighbours")
-    if found.negative:
+    if found.first_negative:
         row, column = found.first_negative
         warnings.append(
             f"{found.negative} texels are negative (down to {found.minimum:.3g}), the first at row {row}, "
             f"column {column}: set to 0"
         )
     image = np.maximum(image, 0)  # also turns -0.0 into 0
-    if found.saturated:
+    if found.first_saturated:
         row, column = found.first_saturated
         warnings.append(
             f"{found.saturated} texels sit at 65504, the largest half, the first at row {row}, "
@@ -258,7 +258,7 @@ def write_exr(
     import OpenEXR
 
     name = os.fsdecode(path)
-    image = _checked(name, image)
+    pixels = _checked(name, image)
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -275,8 +275,8 @@ def write_exr(
         header[str(key)] = value if plain else str(value)
     if half:
         with np.errstate(over="ignore"):  # refused as an infinity
-            image = _checked(name, image.astype(np.float16)).astype(np.float16)
-    planes = {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}
+            pixels = _checked(name, pixels.astype(np.float16)).astype(np.float16)
+    planes = {c: np.ascontiguousarray(pixels[..., i]) for i, c in enumerate("RGB")}
     if alpha is not None:
         planes["A"] = np.ascontiguousarray(alpha, np.float32)
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)

@@ -15,7 +15,7 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`."""
     end = re.search(rb"\n\r?\n([^\n]*)\n", head)
     size = end and re.fullmatch(rb"([-+][XY]) +(\d{1,9}) +([-+][XY]) +(\d{1,9})\s*", end[1])
-    if not size:
+    if not end or not size:
         raise damaged(name, "no Radiance resolution line")
     if (size[1], size[3]) != (b"-Y", b"+X"):
         stored_as = " ".join(end[1].decode().split())

@@ -113,8 +113,8 @@ def compare(
     a: np.ndarray,
     b: np.ndarray,
     tonemap: str = "gamma",
-    lpips: distances.Lpips = None,
-    seen: np.ndarray = None,
+    lpips: distances.Lpips | None = None,
+    seen: np.ndarray | None = None,
     views: Views = (),
 ) -> dict:
     """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.

@@ -159,7 +159,7 @@ class Adam:
 
     def state_dict(self) -> Arrays:
         """Return everything that a later `load_state_dict` needs, as a flat dict of numpy arrays."""
-        state = {"step": np.int64(self.t)}
+        state: Arrays = {"step": np.array(self.t, np.int64)}
         for part, values in self._parts():
             state |= {f"{part}/{name}": np.array(value) for name, value in values.items()}
         return state
@@ -256,7 +256,7 @@ def cosine_warm_restarts(lr: float, step: int, period: int) -> float:
     return cosine(lr, step % period, period)
 
 
-def ramp(start: float, end: float, step: int, total: int) -> float:
+def ramp(start: float, end: float, step: float, total: int) -> float:
     """Walk geometrically from ``start`` at step 0 to ``end`` at step ``total - 1``, and stay there.
 
     ``start (end / start)^(step / (total - 1))``; a run of one step stays at ``start``.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+from typing import Any
 
 from envedit.losses.optimizer import ramp
 from envedit.report.manifest import columns
@@ -119,15 +120,15 @@ def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dic
     return made, f"{about} Weights change during the run: {which}. All are drawn with the last ones."
 
 
-def number(value: object) -> float | None:
+def number(value: Any) -> float | None:
     """Read a cell as a finite float, or None for whatever else it may hold."""
     if isinstance(value, (bool, str)) or value is None:
         return None
     try:
-        value = float(value)
+        found = float(value)
     except (TypeError, ValueError, OverflowError):
         return None
-    return value if math.isfinite(value) else None
+    return found if math.isfinite(found) else None
 
 
 def _ticks(low, high, count, least=0.0):

@@ -55,7 +55,7 @@ def plain(value: Any, where: str, lost: list[str]) -> Any:
     raise TypeError(f"{where}: {type(value).__name__} cannot be written as JSON")
 
 
-def _write_json(path, value) -> list[str]:
+def _write_json(path: FilePath, value: Any) -> list[str]:
     lost: list[str] = []
     text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
     write_atomically(path, text.encode("ascii") + b"\n")

@@ -7,7 +7,7 @@ import filecmp
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from envedit.core.types import FilePath, Views
@@ -15,7 +15,7 @@ from envedit.core.types import FilePath, Views
 try:
     import fcntl
 except ImportError:  # Windows
-    fcntl = None
+    fcntl = None  # type: ignore[assignment]
 
 from envedit.core.errors import InputError
 
@@ -109,7 +109,7 @@ def alone(folder: Path) -> Iterator[None]:
 
 def prepare_folder(
     folder: Path,
-    names: Iterable[str],
+    names: Sequence[str],
     inputs: Iterable[FilePath] = (),
     keep: bool = False,
     spare: Iterable[FilePath] = (),

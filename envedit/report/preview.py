@@ -149,14 +149,14 @@ def preview(
     """
     scale = 2  # of the labels: pixels a dot
     names = list(dict.fromkeys([*renders, *maps]))
-    renders = {name: checked(image, name) for name, image in renders.items() if image is not None}
-    maps = {name: checked(image, name) for name, image in maps.items() if image is not None}
-    if not renders and not maps:
+    shown = {name: checked(image, name) for name, image in renders.items() if image is not None}
+    drawn = {name: checked(image, name) for name, image in maps.items() if image is not None}
+    if not shown and not drawn:
         raise InputError("report: no picture to preview")
     # Columns of 214 to 768 pixels whatever the run's size; small pictures are enlarged by a whole factor.
-    widest = max((image.shape[1] for image in renders.values()), default=512)
+    widest = max((image.shape[1] for image in shown.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
-    pictures = {name: [image[rows] for rows in views or (slice(None),)] for name, image in renders.items()}
+    pictures = {name: [image[rows] for rows in views or (slice(None),)] for name, image in shown.items()}
     heights = {name: [_height(image, width) for image in images] for name, images in pictures.items()}
     top = 7 * scale + GAP if labels else 0
     render_height = max((sum(each) + GAP * (len(each) - 1) for each in heights.values()), default=0)
@@ -167,7 +167,7 @@ def preview(
         column = slice(GAP + i * (width + GAP), (i + 1) * (width + GAP))
         if labels:
             canvas[GAP : GAP + 7 * scale, column][_text(str(name), width, scale)] = INK
-        if name in renders:
+        if name in shown:
             first = GAP + top
             for image, height in zip(pictures[name], heights[name], strict=True):
                 canvas[first : first + height, column] = display(image, height, width, tonemap)
@@ -176,8 +176,8 @@ def preview(
             canvas[GAP + top : map_top - GAP, column] = PLACEHOLDER
         rows = slice(map_top, map_top + width // 2)
         canvas[rows, column] = PLACEHOLDER
-        if name in maps:
-            canvas[rows, column] = display(maps[name], width // 2, width, tonemap, exposure)
+        if name in drawn:
+            canvas[rows, column] = display(drawn[name], width // 2, width, tonemap, exposure)
     write_atomically(path, png(canvas))
 
 

@@ -33,10 +33,17 @@ class Representation(Protocol):
         Lights and background of the map, where :meth:`encode` separates them.
     """
 
-    lr: float
-    models_edit: bool
-    fitted: Fitted | None
-    separation: Separation | None
+    @property
+    def lr(self) -> float: ...  # noqa: D102
+
+    @property
+    def models_edit(self) -> bool: ...  # noqa: D102
+
+    @property
+    def fitted(self) -> Fitted | None: ...  # noqa: D102
+
+    @property
+    def separation(self) -> Separation | None: ...  # noqa: D102
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Return the parameters that reproduce an image (H, W, 3) as well as the representation can.

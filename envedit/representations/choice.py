@@ -8,7 +8,7 @@ from pathlib import Path
 from envedit import config
 from envedit.representations.base import Representation
 from envedit.representations.layers.gain import CYCLES
-from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.layers import Horizon, Layers
 from envedit.representations.pixels import LogPixels, Pixels
 from envedit.representations.siren import fit
 from envedit.representations.siren.siren import Siren
@@ -16,10 +16,10 @@ from envedit.representations.siren.siren import Siren
 
 def make(
     settings: config.Config,
-    folder: Path = None,
-    progress: Callable[[int, int, float], None] = None,
-    rows: tuple[int, int] = None,
-    horizon: str = "free",
+    folder: Path | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    rows: tuple[int, int] | None = None,
+    horizon: Horizon = "free",
 ) -> Representation:
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
 
@@ -28,7 +28,7 @@ def make(
     kind = settings.representation.kind
     if kind == "layers":
         cycles = settings.representation.cycles
-        return Layers(rows, CYCLES if cycles == "auto" else cycles, horizon)
+        return Layers(rows, CYCLES if isinstance(cycles, str) else cycles, horizon)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":

@@ -246,7 +246,7 @@ def fit_to_stage(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> Non
     props["to_world"] = mi.ScalarTransform4d(place @ transform)
 
 
-def _matrix(transform, where: str) -> np.ndarray:
+def _matrix(transform: Any, where: str) -> np.ndarray:
     """Return a transformation's matrix (4, 4)."""
     if not hasattr(transform, "matrix"):
         raise InputError(f"{where}: to_world is {str(transform)[:60]!r}, expected a <transform>")
@@ -283,7 +283,7 @@ def hash_node(digest: hashlib._Hash, node: mi.parser.SceneNode) -> None:
             _hash_value(digest, value)
 
 
-def _hash_value(digest, value) -> None:
+def _hash_value(digest: hashlib._Hash, value: Any) -> None:
     if isinstance(value, bool | int | float | str):
         digest.update(repr(value).encode())
     elif isinstance(value, mi.Properties.ResolvedReference):

@@ -28,6 +28,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -245,12 +246,13 @@ class Scene:
         ConfigError, InputError, NumericalError
             As :meth:`render`.
         """
-        if spp != "auto":
+        if not isinstance(spp, str):
             return self.render(image, spp, seed), spp, None
         seed = _whole("seed", seed, 0)
         self.set_envmap(image)
         count = min(self._pass_samples(), _QUIET_PASS)
-        total, shown, power = 0.0, 0.0, 0.0
+        total: Any = 0.0  # then arrays
+        shown, power = total, total
         for i in range(QUIET_MOST // count):
             picture = self._pass(count, seed, i, self.max_depth)
             display = tonemap(picture)
@@ -476,8 +478,8 @@ def find(file: FilePath) -> Path:
         return path.absolute()
     name = path.name.removesuffix(".xml")
     bare, names = path.name == str(file), shipped.scenes()
-    if bare and name in names:
-        return shipped.folder() / f"{name}.xml"
+    if bare and name in names and (folder := shipped.folder()):
+        return folder / f"{name}.xml"
     if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML file")
     close = difflib.get_close_matches(name, names, 1) if bare else []
@@ -520,7 +522,7 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], lis
     return filled, outline.folders
 
 
-def _whole(name: str, value, low: int) -> int:
+def _whole(name: str, value: Any, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
         raise ConfigError(f"{name}: got {value!r}, expected a whole number of at least {low}")
     return int(value)

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -63,16 +64,18 @@ def own_map(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -
     if len(nodes) != 1:
         return OwnMap(None, 1.0)
     props = nodes[0].props
-    scale = props.get("scale", 1.0)
+    scale: Any = props.get("scale", 1.0)
     number = isinstance(scale, int | float) and not isinstance(scale, bool)
-    if not number or not math.isfinite(scale) or not 0 < np.float32(scale) < np.inf:
+    if not number or not math.isfinite(scale) or not 0 < float(np.float32(scale)) < math.inf:
         raise InputError(
             f"{place_of(state, nodes[0], where)}: scale of the environment map is {scale}, expected a number "
             "above 0"
         )
     matrix = getattr(props.get("to_world", None), "matrix", None)
-    size = 1.0 if matrix is None else np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0])
-    notes = ()
+    size = 1.0
+    if matrix is not None:
+        size = float(np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0]))
+    notes: tuple[str, ...] = ()
     if np.isfinite(size) and abs(size - 1) > _ROUNDING:
         notes = (
             f"to_world of the environment map scales by {size:.4g}: taken as the rotation in it, while "
@@ -82,7 +85,7 @@ def own_map(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -
     if not isinstance(name, str) or not name:
         return OwnMap(None, float(scale), notes)
     found = [folder / name for folder in folders if os.path.isfile(folder / name)]
-    return OwnMap(Path(found[0] if found else folders[0] / name), float(scale), notes)
+    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), float(scale), notes)
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,8 @@ def optimise(
     lr = _rate(representation, settings)
     fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
-    waiting, last_read = [], time.perf_counter()
+    waiting: list = []
+    last_read = time.perf_counter()
     while state.step < settings.iterations:
         start = time.perf_counter()
         leaves, slopes = adam.leaves(), _Slopes()

@@ -29,7 +29,7 @@ class BlockJacobian:
         light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
         hats = []
         for level, (rows, columns) in enumerate(layers.gain.sizes):
-            nodes, one = rows * columns, 0.0
+            nodes, one = rows * columns, np.zeros(())
             for node, share in layers.hats(level):
                 one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
             hats.append(one.reshape(cells, nodes) / light[:, None])
@@ -54,10 +54,10 @@ class BlockJacobian:
         """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
         found = np.empty((len(changes), len(self.block_of), 3), np.float32)
         for c, matrix in enumerate(self._matrix):
-            cells = np.stack(
+            sums = np.stack(
                 [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
             )
-            cells = (cells / np.maximum(self._total, 1e-30))[:, self._used]
+            cells = (sums / np.maximum(self._total, 1e-30))[:, self._used]
             found[..., c] = (cells.astype(np.float32) @ matrix.T)[:, self.block_of]
         return found
 
@@ -67,7 +67,7 @@ class BlockJacobian:
         size = np.bincount(self.block_of, minlength=self.count)
         mean = (self.summed(flat.reshape(picture.shape)) / np.maximum(size, 1)[:, None])[self.block_of]
         profile = np.divide(flat, mean, out=np.ones_like(flat), where=mean > 0)
-        return np.float32(profile).reshape(picture.shape)
+        return profile.astype(np.float32).reshape(picture.shape)
 
     def sky_cells(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """List the cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError, place_of
 from envedit.core.types import Params
 from envedit.losses import display_curve, optimizer
+from envedit.losses.perceptual import distances
+from envedit.renderers import Renderer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.layers import unseen_kept
 from envedit.representations.layers.lights import SPARE
@@ -83,8 +86,8 @@ class Job:
         Active texels that may change; None: all.
     wanted : target.Target
         What the renderer is to make.
-    representation, renderer : object
-        As :func:`.adam_loop.optimise` takes them.
+    representation, renderer : Representation, Renderer
+        As :func:`.adam_loop.optimise` takes them; of layers, more than the protocol is used.
     folder : Path, optional
         Of the checkpoint.
     watch : Watch
@@ -105,11 +108,11 @@ class Job:
     first: int
     free: np.ndarray | None
     wanted: target.Target
-    representation: object
-    renderer: object
+    representation: Any
+    renderer: Renderer
     folder: Path | None
     watch: Watch
-    dists: object = None
+    dists: distances.Dists | None = None
     posterior: map_problem.Posterior | None = None
     note: str = ""
     begun: gauss_newton.Run | None = None
@@ -153,7 +156,8 @@ class Job:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         if len(starts) == 1:
             return starts[0]
-        reached, begun, trials = [], [], self.trials
+        begun: list[gauss_newton.Run | None] = []
+        reached, trials = [], self.trials
         for params, _ in starts:
             self.begun = None
             try:

@@ -199,7 +199,8 @@ def reachable(
     left = np.abs(residual) * question.painted[..., None]
     too_dark = float(left[residual > 0].sum() / max(left.sum(), 1e-30))
     share = float(np.clip(1 - distance / asked, 0, 1)) if asked > 0 else 1.0
-    return Reach(share, np.float32(picture), np.float32(residual), np.float32(envmap), bound, steps, too_dark)
+    shown, left_over, lit = (np.asarray(a, np.float32) for a in (picture, residual, envmap))
+    return Reach(share, shown, left_over, lit, bound, steps, too_dark)
 
 
 class _Question:

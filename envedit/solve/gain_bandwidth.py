@@ -73,7 +73,8 @@ def octaves(
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
-    found, cycles = [], coarsest
+    found: list[Octave] = []
+    cycles = coarsest
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
         down, across = tents(size, (height, width))

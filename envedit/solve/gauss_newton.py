@@ -74,12 +74,12 @@ class Run:
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
         """Make a run of what :meth:`arrays` returned."""
-        parts = [
+        state, start = (
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
-        ]
+        )
         damping, scale, finished, asked, most = arrays["numbers"].tolist()
-        return cls(*parts, damping, scale, bool(finished), list(history), int(asked), int(most))
+        return cls(state, start, damping, scale, bool(finished), list(history), int(asked), int(most))
 
 
 @dataclass

@@ -107,9 +107,9 @@ def start(
             notes.append("added a light: the target needs one where the map has none")
             pictures.append((i, scene.light(i, places[i])))
 
-    found = dict(params)
+    state = dict(params)
     if only_own:
-        return found | scene.placed(places), notes
+        return state | scene.placed(places), notes
 
     # Flux and gain, from the coarse grid to the finest.
     stack = np.zeros((3, len(overview.matrix[0]), 0))
@@ -124,13 +124,13 @@ def start(
         gain = np.clip(gain, LEAST, MOST)
         name = f"gain.{level}"
         logs = np.log(gain).reshape(*layers.gain.sizes[level], 3) / layers.scales[name]
-        found[name] = tensor(logs)
+        state[name] = tensor(logs)
         factor = factor * scene.in_cells(level, gain)
         strength = np.clip(strength, LEAST, MOST)
         total, stack = total * strength, stack * strength.T[:, None, :]
     for (i, _), s in zip(pictures, total, strict=True):
         places[i] = Place(places[i].direction, places[i].flux * s)
-    return found | scene.placed(places), notes
+    return state | scene.placed(places), notes
 
 
 class Question:
@@ -171,7 +171,7 @@ class Question:
         rest[explained] = 0
         self.known = picture
         self.wanted = picture - transport.apply(tensor(rest)).numpy() if wanted is None else wanted
-        self.active = np.zeros(envmap.shape[:2], bool)
+        self.active: np.ndarray = np.zeros(envmap.shape[:2], bool)
         self.active[rows] = True
         self.active = self.active.ravel()
         self.start, self.rows = first * width, rows
@@ -179,13 +179,13 @@ class Question:
         background = np.zeros(envmap.shape)
         background[explained] = layers.background() if layers.mirrored else layers.separation.background
         self.background = background.reshape(-1, 3)
-        self.gained = np.zeros(envmap.shape[:2], bool)
+        self.gained: np.ndarray = np.zeros(envmap.shape[:2], bool)
         self.gained[explained] = True
         self.gained = self.gained.ravel()
         self.directions = self._seen(latlong.directions(*envmap.shape[:2]))
         self.cells = self._seen(transport.overview().directions)
         self.shape = envmap.shape
-        self._gains = None
+        self._gains: list[np.ndarray] | None = None
 
     def _seen(self, directions):
         """Directions by which gain and glow go: what mirrors the sky goes by what it mirrors."""
@@ -218,10 +218,10 @@ class Question:
         weight = None if self.weight is None else self.weight.reshape(-1, 1)
         wanted, known = self.wanted.reshape(-1, 3), self.known.reshape(-1, 3)
         last = self.rows.stop - 1
-        direction, factor = refine(
+        direction, factors = refine(
             self.transport, wanted, known, weight, np.stack(mixed), direction, flux, self.rows.start, last
         )
-        factor = float(np.median(factor))
+        factor = float(np.median(factors))
         kept = 1 / KEPT_FLUX < factor < KEPT_FLUX
         return direction, 1.0 if kept else float(np.clip(factor, LEAST, MOST))
 
@@ -254,7 +254,8 @@ class Question:
         base = self.background[self.gained]
         base = (1 - VEIL) * base + VEIL * (base @ LUMINANCE)[:, None]
         rows, columns = self.layers.gain.sizes[level]
-        cell, omega, cells, nodes = *self._cells(), len(overview.omega), rows * columns
+        cell, omega = self._cells()
+        cells, nodes = len(overview.omega), rows * columns
         hats = np.zeros((3, cells * nodes))
         for node, share in self._hats(level):
             for c in range(3):

@@ -445,7 +445,7 @@ class Problem:
             return None
         n, found = self.nodes, {name: value.copy() for name, value in state.items()}
         found["gain"] += np.clip(step[: 3 * n], -LARGEST["gain"], LARGEST["gain"]).reshape(3, n).T
-        turns = {}
+        turns: dict[int, np.ndarray] = {}
         for value, (name, i, axis) in zip(step[3 * n :], normal.unknowns, strict=True):
             if name == "turn":
                 turns[i] = turns.get(i, 0.0) + value * axis
@@ -501,7 +501,7 @@ class Problem:
         sky[self.rows] = np.maximum(point.edited[self.rows] - self._core(point.state, point.state["flux"]), 0)
         return self.blocks.profile(self.transport.linear(tensor(sky)).numpy())
 
-    def _lights(self, point, profile) -> _Lights:
+    def _lights(self, point: Point, profile: np.ndarray) -> _Lights:
         """Pictures by which a light's unknowns change the rendering, (k, h, w, 3), and what they are.
 
         A light's core is seen through T, its glow through the block transport.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -116,7 +117,8 @@ def place(
         For the map's lights, then for the spare ones; flux 0: not there.
     """
     overview, search = given.overview, Pursuit(given, picture)
-    directions, atoms = [], []
+    directions: list[np.ndarray | None] = []
+    atoms: list[np.ndarray] = []
     for light in lights:
         flux = given.flux(light)
         atom = search.atoms(flux.sum(axis=0), light.glow)
@@ -218,7 +220,7 @@ class Pursuit:
         share = overview.to_cells(given.active[:, None].astype(float), omega)[:, 0]
         self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
         self.directions = d = given.directions
-        self.cosine = np.float32(d @ d[self.candidates].T)
+        self.cosine = (d @ d[self.candidates].T).astype(np.float32)
         self.wanted = [w * self.weight for w in wanted]
         self.residual = list(self.wanted)
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
@@ -265,7 +267,7 @@ class Pursuit:
 
     def scores(self, atoms: np.ndarray) -> np.ndarray:
         """Squared residual that each atom, (3, blocks, n), explains, summed over channels: (n,)."""
-        score = 0.0
+        score: Any = 0.0
         for c in range(3):
             atom = self._off(c, atoms[c])
             power = (atom * atom).sum(axis=0)
@@ -285,7 +287,8 @@ class Pursuit:
         for c in range(3):
             new = self._off(c, atom[c])
             size = np.linalg.norm(new)
-            if size > 1e-6 * max(np.linalg.norm(atom[c]), 1e-30):
+            whole: Any = max(np.linalg.norm(atom[c]), 1e-30)
+            if size > 1e-6 * whole:
                 self.spans[c] = np.concatenate([self.spans[c], (new / size)[:, None]], axis=1)
                 self.residual[c] = self._off(c, self.residual[c])
 
@@ -320,7 +323,7 @@ def products(d: np.ndarray, order: int) -> np.ndarray:
 
 def not_negative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Solve min |a x - b| with x >= 0 (Lawson and Hanson 1974, by leaving out what turns negative)."""
-    a, b = np.float64(a), np.float64(b)
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     keep = np.ones(a.shape[1], bool)
     for _ in range(a.shape[1]):
         x = np.zeros(a.shape[1])

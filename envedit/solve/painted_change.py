@@ -67,7 +67,7 @@ def start(
     places = place(scene.given(), scene.wanted, lights, SPARE, layers.lights.flux[-1], bold)
     notes, moved = [], {i for i, found in enumerate(places) if found.direction is not None}
     there = [scene.light(i, Place(None, np.ones(3))) for i in range(len(lights))]
-    new = {}
+    new: dict = {}
     for i in sorted(moved):
         direction, glow = places[i].direction, lights[i].glow if i < len(lights) else None
         if transport.capacity >= PROBES:
@@ -131,7 +131,8 @@ def place(
         stays.append(atom[..., 0])
         search.explain(stays[-1])
     own = [given.flux(light).sum(axis=0) for light in lights]
-    new_places, added, atom = [], [], search.atoms(spare_flux, None)
+    new_places: list[np.ndarray] = []
+    added, atom = [], search.atoms(spare_flux, None)
     for _ in range(spare + len(lights)):
         score = search.scores(atom)
         for there in [*(light.direction for light in lights), *new_places]:

@@ -68,12 +68,13 @@ def find(
             known[texels] = residual(transport, turned, picture, weight)
         return known[texels]
 
-    misfit, best = _at_a_glance(transport, envmap, picture, count), []
+    misfit = _at_a_glance(transport, envmap, picture, count)
+    best: list[int] = []
     for shift in np.argsort(misfit, kind="stable"):
         apart = [min(abs(shift - other), width - abs(shift - other)) for other in best]
         if len(best) < CANDIDATES and (not apart or min(apart) >= APART):
             best.append(int(shift))
-    texels = min(best, key=error)
+    texels: float = min(best, key=error)
     for step in (4.0, 2.0, 1.0, 0.5, 0.3, TENTH):
         texels = min((texels, texels - step, texels + step), key=error)
     texels = round(texels / TENTH) * TENTH % width

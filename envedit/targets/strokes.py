@@ -416,9 +416,9 @@ def membrane(values: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     padded = np.pad(np.where(unknown[..., None], 0, values), ((1, 1), (1, 1), (0, 0)))  # unknown, outside: 0
     steps = ((0, 1), (2, 1), (1, 0), (1, 2))
     around = [index[row + dr, column + dc] for dr, dc in steps]
-    right = sum(padded[row + dr, column + dc] for dr, dc in steps)
+    right = np.asarray(sum(padded[row + dr, column + dc] for dr, dc in steps))
     inside = np.pad(np.ones((height, width)), 1)
-    degree = sum(inside[row + dr, column + dc] for dr, dc in steps)[:, None]
+    degree = np.asarray(sum(inside[row + dr, column + dc] for dr, dc in steps))[:, None]
 
     def laplacian(x):
         extended = np.concatenate([x, np.zeros((1, x.shape[1]))])  # index -1 is no unknown

@@ -76,7 +76,7 @@ class Target:
 
     def aimed_at(self, picture: np.ndarray) -> Target:
         """Return the target with another :attr:`aim`."""
-        return replace(self, **{"picture" if self.compared is None else "compared": picture})
+        return replace(self, picture=picture) if self.compared is None else replace(self, compared=picture)
 
 
 def make(
@@ -112,7 +112,8 @@ def make(
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap), hidden)
     shape = scene.height, scene.width
-    initial, asked = painted_image.initial(scene, envmap, settings), ()
+    initial = painted_image.initial(scene, envmap, settings)
+    asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
         found = painted_image.given(picture, shape, initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))

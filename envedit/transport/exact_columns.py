@@ -10,6 +10,7 @@ kernels, not a part of them: more columns compile nothing.
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -64,7 +65,8 @@ class ExactColumns:
         self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
         self._count = dr.opaque(mi.UInt32, 0)
         self._lost = dr.opaque(mi.UInt32, 0)
-        self.paths_bytes, self._kept = paths_bytes, {}
+        self.paths_bytes = paths_bytes
+        self._kept: dict[str, Any] = {}
         dr.make_opaque(self._store, self._texel_of, self.mask)
 
     @property

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -112,7 +113,7 @@ class LightTransport:
         self.paths, self.tolerance = COLUMN_PATHS, COLUMN_TOLERANCE
         self._looks = np.zeros(grid.texels, np.uint8)
         self._overview: overviews.Overview | None = None
-        self._stored = DiskCache(None), {}
+        self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
         self._exact = ExactColumns(scene, grid, bounces, capacity, paths_bytes)
 
     # ------------------------------------------------------------------ building
@@ -171,7 +172,7 @@ class LightTransport:
         latlong.check_envmap_size(height, width)
         memory_gb = allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
-            if value != "auto" and not value >= 1:
+            if not isinstance(value, str) and not value >= 1:
                 raise ConfigError(
                     f"renderer.{name}: got {value}, expected a whole number of at least 1, or auto"
                 )
@@ -548,7 +549,8 @@ class LightTransport:
         """
         require_radiance(envmap, "light transport")
         rest = self._exact.slot_of < 0
-        return bright_texels.error(*self._radiance(np.asarray(envmap)), self._samples, rest)
+        radiance, omega = self._radiance(np.asarray(envmap))
+        return bright_texels.error(radiance, omega, self._samples, rest)
 
     @property
     def _samples(self):
@@ -565,7 +567,8 @@ class LightTransport:
     def bright_texels(self, envmap: np.ndarray, tolerance: float | None = None) -> np.ndarray:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
         tolerance = self.tolerance if tolerance is None else tolerance
-        return bright_texels.brightest(*self._radiance(envmap), self._samples, tolerance)
+        radiance, omega = self._radiance(envmap)
+        return bright_texels.brightest(radiance, omega, self._samples, tolerance)
 
 
 def _under(arrays, part):

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -170,7 +170,7 @@ class Server:
             lifespan=lifespan,
         )
 
-    def _known(self, request) -> bool:
+    def _known(self, request: HTTPConnection) -> bool:
         """Whether a request has the token, and comes to this machine's own name."""
         host = request.headers.get("host", "")
         own = [origin.removeprefix("http://") for origin in self.origins]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +82,13 @@ class Session:
         self.project, self.tell, self.newer = project, tell, newer
         self.document, self.resting, self.phase = Document(), False, "done"
         self._shown = None  # the rendering by T that the pages show
-        self.status = {"reachable": None, "iterations": 0, "steps": 0, "number": 0, "client": ""}
+        self.status: dict[str, Any] = {
+            "reachable": None,
+            "iterations": 0,
+            "steps": 0,
+            "number": 0,
+            "client": "",
+        }
         settings = project.settings
         self._stage("loading the scene")
         self.lit = inputs.load_scene(settings.scene, project.base)

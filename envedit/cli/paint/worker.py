@@ -76,7 +76,7 @@ class Worker(threading.Thread):
                 self._attempt(lambda request=request: self._carry_out(request))
                 busy = self.session is not None
             else:
-                busy = bool(self._attempt(self.session.advance))
+                busy = self.session is not None and bool(self._attempt(self.session.advance))
 
     def _carry_out(self, request):
         if isinstance(request, Open):

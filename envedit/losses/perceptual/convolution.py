@@ -16,6 +16,8 @@ flat arrays without derivatives attached.
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import drjit as dr
 import mitsuba as mi
 
@@ -121,6 +123,18 @@ class _Windows:
         """Index of a packet of the matrix of patches."""
         place = (row * self._w_after + column) * self._kk.value + tap_y * self._k.value + tap_x
         return place * self._c.value + c
+
+
+class Step(Protocol):
+    """A layer: what it makes of its input, and what its backward pass needs beside that."""
+
+    def forward(self, x: DrArray) -> tuple[DrArray, Any]:
+        """Return the output, and what to keep."""
+        ...
+
+    def backward(self, x: DrArray, y: DrArray, kept: Any, gradient: DrArray, /) -> DrArray:
+        """Pull a gradient of the output back to the input."""
+        ...
 
 
 class Convolution:

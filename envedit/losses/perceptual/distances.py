@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError, place_of
-from envedit.core.types import DrArray, FilePath, Tensor
+from envedit.core.types import DrArray, FilePath, Shape, Tensor
 from envedit.losses.perceptual import weights
 from envedit.losses.perceptual.backbones import Backbone, title
 from envedit.losses.perceptual.convolution import Divisor
@@ -42,14 +42,14 @@ NORM_EPS = 1e-10
 class _Measure:
     """A distance to a fixed image: value, and gradient by hand."""
 
-    def __init__(self, backbone: Backbone, reference, pooling: str, name: str):
+    def __init__(self, backbone: Backbone, reference: Tensor, pooling: str, name: str):
         _check(reference, f"{name}: reference")
         if dr.grad_enabled(reference):
             raise InputError(
                 f"{name}: gradients of the reference are not available: swap the two, or detach it."
             )
         self.name, self.shape = name, tuple(reference.shape)
-        self._stack = backbone.stack(*self.shape[:2], pooling)
+        self._stack = backbone.stack(self.shape[0], self.shape[1], pooling)
 
     def __call__(self, x):
         """Return the distance of the image ``(H, W, 3)`` as a size-1 array, differentiable in ``x``.
@@ -285,13 +285,14 @@ class Lpips:
 
     def __init__(self, kind: str, backbone_file: FilePath | Backbone, heads_file: FilePath):
         words = title(kind)
-        given = isinstance(backbone_file, Backbone)
-        self.kind, self.backbone = kind, backbone_file if given else Backbone.load(kind, backbone_file)
+        self.kind, self.backbone = kind, _backbone(kind, backbone_file)
         if self.backbone.kind != kind:
             raise ConfigError(
                 f"LPIPS '{kind}' needs the features of {words}, not those of {self.backbone.title}"
             )
-        wanted = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)}
+        wanted: dict[str, Shape] = {
+            f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)
+        }
         read = weights.read(heads_file, wanted, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
         self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in wanted]
 
@@ -319,6 +320,10 @@ class Lpips:
         if not np.isfinite(found):
             raise InputError("LPIPS: the images hold values too large to compare; give display values.")
         return found
+
+
+def _backbone(kind: str, given: FilePath | Backbone) -> Backbone:
+    return given if isinstance(given, Backbone) else Backbone.load(kind, given)
 
 
 class _LpipsTo(_Measure):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -90,7 +91,7 @@ class GridGain:
 
     def __init__(self, cycles: int, share: float):
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
-        self._units = [0.5**level for level in range(LEVELS)]
+        self._units: list[Any] = [0.5**level for level in range(LEVELS)]
 
     def refine(self, octaves: Sequence[Octave]) -> None:
         """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
@@ -125,7 +126,7 @@ class GridGain:
                 taps.append((node.ravel(), weight.ravel()))
         return taps
 
-    def prepare(self, shape: Shape, rows: object = None) -> list:
+    def prepare(self, shape: tuple[int, int], rows: object = None) -> list:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
         found = []
         for size in self.sizes:
@@ -139,7 +140,7 @@ class GridGain:
 
         Products of matrices and not gathers, whose adjoint adds in the order in which threads come.
         """
-        g = 0
+        g: Any = 0
         for level, (down, across) in enumerate(prepared):
             rows, columns = self.sizes[level]
             nodes = dr.reshape(params[f"gain.{level}"], (rows, 3 * columns))

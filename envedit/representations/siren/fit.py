@@ -227,7 +227,7 @@ class Perturbation:
     def __init__(self, params: siren.Params, gamma: float):
         self.gamma, self.names = gamma, siren.weight_names(params)
         self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
-        self._direction = None
+        self._direction: siren.Params | None = None
 
     def update(self, grads: siren.Params, lr: float) -> None:
         """Set the direction of ascent from a gradient of the loss that is to be made worse."""

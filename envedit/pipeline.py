@@ -16,6 +16,7 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
+from envedit.core.seeds import Seeds
 from envedit.export import adjustments, light_list
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
@@ -29,8 +30,6 @@ from envedit.targets import target
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
-JUDGE_SEED = 9_000_011
-"""Seed of the renderings that are judged; the optimiser never sees their samples."""
 INITIAL_SPP = 256
 """Samples a pixel of the initial rendering, which is far from the target."""
 
@@ -126,7 +125,9 @@ def run(
         few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
         initial = wanted.initial
         if initial is None and wanted.coverage is not None:
-            initial, _, _ = rendered(lit, original, few, settings.seed + JUDGE_SEED, settings.renderer.cache)
+            initial, _, _ = rendered(
+                lit, original, few, Seeds.of(settings.seed).painted_initial, settings.renderer.cache
+            )
     rows = slice(first, last + 1)
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
     start.trace()
@@ -156,7 +157,7 @@ def run(
 
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        spp, seed = settings.output.spp, settings.seed + JUDGE_SEED + 1
+        spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, _ = lit.sampled(edited, spp, seed)
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
@@ -234,9 +235,9 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        seed, spp = settings.seed + JUDGE_SEED, settings.output.spp
-        initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache)
-        final, judged, _ = lit.sampled(edited, spp, seed + 1)
+        seeds, spp = Seeds.of(settings.seed), settings.output.spp
+        initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, settings.renderer.cache)
+        final, judged, _ = lit.sampled(edited, spp, seeds.judged)
         renders = {"initial": initial, "target": initial, "edited": final}
         maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)

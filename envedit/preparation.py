@@ -16,6 +16,7 @@ import numpy as np
 from envedit import config, renderers, representations
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
+from envedit.core.seeds import Seeds
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
@@ -35,8 +36,8 @@ and more); and up to which the turned map is rendered to ask, as T's errors depe
 NOISIEST, QUIET = 0.03, 0.008
 """Display residual of T beyond which noise would hide what is asked for (four scenes have at most 0.016), and
 what is taken for T's error then."""
-CHECKED_SPP, CHECKED_SEED = 256, 800_011
-"""Samples a pixel of these renderings, and what is added to the run's seed."""
+CHECKED_SPP = 256
+"""Samples a pixel of these renderings."""
 PREFERRED = 0.05
 """By this share the residual of the sky as it is must be smaller: where it turns, nothing is made up."""
 
@@ -169,7 +170,7 @@ class Preparation:
         if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
             return 0.0
         with self.clock("start_s"):
-            cache, seed = self.settings.renderer.cache, (self.settings.seed + CHECKED_SEED) % 2**32
+            cache, seed = self.settings.renderer.cache, Seeds.of(self.settings.seed).turn_check
             shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
             near = turning.apart(shown, wanted.picture, wanted.weight) < 2 * TO_NOISE * NOISIEST
             if not near and (turn is None or turn.error > DOUBTFUL * NOISIEST):
@@ -190,7 +191,7 @@ class Preparation:
             return turn.error <= TO_NOISE * noise
         with self.clock("start_s"):
             turned = latlong.rotate(self.original, turn.degrees)
-            shown = self.lit.render(turned, CHECKED_SPP, (self.settings.seed + CHECKED_SEED) % 2**32)
+            shown = self.lit.render(turned, CHECKED_SPP, Seeds.of(self.settings.seed).turn_check)
             return turn.error <= TO_NOISE * turning.residual(self.renderer.transport, turned, shown)
 
     def _prepared(self, wanted, degrees, notes, search=True):

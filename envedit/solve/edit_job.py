@@ -16,6 +16,7 @@ import numpy as np
 from envedit import config
 from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError, place_of
+from envedit.core.seeds import Seeds
 from envedit.core.types import Params
 from envedit.losses import display_curve, optimizer
 from envedit.losses.perceptual import distances
@@ -27,8 +28,8 @@ from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
 from envedit.targets import target
 
-CHECKED_SPP, CHECKED_SEED = 64, 700_001
-"""Samples a pixel of renderings by which start and solution are compared, and what is added to the seed."""
+CHECKED_SPP = 64
+"""Samples a pixel of renderings by which start and solution are compared."""
 TRIAL_STEPS, NEWTON_TRIAL = 30, 6
 """Steps of Adam and of Gauss-Newton after which the better of two starts is chosen."""
 TRIAL_GAIN, LIKELIER = 0.05, 20.0
@@ -292,7 +293,7 @@ class Job:
 
     def _display_error(self, envmap):
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
-        seed = (self.settings.seed + CHECKED_SEED) % 2**32
+        seed = Seeds.of(self.settings.seed).step_check
         shown = display_curve.to_display(tensor(self.lit.render(envmap, CHECKED_SPP, seed)))
         off = shown.numpy() - display_curve.to_display(tensor(self.wanted.aim)).numpy()
         return float((np.square(off) * (1 if self.wanted.weight is None else self.wanted.weight)).mean())

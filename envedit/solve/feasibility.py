@@ -31,6 +31,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.errors import InputError, place_of
+from envedit.core.seeds import SIGNS
 from envedit.solve import light_search, matching_pursuit
 from envedit.transport.light_transport import LightTransport
 
@@ -270,7 +271,7 @@ def _cells(transport, shape):
     size = _size(width)
     across = -(-width // size)
     cell = (np.arange(height) // size)[:, None] * across + np.arange(width) // size
-    flat, rng = cell.ravel(), np.random.default_rng(0)
+    flat, rng = cell.ravel(), np.random.default_rng(SIGNS)
     square = np.zeros((height, width))
     for _ in range(PROBES):
         signs = rng.choice(np.float32([-1, 1]), size=(*transport.shape, 3))

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.seeds import SIGNS
 from envedit.losses import display_curve
 from envedit.representations.layers.gain import Octave, grid_size, tents
 from envedit.transport.light_transport import LightTransport
@@ -96,7 +97,7 @@ def octaves(
 
 def _pulled_back(transport, second, slope, background, first):
     """Yield :data:`PROBES` pairs of J' z, (n, W, 3) each, through T and through a second recording of it."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(SIGNS)
     for _ in range(PROBES):
         z = mi.TensorXf((rng.choice([-1.0, 1.0], slope.shape) * slope).astype(np.float32))
         rows = slice(first, first + len(background))

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, renderers
+from envedit.core.seeds import Seeds
 from envedit.core.types import Progress
 from envedit.representations.layers.gain import CYCLES, Octave
 from envedit.representations.layers.layers import Layers
@@ -22,9 +23,8 @@ from envedit.targets.target import Target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 
-AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
-"""Added to the run's seed for the second recording of T, which measures its noise; its most samples a pixel
-and exact columns."""
+AGAIN_SPP, AGAIN_COLUMNS = 32, 64
+"""Most samples a pixel and exact columns of the second recording of T, which measures its noise."""
 MIRRORED = 0.8
 """Share of the sky whose detail must be identifiable, as in a mirror. In glossy scenes less is: there finer
 grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that no sky has."""
@@ -119,7 +119,7 @@ def recordings(
         return Recordings(transport)
     pixels, few = lit.width * lit.height, min(AGAIN_SPP, transport.spp)
     second = trace(
-        (settings.seed + AGAIN_SEED) % 2**32,
+        Seeds.of(settings.seed).second_recording,
         spp=few,
         max_depth=transport.bounces + 1,
         memory_gb=recording.gigabytes(pixels, few, min(AGAIN_COLUMNS, transport.capacity) + 1),

@@ -16,14 +16,13 @@ import numpy as np
 from envedit import config
 from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.core.seeds import Seeds
 from envedit.core.types import FilePath, Shape
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets.paint_detection import differs
 
-SEED = 8_000_009
-"""Apart from the seeds of all other renderings; a run renders the exported picture again."""
 ENDINGS = (".exr", ".png")
 """What the initial rendering can be exported as; a JPEG would not keep it."""
 
@@ -60,7 +59,9 @@ class Painted:
 
 def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
     """Render the picture to paint on, (h, w, 3): the scene under the map as it is, at [target] spp."""
-    picture, _, _ = rendered(lit, envmap, settings.target.spp, settings.seed + SEED, settings.renderer.cache)
+    picture, _, _ = rendered(
+        lit, envmap, settings.target.spp, Seeds.of(settings.seed).exported, settings.renderer.cache
+    )
     return picture
 
 

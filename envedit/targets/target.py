@@ -19,13 +19,11 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import painted_image, strokes
-
-SEED = 7_000_003
-"""Apart from the seeds of all other renderings, so that no noise is shared between question and answer."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +238,9 @@ def _rendered(settings, scene, envmap):
         true, warnings = latlong.rotate(envmap, chosen.rotate_degrees), ()
         source = f"rendered under the map turned by {chosen.rotate_degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
-    picture, spp, noise = rendered(scene, true, chosen.spp, settings.seed + SEED, settings.renderer.cache)
+    picture, spp, noise = rendered(
+        scene, true, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
+    )
     weight = np.ones((*picture.shape[:2], 1), np.float32) if chosen.masks else None
     for view, mask in zip(chosen.views, chosen.masks, strict=True):
         rows = scene.rows[scene.view(view, "target.view")]

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import seeds
 from envedit.scene.scene import Scene
 from envedit.transport import path_vertices
 from envedit.transport.sparse_matrix import SLICE, merge
@@ -131,8 +132,8 @@ class ExactColumns:
             return
         self._kept = {key: kept for key, kept in self._kept.items() if key[1] == seed}
         made, room = [], self.paths_bytes - self.kept_bytes
-        traced = path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, seed + 7919)
-        for block in traced:
+        own = seeds.columns(seed)
+        for block in path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, own):
             made.append(block)
             room -= block.bytes
             yield block

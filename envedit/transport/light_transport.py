@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import latlong
+from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_radiance
@@ -281,7 +281,7 @@ class LightTransport:
     @property
     def seed(self) -> int:
         """Seed of the present recording."""
-        return self._base_seed + 1_000_003 * self.epoch
+        return seeds.recording(self._base_seed, self.epoch)
 
     @property
     def choices(self) -> list[str]:

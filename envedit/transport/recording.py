@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import seeds
 from envedit.core.errors import InputError
 from envedit.core.types import Progress
 from envedit.scene import camera_paths
@@ -198,7 +199,9 @@ def pilot(scene: Scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     stride = max(1, int(np.sqrt(len(pixels) / 4096)))
     some = pixels.reshape(scene.height, scene.width)[::stride, ::stride].ravel()
     by_row, by_bounce = np.zeros(grid.height), np.zeros(MAX_BOUNCES + 1)
-    for bounce, _, texel, value in contributions(scene.mi, grid, some, PILOT_SPP, MAX_BOUNCES, seed + 104729):
+    for bounce, _, texel, value in contributions(
+        scene.mi, grid, some, PILOT_SPP, MAX_BOUNCES, seeds.pilot(seed)
+    ):
         # Summed on the host: atomics would give other bits, and so other samples, on every run.
         amount = np.nan_to_num(dr.mean(value).numpy().astype(np.float64), nan=0, posinf=0, neginf=0)
         by_row += np.bincount(texel.numpy() // grid.width, amount, minlength=grid.height)

@@ -11,6 +11,7 @@ import pytest
 from envedit import config
 from envedit.core.color import TONEMAPS, tonemap
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.targets import painted_image
 from tests.oracles.builders import exr
@@ -649,4 +650,4 @@ def test_the_run_renders_the_exported_picture_again(monkeypatch):
 
     monkeypatch.setattr(painted_image, "rendered", rendered)
     assert painted_image.initial(None, "map", settings(spp=32)) == "map"
-    assert seen == [(32, 3 + painted_image.SEED)]
+    assert seen == [(32, Seeds.of(3).exported)]

@@ -24,6 +24,7 @@ from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, NumericalError
+from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
 from envedit.losses import display_curve
@@ -45,8 +46,6 @@ SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
-RENDER_SEED = 9_000_021
-"""Added to the run's seed."""
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
@@ -309,7 +308,7 @@ class Session:
             return False
         if self._sharp is None:
             self._sharp = self._sharper()
-        seed = (self.project.settings.seed + RENDER_SEED + done) % 2**32
+        seed = Seeds.of(self.project.settings.seed).pass_of_page(done)
         total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
         done += 1
         self._rendered = done, total

@@ -16,6 +16,7 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
+from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.export import adjustments, light_list
 from envedit.losses import metrics, naturalness
@@ -115,7 +116,7 @@ def run(
         original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
         height, width, _ = original.shape
-        first, last = inputs.active_rows(settings.input.rows, height)
+        rows = inputs.active_rows(settings.input.rows, height)
         if settings.target.kind == "none" and picture is None:
             return _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
         renderers.check(settings, lit, (height, width))
@@ -128,7 +129,6 @@ def run(
             initial, _, _ = rendered(
                 lit, original, few, Seeds.of(settings.seed).painted_initial, settings.renderer.cache
             )
-    rows = slice(first, last + 1)
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
     start.trace()
     traced, within, notes = start.renderer.transport, None, []
@@ -165,7 +165,7 @@ def run(
     notes += [job.note] if job.note else []
     notes += [said_of] if (said_of := light_list.told(lights, height)) else []
     if representation.models_edit:
-        kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
+        kept = 100 * float((found_map == job.original)[rows.slice].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
     notes = [*said, wanted.source, *renderer.choices, *notes, *adjusted]
     notes.append(f"result rendered with {judged} samples a pixel")
@@ -197,7 +197,7 @@ def run(
         "turn_degrees": edit.degrees,
     }
     if traced:
-        share = float(frozen[rows].mean())
+        share = float(frozen[rows.slice].mean())
         measured["transport"] = {**traced.summary(), "predicted_error": predicted, "frozen": share}
         if share:
             least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
@@ -222,7 +222,7 @@ def run(
         separation=representation.separation,
         scene=lit.path,
         reach=within,
-        found=Found(representation, params, first, job.free, edit.degrees, found_map),
+        found=Found(representation, params, rows.first, job.free, edit.degrees, found_map),
         posterior=job.posterior,
     )
 
@@ -239,7 +239,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, settings.renderer.cache)
         final, judged, _ = lit.sampled(edited, spp, seeds.judged)
         renders = {"initial": initial, "target": initial, "edited": final}
-        maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
+        maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
         lights, core = _lights(original, edited, lit.to_world)
@@ -324,7 +324,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
         "initial": metrics.compare(before, wanted, tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
-        "active_rows": [rows.start, rows.stop - 1],
+        "active_rows": [rows.first, rows.last],
         "natural": naturalness.natural(maps["edited"], maps["initial"], maps["target"]),
         "painted": None,
     }
@@ -334,7 +334,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
         measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
-        original, true, edited = (maps[name][rows] for name in ("initial", "target", "edited"))
+        original, true, edited = (maps[name][rows.slice] for name in ("initial", "target", "edited"))
         measured["envmap"] = metrics.compare(edited, true, tonemap, lpips)
         measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
         measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)

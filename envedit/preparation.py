@@ -16,6 +16,7 @@ import numpy as np
 from envedit import config, renderers, representations
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
+from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
@@ -82,7 +83,7 @@ class Preparation:
         The scene.
     original : ndarray (H, W, 3)
         The map.
-    rows : slice
+    rows : Rows
         Its active rows.
     folder : Path, optional
         Of the checkpoint.
@@ -97,7 +98,7 @@ class Preparation:
     settings: config.Config
     lit: scene.Scene
     original: np.ndarray
-    rows: slice
+    rows: Rows
     folder: Path | None
     watch: Watch
     dists: distances.Dists | None
@@ -152,7 +153,7 @@ class Preparation:
     def _turn(self, wanted):
         """Return the turn that explains the target best; None where the sky is not to turn."""
         asked, transport = self.settings.representation.turn, self.renderer.transport
-        if asked is False or transport is None or self.rows != slice(0, len(self.original)):
+        if asked is False or transport is None or not self.rows.all:
             return None
         if asked == "auto" and wanted.coverage is not None:  # most of a painted picture is to stay
             return None
@@ -197,7 +198,8 @@ class Preparation:
     def _prepared(self, wanted, degrees, notes, search=True):
         settings = self.settings
         original = latlong.rotate(self.original, degrees)
-        crop, notes = original[self.rows], list(notes)
+        rows = self.rows.slice
+        crop, notes = original[rows], list(notes)
         with self.clock("fit_s"):
             kind = settings.representation.kind
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
@@ -207,7 +209,7 @@ class Preparation:
                 settings,
                 fit.default_folder(),
                 lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
-                (self.rows.start, len(original)),
+                self.rows.place,
                 horizon,
             )
             params = representation.encode(crop, settings.seed)
@@ -218,7 +220,7 @@ class Preparation:
             settings=settings,
             lit=self.lit,
             original=original,
-            first=self.rows.start,
+            first=self.rows.first,
             free=None,
             wanted=wanted,
             representation=representation,
@@ -233,9 +235,9 @@ class Preparation:
         if traced:
             frozen = np.zeros(original.shape[:2], bool)
             if not job.newton:  # its prior holds what the picture does not determine
-                known = traced.determined(self.rows, settings.renderer.influence_threshold)
-                frozen[self.rows] = ~known[self.rows]
-            job.free = ~frozen[self.rows] if frozen.any() else None
+                known = traced.determined(rows, settings.renderer.influence_threshold)
+                frozen[rows] = ~known[rows]
+            job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
             params, found = self._started(job, params, recordings, crop, search)
             notes += found

@@ -26,10 +26,8 @@ ROUNDS = 3, 3
 class Ratio:
     """What was done to a working map, applied to its source; see :func:`.full_resolution.carry`."""
 
-    def __init__(
-        self, original: np.ndarray, edited: np.ndarray, rows: slice, free: np.ndarray | None, grid: Places
-    ):
-        self.grid = grid
+    def __init__(self, original: np.ndarray, edited: np.ndarray, free: np.ndarray | None, grid: Places):
+        self.grid, rows = grid, grid.rows.slice
         self.old, self.want = (np.asarray(e, np.float64)[rows] for e in (original, edited))
         self.changed = (np.asarray(original)[rows] != np.asarray(edited)[rows]).any(axis=2)
         if free is not None:

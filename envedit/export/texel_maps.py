@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.rows import Rows
 from envedit.core.types import DrArray
 
 BAND_TEXELS = 1 << 21
@@ -25,8 +26,10 @@ class Places:
     ----------
     shape : (int, int)
         Rows and columns of the source.
-    coarse : (int, int, int, int)
-        First row and number of rows of the coarser image, rows and columns of its map.
+    rows : Rows
+        Which rows of its map the coarser image is.
+    columns : int
+        Its columns.
 
     Attributes
     ----------
@@ -38,10 +41,10 @@ class Places:
         Rows of the source whose nearest row is in the coarser image.
     """
 
-    def __init__(self, shape: tuple[int, int], coarse: tuple[int, int, int, int]):
-        self.shape, (first, self.count, total, self.columns) = shape, coarse
+    def __init__(self, shape: tuple[int, int], rows: Rows, columns: int):
+        self.shape, self.rows, self.count, self.columns = shape, rows, rows.count, columns
         height, width = shape
-        place = np.arange(height) * ((total - 1) / max(height - 1, 1)) - first
+        place = np.arange(height) * ((rows.total - 1) / max(height - 1, 1)) - rows.first
         nearest = np.rint(place)
         inside = np.flatnonzero((nearest >= 0) & (nearest < self.count))
         self.start, self.stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)

@@ -31,6 +31,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.errors import InputError, place_of
+from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.solve import light_search, matching_pursuit
 from envedit.transport.light_transport import LightTransport
@@ -135,7 +136,7 @@ def reachable(
     original: np.ndarray,
     target: np.ndarray,
     weight: np.ndarray | None = None,
-    rows: slice | tuple[int, int] | None = None,
+    rows: Rows | None = None,
     free: np.ndarray | None = None,
     painted: np.ndarray | None = None,
     rendered: np.ndarray | None = None,
@@ -152,7 +153,7 @@ def reachable(
         The picture wanted, linear radiance.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts; all the same by default.
-    rows : slice or (first, last), optional
+    rows : Rows, optional
         Active rows; the light of the others stays. All by default.
     free : ndarray of bool (rows, W), optional
         Texels of the active rows that may change; all by default.
@@ -211,10 +212,8 @@ class _Question:
         self.transport = transport
         self.original = np.ascontiguousarray(original, np.float32)
         height, width, _ = self.original.shape
-        if isinstance(rows, tuple):
-            rows = slice(rows[0], rows[1] + 1)
         self.active = np.zeros((height, width), bool)
-        self.active[rows or slice(None)] = True if free is None else free
+        self.active[slice(None) if rows is None else rows.slice] = True if free is None else free
         shape = transport.shape
         self.target = _shaped("target", target, (*shape, 3))
         if (bad := ~np.isfinite(self.target)).any():

@@ -96,8 +96,7 @@ class Session:
         self.notes = self.given.warnings
         self.map = self.given.radiance
         height = len(self.map)
-        first, last = inputs.active_rows(settings.input.rows, height)
-        self.rows = slice(first, last + 1)
+        self.rows = inputs.active_rows(settings.input.rows, height)
         renderers.check(settings, self.lit, self.map.shape[:2])
         self._stage("tracing light transport")
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
@@ -138,8 +137,8 @@ class Session:
         """Take lights and turn of a document for the map that is painted on."""
         self.document, self._dragged = document, False
         self.origin = self._by_hand(document)
-        layers = Layers((self.rows.start, len(self.origin)), horizon=self._horizon())
-        params = layers.encode(self.origin[self.rows])
+        layers = Layers(self.rows.place, horizon=self._horizon())
+        params = layers.encode(self.origin[self.rows.slice])
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)

@@ -203,12 +203,12 @@ def _trusted(envmap, recordings, wanted):
 
 def _searched(layers, params, transport, wanted, original, only_own=False):
     """List the starts of the searches, (parameters, notes)."""
-    asked = wanted.picture, wanted.weight, original
+    problem = light_search.SearchProblem(layers, transport, wanted.picture, wanted.weight, original)
     if wanted.coverage is None:
-        return [light_search.start(layers, params, transport, *asked, only_own)]
-    begin = layers, params, transport, wanted.initial, *asked
+        return [light_search.start(problem, params, only_own)]
+    problem = replace(problem, initial=wanted.initial)
     daring = (False, True) if (wanted.coverage < 1).any() else (False,)
-    found = [painted_change.start(*begin, bold=bold) for bold in daring]
+    found = [painted_change.start(problem, params, bold) for bold in daring]
     if layers.separation.lights:
         found.append(painted_change.softened(layers, params))
     return [one for i, one in enumerate(found) if not any(_same(one, other) for other in found[:i])]

@@ -13,6 +13,7 @@ What comes out is most of the way.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,31 +41,43 @@ PROBES = 25
 """Exact columns that are looked at together."""
 
 
-def start(
-    layers: Layers,
-    params: dict,
-    transport: LightTransport,
-    picture: np.ndarray,
-    weight: np.ndarray | None,
-    envmap: np.ndarray,
-    only_own: bool = False,
-) -> tuple[dict, list[str]]:
+@dataclass(frozen=True, eq=False)
+class SearchProblem:
+    """What a search for lights is given.
+
+    Attributes
+    ----------
+    layers : Layers
+        Lights and background of the map's active rows.
+    transport : LightTransport
+        T; gets exact columns for the texels that are looked at.
+    picture : ndarray (h, w, 3)
+        The target, linear radiance.
+    weight : ndarray (h, w, 1) or None
+        How much each pixel counts.
+    envmap : ndarray (H, W, 3)
+        The whole original map.
+    initial : ndarray (h, w, 3), optional
+        What the target was painted on: the change is explained then, ``picture - initial``.
+    """
+
+    layers: Layers
+    transport: LightTransport
+    picture: np.ndarray
+    weight: np.ndarray | None
+    envmap: np.ndarray
+    initial: np.ndarray | None = None
+
+
+def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple[dict, list[str]]:
     """Find where the optimisation of layers starts.
 
     Parameters
     ----------
-    layers : Layers
-        Lights and background of the map's active rows.
+    problem : SearchProblem
+        Without ``initial``.
     params : dict
-        As its ``encode`` returned them.
-    transport : LightTransport
-        T; gets exact columns for the texels that are looked at.
-    picture : ndarray (h, w, 3)
-        What is wanted.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts.
-    envmap : ndarray (H, W, 3)
-        The whole map.
+        Of the layers, as ``encode`` returned them.
     only_own : bool
         Place the map's own lights only: gain and further lights are found by Gauss-Newton steps.
 
@@ -75,7 +88,8 @@ def start(
     notes : list of str
         What was found.
     """
-    scene = Question(layers, transport, picture, weight, envmap)
+    layers, transport, picture, weight = problem.layers, problem.transport, problem.picture, problem.weight
+    scene = Question(problem)
     overview, lights = transport.overview(), layers.separation.lights
     spare = 0 if only_own else SPARE
     places = place(scene.given(), scene.wanted, lights, spare, layers.lights.flux[-1])
@@ -134,34 +148,11 @@ def start(
 
 
 class Question:
-    """What is asked: the picture less all that is fixed, and what may make it.
+    """What is asked: the picture less all that is fixed, or the painted change, and what may make it."""
 
-    Parameters
-    ----------
-    layers : Layers
-        Of the map.
-    transport : LightTransport
-        T.
-    picture : ndarray (h, w, 3)
-        What is asked for, linear radiance, where there is no ``wanted``: how bright pixels are.
-    weight : ndarray (h, w, 1) or None
-        How much each pixel counts.
-    envmap : ndarray (H, W, 3)
-        The original map.
-    wanted : ndarray (h, w, 3), optional
-        What is to be explained in place of the picture less the light of what is fixed.
-    """
-
-    def __init__(
-        self,
-        layers: Layers,
-        transport: LightTransport,
-        picture: np.ndarray,
-        weight: np.ndarray | None,
-        envmap: np.ndarray,
-        wanted: np.ndarray | None = None,
-    ):
-        self.layers, self.transport, self.weight = layers, transport, weight
+    def __init__(self, problem: SearchProblem):
+        layers, transport, envmap = problem.layers, problem.transport, problem.envmap
+        self.layers, self.transport, self.weight = layers, transport, problem.weight
         first, _ = layers.rows
         height, width = layers.shape
         rows = slice(first, first + height)
@@ -169,8 +160,11 @@ class Question:
         explained = layers.active if layers.mirrored else rows
         rest = envmap.copy()
         rest[explained] = 0
-        self.known = picture
-        self.wanted = picture - transport.apply(tensor(rest)).numpy() if wanted is None else wanted
+        painted = problem.initial is not None
+        self.known = problem.initial if painted else problem.picture
+        self.wanted = problem.picture - (
+            problem.initial if painted else transport.apply(tensor(rest)).numpy()
+        )
         self.active: np.ndarray = np.zeros(envmap.shape[:2], bool)
         self.active[rows] = True
         self.active = self.active.ravel()

@@ -47,7 +47,8 @@ def main():
     rows = active.slice
     layers = Layers(active.place)
     params = layers.encode(original[rows])
-    params, _ = light_search.start(layers, params, transport, wanted.picture, None, original)
+    asked = light_search.SearchProblem(layers, transport, wanted.picture, None, original)
+    params, _ = light_search.start(asked, params)
 
     curves = {}
     for name in ("Gauss-Newton", "Adam"):

@@ -34,6 +34,7 @@ from envedit.representations.layers.layers import Layers, unseen_kept
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
+from envedit.solve.light_search import SearchProblem
 from envedit.targets import strokes
 from envedit.targets.target import pixel_weight
 
@@ -266,8 +267,8 @@ class Session:
         """
         self._tell_doing("looking for other lights")
         layers, params = self.problem.layers, self.problem.params(self.still)
-        asked = layers, params, self._watched, self.base, self.target, self.weight, self.origin
-        starts = [painted_change.start(*asked, bold=bold)[0] for bold in (False, True)]
+        asked = SearchProblem(layers, self._watched, self.target, self.weight, self.origin, self.base)
+        starts = [painted_change.start(asked, params, bold)[0] for bold in (False, True)]
         if layers.separation.lights:
             starts.append(painted_change.softened(layers, params)[0])
         more = {"iterations": 0, "run": self.run, "trial": True, "sparing": False}

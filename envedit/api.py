@@ -33,7 +33,7 @@ def edit(
         A configuration, or the TOML file of one.
     target : ndarray (h, w, 3), optional
         A painted picture in linear radiance, in place of the configuration's target: what
-        :func:`envedit.targets.painted_image.initial` rendered, with something painted over it.
+        :func:`envedit.targets.initial_rendering.initial` rendered, with something painted over it.
     mask : ndarray (h, w), optional
         Where it was painted, in [0, 1]; by default where it differs from the initial rendering.
     base : Path, optional

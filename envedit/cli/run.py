@@ -353,9 +353,9 @@ def _export_initial(settings, arguments):
     mi.set_log_level(mi.LogLevel.Error)
     from envedit import inputs
     from envedit.report import output_folder
-    from envedit.targets import painted_image
+    from envedit.targets import initial_rendering
 
-    painted_image.check_export(file)
+    initial_rendering.check_export(file)
     with _progress(arguments) as progress:
         progress.stage("rendering the picture to paint on")
         lit = inputs.load_scene(settings.scene, arguments.base)
@@ -363,15 +363,15 @@ def _export_initial(settings, arguments):
         files = files[1:] or files
         files = [(file.with_name(name), rows) for name, rows in files]
         for one, _ in files:
-            painted_image.check_export(one)
+            initial_rendering.check_export(one)
         envmap, warnings = inputs.load_map(settings.input, lit)
         notes = inputs.notes(settings.input, lit)
         source = inputs.source_of(settings.input, lit)  # what the picture is marked as made from
         settings = replace(settings, input=replace(settings.input, envmap=source))
-        picture = painted_image.initial(lit, envmap, settings)
-        under = painted_image.export_tonemap(file, picture, settings)
+        picture = initial_rendering.initial(lit, envmap, settings)
+        under = initial_rendering.export_tonemap(file, picture, settings)
         for one, rows in files:
-            warnings += painted_image.export(one, picture[rows], settings, under)
+            warnings += initial_rendering.export(one, picture[rows], settings, under)
     for line in warnings:
         _tell(arguments, "warning", line)
     for line in notes:

@@ -23,7 +23,7 @@ from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.targets import painted_image, strokes
+from envedit.targets import initial_rendering, painted_image, strokes
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def make(
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap), hidden)
     shape = scene.height, scene.width
-    initial = painted_image.initial(scene, envmap, settings)
+    initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
         found = painted_image.given(picture, shape, initial, mask)

@@ -10,7 +10,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene import scene
-from envedit.targets import painted_image, target
+from envedit.targets import initial_rendering, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 
 SIZE = (12, 16)
@@ -108,7 +108,7 @@ def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
 @pytest.fixture(scope="module")
 def seen(ball):
     envmap = sky(np.random.default_rng(3))
-    return envmap, painted_image.initial(ball, envmap, asking())
+    return envmap, initial_rendering.initial(ball, envmap, asking())
 
 
 def a_stroke(**kwargs):

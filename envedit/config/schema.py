@@ -9,6 +9,8 @@ Whether input files exist is not looked at here: the modules that read them say 
 >>> config = loads("[fit]\nepochs = 100", preset="draft", overrides=["seed=3"])
 >>> config.fit.epochs, config.representation.hidden, config.seed
 (100, 64, 3)
+
+Longer than 400 lines: a line for every key.
 """
 
 from __future__ import annotations

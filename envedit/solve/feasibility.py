@@ -19,6 +19,8 @@ directly or in a mirror, and those around a concentrated light, for which exact 
 Solved by accelerated projected gradient (Beck and Teboulle 2009) with restart (O'Donoghue and Candes 2015),
 in the diagonal metric of De Pierro (1995): for y > 0, A'WA is at most diag(A'WA y / y), as A is not negative.
 A dual point, the residual made feasible, bounds how far from the least the solution is.
+
+Longer than 400 lines: the model in cells, its solver and its refinement are one algorithm, used nowhere else.
 """
 
 from __future__ import annotations

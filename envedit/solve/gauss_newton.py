@@ -3,6 +3,8 @@
 A step solves the normal equations, and is kept if it lowers F. Huber's threshold s and sigma are at first as
 large as the residual, and at most halved at every step: a start that is far away is not judged by its
 outliers.
+
+Longer than 400 lines: the steps, their damping and the trials of added lights share the state of a run.
 """
 
 from __future__ import annotations

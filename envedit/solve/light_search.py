@@ -8,6 +8,8 @@ Three steps, from far to near, all through T and none from where a light was:
    coarse grid to a fine one.
 
 What comes out is most of the way.
+
+Longer than 400 lines: the three steps share one :class:`Question`, and are read in their order.
 """
 
 from __future__ import annotations

@@ -14,6 +14,8 @@ E(x) the map that the layers compose, minimised is
 
 The residual is exact, through T. The Jacobian is that of the block transport (``block_jacobian.py``), but
 pictures of lights are exact.
+
+Longer than 400 lines: objective, normal equations and posterior share the layout of the unknowns.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ new edit comes.
 While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
 target. The target is painted on T E_0. The edit that is saved is the pipeline's, which paints on Mitsuba's
 rendering, tries several starts, and judges its result.
+
+Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
 """
 
 from __future__ import annotations

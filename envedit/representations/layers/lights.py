@@ -9,6 +9,8 @@ all of it: no blur; turned about the vertical, a light is interpolated as any tu
 
 The shares are piecewise linear in the place, so their derivatives are exact everywhere but on the lines
 through texel centres, where they jump. Sums run in integers: the order in which threads add does not matter.
+
+Longer than 400 lines: the shares of a point and their derivatives by hand are read side by side.
 """
 
 from __future__ import annotations

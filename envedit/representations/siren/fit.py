@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,7 +24,6 @@ from envedit import config
 from envedit.core.array_cache import DiskCache, cache_folder, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError, NumericalError, place_of
-from envedit.core.types import DrArray
 from envedit.losses import losses, metrics, optimizer, ssim
 from envedit.representations.base import EPSILON
 from envedit.representations.siren import network as siren
@@ -64,7 +62,7 @@ class Normalisation:
         """Map radiance to [0, 1], in float64 (Eq. 1)."""
         return (np.log(np.asarray(image, np.float64) + EPSILON) - self.low) / self.span
 
-    def decode(self, values: Any) -> Any:
+    def decode(self, values: mi.TensorXf) -> mi.TensorXf:
         """Map network output in (0, 1) to finite radiance >= 0 (Eq. 2-3), on tensors and arrays."""
         # dr.exp is infinite from 88.38 on. Below 0, where a flat or black map can lead, the slope is kept.
         radiance = dr.exp(dr.minimum(values * self.span + self.low, 88)) - EPSILON
@@ -195,7 +193,7 @@ class Objective:
         self.radiance = tensor(image)
         self.ssim = ssim.Ssim(self.logs)
 
-    def gradient(self, y: mi.TensorXf, only_ssim: bool = False) -> tuple[DrArray, mi.TensorXf]:
+    def gradient(self, y: mi.TensorXf, only_ssim: bool = False) -> tuple[mi.Float, mi.TensorXf]:
         """Return the loss (size-1 array) and its gradient with respect to y."""
         y = mi.TensorXf(y)
         dr.enable_grad(y)

@@ -109,6 +109,8 @@ def run(
         warnings.append(
             "loss.dists is off: it needs weights, [perceptual] vgg and dists; docs/architecture.md says whose"
         )
+
+    # ---- Scene, map and target
     with clock("target_s"):
         watch.stage("loading")
         lit = inputs.load_scene(settings.scene, base)
@@ -129,6 +131,8 @@ def run(
             initial, _, _ = rendered(
                 lit, original, few, Seeds.of(settings.seed).painted_initial, settings.renderer.cache
             )
+
+    # ---- Transport, and what any light can do
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
     start.trace()
     traced, within, notes = start.renderer.transport, None, []
@@ -141,6 +145,8 @@ def run(
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
             wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
+
+    # ---- The edit: where it starts, and its optimisation
     edit = start.edit(wanted)
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, notes = job.renderer, notes + edit.notes
@@ -155,6 +161,7 @@ def run(
         edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
         wanted = job.wanted  # a resumed run has the picture that it began with
 
+    # ---- The result, rendered with fresh samples
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
@@ -162,6 +169,8 @@ def run(
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         lights, core = _lights(original, edited, lit.to_world, edit.degrees)
+
+    # ---- Notes
     notes += [job.note] if job.note else []
     notes += [said_of] if (said_of := light_list.told(lights, height)) else []
     if representation.models_edit:
@@ -169,6 +178,8 @@ def run(
         notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
     notes = [*said, wanted.source, *renderer.choices, *notes, *adjusted]
     notes.append(f"result rendered with {judged} samples a pixel")
+
+    # ---- Measures, and what to warn of
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
     with _in_file_units(given), keeping(edited):

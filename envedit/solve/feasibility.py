@@ -180,6 +180,7 @@ def reachable(
     A target that was rendered has noise of its own, which is out of reach: under a map that is known to make
     the picture, 15 to 20 % of a request of 0.07 in display values are such noise at 128x128 pixels.
     """
+    # ---- Search: in cells, then with single texels around the most concentrated light
     question = _Question(transport, original, target, weight, rows, free, painted, rendered)
     initial, asked = question.initial, question.asked
     best, bound, steps = (asked, question.original, initial), 0.0, 0
@@ -198,6 +199,7 @@ def reachable(
             if not last:
                 model, x = _around_light(question, model, x, found)
                 picture = question.apply(model.map(x))
+    # ---- What is left
     distance, envmap, picture = best
     residual = tonemap(question.target) - tonemap(picture)
     left = np.abs(residual) * question.painted[..., None]
@@ -351,6 +353,7 @@ def _solve(model, x, picture):
     bound : float
         Primal less dual value, as a share of the primal value of the original.
     """
+    # ---- The problem, linearised at the picture
     question = model.question
     weight = question.weights(picture)
     white = question.target >= 1  # any value above will do
@@ -360,6 +363,7 @@ def _solve(model, x, picture):
         r = wanted - light
         return np.where(white, np.maximum(r, 0), r)
 
+    # ---- Metric (De Pierro)
     one = model.render(np.stack([np.zeros((model.count, 3)), np.ones((model.count, 3))]))
     light = picture - model.base
     # A sky of one radiance that is as bright as the picture or the target.
@@ -372,6 +376,7 @@ def _solve(model, x, picture):
     seen = metric > 1e-9 * metric.max(axis=1, keepdims=True)
     step = np.where(seen, 1 / np.maximum(metric, 1e-300), 0)
 
+    # ---- Accelerated projected gradient
     slack = np.where(white, 0, 1.0)  # pulled back, it is positive: it makes a dual point feasible
     pulled = model.adjoint(weight * slack)
     start = 0.5 * (weight * rest(question.initial - model.base) ** 2).sum()
@@ -389,6 +394,7 @@ def _solve(model, x, picture):
         x, light, taken = new, new_light, taken + 1
         if taken % LOOK and taken < STEPS:
             continue
+        # ---- Bound, by a dual point
         r = rest(light)
         before, value = value, 0.5 * (weight * r * r).sum()
         slope = np.where(seen, model.adjoint(weight * r) / np.maximum(pulled, 1e-300), 0)
@@ -409,6 +415,7 @@ def _around_light(question, model, x, found):
     sun spread over its cell, a target was estimated to be infeasible that a rendering showed to be 92 %
     reached.
     """
+    # ---- Where light was added, most of it beyond the surroundings
     transport, active = question.transport, question.active
     height, width = active.shape
     influence = transport.influence * active
@@ -422,6 +429,7 @@ def _around_light(question, model, x, found):
     room = transport.capacity - len(transport.columns)
     if not beyond[row, column] > LIGHT * total or room < 2 * light_search.PROBES:
         return model, x
+    # ---- Its place, by exact columns
     directions, omega = latlong.directions(height, width), latlong.lookup_solid_angles(height, width)
     near = _window(row, column, 2 * size, height, width)
     excess = np.maximum(light[near] - np.median(light[near]), 0)
@@ -437,6 +445,7 @@ def _around_light(question, model, x, found):
         transport, (wanted - model.base).reshape(-1, 3), known, question.weight.reshape(-1, 1), mixed,
         towards, np.ones(3), int(first), int(last),
     )  # fmt: skip
+    # ---- Single texels there
     row, column = (round(float(v)) for v in latlong.texel_position(place, height, width))
     single = np.zeros_like(active)
     single[_window(row, column, SPAN, height, width)] = True

@@ -9,7 +9,7 @@ import numpy as np
 
 import envedit
 from envedit import config, inputs
-from envedit.targets import painted_image
+from envedit.targets import initial_rendering
 
 mi.set_variant("llvm_ad_rgb")
 settings = config.loads(
@@ -32,7 +32,7 @@ settings = config.loads(
 # %% The rendering under the map as it is: what there is to paint on.
 sky, _ = inputs.load_map(settings.input)
 lit = inputs.load_scene(settings.scene)
-initial = painted_image.initial(lit, sky, settings)
+initial = initial_rendering.initial(lit, sky, settings)
 print(f"initial rendering {initial.shape}, mean radiance {initial.mean():.3f}")
 
 # %% Paint: the lower right corner, where the shadow falls, becomes warmer and brighter.

@@ -6,6 +6,8 @@ make what they take. Errors that a user can mend are ``EnveditError``s. All are 
 ``import envedit`` is quick and works without LLVM.
 """
 
+from __future__ import annotations
+
 __version__ = "0.1.0"
 _PUBLIC = {
     "Config": "envedit.config",

@@ -207,7 +207,8 @@ def load_scene(
     """
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
-    given = config.Scene(width=width, height=height, parameters=dict(parameters or {}), sensors=sensors)
+    named = sensors if isinstance(sensors, str) else tuple(sensors)
+    given = config.Scene(width=width, height=height, parameters=dict(parameters or {}), sensors=named)
     return _lit(scene, given, base)
 
 
@@ -276,7 +277,7 @@ def _lit(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
 def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
     """Describe a scene in a configuration as far as that is possible; a built one is not kept on disk."""
     heights = {rows.stop - rows.start for rows in lit.rows}
-    given = {"width": lit.width, "height": heights.pop() if len(heights) == 1 else 0}
+    given: dict[str, Any] = {"width": lit.width, "height": heights.pop() if len(heights) == 1 else 0}
     if lit.path is None:
         if lit.digest.startswith(built_scene.UNKNOWN):
             settings = replace(settings, renderer=replace(settings.renderer, cache=False))

@@ -14,6 +14,7 @@ from envedit.core import latlong, primaries
 from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.core.primaries import Chromaticities
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images
 from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene
@@ -282,11 +283,11 @@ def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = Non
     return said
 
 
-def active_rows(rows, height: int) -> tuple[int, int]:
-    """Return the first and last row that may change; "upper": above the horizon (paper, Sec. 5.1)."""
-    if rows == "upper":
-        return 0, (height + 1) // 2 - 1
-    return (0, height - 1) if rows == "all" else (rows[0], rows[1])
+def active_rows(rows: str | tuple[int, int], height: int) -> Rows:
+    """Return the rows that may change: all, those above the horizon (paper, Sec. 5.1), or (first, last)."""
+    if isinstance(rows, str):
+        return Rows.of(height, last=(height + 1) // 2 - 1 if rows == "upper" else -1)
+    return Rows.of(height, *rows)
 
 
 def load_scene(settings: config.Scene, base: Path | None = None) -> scene.Scene:

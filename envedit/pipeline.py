@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core.errors import unwrapped
+from envedit.core.rows import Rows
+from envedit.core.seeds import Seeds
 from envedit.export import adjustments, light_list
 from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
@@ -29,8 +32,6 @@ from envedit.targets import target
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
-JUDGE_SEED = 9_000_011
-"""Seed of the renderings that are judged; the optimiser never sees their samples."""
 INITIAL_SPP = 256
 """Samples a pixel of the initial rendering, which is far from the target."""
 
@@ -42,14 +43,14 @@ class _Clock:
     seconds: dict = field(default_factory=dict)
 
     @contextlib.contextmanager
-    def __call__(self, name):
+    def __call__(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         try:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
-    def table(self, history, total) -> dict:
+    def table(self, history: list[dict], total: float) -> dict:
         """Return the timing of the metrics, but for what the command line adds."""
         parts = ("target", "fit", "transport", "reach", "start", "edit", "judge")
         steps = [row["step_ms"] for row in history]
@@ -107,6 +108,8 @@ def run(
         warnings.append(
             "loss.dists is off: it needs weights, [perceptual] vgg and dists; docs/architecture.md says whose"
         )
+
+    # ---- Scene, map and target
     with clock("target_s"):
         watch.stage("loading")
         lit = memory.scene or inputs.load_scene(settings.scene, base)
@@ -114,7 +117,7 @@ def run(
         original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
         height, width, _ = original.shape
-        first, last = inputs.active_rows(settings.input.rows, height)
+        rows = inputs.active_rows(settings.input.rows, height)
         if settings.target.kind == "none":
             warnings += config.unused(settings)
             found = _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
@@ -126,8 +129,11 @@ def run(
         few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
         initial = wanted.initial
         if initial is None and wanted.coverage is not None:
-            initial, _, _ = rendered(lit, original, few, settings.seed + JUDGE_SEED, settings.renderer.cache)
-    rows = slice(first, last + 1)
+            initial, _, _ = rendered(
+                lit, original, few, Seeds.of(settings.seed).painted_initial, settings.renderer.cache
+            )
+
+    # ---- Transport, and what any light can do
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
     start.trace()
     traced, within, notes = start.renderer.transport, None, []
@@ -140,6 +146,8 @@ def run(
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
             wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
+
+    # ---- The edit: where it starts, and its optimisation
     edit = start.edit(wanted)
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, notes = job.renderer, notes + edit.notes
@@ -152,20 +160,25 @@ def run(
         edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
         wanted = job.wanted  # a resumed run has the picture that it began with
 
+    # ---- The result, rendered with fresh samples
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        spp, seed = settings.output.spp, settings.seed + JUDGE_SEED + 1
+        spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, _ = lit.sampled(edited, spp, seed)
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         lights, core = _lights(original, edited, lit.to_world, edit.degrees)
+
+    # ---- Notes
     notes += [job.note] if job.note else []
     notes += [said_of] if (said_of := light_list.told(lights, height)) else []
     if representation.models_edit:
-        kept = 100 * float((found_map == job.original)[rows].all(axis=2).mean())
+        kept = 100 * float((found_map == job.original)[rows.slice].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
     notes = [*said, wanted.source, *renderer.choices, *notes, *adjusted]
     notes.append(f"result rendered with {judged} samples a pixel")
+
+    # ---- Measures, and what to warn of
     renders = {"initial": initial, "target": wanted.picture, "edited": final}
     maps = {"initial": original, "target": wanted.envmap, "edited": edited}
     with _in_file_units(given), keeping(edited):
@@ -173,10 +186,10 @@ def run(
         measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit)
         predicted = traced.coarse_error(edited) if traced else None
     rate = "; lower optimizer.lr" if job.raised_rate else ""
-    judged = [measured[name] for name in ("render", "initial")]
-    measured["worse"] = wanted.coverage is None and metrics.worse(*judged)
+    pair = [measured[name] for name in ("render", "initial")]
+    measured["worse"] = wanted.coverage is None and metrics.worse(*pair)
     if measured["worse"]:
-        after, before = (metrics.score(one, judged, 2) for one in judged)
+        after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
             f"the result is farther from the target than the input: {after}, {before} before{rate}"
         )
@@ -194,7 +207,7 @@ def run(
         "turn_degrees": edit.degrees,
     }
     if traced:
-        share = float(frozen[rows].mean())
+        share = float(frozen[rows.slice].mean())
         measured["transport"] = {**traced.summary(), "predicted_error": predicted, "frozen": share}
         if share:
             least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
@@ -219,7 +232,7 @@ def run(
         separation=representation.separation,
         scene=lit.path,
         reach=within,
-        found=Found(representation, params, first, job.free, edit.degrees, found_map),
+        found=Found(representation, params, rows.first, job.free, edit.degrees, found_map),
         posterior=job.posterior,
         settings=settings,
         memory=memory,
@@ -235,11 +248,11 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        seed, spp = settings.seed + JUDGE_SEED, settings.output.spp
-        initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache)
-        final, judged, _ = lit.sampled(edited, spp, seed + 1)
+        seeds, spp = Seeds.of(settings.seed), settings.output.spp
+        initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, settings.renderer.cache)
+        final, judged, _ = lit.sampled(edited, spp, seeds.judged)
         renders = {"initial": initial, "target": initial, "edited": final}
-        maps, rows = {"initial": original, "target": None, "edited": edited}, slice(0, len(original))
+        maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
         lights, core = _lights(original, edited, lit.to_world)
@@ -313,7 +326,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
         "initial": metrics.compare(before, wanted, tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
-        "active_rows": [rows.start, rows.stop - 1],
+        "active_rows": [rows.first, rows.last],
         "natural": naturalness.natural(maps["edited"], maps["initial"], maps["target"]),
         "painted": None,
     }
@@ -323,7 +336,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
         measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
-        original, true, edited = (maps[name][rows] for name in ("initial", "target", "edited"))
+        original, true, edited = (maps[name][rows.slice] for name in ("initial", "target", "edited"))
         measured["envmap"] = metrics.compare(edited, true, tonemap, lpips)
         measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
         measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)

@@ -6,6 +6,8 @@ or a network is fitted, and it is found out where the edit starts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +16,9 @@ import numpy as np
 from envedit import config, renderers, representations
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
-from envedit.representations import Representation
+from envedit.core.rows import Rows
+from envedit.core.seeds import Seeds
+from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
 from envedit.scene import scene
@@ -33,8 +37,8 @@ and more); and up to which the turned map is rendered to ask, as T's errors depe
 NOISIEST, QUIET = 0.03, 0.008
 """Display residual of T beyond which noise would hide what is asked for (four scenes have at most 0.016), and
 what is taken for T's error then."""
-CHECKED_SPP, CHECKED_SEED = 256, 800_011
-"""Samples a pixel of these renderings, and what is added to the run's seed."""
+CHECKED_SPP = 256
+"""Samples a pixel of these renderings."""
 PREFERRED = 0.05
 """By this share the residual of the sky as it is must be smaller: where it turns, nothing is made up."""
 
@@ -79,7 +83,7 @@ class Preparation:
         The scene.
     original : ndarray (H, W, 3)
         The map.
-    rows : slice
+    rows : Rows
         Its active rows.
     folder : Path, optional
         Of the checkpoint.
@@ -94,11 +98,11 @@ class Preparation:
     settings: config.Config
     lit: scene.Scene
     original: np.ndarray
-    rows: slice
+    rows: Rows
     folder: Path | None
     watch: Watch
-    dists: object
-    clock: object
+    dists: distances.Dists | None
+    clock: Callable[[str], AbstractContextManager]
     renderer: renderers.Renderer | None = None
     _recordings: initialization.Recordings | None = None
 
@@ -149,7 +153,7 @@ class Preparation:
     def _turn(self, wanted):
         """Return the turn that explains the target best; None where the sky is not to turn."""
         asked, transport = self.settings.representation.turn, self.renderer.transport
-        if asked is False or transport is None or self.rows != slice(0, len(self.original)):
+        if asked is False or transport is None or not self.rows.all:
             return None
         if asked == "auto" and wanted.coverage is not None:  # most of a painted picture is to stay
             return None
@@ -167,7 +171,7 @@ class Preparation:
         if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
             return 0.0
         with self.clock("start_s"):
-            cache, seed = self.settings.renderer.cache, (self.settings.seed + CHECKED_SEED) % 2**32
+            cache, seed = self.settings.renderer.cache, Seeds.of(self.settings.seed).turn_check
             shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
             near = turning.apart(shown, wanted.picture, wanted.weight) < 2 * TO_NOISE * NOISIEST
             if not near and (turn is None or turn.error > DOUBTFUL * NOISIEST):
@@ -188,13 +192,14 @@ class Preparation:
             return turn.error <= TO_NOISE * noise
         with self.clock("start_s"):
             turned = latlong.rotate(self.original, turn.degrees)
-            shown = self.lit.render(turned, CHECKED_SPP, (self.settings.seed + CHECKED_SEED) % 2**32)
+            shown = self.lit.render(turned, CHECKED_SPP, Seeds.of(self.settings.seed).turn_check)
             return turn.error <= TO_NOISE * turning.residual(self.renderer.transport, turned, shown)
 
     def _prepared(self, wanted, degrees, notes, search=True):
         settings = self.settings
         original = latlong.rotate(self.original, degrees)
-        crop, notes = original[self.rows], list(notes)
+        rows = self.rows.slice
+        crop, notes = original[rows], list(notes)
         with self.clock("fit_s"):
             kind = settings.representation.kind
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
@@ -204,7 +209,7 @@ class Preparation:
                 settings,
                 fit.default_folder(),
                 lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
-                (self.rows.start, len(original)),
+                self.rows.place,
                 horizon,
             )
             params = representation.encode(crop, settings.seed)
@@ -215,7 +220,7 @@ class Preparation:
             settings=settings,
             lit=self.lit,
             original=original,
-            first=self.rows.start,
+            first=self.rows.first,
             free=None,
             wanted=wanted,
             representation=representation,
@@ -230,15 +235,15 @@ class Preparation:
         if traced:
             frozen = np.zeros(original.shape[:2], bool)
             if not job.newton:  # its prior holds what the picture does not determine
-                known = traced.determined(self.rows, settings.renderer.influence_threshold)
-                frozen[self.rows] = ~known[self.rows]
-            job.free = ~frozen[self.rows] if frozen.any() else None
+                known = traced.determined(rows, settings.renderer.influence_threshold)
+                frozen[rows] = ~known[rows]
+            job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
             params, found = self._started(job, params, recordings, crop, search)
             notes += found
         return Edit(job, params, crop, degrees, frozen, notes)
 
-    def _recorded(self, representation: Representation, wanted):
+    def _recorded(self, representation, wanted):
         """Return what is looked through for where layers start; None for what is fitted."""
         if not representation.models_edit:
             return None

@@ -9,6 +9,7 @@ import mitsuba as mi
 from envedit import config
 from envedit.core import array_cache
 from envedit.core.errors import ConfigError
+from envedit.core.types import Progress
 from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
 from envedit.transport import recording
@@ -16,18 +17,15 @@ from envedit.transport.light_transport import LightTransport
 
 
 class Renderer(Protocol):
-    """What the edit loop renders with.
+    """What the edit loop renders with."""
 
-    Attributes
-    ----------
-    choices : list of str
-        What was chosen automatically.
-    transport : LightTransport or None
-        The stored T that it renders through, where there is one.
-    """
+    @property
+    def choices(self) -> list[str]:
+        """What was chosen automatically."""
 
-    choices: list[str]
-    transport: LightTransport | None
+    @property
+    def transport(self) -> LightTransport | None:
+        """The stored T that it renders through, where there is one."""
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
         """Render (H, W, 3) linear radiance to (h, w, 3), differentiable in the map."""
@@ -39,7 +37,9 @@ class Renderer(Protocol):
         """Continue from :meth:`state`."""
 
 
-def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Renderer:
+def make(
+    settings: config.Config, lit: scene.Scene, shape: tuple[int, int], progress: Progress | None = None
+) -> Renderer:
     """Build the renderer of a configuration for maps of the given (H, W).
 
     Parameters
@@ -59,7 +59,7 @@ def make(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Ren
     return trace(settings, lit, shape, progress)
 
 
-def check(settings: config.Config, lit: scene.Scene, shape) -> None:
+def check(settings: config.Config, lit: scene.Scene, shape: tuple[int, int]) -> None:
     """Refuse, before anything is rendered, what :func:`make` will refuse.
 
     Raises
@@ -79,7 +79,9 @@ def check(settings: config.Config, lit: scene.Scene, shape) -> None:
         recording.choose_samples(lit, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
 
 
-def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> LightTransport:
+def trace(
+    settings: config.Config, lit: scene.Scene, shape: tuple[int, int], progress: Progress | None = None
+) -> LightTransport:
     """Trace the light transport of a configuration, or take it from disk; arguments as :func:`make`."""
     chosen = settings.renderer
     return LightTransport.build(
@@ -89,7 +91,7 @@ def trace(settings: config.Config, lit: scene.Scene, shape, progress=None) -> Li
         max_depth=chosen.max_depth,
         seed=settings.seed,
         memory_gb=chosen.memory_gb,
-        refresh=0 if chosen.refresh == "auto" else chosen.refresh,
+        refresh=0 if isinstance(chosen.refresh, str) else chosen.refresh,
         few=settings.representation.kind == "layers",
         folder=array_cache.cache_folder("transport") if chosen.cache else None,
         progress=progress,

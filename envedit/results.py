@@ -160,7 +160,7 @@ class Result:
                 if picture is None:
                     axis.axis("off")
                     continue
-                axis.imshow(preview.display(picture, *picture.shape[:2], curve), extent=extent)
+                axis.imshow(preview.display(picture, len(picture), picture.shape[1], curve), extent=extent)
                 if extent is None:
                     axis.set(title=name, xticks=[], yticks=[])
                 else:

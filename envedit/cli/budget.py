@@ -124,7 +124,9 @@ class Calibration:
     quiet_spp: int
 
 
-def apply(settings: config.Config, budget: float, elapsed: float = 0.0, base: Path | None = None):
+def apply(
+    settings: config.Config, budget: float, elapsed: float = 0.0, base: Path | None = None
+) -> tuple[config.Config, str]:
     """Choose the level for a budget.
 
     Parameters
@@ -219,7 +221,7 @@ def loss(level: Level) -> str:
 def expect(level: Level, found: Calibration, work: Work) -> float:
     """Expect the seconds of a run after the calibration."""
     pixels = level.film**2 * work.aspect
-    each = found.quiet_spp if level.spp == "auto" else level.spp
+    each = found.quiet_spp if isinstance(level.spp, str) else level.spp
     samples = 2 * each + min(pipeline.INITIAL_SPP, each)
     traced = level.traced_s * work.aspect * found.render / REFERENCE_RENDER * (PAINTED if work.painted else 1)
     numbers = (level.numbers_s + FULL * work.texels) * found.machine

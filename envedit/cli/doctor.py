@@ -12,6 +12,8 @@ it died, and its last words, are the diagnosis.
 LLVM library changes, so that later runs pay a millisecond.
 """
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 import glob
@@ -27,6 +29,8 @@ import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 from envedit.cli.streams import steady
 from envedit.core.array_cache import cache_home
@@ -102,7 +106,7 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
             return Diagnosis(False, (f"cannot start {sys.executable}: {error.strerror or error}",))
         errors.seek(0)
         said = errors.read(200_000).decode(errors="replace")
-    versions = {}
+    versions: dict[str, Any] = {}
     for line in output.decode(errors="replace").splitlines():
         with contextlib.suppress(ValueError):
             found = json.loads(line)
@@ -126,7 +130,7 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
     """
     memory = _memory(variant)
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        with opened(memory) as file:
+        with opened(memory or "") as file:  # without a folder: no such file
             known = json.loads(file.read(1 << 16))
         if known["ok"] is True and known["library"] == _stamp(known["library"][0]):
             return
@@ -246,7 +250,7 @@ def _probe(variant: str) -> None:
     say(done=True)
 
 
-def _self_test(mi) -> float:
+def _self_test(mi: ModuleType) -> float:
     """Return the mean radiance of a plane of albedo 0.5 under a white map: 0.5, within the noise of 1e-3.
 
     A convex diffuse surface under radiance 1 reflects its albedo. The light is an ``envmap`` and is found by
@@ -276,7 +280,7 @@ def _self_test(mi) -> float:
     return float(np.array(mi.render(scene, integrator=integrator, spp=1024, seed=1)).mean())
 
 
-def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
+def _matmul_rate(mi: ModuleType, dr: ModuleType, size: int = 256, repeats: int = 20) -> float:
     """Return the rate of ``size`` x ``size`` matrix products in GFLOP/s, after one to compile."""
     a = dr.full(mi.TensorXf, 1 / size, (size, size))
     product = a @ a
@@ -295,7 +299,7 @@ def _matmul_rate(mi, dr, size: int = 256, repeats: int = 20) -> float:
 
 
 @steady
-def main(arguments=None) -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
     parser = argparse.ArgumentParser(
         prog="envedit doctor",

@@ -72,9 +72,8 @@ def _run(arguments):
 
 def _fit(arguments, settings, original, warnings, folder):
     """Fit, and leave the results in a folder."""
-    first, last = inputs.active_rows(settings.input.rows, original.shape[0])
-    crop = original[first : last + 1]
-    rows = first, original.shape[0]
+    rows = inputs.active_rows(settings.input.rows, original.shape[0])
+    crop = original[rows.slice]
     with Progress() as progress:
         progress.stage(f"fitting {arguments.map}")
         fitted = fit.fit(
@@ -82,16 +81,16 @@ def _fit(arguments, settings, original, warnings, folder):
             settings.representation,
             settings.fit,
             settings.seed,
-            rows,
+            rows.place,
             folder=fit.default_folder(),
             progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
         )
     params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
     network = settings.representation
     shape = crop.shape[:2]
-    x = fit.points(network, shape, rows)
+    x = fit.points(network, shape, rows.place)
     got = fit.evaluate(params, fitted.normalisation, x, shape, network.omega).numpy()
-    about = {"source": arguments.map, "rows": f"{first} to {last}"}
+    about = {"source": arguments.map, "rows": f"{rows.first} to {rows.last}"}
     images.write_exr(folder / "fitted.exr", got, about, panorama=len(got) == len(original))
     preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
     numbers = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from typing import TextIO
 
 from tqdm import tqdm
 
@@ -22,16 +23,17 @@ class Progress:
         Where to; a bar if it is a terminal.
     """
 
-    def __init__(self, quiet: bool = False, stream=None):
+    def __init__(self, quiet: bool = False, stream: TextIO | None = None):
         self.quiet, self.stream = quiet, stream or sys.stderr
-        self._bar = None
-        self._stage, self._first, self._last_line = "", None, 0.0
+        self._bar: tqdm | None = None
+        self._first: tuple[int, float] | None = None
+        self._stage, self._last_line = "", 0.0
         self._terminal = self.stream.isatty()
 
-    def __enter__(self):
+    def __enter__(self) -> Progress:
         return self
 
-    def __exit__(self, *exception):
+    def __exit__(self, *exception: object) -> None:
         self._close()
 
     def stage(self, text: str) -> None:
@@ -81,16 +83,16 @@ class JsonProgress:
     when it is done, come ``{"event": "progress", "stage":, "done":, "total":, "text":}``.
     """
 
-    def __init__(self, stream=None):
+    def __init__(self, stream: TextIO | None = None):
         self.stream, self._stage, self._last = stream or sys.stderr, "", 0.0
 
-    def __enter__(self):
+    def __enter__(self) -> JsonProgress:
         return self
 
-    def __exit__(self, *exception):
+    def __exit__(self, *exception: object) -> None:
         pass
 
-    def tell(self, event: str, **facts) -> None:
+    def tell(self, event: str, **facts: object) -> None:
         """Write one line."""
         print(json.dumps({"event": event, **facts}), file=self.stream, flush=True)
 

@@ -6,18 +6,22 @@ with ``--json`` as one object at the end; progress, warnings and errors go to st
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import json
 import os
-import re
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from envedit.cli import run_options
 from envedit.cli.streams import steady
 from envedit.core import shipped
+
+if TYPE_CHECKING:
+    from envedit import config
 
 
 @steady
@@ -26,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     start = time.perf_counter()
     from envedit.core.errors import EnveditError, unwrapped
 
-    parser = _parser()
+    parser = run_options.parser()
     arguments = parser.parse_args(argv)
     if arguments.config is None:
         known = ", ".join(shipped.configurations())
@@ -69,7 +73,7 @@ def _progress(arguments):
     return JsonProgress() if wanted else Progress(quiet=arguments.quiet)
 
 
-def load(name, preset, overrides):
+def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[config.Config, Path | None, Path]:
     """Read a configuration, given as a path or as the name of a shipped one.
 
     Returns
@@ -84,7 +88,7 @@ def load(name, preset, overrides):
     from envedit import config
     from envedit.core.errors import ConfigError
 
-    if _is_scene(name):
+    if run_options.is_scene(name):
         file = Path(name)
         overrides = [f"scene.file={config.quote(name)}", *overrides]
         label = str(file.with_name(f"{file.stem or 'scene'}.toml"))  # its stem names the folder of results
@@ -104,39 +108,6 @@ def load(name, preset, overrides):
     return config.loads(text, Path.cwd(), str(file), preset, overrides), file, Path.cwd()
 
 
-def _is_scene(name):
-    """Distinguish a scene from a configuration: an XML file, or the name of a shipped scene."""
-    plain = not os.path.isfile(name) and name in shipped.scenes() and name not in shipped.configurations()
-    return name.lower().endswith(".xml") or plain
-
-
-def _quick(arguments):
-    """Return the overrides that --envmap, --paint, --target and --rotate stand for.
-
-    Raises
-    ------
-    ConfigError
-        They are given beside a configuration, which says the same.
-    """
-    from envedit import config
-    from envedit.core.errors import ConfigError
-
-    asked = {
-        "envmap": (("input.envmap", arguments.envmap),),
-        "paint": (("target.kind", "image"), ("target.file", arguments.paint)),
-        "target": (("target.file", arguments.target),),
-        "rotate": (("target.rotate_degrees", arguments.rotate),),
-    }
-    given = [name for name in asked if getattr(arguments, name) is not None]
-    if given and not _is_scene(arguments.config):
-        key = asked[given[0]][-1][0]
-        raise ConfigError(
-            f"--{given[0]}: got it beside a configuration, expected it beside a scene: "
-            f"set {key} in {arguments.config}, or --set {key}=..."
-        )
-    return [f"{key}={config.quote(value)}" for name in given for key, value in asked[name]]
-
-
 def _missing(file):
     """Return whether a file is missing; False where it cannot be looked at, which reading it will explain."""
     try:
@@ -148,103 +119,16 @@ def _missing(file):
     return False
 
 
-def _parser():
-    parser = argparse.ArgumentParser(
-        prog="envedit run",
-        description="Edit an HDR environment map so that a scene renders like a target.",
-        epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n"
-        "  envedit run scene.xml --envmap sky.hdr --rotate 90\n"
-        "  envedit run scene.xml --export-initial paint_me.png\n"
-        "  envedit run scene.xml --paint paint_me.png\n"
-        "  envedit run edits/move_shadow --out shadow --preset draft\n\n"
-        f"shipped configurations: {', '.join(shipped.configurations())}\n"
-        f"shipped scenes, for [scene] file: {', '.join(shipped.scenes())}\n\n"
-        "exit codes: 0 done; 2 bad configuration or usage; 3 bad image or scene file; 4 this machine cannot\n"
-        "run it; 5 the optimisation could not proceed; 130 interrupted, after writing a checkpoint",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "config",
-        metavar="CONFIG",
-        nargs="?",
-        help="a file, CONFIG.toml, or the name of a shipped one; or SCENE.xml, or the name of a shipped "
-        "scene, with the options of the next group",
-    )
-    quick = parser.add_argument_group(
-        "edits of a scene without a configuration",
-        "config.toml among the results says what was run; without a target the map is turned by 60 degrees",
-    )
-    quick.add_argument(
-        "--envmap", metavar="MAP", help="map to edit: a file, scene or sunsky (default: the scene's own)"
-    )
-    target = quick.add_mutually_exclusive_group()
-    target.add_argument("--paint", metavar="PICTURE", help="the rendering, painted over")
-    target.add_argument("--target", metavar="MAP", help="the rendering shall be as under this map")
-    target.add_argument("--rotate", metavar="DEGREES", type=float, help="... as under the map, turned")
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        help="folder for the results (default: CONFIG_out beside the configuration; "
-        "for a shipped one runs/NAME in the working folder)",
-    )
-    parser.add_argument(
-        "--preset",
-        choices=("draft", "standard", "paper"),
-        help="named set of defaults: standard; draft, in a third of the time; paper, the paper's method",
-    )
-    parser.add_argument(
-        "--set",
-        metavar="table.key=value",
-        action="append",
-        default=[],
-        dest="overrides",
-        help="change one key of the configuration, such as optimizer.iterations=50; may be repeated",
-    )
-    instead = parser.add_mutually_exclusive_group()
-    instead.add_argument(
-        "--resume", action="store_true", help="continue an interrupted run from its checkpoint"
-    )
-    instead.add_argument(
-        "--export-initial",
-        metavar="FILE",
-        help="only write the initial rendering, to paint on: linear .exr, or 16-bit .png under "
-        "[target] tonemap, or under reinhard where that would clip",
-    )
-    instead.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="only write the target, dry_run.png and dry_run.exr in the folder of the results: no edit",
-    )
-    instead.add_argument(
-        "--budget",
-        metavar="TIME",
-        help="choose widths, steps and samples so that the run ends within 30, 30s or 2m",
-    )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument(
-        "--json",
-        action="store_true",
-        help="print one JSON object at the end: folder, files, metrics, or error",
-    )
-    parser.add_argument(
-        "--progress",
-        choices=("text", "json"),
-        default="text",
-        help="progress on stderr as text or JSON lines",
-    )
-    return parser
-
-
 def _run(arguments, start):
     from envedit import config
     from envedit.core.errors import ConfigError
     from envedit.report import output_folder
 
-    overrides = [*_quick(arguments), *arguments.overrides]
+    overrides = [*run_options.quick(arguments), *arguments.overrides]
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
     settings, arguments.config, arguments.base = load(arguments.config, arguments.preset, overrides)
-    allowed = None if arguments.budget is None else _seconds(arguments.budget)
+    allowed = None if arguments.budget is None else run_options.seconds(arguments.budget)
     if arguments.export_initial is not None:
         return _export_initial(settings, arguments)
     if arguments.dry_run:
@@ -325,17 +209,6 @@ def _interrupted(arguments, folder, again):
     return 130
 
 
-def _seconds(text):
-    """Read --budget."""
-    from envedit.core.errors import ConfigError
-
-    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
-    value = float(found[1]) * (60 if found[2].startswith("m") else 1) if found else 0
-    if not 0 < value < 1e6:
-        raise ConfigError(f"--budget: got {text!r}, expected seconds or minutes, such as 30s or 2m")
-    return value
-
-
 def _export_initial(settings, arguments):
     """Write the picture to paint on, and nothing else."""
     from envedit.cli import doctor
@@ -348,9 +221,9 @@ def _export_initial(settings, arguments):
     mi.set_log_level(mi.LogLevel.Error)
     from envedit import inputs
     from envedit.report import output_folder
-    from envedit.targets import painted_image
+    from envedit.targets import initial_rendering
 
-    painted_image.check_export(file)
+    initial_rendering.check_export(file)
     with _progress(arguments) as progress:
         progress.stage("rendering the picture to paint on")
         lit = inputs.load_scene(settings.scene, arguments.base)
@@ -358,15 +231,15 @@ def _export_initial(settings, arguments):
         files = files[1:] or files
         files = [(file.with_name(name), rows) for name, rows in files]
         for one, _ in files:
-            painted_image.check_export(one)
+            initial_rendering.check_export(one)
         envmap, warnings = inputs.load_map(settings.input, lit)
         notes = inputs.notes(settings.input, lit)
         source = inputs.source_of(settings.input, lit)  # what the picture is marked as made from
         settings = replace(settings, input=replace(settings.input, envmap=source))
-        picture = painted_image.initial(lit, envmap, settings)
-        under = painted_image.export_tonemap(file, picture, settings)
+        picture = initial_rendering.initial(lit, envmap, settings)
+        under = initial_rendering.export_tonemap(file, picture, settings)
         for one, rows in files:
-            warnings += painted_image.export(one, picture[rows], settings, under)
+            warnings += initial_rendering.export(one, picture[rows], settings, under)
     for line in warnings:
         _tell(arguments, "warning", line)
     for line in notes:

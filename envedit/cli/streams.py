@@ -10,6 +10,7 @@ import contextlib
 import functools
 import os
 import sys
+from collections.abc import Callable
 
 
 class _Steady:
@@ -51,7 +52,7 @@ class _Steady:
         return getattr(self._stream, name)
 
 
-def steady(main):
+def steady(main: Callable[..., int]) -> Callable[..., int]:
     """Let a command line's ``main`` run with streams that do not fail."""
 
     @functools.wraps(main)

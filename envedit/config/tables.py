@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 from envedit.config.validators import Check, meant, named, show
 from envedit.core.errors import ConfigError
 
-When = Mapping[str, tuple[Any, ...]]
+When = dict[str, tuple[Any, ...]]
 """Where a key has a meaning: other keys, "table.key", with the values that they have there; () stands for any
 but an empty one or 0. The key ``solver`` is not one of a file: the steps that are made, "gauss-newton" or
 "adam"."""
@@ -52,7 +52,7 @@ class Table:
 
     def __new__(cls, *values: Any, **named: Any) -> Self:
         """Note which fields are given; ConfigError for one that there is not."""
-        table, known = super().__new__(cls), [f.name for f in fields(cls)]
+        table, known = super().__new__(cls), [f.name for f in fields(cls)]  # type: ignore[arg-type]
         where = "" if cls.__name__ == "Config" else f"{cls.__name__.lower()}."
         if len(values) > len(known):
             raise ConfigError(f"{cls.__name__}: got {len(values)} values, expected at most {len(known)}")
@@ -71,7 +71,7 @@ class Table:
         return table
 
     def __post_init__(self) -> None:
-        for f in fields(self):
+        for f in fields(self):  # type: ignore[arg-type]  # every table is a dataclass
             object.__setattr__(self, f.name, checked(f, self._name(f.name), getattr(self, f.name)))
         self._check_together()
 

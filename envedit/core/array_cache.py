@@ -98,7 +98,7 @@ class DiskCache:
             with replacing(path) as temporary, open(temporary, "wb") as file:
                 file.write(head)
                 for array in arrays.values():
-                    file.write(array.reshape(-1).view(np.uint8))
+                    file.write(array.reshape(-1).view(np.uint8).data)
                     file.write(bytes(_padded(array.nbytes) - array.nbytes))
 
     def remove(self, key: dict) -> None:

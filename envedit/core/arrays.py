@@ -6,13 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.types import ArrayLike, DrArray
 
-def tensor(values) -> mi.TensorXf:
+
+def tensor(values: ArrayLike) -> mi.TensorXf:
     """Copy numbers of any shape to a float32 tensor."""
     return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
 
 
-def flat(kind, values):
+def flat(kind: type[DrArray], values: ArrayLike) -> DrArray:
     """Copy numbers to an array of a Dr.Jit type; done when this returns, so that ``values`` may change.
 
     Parameters

@@ -1,17 +1,24 @@
 """Files that are written whole or not at all."""
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 from envedit.core.errors import EnveditError, InputError
 
+if TYPE_CHECKING:
+    from envedit.core.types import FilePath
+
 
 @contextlib.contextmanager
-def replacing(path, suffix: str = ""):
+def replacing(path: FilePath, suffix: str = "") -> Iterator[Path]:
     """Give a temporary name in the same folder, and move what was written there to ``path`` at the end.
 
     .. code-block:: python
@@ -53,7 +60,7 @@ def replacing(path, suffix: str = ""):
             temporary.unlink(missing_ok=True)
 
 
-def write_atomically(path, data: bytes) -> None:
+def write_atomically(path: FilePath, data: bytes) -> None:
     """Write bytes as a file, whole or not at all; see :func:`replacing`.
 
     Raises
@@ -65,7 +72,7 @@ def write_atomically(path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def opened(path):
+def opened(path: FilePath) -> BinaryIO:
     """Open a regular file for reading bytes; a pipe or a device would wait or never end.
 
     Raises

@@ -3,31 +3,34 @@
 Everything here is numpy on arrays of any shape. The losses take their luminance weights from here.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 
 import numpy as np
 
 from envedit.core.errors import ConfigError
+from envedit.core.types import ArrayLike
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Rec.709 weights of red, green and blue (Eq. 7)."""
 
 
-def luminance(image) -> np.ndarray:
+def luminance(image: ArrayLike) -> np.ndarray:
     """Return Rec.709 luminance float64 ``(...)`` of radiance ``(..., 3)``: 0.2126 R + 0.7152 G + 0.0722 B."""
     image = np.asarray(image)
     r, g, b = (np.float64(w) for w in LUMINANCE)  # float64, so that 3e38 does not overflow
     return r * image[..., 0] + g * image[..., 1] + b * image[..., 2]
 
 
-def srgb_to_linear(t) -> np.ndarray:
+def srgb_to_linear(t: ArrayLike) -> np.ndarray:
     """Undo the sRGB curve (IEC 61966-2-1) of display values in [0, 1]."""
     t = np.clip(t, 0, 1)
     return np.where(t <= 0.04045, t / 12.92, ((t + 0.055) / 1.055) ** 2.4)
 
 
-def linear_to_srgb(e) -> np.ndarray:
+def linear_to_srgb(e: ArrayLike) -> np.ndarray:
     """Apply the sRGB curve (IEC 61966-2-1) to linear values, cut to [0, 1]."""
     e = np.clip(e, 0, 1)
     return np.where(e <= 0.0031308, 12.92 * e, 1.055 * e ** (1 / 2.4) - 0.055)
@@ -63,7 +66,7 @@ def _reinhard_inverse(t):
     return t / (1 + 1 / REINHARD_WHITE - t)
 
 
-def tonemap(image, name: str = "gamma") -> np.ndarray:
+def tonemap(image: ArrayLike, name: str = "gamma") -> np.ndarray:
     """Map linear radiance to display values in [0, 1], element by element; NaN stays NaN.
 
     - ``gamma``: clip(E, 0, 1)^(1/2.2)
@@ -81,7 +84,7 @@ def tonemap(image, name: str = "gamma") -> np.ndarray:
     return _named(TONEMAPS, name)(np.asarray(image))
 
 
-def inverse_tonemap(image, name: str = "gamma") -> np.ndarray:
+def inverse_tonemap(image: ArrayLike, name: str = "gamma") -> np.ndarray:
     """Map display values back to linear radiance; what :func:`tonemap` has cut does not come back."""
     return _named(INVERSE_TONEMAPS, name)(np.asarray(image))
 

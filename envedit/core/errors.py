@@ -4,7 +4,14 @@ Every message is one or two lines: what, where (file, key, row and column), what
 Modules raise these; only the command lines turn them into text on stderr and an exit code.
 """
 
+from __future__ import annotations
+
 import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 class EnveditError(ValueError):
@@ -37,7 +44,7 @@ class NumericalError(EnveditError):
     exit_code = 5
 
 
-def place_of(bad, first_row: int = 0) -> str:
+def place_of(bad: np.ndarray, first_row: int = 0) -> str:
     """Name the first True of a mask (H, W) or (H, W, C), whose row 0 is ``first_row``: "row 3, column 7"."""
     texels = bad.reshape(*bad.shape[:2], -1).any(axis=2)
     row, column = divmod(int(texels.argmax()), texels.shape[1])
@@ -45,7 +52,7 @@ def place_of(bad, first_row: int = 0) -> str:
 
 
 @contextlib.contextmanager
-def unwrapped():
+def unwrapped() -> Iterator[None]:
     """Raise errors that a user should see, and Ctrl-C, as they are; also a decorator.
 
     Dr.Jit raises RuntimeError from whatever is raised inside its operations and loops.
@@ -53,7 +60,7 @@ def unwrapped():
     try:
         yield
     except RuntimeError as error:
-        cause = error
+        cause: BaseException | None = error
         while cause and not isinstance(cause, (EnveditError, KeyboardInterrupt)):
             cause = cause.__cause__
         if cause is None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import mitsuba as mi
@@ -34,7 +35,7 @@ def come_first() -> None:
 
 
 @contextlib.contextmanager
-def restored():
+def restored() -> Iterator[None]:
     """Take back, at the end, what a parsed scene adds to Mitsuba's file resolver."""
     before = _folders()
     try:

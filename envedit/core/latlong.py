@@ -13,11 +13,15 @@ radians they differ by a factor 1 + h^2 / 24, and at the poles, per radian of az
 and the second h^2 / 6.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import ArrayLike
 
 __all__ = [
     "check_envmap_size",
@@ -58,13 +62,13 @@ def directions(height: int, width: int) -> np.ndarray:
     return d
 
 
-def on_sphere(theta, phi) -> np.ndarray:
+def on_sphere(theta: ArrayLike, phi: ArrayLike) -> np.ndarray:
     """Return directions (..., 3) in the emitter's frame at a colatitude and an azimuth of the map, 2 pi u."""
     sin = np.sin(theta)
     return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta), -sin * np.cos(phi)), axis=-1)
 
 
-def texel_position(d, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def texel_position(d: ArrayLike, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the fractional (row, column) at which Mitsuba looks up directions.
 
     Parameters
@@ -89,7 +93,7 @@ def texel_position(d, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return v * (height - 1), u * width - 0.5
 
 
-def lookup(image, d) -> np.ndarray:
+def lookup(image: ArrayLike, d: ArrayLike) -> np.ndarray:
     """Interpolate a map at directions as Mitsuba's ``envmap`` does, in float64.
 
     Parameters
@@ -166,7 +170,7 @@ def _caps(v):
 # Resampling
 
 
-def resize(image, height: int, width: int) -> np.ndarray:
+def resize(image: ArrayLike, height: int, width: int) -> np.ndarray:
     """Resample a map to another size on the sphere.
 
     An axis that shrinks is averaged over the area of the sphere that each new texel covers (columns are
@@ -207,7 +211,7 @@ def resize(image, height: int, width: int) -> np.ndarray:
     return result
 
 
-def _row_weights(old: int, new: int):
+def _row_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.ndarray]]:
     """Yield (source rows, weights) for each new row."""
     if new == old:
         yield from (([i], np.ones(1)) for i in range(new))
@@ -221,7 +225,7 @@ def _row_weights(old: int, new: int):
             yield [first, min(first + 1, old - 1)], np.array([1 - (p - first), p - first])
 
 
-def _column_weights(old: int, new: int):
+def _column_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.ndarray]]:
     """Yield (source columns, weights) for each new column."""
     if new == old:
         yield from (([i], np.ones(1)) for i in range(new))
@@ -242,7 +246,7 @@ def _overlaps(source, target, measure):
         yield slice(first, last), weight / weight.sum()
 
 
-def rotate(image, degrees: float) -> np.ndarray:
+def rotate(image: ArrayLike, degrees: float) -> np.ndarray:
     """Turn a map about the vertical axis; positive degrees move the picture to the left, to smaller columns.
 
     360 degrees are one width: new(u) = old(u + degrees / 360). A shift by whole texels (to 1e-6) is exactly
@@ -289,7 +293,7 @@ def halo_index(height: int, width: int) -> np.ndarray:
     return (3 * texel[..., None] + np.arange(3)).astype(np.uint32).ravel()
 
 
-def to_envmap_data(image) -> np.ndarray:
+def to_envmap_data(image: ArrayLike) -> np.ndarray:
     """Return ``envmap.data`` of Mitsuba >= 3.9, ``(H, W + 2, 3)`` float32, for a map ``(H, W, 3)``.
 
     The first column repeats the last texel of each row and the last column the first. Mitsuba does not
@@ -307,7 +311,7 @@ def to_envmap_data(image) -> np.ndarray:
     return np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
 
 
-def from_envmap_data(data) -> np.ndarray:
+def from_envmap_data(data: ArrayLike) -> np.ndarray:
     """Return the map ``(H, W, 3)`` float32 held by Mitsuba's ``envmap.data``, ``(H, W + 2, 3)``."""
     data = np.array(data, dtype=np.float32)
     if data.ndim != 3 or data.shape[2] != 3 or data.shape[1] < MIN_WIDTH + 2:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from envedit.core.errors import InputError
@@ -34,7 +36,7 @@ _BRADFORD = np.array(  # Lam 1985, as of ICC.1:2010, Annex E
 )
 
 
-def known(chromaticities, where: str) -> Chromaticities | None:
+def known(chromaticities: Iterable[float], where: str) -> Chromaticities | None:
     """Check chromaticities of a file; None where they are those of Rec. 709.
 
     Raises

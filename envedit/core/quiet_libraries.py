@@ -1,21 +1,25 @@
 """C libraries that print about the files they read, kept off the terminal."""
 
+from __future__ import annotations
+
 import contextlib
 import ctypes
 import io
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def quiet_libraries():
+def quiet_libraries() -> Iterator[list[str]]:
     """Keep what C libraries print about a file off the user's terminal; yields a list that receives the text.
 
     OpenEXR and libjpeg write to file descriptor 2 and to ``sys.stdout``, OpenEXR's decoder of JPEG 2000 to
     file descriptor 1, and carry on.
     """
-    said, text = [], io.StringIO()
+    said: list[str] = []
+    text = io.StringIO()
     with contextlib.ExitStack() as stack:
         _flush_c()
         kept = {}

@@ -1,12 +1,16 @@
 """What is wrong with an image: texels not finite, negative or cut; counted, named, mended, refused."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.errors import InputError
+from envedit.core.types import ArrayLike
 
 HALF_MAX = 65504.0
 """The largest half: where many programs cut the sun."""
@@ -51,13 +55,13 @@ class Health:
             (self.negative, "negative", self.first_negative),
             (self.saturated, "at the largest half (65504)", self.first_saturated),
         )
-        found = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if n]
+        found = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if p]
         stops = math.log2(self.dynamic_range) if self.dynamic_range > 0 else 0.0
         spread = f"{self.minimum:.4g} to {self.maximum:.4g}, median {self.median:.4g}, {stops:.1f} stops"
         return f"{self.texels} texels, {spread}; {', '.join(found) or 'nothing unusual'}"
 
 
-def health(image) -> Health:
+def health(image: ArrayLike) -> Health:
     """Count the NaN, infinite, negative and half-saturated texels of an image; see :class:`Health`."""
     image = np.asarray(image)
     finite = np.isfinite(image)
@@ -70,11 +74,11 @@ def health(image) -> Health:
     clean = bool(finite.all())  # then nothing has to be copied
     if not clean:
         masks["negative"] &= ~any_channel(~finite)
-    fields = {}
+    found: dict[str, Any] = {}
     for kind, mask in masks.items():
-        fields[kind] = int(mask.sum())
+        found[kind] = int(mask.sum())
         first = np.unravel_index(mask.argmax(), mask.shape)
-        fields[f"first_{kind}"] = (int(first[0]), int(first[1])) if fields[kind] else None
+        found[f"first_{kind}"] = (int(first[0]), int(first[1])) if found[kind] else None
     values = image if clean else image[finite]
     y = luminance(image if clean else image[~any_channel(~finite)])
     positive = y[y > 0]
@@ -84,16 +88,16 @@ def health(image) -> Health:
         maximum=float(values.max()) if values.size else 0.0,
         median=float(np.median(y)) if y.size else 0.0,
         dynamic_range=float(positive.max() / positive.min()) if positive.size else 0.0,
-        **fields,
+        **found,
     )
 
 
-def any_channel(mask):
+def any_channel(mask: np.ndarray) -> np.ndarray:
     """Return where any channel of (H, W, 3) is set; numpy's own ``any(2)`` takes five times as long."""
     return mask[..., 0] | mask[..., 1] | mask[..., 2]
 
 
-def require_radiance(image, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
+def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
     """Refuse an image that holds anything but radiance: finite, not negative and at most ``brightest``.
 
     Parameters
@@ -125,7 +129,7 @@ def require_radiance(image, what: str, first_row: int = 0, brightest: float = ma
             raise InputError(f"{what}: {texels.sum()} texels are {how}, {where}: {cure}")
 
 
-def repair(image) -> tuple[np.ndarray, int]:
+def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
     """Replace every non-finite texel by the mean of its finite neighbours.
 
     The eight neighbours, columns periodic; holes are filled from their rim inwards. A texel with one bad
@@ -172,7 +176,7 @@ def repair(image) -> tuple[np.ndarray, int]:
         image[row, column] = total[rim] / weight[rim, None]
         good[row, column] = True
         # Only neighbours of what was just filled can be next.
-        texel = [np.clip(row + i, 0, height - 1) * width + (column + j) % width for i, j in steps]
-        texel = np.unique(np.concatenate(texel))
+        beside = [np.clip(row + i, 0, height - 1) * width + (column + j) % width for i, j in steps]
+        texel = np.unique(np.concatenate(beside))
         row, column = np.divmod(texel[~good.ravel()[texel]], width)
     return image, count

@@ -17,7 +17,8 @@ def folder() -> Path | None:
 
 def scenes() -> tuple[str, ...]:
     """Name the shipped scenes: what ``[scene] file`` takes without a path."""
-    return tuple(sorted(path.stem for path in folder().glob("*.xml"))) if folder() else ()
+    root = folder()
+    return tuple(sorted(path.stem for path in root.glob("*.xml"))) if root else ()
 
 
 def configurations() -> tuple[str, ...]:
@@ -28,7 +29,8 @@ def configurations() -> tuple[str, ...]:
 
 def configuration(name: str) -> Path | None:
     """Return the file of a shipped configuration; None if none has that name."""
-    return folder() / f"{name}.toml" if name in configurations() else None
+    root = folder()
+    return root / f"{name}.toml" if root and name in configurations() else None
 
 
 def holds(path: Path) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
+from envedit.core.rows import Rows
 from envedit.export import adjustments, full_resolution
 from envedit.representations import Representation
 from envedit.representations.layers import placed_lights
@@ -49,8 +50,7 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
         return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
     before = latlong.rotate(result.maps["initial"], found.turn_degrees)
     source = latlong.rotate(full.radiance, found.turn_degrees)
-    first, last = inputs.active_rows(settings.input.rows, before.shape[0])
-    rows = first, last - first + 1
+    rows = inputs.active_rows(settings.input.rows, before.shape[0])
     edited = found.edited
     carried = full_resolution.carry(
         found.representation, found.params, before, edited, source, rows, found.free
@@ -63,7 +63,7 @@ def _by_hand(settings: config.Input, given: inputs.InputMap) -> inputs.InputMap:
     full = given.at_file_size(settings.repair)
     if given.placed is not None:
         own = given.placed
-        before, rows = own.envmap, (0, len(own.envmap))
+        before, rows = own.envmap, Rows.of(len(own.envmap))
         moved = full.radiance
         if any("light" in light for light in settings.lights):
             moved = full_resolution.carry(

@@ -16,8 +16,10 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat
 from envedit.core.errors import NumericalError, place_of
+from envedit.core.rows import Rows
 from envedit.export.ratio_transfer import Ratio
 from envedit.export.texel_maps import Places, as_image
+from envedit.representations.base import Representation
 from envedit.representations.layers import lights
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.layers import Layers, gone_of, unseen_kept
@@ -28,12 +30,12 @@ POINTS_AT_ONCE = 1 << 20
 
 
 def carry(
-    representation,
+    representation: Representation,
     params: dict,
     original_working: np.ndarray,
     edited_working: np.ndarray,
     source: np.ndarray,
-    rows_working: tuple[int, int],
+    rows_working: Rows,
     free: np.ndarray | None = None,
 ) -> np.ndarray:
     """Apply an edit to the source of a working map.
@@ -63,8 +65,8 @@ def carry(
         The working map before and after; the first is the source resized. Layers need neither.
     source : ndarray (H, W, 3) float32
         Linear radiance, finite and not negative.
-    rows_working : (int, int)
-        First active row of the working map and number of active rows.
+    rows_working : Rows
+        Active rows of the working map.
     free : ndarray of bool (rows, w), optional
         Active working texels that may change at all; None: all. Layers know which keep their gain
         (:meth:`.layers.Layers.keep`): a light may move across those.
@@ -88,19 +90,18 @@ def carry(
     source = np.asarray(source)
     if source.ndim != 3 or source.shape[2] != 3 or source.dtype != np.float32:
         raise ValueError(f"carry: a source is (H, W, 3) float32, got {source.shape} {source.dtype}")
-    height, width = np.shape(edited_working)[:2]
+    width = np.shape(edited_working)[1]
     if np.shape(original_working) != np.shape(edited_working):
         raise ValueError(
             f"carry: the working maps have shapes {np.shape(original_working)} and {np.shape(edited_working)}"
         )
-    first, count = rows_working
-    grid = Places(source.shape[:2], (first, count, height, width))
-    if representation.models_edit:
+    grid = Places(source.shape[:2], rows_working, width)
+    work: _LayersAt | Ratio
+    if isinstance(representation, Layers):
         work = _LayersAt(representation, params, grid)
         work.collect(source)
     else:
-        rows = slice(first, first + count)
-        work = Ratio(original_working, edited_working, rows, free, grid)
+        work = Ratio(original_working, edited_working, free, grid)
         work.correct(source)
     result = source.copy()
     for start, fresh, size in grid.bands():
@@ -167,7 +168,7 @@ class _LayersAt:
         if self.survey is not None:
             start, total = self.survey.rows
             rows, columns = self.survey.label.shape
-            self.surveyed = Places(grid.shape, (start, rows, total, columns))
+            self.surveyed = Places(grid.shape, Rows(start, rows, total), columns)
             self.inside = self.survey.label >= 0
             self.label = grown(self.survey.label)
         theta = np.pi * np.arange(self.height) / max(self.height - 1, 1)

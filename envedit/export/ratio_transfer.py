@@ -26,8 +26,8 @@ ROUNDS = 3, 3
 class Ratio:
     """What was done to a working map, applied to its source; see :func:`.full_resolution.carry`."""
 
-    def __init__(self, original, edited, rows, free, grid: Places):
-        self.grid = grid
+    def __init__(self, original: np.ndarray, edited: np.ndarray, free: np.ndarray | None, grid: Places):
+        self.grid, rows = grid, grid.rows.slice
         self.old, self.want = (np.asarray(e, np.float64)[rows] for e in (original, edited))
         self.changed = (np.asarray(original)[rows] != np.asarray(edited)[rows]).any(axis=2)
         if free is not None:
@@ -78,7 +78,7 @@ class Ratio:
         weights = np.diff(np.clip(np.arange(width + 1) / width, target[:-1, None], target[1:, None]), axis=1)
         self.over = (weights / weights.sum(axis=1, keepdims=True)).T
 
-    def correct(self, source):
+    def correct(self, source: np.ndarray) -> None:
         """Correct m and a until the means of the changed working texels are the edited map's."""
         if self.same_size or not self.changed.any():
             return
@@ -122,7 +122,7 @@ class Ratio:
             result[used] = np.einsum("rwc,wk->rkc", part.astype(np.float64), self.over, optimize=True)
         return result
 
-    def band(self, source, start):
+    def band(self, source: np.ndarray, start: int) -> np.ndarray:
         """Compose the rows of a source that begin at ``start``."""
         size = len(source)
         low, high = (r[start : start + size] for r in self.rows)

@@ -6,9 +6,14 @@ on the host, where it is small, and across the columns on the device.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from envedit.core.rows import Rows
+from envedit.core.types import DrArray
 
 BAND_TEXELS = 1 << 21
 """Texels of the source that are worked on at a time."""
@@ -21,8 +26,10 @@ class Places:
     ----------
     shape : (int, int)
         Rows and columns of the source.
-    coarse : (int, int, int, int)
-        First row and number of rows of the coarser image, rows and columns of its map.
+    rows : Rows
+        Which rows of its map the coarser image is.
+    columns : int
+        Its columns.
 
     Attributes
     ----------
@@ -34,10 +41,10 @@ class Places:
         Rows of the source whose nearest row is in the coarser image.
     """
 
-    def __init__(self, shape, coarse):
-        self.shape, (first, self.count, total, self.columns) = shape, coarse
+    def __init__(self, shape: tuple[int, int], rows: Rows, columns: int):
+        self.shape, self.rows, self.count, self.columns = shape, rows, rows.count, columns
         height, width = shape
-        place = np.arange(height) * ((total - 1) / max(height - 1, 1)) - first
+        place = np.arange(height) * ((rows.total - 1) / max(height - 1, 1)) - rows.first
         nearest = np.rint(place)
         inside = np.flatnonzero((nearest >= 0) & (nearest < self.count))
         self.start, self.stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
@@ -52,14 +59,14 @@ class Places:
         self._index = [dr.opaque(mi.UInt32(np.ascontiguousarray(i))) for i in index.T]
         self._part = [dr.opaque(mi.Float(np.ascontiguousarray(p))) for p in part.T]
 
-    def bands(self):
+    def bands(self) -> Iterator[tuple[int, int, int]]:
         """Yield (first row, first row not in an earlier band, rows): bands of one size over start to stop."""
         height = self.stop - self.start
         size = min(max(BAND_TEXELS // self.shape[1], 1), height)
         for fresh in range(self.start, self.stop, max(size, 1)):
             yield min(fresh, self.stop - size), fresh, size
 
-    def along_rows(self, values, start, size, edge=None):
+    def along_rows(self, values: np.ndarray, start: int, size: int, edge: int | None = None) -> np.ndarray:
         """Interpolate values (rows, w, C) at rows of the source; float32 (size, w, C).
 
         Nothing is interpolated across the edge before row ``edge`` of the values.
@@ -70,7 +77,7 @@ class Places:
             place = np.where(above, np.minimum(place, edge - 1), np.clip(place, edge, self.count - 1))
         return _between(values, place)
 
-    def inner(self, mask, start, size):
+    def inner(self, mask: np.ndarray, start: int, size: int) -> np.ndarray:
         """Interpolate a mask (rows, w) by its corners, 0 wherever a texel is not in it; (size, w + 1)."""
         around = np.pad(mask, ((1, 1), (0, 0)), mode="edge")
         across = around & np.roll(around, 1, axis=1)
@@ -79,7 +86,9 @@ class Places:
         place = np.clip(self.place[start : start + size] + 0.5, 0, self.count)
         return _between(corners[..., None], place)[..., 0]
 
-    def across(self, kind, table, row, column, corners=False):
+    def across(
+        self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32, corners: bool = False
+    ) -> DrArray:
         """Interpolate a table of :meth:`along_rows`, or of :meth:`inner`, at texels of a band."""
         left, right = self._index[2:4] if corners else self._index[:2]
         part = dr.gather(mi.Float, self._part[1 if corners else 0], column)
@@ -88,16 +97,16 @@ class Places:
         b = dr.gather(kind, table, first + dr.gather(mi.UInt32, right, column))
         return a + (b - a) * part
 
-    def nearest(self, kind, table, row, column):
+    def nearest(self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32) -> DrArray:
         """Look up a table (size, w) at texels of a band."""
         place = row * dr.opaque(mi.UInt32, self.columns) + dr.gather(mi.UInt32, self._index[4], column)
         return dr.gather(kind, table, place)
 
-    def beside(self, column):
+    def beside(self, column: mi.UInt32) -> mi.Float:
         """Columns from the nearest, -1/2 to 1/2."""
         return dr.gather(mi.Float, self._part[1], column) - 0.5
 
-    def texels(self, size):
+    def texels(self, size: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Row and column in the band of all its texels."""
         index = dr.arange(mi.UInt32, size * self.shape[1])
         row = index // dr.opaque(mi.UInt32, self.shape[1])
@@ -111,6 +120,6 @@ def _between(values, place):
     return (values[top] + (values[bottom] - values[top]) * part).astype(np.float32)
 
 
-def as_image(colour, size, width):
+def as_image(colour: mi.Color3f, size: int, width: int) -> mi.TensorXf:
     """Arrange the texels of a band as a tensor (size, width, 3)."""
     return mi.TensorXf(dr.ravel(colour), (size, width, 3))

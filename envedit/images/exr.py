@@ -1,5 +1,7 @@
 """OpenEXR files: which part and channels are a picture, and their pixels as float32."""
 
+from __future__ import annotations
+
 import re
 
 import numpy as np
@@ -7,6 +9,7 @@ import numpy as np
 from envedit.core import primaries
 from envedit.core.errors import InputError
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.types import Info
 from envedit.images.headers import MAX_TEXELS, check_declared, damaged, shown
 
 _SPACE_NAMES = "colorInteropID", "oiio:ColorSpace"  # attributes that name a colour space
@@ -14,7 +17,7 @@ _MOST_VALUES = 4 * MAX_TEXELS  # over all channels: colour and alpha of the larg
 _MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
 
 
-def declared(name):
+def declared(name: str) -> list:
     """Return the parts of a file, without pixels, once the sizes that they declare have been checked."""
     import OpenEXR
 
@@ -44,7 +47,7 @@ def declared(name):
     return parts
 
 
-def read(name, head, info, stored):
+def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`."""
     import OpenEXR
 

@@ -6,6 +6,8 @@ first bytes, the ``info`` of :func:`.images.read`, which it fills, and whether t
 exception.
 """
 
+from __future__ import annotations
+
 import os
 import stat
 
@@ -16,7 +18,7 @@ MAX_TEXELS = 2**27
 """16384 x 8192 texels: 1.6 GB as float32. A header that declares more is refused before allocation."""
 
 
-def head_of(name):
+def head_of(name: str) -> bytes:
     """Return the first bytes of a regular file."""
     try:
         mode = os.stat(name).st_mode
@@ -37,7 +39,7 @@ def head_of(name):
     return head
 
 
-def check_declared(name, width, height):
+def check_declared(name: str, width: int, height: int) -> None:
     """Refuse a size before memory is asked for."""
     if width < 1 or height < 1:
         raise InputError(f"{name}: the header declares {width} x {height} texels; the file is damaged")
@@ -48,13 +50,13 @@ def check_declared(name, width, height):
         )
 
 
-def damaged(name, reason):
+def damaged(name: str, reason: object) -> InputError:
     """Return the error for a file that starts well and cannot be decoded."""
     reason = shown(" ".join(str(reason).split()), 160) or "no reason given"
     return InputError(f"{name}: damaged or truncated ({reason}); export or download it again")
 
 
-def shown(text, most=60):
+def shown(text: str, most: int = 60) -> str:
     """Return text of a file for a message: cut to ``most`` characters, without control codes."""
     text = text[:most]
     return text if text.isprintable() else ascii(text)[1:-1][:most]

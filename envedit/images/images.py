@@ -5,6 +5,8 @@ mend raise ``InputError`` with the file's name; what is merely odd goes to ``inf
 sentences.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 import zlib
@@ -15,6 +17,7 @@ from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import replacing, write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, rgbe
 from envedit.images.headers import MAX_SIDE, damaged, head_of
 
@@ -35,7 +38,7 @@ __all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_hdr", "writ
 # Reading
 
 
-def read(path) -> tuple[np.ndarray, dict]:
+def read(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as linear radiance.
 
     The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; layers; the
@@ -67,7 +70,7 @@ def read(path) -> tuple[np.ndarray, dict]:
     return _in_rec709(image, info), info
 
 
-def read_stored(path) -> tuple[np.ndarray, dict]:
+def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as it was painted: with alpha, and without undoing any display curve.
 
     Parameters
@@ -138,7 +141,11 @@ def _decode(path, stored):
 
 
 def load_envmap(
-    path, width: int | None = None, repair: bool = False, convert: bool = True, name: str = ARRAY
+    path: FilePath | np.ndarray,
+    width: int | None = None,
+    repair: bool = False,
+    convert: bool = True,
+    name: str = ARRAY,
 ) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
@@ -195,14 +202,14 @@ def load_envmap(
         except InputError as e:
             raise InputError(f"{name}: {e}") from None
         warnings.append(f"{where}: replaced from their neighbours")
-    if found.negative:
+    if found.first_negative:
         row, column = found.first_negative
         warnings.append(
             f"{found.negative} texels are negative (down to {found.minimum:.3g}), the first at row {row}, "
             f"column {column}: set to 0"
         )
     image = np.maximum(image, 0)  # also turns -0.0 into 0
-    if found.saturated:
+    if found.first_saturated:
         row, column = found.first_saturated
         warnings.append(
             f"{found.saturated} texels sit at 65504, the largest half, the first at row {row}, "
@@ -225,7 +232,7 @@ def _of_array(values: np.ndarray, name: str) -> tuple[np.ndarray, dict]:
     with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is named as such
         image = np.array(values, np.float32)
     size = image.shape[1], image.shape[0]
-    info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
+    info: Info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
     return image, info | {"chromaticities": None}
 
 
@@ -234,11 +241,11 @@ def _of_array(values: np.ndarray, name: str) -> tuple[np.ndarray, dict]:
 
 
 def write_exr(
-    path,
-    image,
+    path: FilePath,
+    image: ArrayLike,
     metadata: dict | None = None,
     panorama: bool = True,
-    alpha=None,
+    alpha: ArrayLike | None = None,
     half: bool = False,
     chromaticities: primaries.Chromaticities | None = None,
 ) -> None:
@@ -274,7 +281,7 @@ def write_exr(
     import OpenEXR
 
     name = os.fsdecode(path)
-    image = _checked(name, image)
+    pixels = _checked(name, image)
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -291,14 +298,14 @@ def write_exr(
         header[str(key)] = value if plain else str(value)
     if half:
         with np.errstate(over="ignore"):  # refused as an infinity
-            image = _checked(name, image.astype(np.float16)).astype(np.float16)
-    planes = {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}
+            pixels = _checked(name, pixels.astype(np.float16)).astype(np.float16)
+    planes = {c: np.ascontiguousarray(pixels[..., i]) for i, c in enumerate("RGB")}
     if alpha is not None:
         planes["A"] = np.ascontiguousarray(alpha, np.float32)
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
 
 
-def write_hdr(path, image) -> None:
+def write_hdr(path: FilePath, image: ArrayLike) -> None:
     """Write an image as a Radiance file (:func:`.rgbe.encode`), whole or not at all.
 
     Parameters
@@ -317,7 +324,7 @@ def write_hdr(path, image) -> None:
     write_atomically(name, rgbe.encode(np.maximum(_checked(name, image), 0)))
 
 
-def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
+def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:
     """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel, whole or not at all.
 
     Parameters
@@ -346,7 +353,7 @@ def write_png(path, image, bits: int = 8, metadata: dict | None = None) -> None:
     write_atomically(name, data[:_PNG_HEADER] + texts + data[_PNG_HEADER:])
 
 
-def png(codes) -> bytes:
+def png(codes: np.ndarray) -> bytes:
     """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG.
 
     In memory: Mitsuba does not report that the last bytes of a file did not fit on the disk.

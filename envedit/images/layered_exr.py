@@ -11,6 +11,7 @@ from envedit.core.atomic_files import replacing
 from envedit.core.errors import ConfigError, NumericalError, place_of
 from envedit.core.primaries import REC709, Chromaticities
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.types import FilePath
 
 DEFAULT = "edited"
 """The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
@@ -19,7 +20,7 @@ COMPRESSIONS = {"none": "NO", "rle": "RLE", "zips": "ZIPS", "zip": "ZIP", "piz":
 
 
 def write(
-    path,
+    path: FilePath,
     layers: dict[str, np.ndarray],
     compression: str = "zip",
     threads: int | None = None,

@@ -1,5 +1,7 @@
 """PNG and JPEG files: pixels decoded by Mitsuba, and the marks that say how they are meant."""
 
+from __future__ import annotations
+
 import os
 import re
 import zlib
@@ -9,10 +11,11 @@ import numpy as np
 from envedit.core.color import srgb_to_linear
 from envedit.core.errors import InputError
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.types import Info
 from envedit.images.headers import check_declared, damaged
 
 
-def read(name, head, info, stored):
+def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`."""
     declared(name, head, info if stored else {})
     image = _bitmap(name)
@@ -30,7 +33,7 @@ def read(name, head, info, stored):
     return values[image]
 
 
-def declared(name, head, info=None):
+def declared(name: str, head: bytes, info: Info | None = None) -> None:
     """Check the size that a file declares; marks of a JPEG file are noted in ``info``."""
     if head.startswith(b"\x89PNG"):
         size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))

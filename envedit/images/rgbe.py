@@ -1,18 +1,21 @@
 """Radiance files (RGBE). Decoded here, as ``mi.Bitmap`` corrupts the heap on damaged ones."""
 
+from __future__ import annotations
+
 import re
 
 import numpy as np
 
 from envedit.core.errors import InputError
+from envedit.core.types import Info
 from envedit.images.headers import check_declared, damaged, shown
 
 
-def read(name, head, info, stored):
+def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`."""
     end = re.search(rb"\n\r?\n([^\n]*)\n", head)
     size = end and re.fullmatch(rb"([-+][XY]) +(\d{1,9}) +([-+][XY]) +(\d{1,9})\s*", end[1])
-    if not size:
+    if not end or not size:
         raise damaged(name, "no Radiance resolution line")
     if (size[1], size[3]) != (b"-Y", b"+X"):
         stored_as = " ".join(end[1].decode().split())

@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.types import ArrayLike
+
 LOW = 1e-3
 """Below this the root is too steep, and the curve is linear."""
 
@@ -23,7 +25,7 @@ def to_display(radiance: mi.TensorXf) -> mi.TensorXf:
     return mi.TensorXf(y, radiance.shape)
 
 
-def slope(radiance) -> np.ndarray:
+def slope(radiance: ArrayLike) -> np.ndarray:
     """Return the derivative of :func:`to_display` at linear radiance (h, w, 3)."""
     x = mi.TensorXf(np.ascontiguousarray(radiance, np.float32))
     with dr.isolate_grad():

@@ -7,12 +7,15 @@ all weights are 0. Sums run in double precision: Dr.Jit's single-precision sum i
 sky with a sun of 1e6. A non-finite texel makes the loss non-finite, whatever its weight; nothing is clipped.
 """
 
+from __future__ import annotations
+
 import math
 
 import drjit as dr
 
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import InputError
+from envedit.core.types import DrArray, Tensor
 from envedit.losses.ssim import check_image, check_pair, expand, ssim_loss, total
 
 CHANGE_SOFT = 0.05
@@ -25,7 +28,7 @@ CHANGE_FLOOR = 0.01
 # --------------------------------------------------------------------------------------------------------
 
 
-def image_l1(x, reference, weight=None):
+def image_l1(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     """Compute the mean absolute error of two images ``(H, W, C)``.
 
     The subgradient where they are equal is 0.
@@ -39,18 +42,18 @@ def image_l1(x, reference, weight=None):
     return _mean(dr.abs(x.array - reference.array), x.shape, weight)
 
 
-def image_l2(x, reference, weight=None):
+def image_l2(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     """Compute the mean squared error of two images ``(H, W, C)``; arguments and errors as `image_l1`."""
     check_pair(x, reference)
     return _mean(dr.square(x.array - reference.array), x.shape, weight)
 
 
-def log_mse(x, reference, weight=None):
+def log_mse(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     """Compare normalised log radiance: the first term of Eq. 4, its norm read as the mean squared error."""
     return image_l2(x, reference, weight)
 
 
-def hdr(x, reference, weight=None):
+def hdr(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     """Compare linear radiance: the last term of Eq. 4, its norm read as the mean absolute error.
 
     Squared, this term is 1e5 times the logarithmic ones on a map with a sun.
@@ -58,7 +61,7 @@ def hdr(x, reference, weight=None):
     return image_l1(x, reference, weight)
 
 
-def luminance(x, reference, weight=None):
+def luminance(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     r"""Compare total luminance, ``|Lum(E) - Lum(E')|`` (Eq. 8).
 
     ``Lum(E) = sum of 0.2126 R + 0.7152 G + 0.0722 B`` over texels (Eq. 7), not weighted by solid angle, as
@@ -86,7 +89,7 @@ def _luminance_sum(x, weight):
     return dr.sum(wide(values) * factor)
 
 
-def l1(x, reference=None, weight=None):
+def l1(x: Tensor, reference: Tensor | None = None, weight: Tensor | None = None) -> DrArray:
     """Sum ``|E|`` over texels and channels (Eq. 9): a sum, not a mean; ``reference`` is not used.
 
     A ``weight`` multiplies the terms. The subgradient at 0 is 0.
@@ -95,7 +98,7 @@ def l1(x, reference=None, weight=None):
     return _sum(dr.abs(x.array), x.shape, weight)
 
 
-def tv(x, reference=None, weight=None):
+def tv(x: Tensor, reference: Tensor | None = None, weight: Tensor | None = None) -> DrArray:
     """Compute the anisotropic total variation of a lat-long image, as a mean; ``reference`` is not used.
 
     The sum of ``|x[i, j+1] - x[i, j]| + |x[i+1, j] - x[i, j]|``, columns periodic, rows not, divided by the
@@ -113,7 +116,7 @@ def tv(x, reference=None, weight=None):
     return _mean(across + dr.select(index < (height - 1) * row, down, 0), x.shape, weight)
 
 
-def change(x, reference, weight=None):
+def change(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     """Compare the logarithms of two maps: mean of sqrt(d^2 + s^2) - s, d = log((x + e) / (reference + e)).
 
     About the mean factor by which texels were changed: a sun that moves counts as a few texels, a sky that

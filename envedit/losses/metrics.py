@@ -4,13 +4,21 @@ Images are numpy arrays ``(H, W, 3)`` of linear radiance unless said otherwise; 
 Every function refuses images that are not finite or differ in shape, and returns a finite number or None.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.core.types import Views
+
+if TYPE_CHECKING:
+    from envedit.losses.perceptual import distances
 
 PSNR_CAP = 200.0
 """PSNR of identical images, and the most that is ever reported, in dB: JSON has no infinity."""
@@ -53,7 +61,7 @@ def _pair(a, b):
 # --------------------------------------------------------------------------------------------------------
 
 
-def mse(a, b) -> float:
+def mse(a: np.ndarray, b: np.ndarray) -> float:
     """Compute the mean squared error over texels and channels.
 
     Raises
@@ -65,7 +73,7 @@ def mse(a, b) -> float:
     return float(np.mean(np.square(a - b)))
 
 
-def psnr(a, b, data_range: float = 1.0) -> float:
+def psnr(a: np.ndarray, b: np.ndarray, data_range: float = 1.0) -> float:
     """Compute the peak signal-to-noise ratio ``10 log10(data_range^2 / MSE)`` in dB, at most `PSNR_CAP`.
 
     Raises
@@ -83,7 +91,7 @@ def psnr(a, b, data_range: float = 1.0) -> float:
     return min(PSNR_CAP, 20 * math.log10(data_range) - 10 * math.log10(error))
 
 
-def ssim(a, b, data_range: float = 1.0) -> float:
+def ssim(a: np.ndarray, b: np.ndarray, data_range: float = 1.0) -> float:
     """Compute the mean structural similarity of ``envedit.losses.ssim.Ssim``, in double precision.
 
     Raises
@@ -101,7 +109,14 @@ def ssim(a, b, data_range: float = 1.0) -> float:
     return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
 
 
-def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None, views=()) -> dict:
+def compare(
+    a: np.ndarray,
+    b: np.ndarray,
+    tonemap: str = "gamma",
+    lpips: distances.Lpips | None = None,
+    seen: np.ndarray | None = None,
+    views: Views = (),
+) -> dict:
     """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.
 
     Parameters
@@ -146,7 +161,7 @@ def compare(a, b, tonemap: str = "gamma", lpips=None, seen=None, views=()) -> di
     return shown | {"log_rmse": log_rmse(*radiance), "beyond_display": _beyond_display(*some, *radiance)}
 
 
-def saturated(compared) -> bool:
+def saturated(compared: Iterable[dict]) -> bool:
     """Say whether PSNR is no score in one of some results of `compare`, and `log_rmse` is one in all."""
     beyond = any((one.get("beyond_display") or 0) > SATURATED for one in compared)
     return beyond and all(one.get("log_rmse") is not None for one in compared)
@@ -159,7 +174,7 @@ def worse(one: dict, other: dict) -> bool:
     return one["psnr"] < other["psnr"]
 
 
-def score(one: dict, among, digits: int = 1) -> str:
+def score(one: dict, among: Iterable[dict], digits: int = 1) -> str:
     """Return the score of a result of `compare` among others: PSNR in dB, or `log_rmse` in stops."""
     if saturated([one, *among]):
         return f"{one['log_rmse']:.{max(digits, 2)}f} stops"
@@ -175,7 +190,7 @@ def _beyond_display(shown_a, shown_b, a, b):
     return float(((low >= 1 - half) | (high <= half))[differ].mean())
 
 
-def log_rmse(a, b) -> float | None:
+def log_rmse(a: np.ndarray, b: np.ndarray) -> float | None:
     """Compute the root mean square of ``log2((a + e) / (b + e))`` in stops, over texels and channels.
 
     e is `RELATIVE_EPS` of the median of the reference ``b`` where it is above 0: the same at every exposure,
@@ -196,7 +211,9 @@ def log_rmse(a, b) -> float | None:
     return float(np.sqrt(np.mean(np.square(np.log2(a + offset) - np.log2(b + offset)))))
 
 
-def painted(edited, wanted, initial, coverage, tonemap: str = "gamma") -> dict:
+def painted(
+    edited: np.ndarray, wanted: np.ndarray, initial: np.ndarray, coverage: np.ndarray, tonemap: str = "gamma"
+) -> dict:
     """Measure how far a painted picture was followed, and how still the rest was held.
 
     On display values d, with coverage c in [0, 1], means over pixels and channels.
@@ -236,7 +253,7 @@ def _log(values):
     return np.log(np.maximum(values, 0) + LOG_EPS)
 
 
-def log_psnr(a, b) -> float | None:
+def log_psnr(a: np.ndarray, b: np.ndarray) -> float | None:
     """Compute the PSNR of log radiance, normalised as in Eq. 1 by the range of the reference ``b``.
 
     The logarithm is that of ``max(E, 0) + LOG_EPS``. None if the reference is constant and the images differ.
@@ -258,7 +275,7 @@ def log_psnr(a, b) -> float | None:
 # --------------------------------------------------------------------------------------------------------
 
 
-def peak_position(image) -> tuple[int, int]:
+def peak_position(image: np.ndarray) -> tuple[int, int]:
     """Find the row and column of the greatest luminance, the first of several.
 
     Raises
@@ -271,7 +288,7 @@ def peak_position(image) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def sun_offset(a, b) -> float:
+def sun_offset(a: np.ndarray, b: np.ndarray) -> float:
     """Measure the distance between the brightest texels of two lat-long maps, in texels, columns periodic.
 
     Raises
@@ -291,7 +308,7 @@ def _ratio(a, b):
     return ratio if math.isfinite(ratio) else None
 
 
-def peak_ratio(a, b) -> float | None:
+def peak_ratio(a: np.ndarray, b: np.ndarray) -> float | None:
     """Divide the greatest luminance of ``a`` by that of the reference ``b``; None where that is 0.
 
     Raises
@@ -303,7 +320,7 @@ def peak_ratio(a, b) -> float | None:
     return _ratio(luminance(a).max(), luminance(b).max())
 
 
-def mean_luminance_ratio(a, b) -> float | None:
+def mean_luminance_ratio(a: np.ndarray, b: np.ndarray) -> float | None:
     """Divide the mean luminance of ``a`` by that of the reference ``b``; None where that is 0.
 
     Texels count alike, not by their solid angle, as in Eq. 7.
@@ -317,7 +334,7 @@ def mean_luminance_ratio(a, b) -> float | None:
     return _ratio(luminance(a).mean(), luminance(b).mean())
 
 
-def high_frequency_energy(image) -> float:
+def high_frequency_energy(image: np.ndarray) -> float:
     """Compute the mean squared high-pass response of a lat-long map: speckle that PSNR does not see.
 
     The high pass is ``log(max(L, 0) + LOG_EPS)`` of the luminance L minus its 5 x 5 binomial blur

@@ -10,12 +10,16 @@
        adam.step({name: dr.grad(leaf) for name, leaf in leaves.items()}, lr=cosine(1e-3, step, total))
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Mapping
 
 import drjit as dr
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import Arrays, Params, Tensor
 
 # --------------------------------------------------------------------------------------------------------
 # Adam
@@ -54,7 +58,13 @@ class Adam:
         If a setting is out of its range.
     """
 
-    def __init__(self, params, lr, betas=(0.9, 0.999), eps=1e-8):
+    def __init__(
+        self,
+        params: Mapping[str, Tensor],
+        lr: float,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ):
         if not (math.isfinite(lr) and lr >= 0):
             raise ConfigError(f"Adam: the learning rate must be a number >= 0, got {lr}.")
         if not all(0 <= beta < 1 for beta in betas):
@@ -69,13 +79,13 @@ class Adam:
         self._m = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
         self._v = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
 
-    def leaves(self):
+    def leaves(self) -> Params:
         """Return the parameters as a new dict of leaves with gradients enabled."""
         leaves = {name: type(value)(value) for name, value in self.params.items()}
         dr.enable_grad(leaves)
         return leaves
 
-    def step(self, grads, lr=None, check=True):
+    def step(self, grads: Mapping[str, Tensor], lr: float | None = None, check: bool = True) -> bool:
         """Update all parameters in one evaluation.
 
         Parameters
@@ -140,16 +150,16 @@ class Adam:
         self.t = t
         return True
 
-    def take_back(self):
+    def take_back(self) -> None:
         """Return to the parameters that the last step was taken from; twice is as once.
 
         The moments stay, as the gradients that they are means of were finite.
         """
         self.params = dict(self._before)
 
-    def state_dict(self):
+    def state_dict(self) -> Arrays:
         """Return everything that a later `load_state_dict` needs, as a flat dict of numpy arrays."""
-        state = {"step": np.int64(self.t)}
+        state: Arrays = {"step": np.array(self.t, np.int64)}
         for part, values in self._parts():
             state |= {f"{part}/{name}": np.array(value) for name, value in values.items()}
         return state
@@ -157,7 +167,7 @@ class Adam:
     def _parts(self):
         return ("params", self.params), ("before", self._before), ("m", self._m), ("v", self._v)
 
-    def load_state_dict(self, state):
+    def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue exactly where `state_dict` was taken.
 
         Raises
@@ -194,7 +204,7 @@ def _shaped(kind, flat, shape):
 # --------------------------------------------------------------------------------------------------------
 
 
-def constant(lr, step=0):
+def constant(lr: float, step: int = 0) -> float:
     """Return ``lr`` at every step.
 
     ======  ====  ====  ====
@@ -205,7 +215,7 @@ def constant(lr, step=0):
     return lr
 
 
-def cosine(lr, step, total, final=0.0):
+def cosine(lr: float, step: int, total: int, final: float = 0.0) -> float:
     """Anneal from ``lr`` at step 0 to ``final`` at step ``total``, and stay there (CosineAnnealingLR).
 
     ``final + (lr - final) (1 + cos(pi step / total)) / 2``. With ``lr=1, total=4``:
@@ -225,7 +235,7 @@ def cosine(lr, step, total, final=0.0):
     return final + (lr - final) * 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
 
 
-def cosine_warm_restarts(lr, step, period):
+def cosine_warm_restarts(lr: float, step: int, period: int) -> float:
     """Anneal from ``lr`` towards 0 again and again, every ``period`` steps.
 
     Loshchilov and Hutter 2017, Eq. 5, with T_mult = 1 and a minimum of 0: PyTorch's
@@ -246,7 +256,7 @@ def cosine_warm_restarts(lr, step, period):
     return cosine(lr, step % period, period)
 
 
-def ramp(start, end, step, total):
+def ramp(start: float, end: float, step: float, total: int) -> float:
     """Walk geometrically from ``start`` at step 0 to ``end`` at step ``total - 1``, and stay there.
 
     ``start (end / start)^(step / (total - 1))``; a run of one step stays at ``start``.

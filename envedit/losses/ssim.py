@@ -3,24 +3,28 @@
 Images are ``(H, W, C)`` tensors of any Dr.Jit precision; a ``weight`` is ``(H, W, 1)`` or ``(H, W, C)``.
 """
 
+from __future__ import annotations
+
 import math
+from typing import Any
 
 import drjit as dr
 
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import DrArray, Shape, Tensor, Views
 
 # --------------------------------------------------------------------------------------------------------
 # Shapes and sums, shared with the other losses
 # --------------------------------------------------------------------------------------------------------
 
 
-def check_image(x, name):
+def check_image(x: Tensor, name: str) -> None:
     """Refuse what is not an image ``(H, W, C)``."""
     if x.ndim != 3 or 0 in x.shape:
         raise InputError(f"{name}: expected an image of shape (H, W, C), got {tuple(x.shape)}.")
 
 
-def check_pair(x, reference):
+def check_pair(x: Tensor, reference: Tensor) -> None:
     """Refuse images that differ in shape."""
     check_image(x, "image")
     if x.shape != reference.shape:
@@ -28,7 +32,7 @@ def check_pair(x, reference):
         raise InputError(f"{shapes} differ in shape: resize one to the other first.")
 
 
-def expand(weight, shape):
+def expand(weight: Tensor, shape: Shape) -> DrArray:
     """Return the weight as a flat array with one entry per texel and channel."""
     height, width, channels = shape
     if weight.shape == shape:
@@ -39,7 +43,7 @@ def expand(weight, shape):
     return dr.gather(type(weight.array), weight.array, index)
 
 
-def total(values):
+def total(values: DrArray) -> DrArray:
     """Sum a flat array in double precision, returned in double precision."""
     return dr.sum(dr.float64_array_t(type(values))(values))
 
@@ -90,7 +94,7 @@ class Ssim:
         If ``data_range`` is not a positive number.
     """
 
-    def __init__(self, reference, weight=None, data_range: float = 1.0):
+    def __init__(self, reference: Tensor, weight: Tensor | None = None, data_range: float = 1.0):
         check_image(reference, "reference")
         if not (math.isfinite(data_range) and data_range > 0):
             raise ConfigError(f"SSIM: data_range must be a positive number, got {data_range}.")
@@ -105,14 +109,14 @@ class Ssim:
             self._weight = self._normalised(dr.detach(weight))
         dr.eval(self._y, self._mean_y, self._variance_y, self._weight)
 
-    def __call__(self, x):
+    def __call__(self, x: Tensor) -> DrArray:
         """Return ``1 - mean SSIM`` of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
         self._check(x)
         if not dr.grad_enabled(x):
             return self._evaluate(x.array, False)[0]
         return dr.custom(KnownGradient, x.array, self)
 
-    def map(self, x):
+    def map(self, x: Tensor) -> Tensor:
         """Return the SSIM of every window, ``(H - 10, W - 10, C)`` from 11 x 11 texels on; no gradient."""
         self._check(x)
         a, b = self._terms(dr.detach(x.array))[:2]
@@ -213,7 +217,7 @@ class StackedSsim:
         Of each picture, from the top, without gaps.
     """
 
-    def __init__(self, reference, weight, rows):
+    def __init__(self, reference: Tensor, weight: Tensor | None, rows: Views):
         check_image(reference, "reference")
         width, channels = reference.shape[1:]
         self.shape, F = tuple(reference.shape), type(reference.array)
@@ -231,7 +235,7 @@ class StackedSsim:
             shares.append(height if counts is None else float(total(counts.array)[0]) / depth / width)
         self._shares = [dr.opaque(F, share / max(sum(shares), 1e-30)) for share in shares]
 
-    def __call__(self, x):
+    def __call__(self, x: Tensor) -> DrArray:
         """Return the loss of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
         if tuple(x.shape) != self.shape:
             raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
@@ -261,20 +265,20 @@ class KnownGradient(dr.CustomOp):
     ``measure._evaluate(x, True)`` returns both.
     """
 
-    def eval(self, x, measure):
+    def eval(self, x: DrArray, measure: Any) -> DrArray:
         """Return the value; keep the gradient."""
         value, self.gradient = measure._evaluate(dr.detach(x), True)
         return value
 
-    def forward(self):
+    def forward(self) -> None:
         """Multiply the tangent by the gradient and add up."""
         self.set_grad_out(dr.sum(self.gradient * self.grad_in("x")))
 
-    def backward(self):
+    def backward(self) -> None:
         """Scale the gradient by the loss's."""
         self.set_grad_in("x", self.gradient * self.grad_out())
 
-    def name(self):
+    def name(self) -> str:
         """Name the node in Dr.Jit's graphs."""
         return "measure"
 
@@ -302,7 +306,7 @@ def _scatter_filter(taps, fields, position, base, step, length):
     return sums
 
 
-def ssim_loss(x, reference, weight=None, data_range: float = 1.0):
+def ssim_loss(x: Tensor, reference: Tensor, weight: Tensor | None = None, data_range: float = 1.0) -> DrArray:
     """Compute ``1 - mean SSIM`` of two images ``(H, W, C)``; see `Ssim`, which keeps the reference's share.
 
     Differentiable in ``x`` only.
@@ -318,11 +322,13 @@ def ssim_loss(x, reference, weight=None, data_range: float = 1.0):
     return Ssim(reference, weight, data_range)(x)
 
 
-def ssim_index(x, reference, weight=None, data_range: float = 1.0):
+def ssim_index(
+    x: Tensor, reference: Tensor, weight: Tensor | None = None, data_range: float = 1.0
+) -> DrArray:
     """Compute the mean SSIM of two images ``(H, W, C)`` as a size-1 array; see `Ssim`."""
     return 1 - ssim_loss(x, reference, weight, data_range)
 
 
-def ssim_map(x, reference, data_range: float = 1.0):
+def ssim_map(x: Tensor, reference: Tensor, data_range: float = 1.0) -> Tensor:
     """Compute the SSIM of every window that lies inside the image; see `Ssim.map`."""
     return Ssim(reference, None, data_range).map(x)

@@ -1,7 +1,10 @@
 """Curves of a run's history as inline SVG, without a plotting library."""
 
+from __future__ import annotations
+
 import html
 import math
+from typing import Any
 
 from envedit.losses.optimizer import ramp
 from envedit.report.manifest import columns
@@ -11,7 +14,7 @@ _TIMES = ("_s", "_ms", "time", "seconds")
 _NOT_LOSSES = ("iteration", "step", "epoch", "lr", "damping", "sigma", "non_finite", "skipped")
 
 
-def curves_svg(rows: list[dict], width=860, height=340) -> str:
+def curves_svg(rows: list[dict], width: int = 860, height: int = 340) -> str:
     """Draw every loss column of a history on a logarithmic axis against the iteration, as an SVG element.
 
     Columns that are no losses (iteration, learning rates, times) are left out, and so is what a logarithm
@@ -117,15 +120,15 @@ def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dic
     return made, f"{about} Weights change during the run: {which}. All are drawn with the last ones."
 
 
-def number(value):
+def number(value: Any) -> float | None:
     """Read a cell as a finite float, or None for whatever else it may hold."""
     if isinstance(value, (bool, str)) or value is None:
         return None
     try:
-        value = float(value)
+        found = float(value)
     except (TypeError, ValueError, OverflowError):
         return None
-    return value if math.isfinite(value) else None
+    return found if math.isfinite(found) else None
 
 
 def _ticks(low, high, count, least=0.0):
@@ -162,12 +165,12 @@ def _thin(points, most=600):
     return kept
 
 
-def round_up(value):
+def round_up(value: float) -> float:
     """Smallest of 1, 2, 5 times a power of ten that is not below ``value`` > 0."""
     decade = 10.0 ** math.floor(math.log10(value))
     return next(m * decade for m in (1, 2, 5, 10) if m * decade >= value * (1 - 1e-9))
 
 
-def escape(text):
+def escape(text: object) -> str:
     """Escape text for HTML and SVG, control characters included."""
     return html.escape("".join(c if c >= " " or c in "\n\t" else "\ufffd" for c in str(text)))

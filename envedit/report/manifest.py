@@ -3,6 +3,8 @@
 Numbers are finite or null; whoever writes learns where one was not.
 """
 
+from __future__ import annotations
+
 import csv
 import datetime
 import hashlib
@@ -13,18 +15,21 @@ import math
 import os
 import platform
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import envedit
 from envedit.core.atomic_files import write_atomically
+from envedit.core.types import FilePath
 
 # ----------------------------------------------------------------------------------------------------------
 # Files
 
 
-def plain(value, where, lost):
+def plain(value: Any, where: str, lost: list[str]) -> Any:
     """Turn a nested value into what JSON knows; the places of non-finite numbers are appended to ``lost``."""
     if isinstance(value, dict):
         inside = f"{where}." if where else ""
@@ -50,14 +55,14 @@ def plain(value, where, lost):
     raise TypeError(f"{where}: {type(value).__name__} cannot be written as JSON")
 
 
-def _write_json(path, value) -> list[str]:
+def _write_json(path: FilePath, value: Any) -> list[str]:
     lost: list[str] = []
     text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
     write_atomically(path, text.encode("ascii") + b"\n")
     return lost
 
 
-def write_metrics(path, metrics: dict) -> list[str]:
+def write_metrics(path: FilePath, metrics: dict) -> list[str]:
     """Write ``metrics.json``; numbers are finite or null.
 
     Returns
@@ -75,12 +80,12 @@ def write_metrics(path, metrics: dict) -> list[str]:
     return _write_json(path, metrics)
 
 
-def write_manifest(path, manifest: dict) -> list[str]:
+def write_manifest(path: FilePath, manifest: dict) -> list[str]:
     """Write ``manifest.json``; returns and raises as `write_metrics`."""
     return _write_json(path, manifest)
 
 
-def write_history(path, rows: list[dict]) -> list[str]:
+def write_history(path: FilePath, rows: list[dict]) -> list[str]:
     """Write ``history.csv``, a row an iteration.
 
     The columns are the union of the rows' keys in the order first seen. A value that is missing, None, NaN
@@ -105,7 +110,7 @@ def write_history(path, rows: list[dict]) -> list[str]:
     return lost
 
 
-def columns(rows) -> list[str]:
+def columns(rows: Iterable[dict]) -> list[str]:
     """List the keys of all rows in the order first seen."""
     return list(dict.fromkeys(str(key) for row in rows for key in row))
 
@@ -158,7 +163,7 @@ def _envedit_version():
     return getattr(envedit, "__version__", None)
 
 
-def changed(file) -> list[str]:
+def changed(file: FilePath) -> list[str]:
     """Return the inputs that a manifest names and that hold something else now; none without a manifest."""
     try:
         listed = json.loads(Path(file).read_text(encoding="utf-8"))["inputs"].values()

@@ -41,8 +41,7 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: in
     """
     source, space = {"source": given.source}, given.chromaticities
     if settings.format == "hdr":  # its colours are Rec. 709 to nearly every program
-        matrix = None if space is None else primaries.to_rec709(space)
-        shown = envmap if space is None else primaries.converted(envmap, matrix)
+        shown = envmap if space is None else primaries.converted(envmap, primaries.to_rec709(space))
         images.write_hdr(path.with_suffix(".hdr"), shown)
         return []
     name = path.with_suffix(".exr")

@@ -1,16 +1,21 @@
 """The folder of a run: the names of what it may hold, one run at a time, nothing of an earlier run lost."""
 
+from __future__ import annotations
+
 import contextlib
 import filecmp
 import os
 import re
 import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+
+from envedit.core.types import FilePath, Views
 
 try:
     import fcntl
 except ImportError:  # Windows
-    fcntl = None
+    fcntl = None  # type: ignore[assignment]
 
 from envedit.core.errors import InputError
 
@@ -30,7 +35,7 @@ EARLIER = "earlier"
 """With a number, the folder that what an earlier run left is moved to."""
 
 
-def of_views(name: str, views) -> list[tuple[str, slice]]:
+def of_views(name: str, views: Views) -> list[tuple[str, slice]]:
     """List the files of a rendering and the rows in each: of several views one more for each, numbered.
 
     >>> of_views("render_edited.exr", [slice(0, 4), slice(4, 9)])[1:]
@@ -73,7 +78,7 @@ def _runs(process):
 
 
 @contextlib.contextmanager
-def alone(folder: Path):
+def alone(folder: Path) -> Iterator[None]:
     """Make a folder for results, and let no other process of this machine work in it meanwhile.
 
     Raises
@@ -103,7 +108,13 @@ def alone(folder: Path):
             os.close(descriptor)
 
 
-def prepare_folder(folder: Path, names, inputs=(), keep: bool = False, spare=()) -> None:
+def prepare_folder(
+    folder: Path,
+    names: Sequence[str],
+    inputs: Iterable[FilePath] = (),
+    keep: bool = False,
+    spare: Iterable[FilePath] = (),
+) -> None:
     """Move what an earlier run left in a folder to ``earlier-N`` in it.
 
     Parameters

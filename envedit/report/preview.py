@@ -3,12 +3,17 @@
 For display only; nothing here feeds back into an edit.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+
 import numpy as np
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import InputError
+from envedit.core.types import ArrayLike, FilePath, Views
 from envedit.images.images import png
 from envedit.report.curves import round_up
 from envedit.transport.influence import per_solid_angle
@@ -40,7 +45,7 @@ _FONT = {
 # Scaling, display and labels
 
 
-def checked(image, name):
+def checked(image: ArrayLike, name: str) -> np.ndarray:
     """Return a picture as an array, refusing what is not ``(H, W, 3)``."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
@@ -72,7 +77,7 @@ def _fit(image, height, width):
     return image
 
 
-def fit_finite(image, height, width):
+def fit_finite(image: ArrayLike, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Scale what is finite, and return the (height, width) mask of pixels that hold a NaN or Inf as well."""
     finite = np.isfinite(image).all(axis=2, keepdims=True)
     if finite.all():
@@ -80,7 +85,9 @@ def fit_finite(image, height, width):
     return _fit(np.where(finite, image, 0), height, width), _fit(~finite, height, width)[..., 0] > 0
 
 
-def display(image, height, width, tonemap="gamma", exposure=0.0):
+def display(
+    image: ArrayLike, height: int, width: int, tonemap: str = "gamma", exposure: float = 0.0
+) -> np.ndarray:
     """Scale, expose and tonemap linear radiance to 8 bits; whatever holds a NaN or Inf is magenta."""
     scaled, bad = fit_finite(image, height, width)
     shown = apply_tonemap(scaled.astype(np.float64) * 2.0**exposure, tonemap)
@@ -105,12 +112,27 @@ def _text(label, width, scale):
 # The preview
 
 
-def preview(path, renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -> None:
+def preview(
+    path: FilePath,
+    renders: Mapping[str, np.ndarray | None],
+    maps: Mapping[str, np.ndarray | None],
+    tonemap: str = "gamma",
+    labels: bool = True,
+    exposure: float = 0.0,
+    views: Views = (),
+) -> None:
     """Write ``preview.png``: what :func:`drawn` draws; errors as there, or that it cannot be written."""
     write_atomically(path, png(drawn(renders, maps, tonemap, labels, exposure, views)))
 
 
-def drawn(renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -> np.ndarray:
+def drawn(
+    renders: Mapping[str, np.ndarray | None],
+    maps: Mapping[str, np.ndarray | None],
+    tonemap: str = "gamma",
+    labels: bool = True,
+    exposure: float = 0.0,
+    views: Views = (),
+) -> np.ndarray:
     """Draw a row of renderings and under each its environment map.
 
     Parameters
@@ -141,14 +163,14 @@ def drawn(renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -
     """
     scale = 2  # of the labels: pixels a dot
     names = list(dict.fromkeys([*renders, *maps]))
-    renders = {name: checked(image, name) for name, image in renders.items() if image is not None}
-    maps = {name: checked(image, name) for name, image in maps.items() if image is not None}
-    if not renders and not maps:
+    shown = {name: checked(image, name) for name, image in renders.items() if image is not None}
+    drawn = {name: checked(image, name) for name, image in maps.items() if image is not None}
+    if not shown and not drawn:
         raise InputError("report: no picture to preview")
     # Columns of 214 to 768 pixels whatever the run's size; small pictures are enlarged by a whole factor.
-    widest = max((image.shape[1] for image in renders.values()), default=512)
+    widest = max((image.shape[1] for image in shown.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
-    pictures = {name: [image[rows] for rows in views or (slice(None),)] for name, image in renders.items()}
+    pictures = {name: [image[rows] for rows in views or (slice(None),)] for name, image in shown.items()}
     heights = {name: [_height(image, width) for image in images] for name, images in pictures.items()}
     top = 7 * scale + GAP if labels else 0
     render_height = max((sum(each) + GAP * (len(each) - 1) for each in heights.values()), default=0)
@@ -159,7 +181,7 @@ def drawn(renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -
         column = slice(GAP + i * (width + GAP), (i + 1) * (width + GAP))
         if labels:
             canvas[GAP : GAP + 7 * scale, column][_text(str(name), width, scale)] = INK
-        if name in renders:
+        if name in shown:
             first = GAP + top
             for image, height in zip(pictures[name], heights[name], strict=True):
                 canvas[first : first + height, column] = display(image, height, width, tonemap)
@@ -168,8 +190,8 @@ def drawn(renders, maps, tonemap="gamma", labels=True, exposure=0.0, views=()) -
             canvas[GAP + top : map_top - GAP, column] = PLACEHOLDER
         rows = slice(map_top, map_top + width // 2)
         canvas[rows, column] = PLACEHOLDER
-        if name in maps:
-            canvas[rows, column] = display(maps[name], width // 2, width, tonemap, exposure)
+        if name in drawn:
+            canvas[rows, column] = display(drawn[name], width // 2, width, tonemap, exposure)
     return canvas
 
 
@@ -185,7 +207,9 @@ def _height(image, width):
 _DIVERGING = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]])
 
 
-def difference_image(a, b, kind="tonemapped", tonemap="gamma", scale=None):
+def difference_image(
+    a: ArrayLike, b: ArrayLike, kind: str = "tonemapped", tonemap: str = "gamma", scale: float | None = None
+) -> tuple[np.ndarray, float]:
     """Draw the difference a - b in luminance: red where a is brighter, blue where it is darker.
 
     Parameters
@@ -254,7 +278,7 @@ def _rising(share):
     return np.rint(np.stack(colours, axis=-1)).astype(np.uint8)
 
 
-def influence_image(influence, frozen=None):
+def influence_image(influence: np.ndarray, frozen: np.ndarray | None = None) -> np.ndarray:
     """Draw the influence of texels per solid angle, as shares of its mean over the sphere, logarithmically.
 
     Parameters
@@ -277,12 +301,12 @@ def influence_image(influence, frozen=None):
     return pixels
 
 
-def share_image(share):
+def share_image(share: np.ndarray) -> np.ndarray:
     """Draw shares from 0 to 1, (H, W), in the colours of :func:`influence_image`: (H, W, 3) uint8."""
     return _rising(np.asarray(share, np.float64))
 
 
-def influence(path, values, frozen=None) -> None:
+def influence(path: FilePath, values: np.ndarray, frozen: np.ndarray | None = None) -> None:
     """Draw ``influence.png``: :func:`influence_image` at 512 pixels or more, over its scale.
 
     Raises

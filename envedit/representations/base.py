@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Protocol
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.types import Params
+
 if TYPE_CHECKING:
     from envedit.representations.layers.separation import Separation
     from envedit.representations.siren.fit import Fitted
 
 EPSILON = 0.01
 """Added to radiance inside a logarithm (paper, below Eq. 3)."""
-Params = dict[str, "mi.TensorXf"]
-"""What the optimiser owns: tensors by name."""
 
 
 class Representation(Protocol):
@@ -33,10 +33,17 @@ class Representation(Protocol):
         Lights and background of the map, where :meth:`encode` separates them.
     """
 
-    lr: float
-    models_edit: bool
-    fitted: Fitted | None
-    separation: Separation | None
+    @property
+    def lr(self) -> float: ...  # noqa: D102
+
+    @property
+    def models_edit(self) -> bool: ...  # noqa: D102
+
+    @property
+    def fitted(self) -> Fitted | None: ...  # noqa: D102
+
+    @property
+    def separation(self) -> Separation | None: ...  # noqa: D102
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Return the parameters that reproduce an image (H, W, 3) as well as the representation can.

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 from envedit import config
 from envedit.representations.base import Representation
 from envedit.representations.layers.gain import CYCLES
-from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.layers import Horizon, Layers
 from envedit.representations.pixels import LogPixels, Pixels
 from envedit.representations.siren import fit
 from envedit.representations.siren.siren import Siren
 
 
 def make(
-    settings: config.Config, folder=None, progress=None, rows=None, horizon: str = "free"
+    settings: config.Config,
+    folder: Path | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    rows: tuple[int, int] | None = None,
+    horizon: Horizon = "free",
 ) -> Representation:
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
 
@@ -21,7 +28,7 @@ def make(
     kind = settings.representation.kind
     if kind == "layers":
         cycles = settings.representation.cycles
-        return Layers(rows, CYCLES if cycles == "auto" else cycles, horizon)
+        return Layers(rows, CYCLES if isinstance(cycles, str) else cycles, horizon)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":

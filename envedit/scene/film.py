@@ -14,7 +14,7 @@ import numpy as np
 
 
 def render(
-    scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medium=None, view=0
+    scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medium: mi.Medium = None, view: int = 0
 ) -> np.ndarray:
     """Render one sensor of a scene as ``mi.render`` does, with sums in a fixed order.
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -40,7 +42,7 @@ _MOST_WIDTH_PER_HEIGHT = 1.5
 # Words for errors
 
 
-def told(where: str, call, /, *arguments, **filled):
+def told(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any:
     """Call the parser, and say in one line what it says in many."""
     try:
         return call(*arguments, **filled)
@@ -59,7 +61,7 @@ def told(where: str, call, /, *arguments, **filled):
         raise InputError(f"{where}: {text if len(text) <= 300 else text[:297] + '...'}") from None
 
 
-def place_of(state, node, where: str) -> str:
+def place_of(state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str) -> str:
     """Say where a node stands: file and line, or its name in a dict."""
     return mi.parser.file_location(state, node) if state.files else f"{where}, {node.props.id()}"
 
@@ -68,7 +70,7 @@ def place_of(state, node, where: str) -> str:
 # Changes
 
 
-def lower_names(state) -> None:
+def lower_names(state: mi.parser.ParserState) -> None:
     """Write the names of plugins as Mitsuba 3 has them: older ones took ``Rectangle`` too."""
     for node in state.nodes:
         name = node.props.plugin_name()
@@ -76,7 +78,7 @@ def lower_names(state) -> None:
             node.props.set_plugin_name(name.lower())
 
 
-def check_required(state, where: str) -> None:
+def check_required(state: mi.parser.ParserState, where: str) -> None:
     """Refuse plugins that lack a property without which Mitsuba stops with a signal."""
     for node in state.nodes:
         name = node.props.plugin_name()
@@ -86,7 +88,7 @@ def check_required(state, where: str) -> None:
             raise InputError(f"{place}: {name} has no {' or '.join(needed)}; give it one")
 
 
-def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
+def replace_environment(state: mi.parser.ParserState, where: str) -> tuple[mi.Properties, np.ndarray]:
     """Put an ``envmap`` in place of the one environment emitter; return its properties and rotation."""
     nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter]
     found = [n for n in nodes if n.props.plugin_name() in _ENVIRONMENTS]
@@ -118,7 +120,7 @@ def replace_environment(state, where: str) -> tuple[mi.Properties, np.ndarray]:
     return node.props, rotation
 
 
-def set_film(state, where: str, sensor: int, width: int, height: int) -> None:
+def set_film(state: mi.parser.ParserState, where: str, sensor: int, width: int, height: int) -> None:
     """Give the film of a sensor, a node's index, the asked size and float32 RGB pixels."""
     node = state.nodes[sensor]
     inside = [
@@ -147,7 +149,7 @@ def set_film(state, where: str, sensor: int, width: int, height: int) -> None:
     film["pixel_format"], film["component_format"] = "rgb", "float32"
 
 
-def set_sampler(state, sensor: int, plugin: str) -> None:
+def set_sampler(state: mi.parser.ParserState, sensor: int, plugin: str) -> None:
     """Give a sensor, a node's index, a sampler of the asked kind, unless it has another than ``independent``.
 
     May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
@@ -167,7 +169,7 @@ def set_sampler(state, sensor: int, plugin: str) -> None:
     state.nodes.append(node)
 
 
-def find_files(state, where: str, folders) -> None:
+def find_files(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -> None:
     """Make every file name absolute; the environment's own bitmap is already gone and need not exist."""
     for node in state.nodes:
         if "filename" not in node.props:
@@ -188,7 +190,7 @@ def find_files(state, where: str, folders) -> None:
         node.props["filename"] = str(found[0])
 
 
-def smooth_limit(state, node) -> None:
+def smooth_limit(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> None:
     """Turn a rough BSDF whose alpha is at most 1e-4 into the smooth one; refuse a negative roughness."""
     props = node.props
     if node.type != mi.ObjectType.BSDF or props.plugin_name() not in _SMOOTH:
@@ -205,7 +207,7 @@ def smooth_limit(state, node) -> None:
         props.set_plugin_name(_SMOOTH[props.plugin_name()])
 
 
-def fit_to_stage(state, node) -> None:
+def fit_to_stage(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> None:
     """Set a shape that carries ``fit_height`` on the plane y = 0, centred and scaled; see the module."""
     props = node.props
     if node.type != mi.ObjectType.Shape or "fit_height" not in props:
@@ -244,7 +246,7 @@ def fit_to_stage(state, node) -> None:
     props["to_world"] = mi.ScalarTransform4d(place @ transform)
 
 
-def _matrix(transform, where: str) -> np.ndarray:
+def _matrix(transform: Any, where: str) -> np.ndarray:
     """Return a transformation's matrix (4, 4)."""
     if not hasattr(transform, "matrix"):
         raise InputError(f"{where}: to_world is {str(transform)[:60]!r}, expected a <transform>")
@@ -266,7 +268,7 @@ def _upright(up: str) -> np.ndarray:
 # Digest
 
 
-def hash_node(digest, node) -> None:
+def hash_node(digest: hashlib._Hash, node: mi.parser.SceneNode) -> None:
     """Add all that a node holds to a digest, the content of files in place of their names."""
     digest.update(f"{node.type}|{node.props.plugin_name()}\n".encode())
     for key, value in node.props.items():
@@ -281,7 +283,7 @@ def hash_node(digest, node) -> None:
             _hash_value(digest, value)
 
 
-def _hash_value(digest, value) -> None:
+def _hash_value(digest: hashlib._Hash, value: Any) -> None:
     if isinstance(value, bool | int | float | str):
         digest.update(repr(value).encode())
     elif isinstance(value, mi.Properties.ResolvedReference):

@@ -46,20 +46,20 @@ class PathTracer:
 
     def __init__(self, scene: Scene, spp: int | str = "auto", max_depth: int | str = "auto", seed: int = 0):
         self.scene = scene
-        self.spp = _whole(scene, AUTO_SPP if spp == "auto" else spp)
+        self.spp = _whole(scene, AUTO_SPP if isinstance(spp, str) else spp)
         if self.spp * scene.width * scene.height > _MOST_SAMPLES:
             raise ConfigError(
                 f"renderer.spp: {self.spp} samples of {scene.width}x{scene.height} pixels are more than one "
                 f"rendering can hold, {_MOST_SAMPLES}: lower [renderer] spp or [scene] width"
             )
         most = AUTO_DEPTH if scene.max_depth < 0 else min(AUTO_DEPTH, scene.max_depth)
-        self.depth = most if max_depth == "auto" else max_depth
+        self.depth = most if isinstance(max_depth, str) else max_depth
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
         installed_plugins.come_first()
         asked = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": scene.hide_emitters}
         self._integrator = mi.load_dict({"type": "prb", **asked})
-        self._index = None
+        self._index: mi.UInt32 | None = None
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
         """Render (H, W, 3) linear radiance to (h, w, 3), differentiable in the map."""

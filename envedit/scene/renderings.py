@@ -15,7 +15,9 @@ MOST_BYTES = 500_000_000
 _RECIPE = 2  # raise when the same inputs give another rendering
 
 
-def rendered(scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: bool = True, exactly=None):
+def rendered(
+    scene: Scene, envmap: np.ndarray, spp: int | str, seed: int, keep: bool = True, exactly: int | None = None
+) -> tuple[np.ndarray, int, np.ndarray | None]:
     """Render as :meth:`.Scene.sampled`, or take what an earlier call rendered from disk.
 
     The judged rendering of a result is not taken from here: it is made with fresh samples every time.

@@ -16,6 +16,8 @@ Maps are radiance as it reaches the scene: a ``scale`` of the environment emitte
 is built (:mod:`envedit.inputs` applies it to what a file holds). With scene and camera fixed a rendering is
 I = T E + I_0: linear in the map E, plus a constant I_0 where the scene has lamps besides its environment,
 which stay as they are.
+
+Longer than 400 lines: what is changed in a scene before it is built belongs to how it is rendered.
 """
 
 from __future__ import annotations
@@ -25,9 +27,10 @@ import difflib
 import functools
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -36,6 +39,7 @@ import numpy as np
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
+from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_text, supported
 
 __all__ = ["Scene", "load"]
@@ -138,7 +142,7 @@ class Scene:
         names = [view.name for view in self.views]
         return supported.index_of(asked, names, names, f"{key}: got view", "; see [scene] sensors")
 
-    def set_envmap(self, image) -> None:
+    def set_envmap(self, image: ArrayLike) -> None:
         """Light the scene by a map.
 
         Parameters
@@ -169,7 +173,9 @@ class Scene:
         self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
         self.params.update()
 
-    def render(self, image, spp: int = 64, seed: int = 0, max_depth: int | None = None) -> np.ndarray:
+    def render(
+        self, image: ArrayLike, spp: int = 64, seed: int = 0, max_depth: int | None = None
+    ) -> np.ndarray:
         """Render the scene under a map by Mitsuba's ``path`` integrator, with fresh samples.
 
         The samples are split into passes of at most 2^22, each with its own seed derived from ``seed``, and
@@ -210,7 +216,9 @@ class Scene:
             total += count / spp * self._pass(count, seed, i, max_depth)
         return self._checked(total)
 
-    def sampled(self, image, spp: int | str = "auto", seed: int = 0, exactly: int | None = None):
+    def sampled(
+        self, image: ArrayLike, spp: int | str = "auto", seed: int = 0, exactly: int | None = None
+    ) -> tuple[np.ndarray, int, np.ndarray | None]:
         """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
 
         Passes of 64 samples a pixel are added until the error of their mean, estimated from how much their
@@ -243,12 +251,13 @@ class Scene:
         ConfigError, InputError, NumericalError
             As :meth:`render`.
         """
-        if spp != "auto":
+        if not isinstance(spp, str):
             return self.render(image, spp, seed), spp, None
         seed = _whole("seed", seed, 0)
         self.set_envmap(image)
         count = min(self._pass_samples(), _QUIET_PASS)
-        total, shown, power = 0.0, 0.0, 0.0
+        total: Any = 0.0  # then arrays
+        shown, power = total, total
         for i in range(QUIET_MOST // count):
             picture = self._pass(count, seed, i, self.max_depth)
             display = tonemap(picture)
@@ -306,7 +315,13 @@ def _two_threads():
 
 
 def load(
-    file, width=None, height=None, parameters=None, base=None, sampler: str = "multijitter", sensors=(0,)
+    file: FilePath | dict,
+    width: int | None = None,
+    height: int | None = None,
+    parameters: Mapping[str, object] | None = None,
+    base: FilePath | None = None,
+    sampler: str = "multijitter",
+    sensors: str | Sequence[int | str] = (0,),
 ) -> Scene:
     """Load a scene and make its environment emitter replaceable.
 
@@ -375,8 +390,9 @@ def load(
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    told = views, own, asked.max_depth, asked.hide_emitters, notes, dict(parameters or {})
-    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told)
+    told = views, own, asked.max_depth, asked.hide_emitters, notes
+    given: dict[str, Any] = dict(parameters or {})
+    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told, given)
 
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
@@ -422,7 +438,9 @@ def _parsed(file, parameters, base):
     return config, state, path, where, folders
 
 
-def relit(file, envmap: str, parameters=None, base=None) -> str:
+def relit(
+    file: FilePath, envmap: str, parameters: Mapping[str, object] | None = None, base: FilePath | None = None
+) -> str:
     """Return the XML of a scene that is lit by another map and otherwise as its author has it.
 
     Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
@@ -459,15 +477,15 @@ def relit(file, envmap: str, parameters=None, base=None) -> str:
 # Files and parameters
 
 
-def find(file) -> Path:
+def find(file: FilePath) -> Path:
     """Return the XML file meant by a path or by the bare name of a shipped scene."""
     path = Path(file)
     if os.path.isfile(path):  # False, and no error, in a folder that may not be entered
         return path.absolute()
     name = path.name.removesuffix(".xml")
     bare, names = path.name == str(file), shipped.scenes()
-    if bare and name in names:
-        return shipped.folder() / f"{name}.xml"
+    if bare and name in names and (folder := shipped.folder()):
+        return folder / f"{name}.xml"
     if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML file")
     close = difflib.get_close_matches(name, names, 1) if bare else []
@@ -510,7 +528,7 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], lis
     return filled, outline.folders
 
 
-def _whole(name: str, value, low: int) -> int:
+def _whole(name: str, value: Any, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
         raise ConfigError(f"{name}: got {value!r}, expected a whole number of at least {low}")
     return int(value)

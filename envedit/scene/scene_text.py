@@ -68,7 +68,7 @@ def read(path: Path, parameters: dict[str, str]) -> Outline:
     return reader.outline
 
 
-def check_references(state, where: str) -> None:
+def check_references(state: mi.parser.ParserState, where: str) -> None:
     """Refuse a parsed scene whose objects refer to one another too deeply for Mitsuba's recursion.
 
     Raises

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -50,7 +52,7 @@ class OwnMap:
     notes: tuple[str, ...] = ()
 
 
-def own_map(state, where: str, folders) -> OwnMap:
+def own_map(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -> OwnMap:
     """Read the file and the ``scale`` of the scene's ``envmap`` emitter, before it is replaced.
 
     Raises
@@ -62,16 +64,18 @@ def own_map(state, where: str, folders) -> OwnMap:
     if len(nodes) != 1:
         return OwnMap(None, 1.0)
     props = nodes[0].props
-    scale = props.get("scale", 1.0)
+    scale: Any = props.get("scale", 1.0)
     number = isinstance(scale, int | float) and not isinstance(scale, bool)
-    if not number or not math.isfinite(scale) or not 0 < np.float32(scale) < np.inf:
+    if not number or not math.isfinite(scale) or not 0 < float(np.float32(scale)) < math.inf:
         raise InputError(
             f"{place_of(state, nodes[0], where)}: scale of the environment map is {scale}, expected a number "
             "above 0"
         )
     matrix = getattr(props.get("to_world", None), "matrix", None)
-    size = 1.0 if matrix is None else np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0])
-    notes = ()
+    size = 1.0
+    if matrix is not None:
+        size = float(np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0]))
+    notes: tuple[str, ...] = ()
     if np.isfinite(size) and abs(size - 1) > _ROUNDING:
         notes = (
             f"to_world of the environment map scales by {size:.4g}: taken as the rotation in it, while "
@@ -81,7 +85,7 @@ def own_map(state, where: str, folders) -> OwnMap:
     if not isinstance(name, str) or not name:
         return OwnMap(None, float(scale), notes)
     found = [folder / name for folder in folders if os.path.isfile(folder / name)]
-    return OwnMap(Path(found[0] if found else folders[0] / name), float(scale), notes)
+    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), float(scale), notes)
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class Integrator:
     notes: tuple[str, ...]
 
 
-def take_integrator(state, where: str) -> Integrator:
+def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     """Read what the integrator asks for and put ``path`` in its place, so that it is never built.
 
     Raises
@@ -145,7 +149,7 @@ def take_integrator(state, where: str) -> Integrator:
     return Integrator(depth, hide, tuple(notes))
 
 
-def ensure_integrator(state) -> None:
+def ensure_integrator(state: mi.parser.ParserState) -> None:
     """Give a scene without an integrator ``path``.
 
     May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
@@ -173,7 +177,9 @@ def _check_media(state, where, integrator, notes):
     notes.append(f"medium {kind} is not rendered, as the scene's integrator ({integrator}) has no media")
 
 
-def take_sensors(state, where: str, asked="all") -> tuple[list[int], list[str], tuple[str, ...]]:
+def take_sensors(
+    state: mi.parser.ParserState, where: str, asked: str | Sequence[int | str] = "all"
+) -> tuple[list[int], list[str], tuple[str, ...]]:
     """Choose the sensors whose pictures are edited, in the order asked for; the scene has no others then.
 
     Parameters

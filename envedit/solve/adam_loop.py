@@ -19,9 +19,13 @@ import numpy as np
 from envedit import config
 from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError
+from envedit.core.types import Params, Views
 from envedit.losses import losses, optimizer
 from envedit.losses.display_curve import to_display
+from envedit.losses.perceptual import distances
 from envedit.losses.ssim import Ssim, StackedSsim
+from envedit.renderers import Renderer
+from envedit.representations.base import Representation
 
 MOST_BAD_STEPS = 20
 """Non-finite steps in a row after which the loop gives up."""
@@ -53,7 +57,14 @@ class Objective:
     """
 
     def __init__(
-        self, weights: config.Loss, picture, pixel_weight, original, iterations: int, dists=None, views=()
+        self,
+        weights: config.Loss,
+        picture: np.ndarray,
+        pixel_weight: np.ndarray | None,
+        original: np.ndarray,
+        iterations: int,
+        dists: distances.Dists = None,
+        views: Views = (),
     ):
         self.iterations = iterations
         self.ramps = {
@@ -68,7 +79,9 @@ class Objective:
         self._ssim = StackedSsim(*shown, views) if len(views) > 1 else Ssim(*shown)
         self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
 
-    def __call__(self, rendering, crop, step: int):
+    def __call__(
+        self, rendering: mi.TensorXf, crop: mi.TensorXf, step: int
+    ) -> tuple[mi.Float, dict[str, mi.Float]]:
         """Weigh a rendering and the active rows of its map.
 
         Returns
@@ -178,7 +191,7 @@ class _Keep:
         return mi.TensorXf(dr.select(self._free, crop.array, self._original), crop.shape)
 
 
-def adam_for(representation, params, settings: config.Optimizer) -> optimizer.Adam:
+def adam_for(representation: Representation, params: Params, settings: config.Optimizer) -> optimizer.Adam:
     """Make the optimiser that a configuration asks for."""
     return optimizer.Adam(params, _rate(representation, settings), (0.9, settings.beta2))
 
@@ -189,9 +202,9 @@ def _rate(representation, settings):
 
 
 def optimise(
-    representation,
-    params,
-    renderer,
+    representation: Representation,
+    params: Params,
+    renderer: Renderer,
     objective: Objective,
     envmap: np.ndarray,
     first_row: int,
@@ -244,7 +257,8 @@ def optimise(
     lr = _rate(representation, settings)
     fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
-    waiting, last_read = [], time.perf_counter()
+    waiting: list = []
+    last_read = time.perf_counter()
     while state.step < settings.iterations:
         start = time.perf_counter()
         leaves, slopes = adam.leaves(), _Slopes()

@@ -67,7 +67,7 @@ def best(
         first = problem.rows.start
         rows = np.unique(np.clip(row + steps, first, first + layers.shape[0] - 1))
         texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
-        unit = np.float32(flux / omega[texels // width][:, None])
+        unit = (flux / omega[texels // width][:, None]).astype(np.float32)
         strengths, falls = model.of_pixels(transport.probe(texels) * unit[:, None, :])
         found = int(np.argmax(falls))
         if not falls[found] > 0:

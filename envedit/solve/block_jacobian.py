@@ -10,12 +10,14 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.representations.layers.layers import Layers
+from envedit.transport.light_transport import LightTransport
 
 
 class BlockJacobian:
     """The block transport with the gain's hats in its cells."""
 
-    def __init__(self, layers, transport, shape):
+    def __init__(self, layers: Layers, transport: LightTransport, shape: tuple[int, int]):
         overview = transport.overview()
         self.block_of, self.count = overview.block_of, len(overview.matrix[0])
         active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])
@@ -34,7 +36,7 @@ class BlockJacobian:
         light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
         hats = []
         for level, (rows, columns) in enumerate(layers.gain.sizes):
-            nodes, one = rows * columns, 0.0
+            nodes, one = rows * columns, np.zeros(())
             for node, share in layers.hats(level):
                 one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
             hats.append(one.reshape(cells, nodes) / light[:, None])
@@ -59,10 +61,10 @@ class BlockJacobian:
         """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
         found = np.empty((3, len(changes), len(self.block_of)), np.float32)
         for c, matrix in enumerate(self._matrix):
-            cells = np.stack(
+            sums = np.stack(
                 [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
             )
-            cells = (cells / np.maximum(self._total, 1e-30))[:, self._used]
+            cells = (sums / np.maximum(self._total, 1e-30))[:, self._used]
             np.take(cells.astype(np.float32) @ matrix.T, self.block_of, axis=1, out=found[c])
         return found.transpose(1, 2, 0)
 
@@ -72,7 +74,7 @@ class BlockJacobian:
         size = np.bincount(self.block_of, minlength=self.count)
         mean = (self.summed(flat.reshape(picture.shape)) / np.maximum(size, 1)[:, None])[self.block_of]
         profile = np.divide(flat, mean, out=np.ones_like(flat), where=mean > 0)
-        return np.float32(profile).reshape(picture.shape)
+        return profile.astype(np.float32).reshape(picture.shape)
 
     @functools.cached_property
     def sky(self) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,7 @@ def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str
     return sha.hexdigest()
 
 
-def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict, picture) -> None:
+def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict, picture: np.ndarray) -> None:
     """Write ``checkpoint.npz`` into a folder."""
     arrays = {f"optimiser/{k}": v for k, v in optimiser.items()} | {
         f"renderer/{k}": v for k, v in renderer.items()

@@ -6,16 +6,21 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from envedit import config
 from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError, place_of
+from envedit.core.seeds import Seeds
+from envedit.core.types import Params
 from envedit.losses import display_curve, optimizer
+from envedit.losses.perceptual import distances
+from envedit.renderers import Renderer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.layers import unseen_kept
 from envedit.representations.layers.lights import SPARE
@@ -23,8 +28,8 @@ from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
 from envedit.targets import target
 
-CHECKED_SPP, CHECKED_SEED = 64, 700_001
-"""Samples a pixel of renderings by which start and solution are compared, and what is added to the seed."""
+CHECKED_SPP = 64
+"""Samples a pixel of renderings by which start and solution are compared."""
 TRIAL_STEPS, NEWTON_TRIAL = 30, 6
 """Steps of Adam and of Gauss-Newton after which the better of two starts is chosen."""
 TRIAL_GAIN, LIKELIER = 0.05, 20.0
@@ -82,8 +87,8 @@ class Job:
         Active texels that may change; None: all.
     wanted : target.Target
         What the renderer is to make.
-    representation, renderer : object
-        As :func:`.adam_loop.optimise` takes them.
+    representation, renderer : Representation, Renderer
+        As :func:`.adam_loop.optimise` takes them; of layers, more than the protocol is used.
     folder : Path, optional
         Of the checkpoint.
     watch : Watch
@@ -104,11 +109,11 @@ class Job:
     first: int
     free: np.ndarray | None
     wanted: target.Target
-    representation: object
-    renderer: object
+    representation: Any
+    renderer: Renderer
     folder: Path | None
     watch: Watch
-    dists: object = None
+    dists: distances.Dists | None = None
     posterior: map_problem.Posterior | None = None
     note: str = ""
     begun: gauss_newton.Run | None = None
@@ -126,7 +131,7 @@ class Job:
         chosen = self.settings.optimizer.lr
         return not self.newton and chosen != "auto" and chosen > self.representation.lr
 
-    def decode(self, params) -> np.ndarray:
+    def decode(self, params: Params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
         rows = slice(self.first, self.first + crop.shape[0])
@@ -148,11 +153,12 @@ class Job:
                 adam.take_back()
         return self.original.copy()
 
-    def best(self, starts, crop):
+    def best(self, starts: list[tuple[Params, list[str]]], crop: np.ndarray) -> tuple[Params, list[str]]:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
         if len(starts) == 1:
             return starts[0]
-        reached, begun, trials = [], [], self.trials
+        begun: list[gauss_newton.Run | None] = []
+        reached, trials = [], self.trials
         for params, _ in starts:
             self.begun = None
             try:
@@ -179,7 +185,7 @@ class Job:
         """Say whether one start is so much better than the usual one that it is to be taken."""
         return loss < usual - LIKELIER if self.newton else loss < (1 - TRIAL_GAIN) * usual
 
-    def tried(self, params, crop) -> float:
+    def tried(self, params: Params, crop: np.ndarray) -> float:
         """Return the loss after a few steps from a start."""
         steps = self.trials
         if self.newton:
@@ -191,7 +197,7 @@ class Job:
         objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists, self.lit.rows)
         return self._loop(params, objective, few)[1].history[-1]["loss"]
 
-    def optimise(self, params, crop, resume):
+    def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
         """Optimise from the start, or from the checkpoint; returns parameters and state."""
         if self.newton:
             return self._solve(params, resume)
@@ -287,7 +293,7 @@ class Job:
 
     def _display_error(self, envmap):
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
-        seed = (self.settings.seed + CHECKED_SEED) % 2**32
+        seed = Seeds.of(self.settings.seed).step_check
         shown = display_curve.to_display(tensor(self.lit.render(envmap, CHECKED_SPP, seed)))
         off = shown.numpy() - display_curve.to_display(tensor(self.wanted.aim)).numpy()
         return float((np.square(off) * (1 if self.wanted.weight is None else self.wanted.weight)).mean())
@@ -339,7 +345,7 @@ class Job:
 
 
 @contextlib.contextmanager
-def keeping(envmap: np.ndarray):
+def keeping(envmap: np.ndarray) -> Iterator[None]:
     """Let numbers that fail after the loop carry the map that it found: Stopped for NumericalError."""
     try:
         yield
@@ -348,7 +354,7 @@ def keeping(envmap: np.ndarray):
 
 
 @contextlib.contextmanager
-def ctrl_c():
+def ctrl_c() -> Iterator[threading.Event]:
     """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -19,6 +19,8 @@ directly or in a mirror, and those around a concentrated light, for which exact 
 Solved by accelerated projected gradient (Beck and Teboulle 2009) with restart (O'Donoghue and Candes 2015),
 in the diagonal metric of De Pierro (1995): for y > 0, A'WA is at most diag(A'WA y / y), as A is not negative.
 A dual point, the residual made feasible, bounds how far from the least the solution is.
+
+Longer than 400 lines: the model in cells, its solver and its refinement are one algorithm, used nowhere else.
 """
 
 from __future__ import annotations
@@ -31,7 +33,10 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.errors import InputError, place_of
+from envedit.core.rows import Rows
+from envedit.core.seeds import SIGNS
 from envedit.solve import light_search, matching_pursuit
+from envedit.transport.light_transport import LightTransport
 
 CELLS = 64
 """Cells around the horizon."""
@@ -129,11 +134,11 @@ def unreachable(reach: Reach) -> np.ndarray:
 
 
 def reachable(
-    transport,
+    transport: LightTransport,
     original: np.ndarray,
     target: np.ndarray,
     weight: np.ndarray | None = None,
-    rows: slice | tuple[int, int] | None = None,
+    rows: Rows | None = None,
     free: np.ndarray | None = None,
     painted: np.ndarray | None = None,
     rendered: np.ndarray | None = None,
@@ -150,7 +155,7 @@ def reachable(
         The picture wanted, linear radiance.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts; all the same by default.
-    rows : slice or (first, last), optional
+    rows : Rows, optional
         Active rows; the light of the others stays. All by default.
     free : ndarray of bool (rows, W), optional
         Texels of the active rows that may change; all by default.
@@ -175,6 +180,7 @@ def reachable(
     A target that was rendered has noise of its own, which is out of reach: under a map that is known to make
     the picture, 15 to 20 % of a request of 0.07 in display values are such noise at 128x128 pixels.
     """
+    # ---- Search: in cells, then with single texels around the most concentrated light
     question = _Question(transport, original, target, weight, rows, free, painted, rendered)
     initial, asked = question.initial, question.asked
     best, bound, steps = (asked, question.original, initial), 0.0, 0
@@ -193,12 +199,14 @@ def reachable(
             if not last:
                 model, x = _around_light(question, model, x, found)
                 picture = question.apply(model.map(x))
+    # ---- What is left
     distance, envmap, picture = best
     residual = tonemap(question.target) - tonemap(picture)
     left = np.abs(residual) * question.painted[..., None]
     too_dark = float(left[residual > 0].sum() / max(left.sum(), 1e-30))
     share = float(np.clip(1 - distance / asked, 0, 1)) if asked > 0 else 1.0
-    return Reach(share, np.float32(picture), np.float32(residual), np.float32(envmap), bound, steps, too_dark)
+    shown, left_over, lit = (np.asarray(a, np.float32) for a in (picture, residual, envmap))
+    return Reach(share, shown, left_over, lit, bound, steps, too_dark)
 
 
 class _Question:
@@ -208,10 +216,8 @@ class _Question:
         self.transport = transport
         self.original = np.ascontiguousarray(original, np.float32)
         height, width, _ = self.original.shape
-        if isinstance(rows, tuple):
-            rows = slice(rows[0], rows[1] + 1)
         self.active = np.zeros((height, width), bool)
-        self.active[rows or slice(None)] = True if free is None else free
+        self.active[slice(None) if rows is None else rows.slice] = True if free is None else free
         shape = transport.shape
         self.target = _shaped("target", target, (*shape, 3))
         if (bad := ~np.isfinite(self.target)).any():
@@ -268,7 +274,7 @@ def _cells(transport, shape):
     size = _size(width)
     across = -(-width // size)
     cell = (np.arange(height) // size)[:, None] * across + np.arange(width) // size
-    flat, rng = cell.ravel(), np.random.default_rng(0)
+    flat, rng = cell.ravel(), np.random.default_rng(SIGNS)
     square = np.zeros((height, width))
     for _ in range(PROBES):
         signs = rng.choice(np.float32([-1, 1]), size=(*transport.shape, 3))
@@ -347,6 +353,7 @@ def _solve(model, x, picture):
     bound : float
         Primal less dual value, as a share of the primal value of the original.
     """
+    # ---- The problem, linearised at the picture
     question = model.question
     weight = question.weights(picture)
     white = question.target >= 1  # any value above will do
@@ -356,6 +363,7 @@ def _solve(model, x, picture):
         r = wanted - light
         return np.where(white, np.maximum(r, 0), r)
 
+    # ---- Metric (De Pierro)
     one = model.render(np.stack([np.zeros((model.count, 3)), np.ones((model.count, 3))]))
     light = picture - model.base
     # A sky of one radiance that is as bright as the picture or the target.
@@ -368,6 +376,7 @@ def _solve(model, x, picture):
     seen = metric > 1e-9 * metric.max(axis=1, keepdims=True)
     step = np.where(seen, 1 / np.maximum(metric, 1e-300), 0)
 
+    # ---- Accelerated projected gradient
     slack = np.where(white, 0, 1.0)  # pulled back, it is positive: it makes a dual point feasible
     pulled = model.adjoint(weight * slack)
     start = 0.5 * (weight * rest(question.initial - model.base) ** 2).sum()
@@ -385,6 +394,7 @@ def _solve(model, x, picture):
         x, light, taken = new, new_light, taken + 1
         if taken % LOOK and taken < STEPS:
             continue
+        # ---- Bound, by a dual point
         r = rest(light)
         before, value = value, 0.5 * (weight * r * r).sum()
         slope = np.where(seen, model.adjoint(weight * r) / np.maximum(pulled, 1e-300), 0)
@@ -405,6 +415,7 @@ def _around_light(question, model, x, found):
     sun spread over its cell, a target was estimated to be infeasible that a rendering showed to be 92 %
     reached.
     """
+    # ---- Where light was added, most of it beyond the surroundings
     transport, active = question.transport, question.active
     height, width = active.shape
     influence = transport.influence * active
@@ -418,6 +429,7 @@ def _around_light(question, model, x, found):
     room = transport.capacity - len(transport.columns)
     if not beyond[row, column] > LIGHT * total or room < 2 * light_search.PROBES:
         return model, x
+    # ---- Its place, by exact columns
     directions, omega = latlong.directions(height, width), latlong.lookup_solid_angles(height, width)
     near = _window(row, column, 2 * size, height, width)
     excess = np.maximum(light[near] - np.median(light[near]), 0)
@@ -433,6 +445,7 @@ def _around_light(question, model, x, found):
         transport, (wanted - model.base).reshape(-1, 3), known, question.weight.reshape(-1, 1), mixed,
         towards, np.ones(3), int(first), int(last),
     )  # fmt: skip
+    # ---- Single texels there
     row, column = (round(float(v)) for v in latlong.texel_position(place, height, width))
     single = np.zeros_like(active)
     single[_window(row, column, SPAN, height, width)] = True

@@ -19,8 +19,10 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.seeds import SIGNS
 from envedit.losses import display_curve
 from envedit.representations.layers.gain import Octave, grid_size, splines
+from envedit.transport.light_transport import LightTransport
 
 PROBES = 12
 """Random z; what is averaged over them, three patterns and the nodes of a patch is within a third."""
@@ -35,7 +37,15 @@ FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
 further one: what a glossy object determines of half of the sky is not worth a third of a run's time."""
 
 
-def octaves(transport, second, background, rows, picture, weight, coarsest: int) -> list[Octave]:
+def octaves(
+    transport: LightTransport,
+    second: LightTransport,
+    background: np.ndarray,
+    rows: tuple[int, int],
+    picture: np.ndarray,
+    weight: np.ndarray | None,
+    coarsest: int,
+) -> list[Octave]:
     """Measure the octaves of detail that a picture determines.
 
     Parameters
@@ -64,7 +74,8 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
-    found, cycles = [], coarsest
+    found: list[Octave] = []
+    cycles = coarsest
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
         down, across = splines(size, (height, width))
@@ -86,7 +97,7 @@ def octaves(transport, second, background, rows, picture, weight, coarsest: int)
 
 def _pulled_back(transport, second, slope, background, first):
     """Yield :data:`PROBES` pairs of J' z, (n, W, 3) each, through T and through a second recording of it."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(SIGNS)
     for _ in range(PROBES):
         z = mi.TensorXf((rng.choice([-1.0, 1.0], slope.shape) * slope).astype(np.float32))
         rows = slice(first, first + len(background))

@@ -3,6 +3,8 @@
 A step solves the normal equations, and is kept if it lowers F. Huber's threshold s and sigma are at first as
 large as the residual, and at most halved at every step: a start that is far away is not judged by its
 outliers.
+
+Longer than 400 lines: the steps, their damping and the trials of added lights share the state of a run.
 """
 
 from __future__ import annotations
@@ -74,12 +76,12 @@ class Run:
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
         """Make a run of what :meth:`arrays` returned."""
-        parts = [
+        state, start = (
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
-        ]
+        )
         damping, scale, finished, asked, most = arrays["numbers"].tolist()
-        return cls(*parts, damping, scale, bool(finished), list(history), int(asked), int(most))
+        return cls(state, start, damping, scale, bool(finished), list(history), int(asked), int(most))
 
 
 @dataclass

@@ -13,6 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, renderers
+from envedit.core.seeds import Seeds
+from envedit.core.types import Progress
 from envedit.representations.layers.gain import CYCLES, Octave
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
@@ -21,9 +23,8 @@ from envedit.targets.target import Target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 
-AGAIN_SEED, AGAIN_SPP, AGAIN_COLUMNS = 500_009, 32, 64
-"""Added to the run's seed for the second recording of T, which measures its noise; its most samples a pixel
-and exact columns."""
+AGAIN_SPP, AGAIN_COLUMNS = 32, 64
+"""Most samples a pixel and exact columns of the second recording of T, which measures its noise."""
 MIRRORED = 0.8
 """Share of the sky whose detail must be identifiable, as in a mirror. In glossy scenes less is: there finer
 grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that no sky has."""
@@ -76,11 +77,11 @@ class Starts:
 def recordings(
     settings: config.Config,
     lit: scene.Scene,
-    shape,
+    shape: tuple[int, int],
     layers: Layers,
     wanted: Target,
     traced: LightTransport | None,
-    progress=None,
+    progress: Progress | None = None,
 ) -> Recordings:
     """Trace what :func:`find` looks through: T, and a second recording where detail is asked about.
 
@@ -118,7 +119,7 @@ def recordings(
         return Recordings(transport)
     pixels, few = lit.width * lit.height, min(AGAIN_SPP, transport.spp)
     second = trace(
-        (settings.seed + AGAIN_SEED) % 2**32,
+        Seeds.of(settings.seed).second_recording,
         spp=few,
         max_depth=transport.bounces + 1,
         memory_gb=recording.gigabytes(pixels, few, min(AGAIN_COLUMNS, transport.capacity) + 1),
@@ -202,12 +203,12 @@ def _trusted(envmap, recordings, wanted):
 
 def _searched(layers, params, transport, wanted, original, only_own=False):
     """List the starts of the searches, (parameters, notes)."""
-    asked = wanted.picture, wanted.weight, original
+    problem = light_search.SearchProblem(layers, transport, wanted.picture, wanted.weight, original)
     if wanted.coverage is None:
-        return [light_search.start(layers, params, transport, *asked, only_own)]
-    begin = layers, params, transport, wanted.initial, *asked
+        return [light_search.start(problem, params, only_own)]
+    problem = replace(problem, initial=wanted.initial)
     daring = (False, True) if (wanted.coverage < 1).any() else (False,)
-    found = [painted_change.start(*begin, bold=bold) for bold in daring]
+    found = [painted_change.start(problem, params, bold) for bold in daring]
     if layers.separation.lights:
         found.append(painted_change.softened(layers, params))
     return [one for i, one in enumerate(found) if not any(_same(one, other) for other in found[:i])]

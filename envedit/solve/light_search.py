@@ -8,20 +8,27 @@ Three steps, from far to near, all through T and none from where a light was:
    coarse grid to a fine one.
 
 What comes out is most of the way.
+
+Longer than 400 lines: the three steps share one :class:`Question`, and are read in their order.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.core.types import Params
 from envedit.representations.layers.gain import LEVELS, VEIL
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE, Lights, rotation_vector
 from envedit.representations.layers.separation import glow_at
 from envedit.solve.matching_pursuit import GAIN_ORDER, Given, Place, place, products, relative
+from envedit.transport.block_transport import Overview
 from envedit.transport.light_transport import LightTransport
 
 KEPT_FLUX = 3.0
@@ -36,31 +43,43 @@ PROBES = 25
 """Exact columns that are looked at together."""
 
 
-def start(
-    layers: Layers,
-    params: dict,
-    transport: LightTransport,
-    picture: np.ndarray,
-    weight: np.ndarray | None,
-    envmap: np.ndarray,
-    only_own: bool = False,
-) -> tuple[dict, list[str]]:
+@dataclass(frozen=True, eq=False)
+class SearchProblem:
+    """What a search for lights is given.
+
+    Attributes
+    ----------
+    layers : Layers
+        Lights and background of the map's active rows.
+    transport : LightTransport
+        T; gets exact columns for the texels that are looked at.
+    picture : ndarray (h, w, 3)
+        The target, linear radiance.
+    weight : ndarray (h, w, 1) or None
+        How much each pixel counts.
+    envmap : ndarray (H, W, 3)
+        The whole original map.
+    initial : ndarray (h, w, 3), optional
+        What the target was painted on: the change is explained then, ``picture - initial``.
+    """
+
+    layers: Layers
+    transport: LightTransport
+    picture: np.ndarray
+    weight: np.ndarray | None
+    envmap: np.ndarray
+    initial: np.ndarray | None = None
+
+
+def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple[dict, list[str]]:
     """Find where the optimisation of layers starts.
 
     Parameters
     ----------
-    layers : Layers
-        Lights and background of the map's active rows.
+    problem : SearchProblem
+        Without ``initial``.
     params : dict
-        As its ``encode`` returned them.
-    transport : LightTransport
-        T; gets exact columns for the texels that are looked at.
-    picture : ndarray (h, w, 3)
-        What is wanted.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts.
-    envmap : ndarray (H, W, 3)
-        The whole map.
+        Of the layers, as ``encode`` returned them.
     only_own : bool
         Place the map's own lights only: gain and further lights are found by Gauss-Newton steps.
 
@@ -71,7 +90,8 @@ def start(
     notes : list of str
         What was found.
     """
-    scene = Question(layers, transport, picture, weight, envmap)
+    layers, transport, picture, weight = problem.layers, problem.transport, problem.picture, problem.weight
+    scene = Question(problem)
     overview, lights = transport.overview(), layers.separation.lights
     spare = 0 if only_own else SPARE
     places = place(scene.given(), scene.wanted, lights, spare, layers.lights.flux[-1])
@@ -103,9 +123,9 @@ def start(
             notes.append("added a light: the target needs one where the map has none")
             pictures.append((i, scene.light(i, places[i])))
 
-    found = dict(params)
+    state = dict(params)
     if only_own:
-        return found | scene.placed(places), notes
+        return state | scene.placed(places), notes
 
     # Flux and gain, from the coarse grid to the finest.
     stack = np.zeros((3, len(overview.matrix[0]), 0))
@@ -120,36 +140,21 @@ def start(
         gain = np.clip(gain, LEAST, MOST)
         name = f"gain.{level}"
         logs = np.log(gain).reshape(*layers.gain.sizes[level], 3) / layers.scales[name]
-        found[name] = tensor(logs)
+        state[name] = tensor(logs)
         factor = factor * scene.in_cells(level, gain)
         strength = np.clip(strength, LEAST, MOST)
         total, stack = total * strength, stack * strength.T[:, None, :]
     for (i, _), s in zip(pictures, total, strict=True):
         places[i] = Place(places[i].direction, places[i].flux * s)
-    return found | scene.placed(places), notes
+    return state | scene.placed(places), notes
 
 
 class Question:
-    """What is asked: the picture less all that is fixed, and what may make it.
+    """What is asked: the picture less all that is fixed, or the painted change, and what may make it."""
 
-    Parameters
-    ----------
-    layers : Layers
-        Of the map.
-    transport : LightTransport
-        T.
-    picture : ndarray (h, w, 3)
-        What is asked for, linear radiance, where there is no ``wanted``: how bright pixels are.
-    weight : ndarray (h, w, 1) or None
-        How much each pixel counts.
-    envmap : ndarray (H, W, 3)
-        The original map.
-    wanted : ndarray (h, w, 3), optional
-        What is to be explained in place of the picture less the light of what is fixed.
-    """
-
-    def __init__(self, layers, transport, picture, weight, envmap, wanted=None):
-        self.layers, self.transport, self.weight = layers, transport, weight
+    def __init__(self, problem: SearchProblem):
+        layers, transport, envmap = problem.layers, problem.transport, problem.envmap
+        self.layers, self.transport, self.weight = layers, transport, problem.weight
         first, _ = layers.rows
         height, width = layers.shape
         rows = slice(first, first + height)
@@ -157,9 +162,12 @@ class Question:
         explained = layers.active if layers.mirrored else rows
         rest = envmap.copy()
         rest[explained] = 0
-        self.known = picture
-        self.wanted = picture - transport.apply(tensor(rest)).numpy() if wanted is None else wanted
-        self.active = np.zeros(envmap.shape[:2], bool)
+        painted = problem.initial is not None
+        self.known = problem.initial if painted else problem.picture
+        self.wanted = problem.picture - (
+            problem.initial if painted else transport.apply(tensor(rest)).numpy()
+        )
+        self.active: np.ndarray = np.zeros(envmap.shape[:2], bool)
         self.active[rows] = True
         self.active = self.active.ravel()
         self.start, self.rows = first * width, rows
@@ -167,13 +175,13 @@ class Question:
         background = np.zeros(envmap.shape)
         background[explained] = layers.background() if layers.mirrored else layers.separation.background
         self.background = background.reshape(-1, 3)
-        self.gained = np.zeros(envmap.shape[:2], bool)
+        self.gained: np.ndarray = np.zeros(envmap.shape[:2], bool)
         self.gained[explained] = True
         self.gained = self.gained.ravel()
         self.directions = self._seen(latlong.directions(*envmap.shape[:2]))
         self.cells = self._seen(transport.overview().directions)
         self.shape = envmap.shape
-        self._gains = None
+        self._gains: list[np.ndarray] | None = None
 
     def _seen(self, directions):
         """Directions by which gain and glow go: what mirrors the sky goes by what it mirrors."""
@@ -184,11 +192,17 @@ class Question:
         rest = self.background, self.omega, self.active, self.start, self.cells
         return Given(self.transport.overview(), self.weight, self.known, *rest)
 
-    def render(self, values):
+    def render(self, values: np.ndarray) -> np.ndarray:
         """Picture (h, w, 3) of a map (H * W, 3) alone, without other lamps' light."""
         return self.transport.linear(tensor(values.reshape(self.shape))).numpy()
 
-    def refine(self, direction, flux, glow, others=()):
+    def refine(
+        self,
+        direction: np.ndarray,
+        flux: np.ndarray,
+        glow: np.ndarray | None,
+        others: Sequence[np.ndarray] = (),
+    ) -> tuple[np.ndarray, float]:
         """Find the direction of a light, and its flux as a factor; ``others``' pictures may be mixed in."""
         if self._gains is None:
             gains = products(self.directions.reshape(-1, 3), GAIN_ORDER)
@@ -200,24 +214,24 @@ class Question:
         weight = None if self.weight is None else self.weight.reshape(-1, 1)
         wanted, known = self.wanted.reshape(-1, 3), self.known.reshape(-1, 3)
         last = self.rows.stop - 1
-        direction, factor = refine(
+        direction, factors = refine(
             self.transport, wanted, known, weight, np.stack(mixed), direction, flux, self.rows.start, last
         )
-        factor = float(np.median(factor))
+        factor = float(np.median(factors))
         kept = 1 / KEPT_FLUX < factor < KEPT_FLUX
         return direction, 1.0 if kept else float(np.clip(factor, LEAST, MOST))
 
-    def parameters(self, places):
+    def parameters(self, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
         """Rotation vectors and log fluxes of lights as they are placed."""
         return rotations(self.layers.lights, places)
 
-    def placed(self, places):
+    def placed(self, places: Sequence[Place]) -> Params:
         """Parameters of lights as they are placed."""
         turn, flux = self.parameters(places)
         scales = self.layers.scales
         return {"turn": tensor(turn / scales["turn"]), "flux": tensor(flux / scales["flux"])}
 
-    def light(self, i, found):
+    def light(self, i: int, found: Place) -> np.ndarray:
         """Picture of one light as it is placed, through exact columns."""
         dark = [Place(None, np.zeros(3))] * self.layers.lights.count
         dark[i] = found
@@ -230,13 +244,14 @@ class Question:
         self.transport.resolve(core + self.background.reshape(self.shape))
         return self.render(core)
 
-    def hats(self, level):
+    def hats(self, level: int) -> np.ndarray:
         """Radiance of what a gain adds, times each hat of a grid, in cells: (3, cells, nodes)."""
         overview = self.transport.overview()
         base = self.background[self.gained]
         base = (1 - VEIL) * base + VEIL * (base @ LUMINANCE)[:, None]
         rows, columns = self.layers.gain.sizes[level]
-        cell, omega, cells, nodes = *self._cells(), len(overview.omega), rows * columns
+        cell, omega = self._cells()
+        cells, nodes = len(overview.omega), rows * columns
         hats = np.zeros((3, cells * nodes))
         for node, share in self._hats(level):
             for c in range(3):
@@ -244,7 +259,7 @@ class Question:
         total = np.bincount(overview.cell_of, self.omega, cells)
         return hats.reshape(3, cells, nodes) / np.maximum(total, 1e-30)[None, :, None]
 
-    def in_cells(self, level, gain):
+    def in_cells(self, level: int, gain: np.ndarray) -> np.ndarray:
         """Mean of a gain (nodes, 3) over each cell, by its logarithm: (cells, 3)."""
         cell, omega = self._cells()
         cells = len(self.transport.overview().omega)
@@ -262,7 +277,7 @@ class Question:
         return self.transport.overview().cell_of[self.gained], self.omega[self.gained]
 
 
-def rotations(lights, places):
+def rotations(lights: Lights, places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
     """Return rotation vectors and log fluxes, (count, 3) each, of lights as they are placed."""
     turn, flux = np.zeros((lights.count, 3)), np.full((lights.count, 3), DARK)
     for i, found in enumerate(places):
@@ -272,7 +287,14 @@ def rotations(lights, places):
     return turn, flux
 
 
-def spread(overview, wanted, weight, known, hats, lights):
+def spread(
+    overview: Overview,
+    wanted: np.ndarray,
+    weight: np.ndarray | None,
+    known: np.ndarray,
+    hats: np.ndarray,
+    lights: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Find strengths, not negative, of overlapping hats of background and of lights that make a picture.
 
     Multiplicative updates (Richardson 1972, Lucy 1974), a <- a * H'(w I / H a) / H' w, from a = 1: they stay
@@ -313,7 +335,17 @@ def spread(overview, wanted, weight, known, hats, lights):
     return found[:n], found[n:]
 
 
-def refine(transport, wanted, known, weight, gains, direction, flux, first, last):
+def refine(
+    transport: LightTransport,
+    wanted: np.ndarray,
+    known: np.ndarray,
+    weight: np.ndarray | None,
+    gains: np.ndarray,
+    direction: np.ndarray,
+    flux: np.ndarray,
+    first: int,
+    last: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Find the place of a light to a fraction of a texel, by exact columns around a first guess.
 
     Parameters

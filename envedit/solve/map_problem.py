@@ -14,10 +14,13 @@ E(x) the map that the layers compose, minimised is
 
 The residual is exact, through T. The Jacobian is that of the block transport (``block_jacobian.py``), but
 pictures of lights are exact.
+
+Longer than 400 lines: objective, normal equations and posterior share the layout of the unknowns.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -30,6 +33,7 @@ from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 from envedit.solve.block_jacobian import BlockJacobian
+from envedit.transport.light_transport import LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
@@ -76,7 +80,7 @@ class Prior:
     size: float = 0.3
     added_size: float = 1.0
 
-    def gain_precisions(self, sizes) -> np.ndarray:
+    def gain_precisions(self, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
         """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n)."""
         fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
         return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
@@ -195,7 +199,16 @@ class Problem:
         How far a sky changes.
     """
 
-    def __init__(self, layers: Layers, transport, envmap, picture, weight=None, free=None, prior=None):
+    def __init__(
+        self,
+        layers: Layers,
+        transport: LightTransport,
+        envmap: np.ndarray,
+        picture: np.ndarray,
+        weight: np.ndarray | None = None,
+        free: np.ndarray = None,
+        prior: Prior = None,
+    ):
         self.layers, self.transport, self.envmap, self.free = layers, transport, envmap, free
         self.prior = prior or Prior()
         self.rows = layers.active
@@ -309,7 +322,7 @@ class Problem:
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         order = np.argsort(size, axis=None)
-        r, w = np.float64(size.ravel()[order]), np.float64(self.weight.ravel()[order])
+        r, w = (v.ravel()[order].astype(np.float64) for v in (size, self.weight))
         a = np.cumsum(np.append(0, w * r * r))
         b, c = (np.append(np.cumsum(part[::-1])[::-1], 0) for part in (w * r, w))
         d = self.area * INDEPENDENT
@@ -441,7 +454,7 @@ class Problem:
             return None
         n, found = self.nodes, {name: value.copy() for name, value in state.items()}
         found["gain"] += np.clip(step[: 3 * n], -LARGEST["gain"], LARGEST["gain"]).reshape(3, n).T
-        turns = {}
+        turns: dict[int, np.ndarray] = {}
         for value, (name, i, axis) in zip(step[3 * n :], normal.unknowns, strict=True):
             if name == "turn":
                 turns[i] = turns.get(i, 0.0) + value * axis
@@ -497,7 +510,7 @@ class Problem:
         sky[self.rows] = np.maximum(point.edited[self.rows] - self._core(point.state, point.state["flux"]), 0)
         return self.blocks.profile(self.transport.linear(tensor(sky)).numpy())
 
-    def _lights(self, point, profile) -> _Lights:
+    def _lights(self, point: Point, profile: np.ndarray) -> _Lights:
         """Pictures by which a light's unknowns change the rendering, (k, h, w, 3), and what they are.
 
         A light's core is seen through T, its glow through the block transport.

@@ -8,7 +8,9 @@ a light was, but that it stays where that explains as much.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -119,7 +121,8 @@ def place(
         For the map's lights, then for the spare ones; flux 0: not there.
     """
     overview, search = given.overview, Pursuit(given, picture)
-    directions, atoms = [], []
+    directions: list[np.ndarray | None] = []
+    atoms: list[np.ndarray] = []
     for light in lights:
         flux = given.flux(light)
         atom = search.atoms(flux.sum(axis=0), light.glow)
@@ -171,7 +174,7 @@ def place(
     return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))
 
 
-def relative(known, wanted, weight=None) -> np.ndarray:
+def relative(known: np.ndarray, wanted: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Weigh pixels, or blocks of them, so that equal relative errors count alike.
 
     That is weight / (brightness + floor).
@@ -208,7 +211,7 @@ class Pursuit:
         Of the gains that the background may take on.
     """
 
-    def __init__(self, given: Given, picture, order=GAIN_ORDER):
+    def __init__(self, given: Given, picture: np.ndarray, order: int = GAIN_ORDER):
         overview, omega = given.overview, given.omega
         self.overview = overview
         blocks = overview.to_blocks(picture)
@@ -227,7 +230,7 @@ class Pursuit:
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
         self.allow(products(d, order))
 
-    def allow(self, gains):
+    def allow(self, gains: np.ndarray) -> None:
         """Let the background take on any mixture of gains, (cells, n)."""
         for c in range(3):
             span = self.overview.matrix[c] @ (self.background[:, c : c + 1] * gains) * self.weight[:, None]
@@ -239,13 +242,13 @@ class Pursuit:
     def _off(self, c, x):
         return x - self.spans[c] @ (self.spans[c].T @ x)
 
-    def atoms(self, flux, glow):
+    def atoms(self, flux: np.ndarray, glow: np.ndarray | None) -> np.ndarray:
         """Pictures of a light of ``flux`` (3,) in each candidate cell: (3, blocks, candidates), weighted.
 
         ``glow`` as of :class:`.separation.Light`; it comes along.
         """
         matrix, size = self.overview.matrix, (len(self.directions), len(self.candidates))
-        unit = np.float32(flux[:, None] / self.overview.omega[self.candidates])
+        unit = (flux[:, None] / self.overview.omega[self.candidates]).astype(np.float32)
         found = np.stack([m[:, self.candidates] * u for m, u in zip(matrix, unit, strict=True)])
         if glow is not None:
             shine = interpolated_glow(dr.opaque(mi.Float(np.float32(glow).ravel())), self.cosine)
@@ -254,7 +257,9 @@ class Pursuit:
                 found[c] += dr.matmul(tensor(matrix[c]), lit).numpy()
         return found * np.float32(self.weight[:, None])
 
-    def atom_of(self, cells, flux, centre, glow):
+    def atom_of(
+        self, cells: np.ndarray, flux: np.ndarray, centre: np.ndarray, glow: np.ndarray | None
+    ) -> np.ndarray:
         """Picture, (3, blocks, 1), of a light with flux (n, 3) in cells (n,) and its glow around a centre."""
         found, shine = [], None if glow is None else glow_at(glow, self.directions @ centre)
         for c in range(3):
@@ -264,16 +269,16 @@ class Pursuit:
             found.append(self.overview.matrix[c] @ light * self.weight)
         return np.stack(found)[..., None]
 
-    def scores(self, atoms):
+    def scores(self, atoms: np.ndarray) -> np.ndarray:
         """Squared residual that each atom, (3, blocks, n), explains, summed over channels: (n,)."""
-        score = 0.0
+        score: Any = 0.0
         for c in range(3):
             atom = self._off(c, atoms[c])
             power = (atom * atom).sum(axis=0)
             score = score + np.maximum(atom.T @ self.residual[c], 0) ** 2 / np.maximum(power, 1e-30)
         return score
 
-    def between(self, score, best):
+    def between(self, score: np.ndarray, best: int) -> np.ndarray:
         """Direction of the best cell, drawn towards neighbours that explain nearly as much."""
         d = self.overview.directions[self.candidates]
         near = d @ d[best] > np.cos(np.radians(NEAR * 360 / CELLS))
@@ -281,24 +286,25 @@ class Pursuit:
         middle = (d[near] * weight[:, None]).sum(axis=0)
         return middle / np.linalg.norm(middle)
 
-    def explain(self, atom):
+    def explain(self, atom: np.ndarray) -> None:
         """Let an atom of any strength explain what it can."""
         for c in range(3):
             new = self._off(c, atom[c])
             size = np.linalg.norm(new)
-            if size > 1e-6 * max(np.linalg.norm(atom[c]), 1e-30):
+            whole: Any = max(np.linalg.norm(atom[c]), 1e-30)
+            if size > 1e-6 * whole:
                 self.spans[c] = np.concatenate([self.spans[c], (new / size)[:, None]], axis=1)
                 self.residual[c] = self._off(c, self.residual[c])
 
-    def left(self):
+    def left(self) -> float:
         """Squared residual."""
         return sum(float(r @ r) for r in self.residual)
 
-    def asked(self):
+    def asked(self) -> float:
         """Squared picture."""
         return sum(float(w @ w) for w in self.wanted)
 
-    def solve(self, atoms, signed=False):
+    def solve(self, atoms: Sequence[np.ndarray], signed: bool = False) -> np.ndarray:
         """Strength of each atom per channel, (n, 3), not negative, beside any gain of the background.
 
         ``signed``: what is wanted is a change, and the background may become darker.
@@ -321,7 +327,7 @@ def products(d: np.ndarray, order: int) -> np.ndarray:
 
 def not_negative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Solve min |a x - b| with x >= 0 (Lawson and Hanson 1974, by leaving out what turns negative)."""
-    a, b = np.float64(a), np.float64(b)
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     keep = np.ones(a.shape[1], bool)
     for _ in range(a.shape[1]):
         x = np.zeros(a.shape[1])

@@ -6,15 +6,16 @@ light, are errors of the change alone. Otherwise as :mod:`.matching_pursuit` and
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import LOBE_DEGREES, SPARE
 from envedit.representations.layers.separation import Light
-from envedit.solve.light_search import LEAST, MOST, PROBES, Question, rotations
+from envedit.solve.light_search import LEAST, MOST, PROBES, Question, SearchProblem, rotations
 from envedit.solve.matching_pursuit import LEAST_FLUX, Given, Place, Pursuit, not_negative, relative
-from envedit.transport.light_transport import LightTransport
 
 ADDED_BESIDE, ADDED_ASKED = 0.3, 0.1
 """For a painted change a light is added where it explains the first share of what is left unexplained, and
@@ -31,24 +32,13 @@ SOFT = 2.0
 """Radius in degrees of the lobes that take the place of lights where a shadow is to be softer."""
 
 
-def start(
-    layers: Layers,
-    params: dict,
-    transport: LightTransport,
-    initial: np.ndarray,
-    picture: np.ndarray,
-    weight: np.ndarray | None,
-    envmap: np.ndarray,
-    bold: bool = False,
-) -> tuple[dict, list[str]]:
+def start(problem: SearchProblem, params: dict, bold: bool = False) -> tuple[dict, list[str]]:
     """Find where the optimisation starts for a picture that was painted on the initial rendering.
 
     Parameters
     ----------
-    layers, params, transport, picture, weight, envmap
-        As for :func:`.light_search.start`.
-    initial : ndarray (h, w, 3)
-        What was painted on. What is looked for explains the change, ``picture - initial``.
+    problem, params
+        As for :func:`.light_search.start`, with ``initial``.
     bold : bool
         Also add lights with a low score: a shadow takes a light elsewhere and a darker sky together,
         and either alone explains next to nothing.
@@ -61,13 +51,14 @@ def start(
         What was found.
     """
     # Paint does not weigh more than the rest here: what is added must leave the rest as it is.
+    layers, transport, weight = problem.layers, problem.transport, problem.weight
     weight = None if weight is None or (weight > 0).all() else (weight > 0).astype(np.float32)
-    scene = Question(layers, transport, initial, weight, envmap, wanted=picture - initial)
+    scene = Question(replace(problem, weight=weight))
     lights = layers.separation.lights
     places = place(scene.given(), scene.wanted, lights, SPARE, layers.lights.flux[-1], bold)
     notes, moved = [], {i for i, found in enumerate(places) if found.direction is not None}
     there = [scene.light(i, Place(None, np.ones(3))) for i in range(len(lights))]
-    new = {}
+    new: dict = {}
     for i in sorted(moved):
         direction, glow = places[i].direction, lights[i].glow if i < len(lights) else None
         if transport.capacity >= PROBES:
@@ -131,7 +122,8 @@ def place(
         stays.append(atom[..., 0])
         search.explain(stays[-1])
     own = [given.flux(light).sum(axis=0) for light in lights]
-    new_places, added, atom = [], [], search.atoms(spare_flux, None)
+    new_places: list[np.ndarray] = []
+    added, atom = [], search.atoms(spare_flux, None)
     for _ in range(spare + len(lights)):
         score = search.scores(atom)
         for there in [*(light.direction for light in lights), *new_places]:

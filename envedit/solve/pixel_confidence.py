@@ -10,6 +10,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.types import Views
 from envedit.losses.display_curve import to_display
 
 TRUSTED = 0.007
@@ -24,7 +25,14 @@ LIT = 0.01
 """Multiples of the target's mean brightness from which on a pixel counts in medians: not a black backdrop."""
 
 
-def weights(first, second, share: float, picture, noise=None, views=()) -> np.ndarray | None:
+def weights(
+    first: np.ndarray,
+    second: np.ndarray,
+    share: float,
+    picture: np.ndarray,
+    noise: np.ndarray = None,
+    views: Views = (),
+) -> np.ndarray | None:
     """Weigh pixels by what is known of them.
 
     Parameters

@@ -68,19 +68,22 @@ def find(
             known[texels] = residual(transport, turned, picture, weight)
         return known[texels]
 
-    misfit, best = _at_a_glance(transport, envmap, picture, count), []
+    misfit = _at_a_glance(transport, envmap, picture, count)
+    best: list[int] = []
     for shift in np.argsort(misfit, kind="stable"):
         apart = [min(abs(shift - other), width - abs(shift - other)) for other in best]
         if len(best) < CANDIDATES and (not apart or min(apart) >= APART):
             best.append(int(shift))
-    texels = min(best, key=error)
+    texels: float = min(best, key=error)
     for step in (4.0, 2.0, 1.0, 0.5, 0.3, TENTH):
         texels = min((texels, texels - step, texels + step), key=error)
     texels = round(texels / TENTH) * TENTH % width
     return Turn(360 * texels / width, error(texels), error(0.0))
 
 
-def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
+def residual(
+    transport: LightTransport, envmap: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None
+) -> float:
     """Return a map's display residual, RMS over channels and mean over pixels; inf if it is not finite.
 
     Parameters are those of :func:`find`.
@@ -89,7 +92,7 @@ def residual(transport: LightTransport, envmap, picture, weight=None) -> float:
     return apart(transport.apply(tensor(envmap)).numpy(), picture, weight)
 
 
-def apart(rendering, picture, weight=None) -> float:
+def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Return the display residual of a rendering (h, w, 3), likewise."""
     off = np.float64(display_curve.to_display(tensor(rendering)).numpy())
     off -= display_curve.to_display(tensor(picture)).numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import TextIO
 
 from tqdm import tqdm
 
@@ -23,11 +24,13 @@ class Board:
         Where to; None: nowhere.
     """
 
-    def __init__(self, total: int, slots: int | None, stream):
+    def __init__(self, total: int, slots: int | None, stream: TextIO | None):
         self._total, self._slots, self._stream = total, slots, stream
-        self._done, self._failed, self._seconds = 0, 0, []
+        self._done, self._failed = 0, 0
+        self._seconds: list[float] = []
         self._begun, self._refreshed = time.monotonic(), 0.0
-        self._bar, self._said = None, set()
+        self._bar: tqdm | None = None
+        self._said: set[str] = set()
 
     def begin(self, line: str) -> None:
         """Say what is going to happen."""

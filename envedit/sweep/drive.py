@@ -13,9 +13,11 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any, TextIO
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import FilePath
 
 from .board import Board
 from .jobs import Job
@@ -39,7 +41,7 @@ class _OneByOne:
         self._run = functools.partial(run, threads=threads or cores(), stop=self._stop)
         self.description = f"1 at a time, {threads or cores()} threads"
 
-    def submit(self, job: Job, waited: bool = False):
+    def submit(self, job: Job, waited: bool = False) -> Any:
         """Return a future of an outcome."""
         return self._pool.submit(self._run, job, waited=waited)
 
@@ -62,13 +64,14 @@ class _Dask:
             raise ConfigError(f"{asked}: {missing}") from None
         # Its tracebacks when a scheduler is gone.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-        self._submitted, self._stop, self._cluster = [], uuid.uuid4().hex, None
+        self._submitted: list[Any] = []
+        self._stop, self._cluster = uuid.uuid4().hex, None
         self.slots = None if address else workers  # a cluster's workers come and go
         if address is None:
             threads = threads or max(1, cores() // workers)
             self.description = f"{workers} at a time, {threads} threads each"
             # Threads of this process, each of which waits for the process of a job.
-            shape = {"n_workers": 1, "threads_per_worker": workers, "processes": False}
+            shape: dict[str, Any] = {"n_workers": 1, "threads_per_worker": workers, "processes": False}
             shape |= dict.fromkeys(("dashboard_address", "worker_dashboard_address"), "127.0.0.1:0")
             shape |= {"scheduler_kwargs": {"dashboard": False}}
             self._cluster = LocalCluster(**shape, silence_logs=logging.CRITICAL)
@@ -84,7 +87,7 @@ class _Dask:
             self.description = f"{jobs} at a time on {address}" if jobs else f"no workers at {address} yet"
         self._run = functools.partial(run, threads=threads, stop=self._stop)
 
-    def submit(self, job: Job, waited: bool = False):
+    def submit(self, job: Job, waited: bool = False) -> Any:
         """Return a future of an outcome."""
         # A key of its own for every try: the scheduler remembers results by their keys.
         key = f"{job.key}-{uuid.uuid4().hex}"
@@ -125,12 +128,12 @@ def _outcome(job, future):
 
 def sweep(
     jobs: Iterable[Job],
-    out,
+    out: FilePath,
     workers: int | None = None,
     scheduler: str | None = None,
     threads: int | None = None,
     command: Sequence[str] = (),
-    stream=None,
+    stream: TextIO | None = None,
 ) -> list[Outcome]:
     """Carry out all jobs that are not done, and report the progress.
 

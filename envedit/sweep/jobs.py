@@ -18,6 +18,7 @@ import envedit
 from envedit import config
 from envedit.config import presets
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import FilePath
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Job:
     program: str
     command: tuple[str, ...] = ()
 
-    def folder(self, out) -> Path:
+    def folder(self, out: FilePath) -> Path:
         """Return the job's folder under ``out``."""
         return Path(out) / self.key
 
@@ -58,7 +59,13 @@ def program() -> str:
     return f"{envedit.__version__}+{found.hexdigest()[:12]}"
 
 
-def job(name: str, toml: str | dict, base=".", version: str = "", command: Sequence[str] = ()) -> Job:
+def job(
+    name: str,
+    toml: str | dict,
+    base: FilePath = ".",
+    version: str = "",
+    command: Sequence[str] = (),
+) -> Job:
     """Make a job of a configuration.
 
     Parameters
@@ -84,8 +91,8 @@ def job(name: str, toml: str | dict, base=".", version: str = "", command: Seque
     if not name or not name.isprintable():
         raise ConfigError(f"job {name!r}: got no printable text, expected a name")
     base = Path(base).absolute()
-    make = config.loads if isinstance(toml, str) else config.from_dict
-    settings = make(toml, base, f"job {name}")
+    said = base, f"job {name}"
+    settings = config.loads(toml, *said) if isinstance(toml, str) else config.from_dict(toml, *said)
     scene, given, files = settings.scene, dict(settings.scene.parameters), {}
     for key, value in given.items():
         # The run looks beside the scene, then beside the configuration, which will lie in the job's folder.
@@ -105,7 +112,7 @@ def job(name: str, toml: str | dict, base=".", version: str = "", command: Seque
     return Job(name, config.to_toml(settings), key, program(), tuple(command))
 
 
-def read_jobs(path) -> list[Job]:
+def read_jobs(path: FilePath) -> list[Job]:
     """Read a TOML file of jobs, or the configurations in a folder; see the package's text.
 
     Raises

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import envedit
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import InputError
+from envedit.core.types import FilePath
 
 from .jobs import Job, program
 from .locks import Lock
@@ -91,7 +92,7 @@ def cores() -> int:
 
 def run_job(
     job: Job,
-    out,
+    out: FilePath,
     command: Sequence[str] = (),
     threads: int | None = None,
     stop: str = "",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.types import Info
+
 FLOAT_TOLERANCE = {"exr": 1e-3, "hdr": 1e-2}
 """Of a pixel's brightest channel: half floats round by 0.0005, shared exponents by up to 0.008."""
 CODE_TOLERANCE = {255: 1.5, 65535: 32.0}
@@ -15,7 +17,7 @@ JPEG_SHARE = 1 / 3
 """A difference below this share of the largest within two pixels is colour that bled across an edge."""
 
 
-def differs(values, before, info, top):
+def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int) -> np.ndarray:
     """Return where (h, w) a picture was painted.
 
     Parameters

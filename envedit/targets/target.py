@@ -19,13 +19,11 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.targets import painted_image, strokes
-
-SEED = 7_000_003
-"""Apart from the seeds of all other renderings, so that no noise is shared between question and answer."""
+from envedit.targets import initial_rendering, painted_image, strokes
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Target:
 
     def aimed_at(self, picture: np.ndarray) -> Target:
         """Return the target with another :attr:`aim`."""
-        return replace(self, **{"picture" if self.compared is None else "compared": picture})
+        return replace(self, picture=picture) if self.compared is None else replace(self, compared=picture)
 
 
 def make(
@@ -115,7 +113,8 @@ def make(
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap, other), hidden)
     shape = scene.height, scene.width
-    initial, asked = painted_image.initial(scene, envmap, settings), ()
+    initial = initial_rendering.initial(scene, envmap, settings)
+    asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
         found = painted_image.given(picture, shape, initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
@@ -211,7 +210,7 @@ def _seen(target, hidden):
     return replace(target, weight=weight, source=f"{target.source}; {share}")
 
 
-def pixel_weight(coverage, excluded, paint: float, hold: float) -> np.ndarray:
+def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:
     """Share the weights of paint and rest among their pixels: (h, w, 1) float32, 1 on average.
 
     weight = paint c / sum(c) + hold (1 - c) / sum(1 - c), where c is coverage, over the pixels that are not
@@ -243,7 +242,9 @@ def _rendered(settings, scene, envmap, other):
         true, warnings = latlong.rotate(envmap, chosen.degrees), ()
         source = f"rendered under the map turned by {chosen.degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
-    picture, spp, noise = rendered(scene, true, chosen.spp, settings.seed + SEED, settings.renderer.cache)
+    picture, spp, noise = rendered(
+        scene, true, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
+    )
     weight = np.ones((*picture.shape[:2], 1), np.float32) if chosen.masks else None
     for view, mask in zip(chosen.views, chosen.masks, strict=True):
         rows = scene.rows[scene.view(view, "target.view")]

@@ -12,6 +12,8 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.array_cache import holds
+from envedit.core.types import Views
+from envedit.transport.sparse_matrix import ColourMatrix
 
 CELLS = 64
 """Cells around the horizon: 5.6 degrees each."""
@@ -52,7 +54,7 @@ class Overview:
         return _means(values, self.cell_of, weight)
 
 
-def make(matrix, shape: tuple[int, int], grid: tuple[int, int], views=()) -> Overview:
+def make(matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()) -> Overview:
     """Sum up the entries of a transport.
 
     Parameters
@@ -79,7 +81,9 @@ def make(matrix, shape: tuple[int, int], grid: tuple[int, int], views=()) -> Ove
     return Overview(dense.astype(np.float32), block_of, cell_of, toward, size)
 
 
-def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int], views=()) -> bool:
+def whole(
+    arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
+) -> bool:
     """Return whether arrays from disk are an overview of such a picture and map: no index leaves it."""
     block_of, blocks = _blocks(shape, views)
     cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))

@@ -10,11 +10,14 @@ kernels, not a part of them: more columns compile nothing.
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import seeds
+from envedit.scene.scene import Scene
 from envedit.transport import path_vertices
 from envedit.transport.sparse_matrix import SLICE, merge
 from envedit.transport.texel_sampling import Grid
@@ -52,7 +55,7 @@ class ExactColumns:
         0 for texels with a column, 1 for others: what is left to the coarse tier.
     """
 
-    def __init__(self, scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
+    def __init__(self, scene: Scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
         self.scene, self.grid, self.bounces, self.capacity = scene, grid, bounces, capacity
         self.pixels = scene.width * scene.height
         self.texels = np.zeros(0, np.int64)
@@ -63,7 +66,8 @@ class ExactColumns:
         self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
         self._count = dr.opaque(mi.UInt32, 0)
         self._lost = dr.opaque(mi.UInt32, 0)
-        self.paths_bytes, self._kept = paths_bytes, {}
+        self.paths_bytes = paths_bytes
+        self._kept: dict[str, Any] = {}
         dr.make_opaque(self._store, self._texel_of, self.mask)
 
     @property
@@ -88,7 +92,14 @@ class ExactColumns:
 
     # ------------------------------------------------------------------ tracing
 
-    def trace(self, texels: np.ndarray, count: int, seed: int, keep: np.ndarray | None = None, blocks=None):
+    def trace(
+        self,
+        texels: np.ndarray,
+        count: int,
+        seed: int,
+        keep: np.ndarray | None = None,
+        blocks: int | None = None,
+    ) -> None:
         """Trace columns; one that was there is replaced.
 
         Parameters
@@ -121,8 +132,8 @@ class ExactColumns:
             return
         self._kept = {key: kept for key, kept in self._kept.items() if key[1] == seed}
         made, room = [], self.paths_bytes - self.kept_bytes
-        traced = path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, seed + 7919)
-        for block in traced:
+        own = seeds.columns(seed)
+        for block in path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, own):
             made.append(block)
             room -= block.bytes
             yield block

@@ -14,12 +14,13 @@ Two tiers, both unbiased:
 
 T E = T_coarse (E outside the columns) + T_exact (E inside them). What it costs follows the light, not the
 grid.
+
+Longer than 400 lines: one class; both tiers, their memory and their checkpoint are one state.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
@@ -29,40 +30,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import latlong
+from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_radiance
+from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
 from envedit.transport import block_transport as overviews
 from envedit.transport import bright_texels
 from envedit.transport.exact_columns import ExactColumns
 from envedit.transport.influence import determined
-from envedit.transport.recording import (
-    MAX_BOUNCES,
-    allowed,
-    choose_bounces,
-    choose_samples,
-    gigabytes,
-    left_out,
-    other_light,
-    pilot,
-    record_all,
-    row_mass,
-)
+from envedit.transport.recording import allowed, other_light, record_all
+from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, SamplingPlan, choose, white_sky
 from envedit.transport.sparse_matrix import ColourMatrix, scale_packets, to_packets
 from envedit.transport.texel_sampling import Grid
 
-COLUMN_TOLERANCE = 0.03
-"""Relative error of the coarse tier above which columns are added."""
-COLUMN_PATHS = (8, 48, 320)
-"""Paths a pixel of a column, by its texel's share of the picture's light (:data:`COLUMN_SHARES`)."""
-FEW_PATHS, FEW_TOLERANCE = (8, 16, 48), 0.08
-"""Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
 COLUMN_SHARES = (0.0, 0.01, 0.1)
-"""Shares of the picture's light from which on a column has so many paths."""
+"""Shares of the picture's light from which on a column has so many paths (:data:`.COLUMN_PATHS`)."""
 RESOLVE_EVERY = 10
 """Steps after which a renderer looks for texels that have grown bright."""
 LASTING_LOOKS = 5
@@ -100,16 +86,16 @@ class LightTransport:
         Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
     """
 
-    def __init__(self, scene, grid, spp, bounces, seed, capacity, refresh, choices, paths_bytes=0):
+    def __init__(self, scene: Scene, grid: Grid, plan: SamplingPlan, seed: int, refresh: int):
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
-        self.spp, self.bounces, self.capacity, self.refresh = spp, bounces, capacity, refresh
-        self.epoch, self._base_seed, self._choices, self._lost = 0, seed, choices, 0
-        self.cached, self.depth_error = False, 0.0
-        self.paths, self.tolerance = COLUMN_PATHS, COLUMN_TOLERANCE
+        self.spp, self.bounces, self.capacity, self.refresh = plan.spp, plan.bounces, plan.capacity, refresh
+        self.epoch, self._base_seed, self._choices, self._lost = 0, seed, plan.choices, 0
+        self.cached, self.depth_error = False, plan.depth_error
+        self.paths, self.tolerance = plan.paths, plan.tolerance
         self._looks = np.zeros(grid.texels, np.uint8)
         self._overview: overviews.Overview | None = None
-        self._stored = DiskCache(None), {}
-        self._exact = ExactColumns(scene, grid, bounces, capacity, paths_bytes)
+        self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
+        self._exact = ExactColumns(scene, grid, plan.bounces, plan.capacity, plan.paths_bytes)
 
     # ------------------------------------------------------------------ building
 
@@ -127,7 +113,7 @@ class LightTransport:
         refresh: int = 0,
         few: bool = False,
         folder: Path | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> LightTransport:
         """Trace T.
 
@@ -176,8 +162,8 @@ class LightTransport:
         latlong.check_envmap_size(height, width)
         memory_gb = allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
-            whole = isinstance(value, Integral) and not isinstance(value, bool)
-            if value != "auto" and not (whole and value >= 1):
+            whole = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
+            if value != "auto" and not whole:
                 raise ConfigError(
                     f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
                 )
@@ -188,45 +174,14 @@ class LightTransport:
             "grid": [height, width, np.asarray(scene.to_world).tolist()],
             "seed": seed,
         }
-        sphere = latlong.solid_angles(height, width)
-        known = {"by_row": ("f8", (height,)), "by_bounce": ("f8", (None,))}
-        light = cache.load(
-            origin | {"part": "pilot"},
-            lambda found: (
-                holds(found, known)
-                and len(found["by_bounce"]) == MAX_BOUNCES + 1
-                and min(a.min() for a in found.values()) >= 0 < found["by_bounce"].sum()
-            ),
-        )
-        if light is None:
-            by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
-            light = {"by_row": by_row, "by_bounce": by_bounce}
-            cache.store(origin | {"part": "pilot"}, light)
-        by_bounce = np.array(light["by_bounce"])
-        if scene.max_depth > 0:
-            by_bounce[scene.max_depth :] = 0
-        bounces, choices = choose_bounces(scene, max_depth, by_bounce)
-        mass = row_mass(sphere, light["by_row"])
-        spp, capacity, choice = choose_samples(scene, spp, height * width, memory_gb)
-        grid = Grid(height, width, scene.to_world, mass)
-        left = memory_gb - gigabytes(scene.width * scene.height, spp, capacity)
-        transport = cls(
-            scene, grid, spp, bounces, seed, capacity, refresh, [*choices, choice], int(1e9 * max(left, 0))
-        )
-        if few:
-            transport.paths, transport.tolerance = FEW_PATHS, FEW_TOLERANCE
-        transport.depth_error = left_out(by_bounce, bounces)
-        rows = hashlib.sha256(mass.tobytes()).hexdigest()
-        # The light of other lamps is constant: it need not be cut where no path depth is asked for.
-        most = scene.max_depth if max_depth == "auto" else bounces + 1
-        lamps = most if len(scene.mi.emitters()) > 1 else 0
-        key = origin | {
-            "part": "recording", "samples": spp, "bounces": bounces, "lamps": lamps, "rows": rows
-        }  # fmt: skip
+        light = white_sky(cache, origin | {"part": "pilot"}, scene, (height, width), seed)
+        plan = choose(scene, (height, width), light, spp, max_depth, memory_gb, few)
+        transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed, refresh)
+        key = origin | {"part": "recording"} | plan.key()
         transport._stored = cache, key | {"part": "overview"}
         found = cache.load(key, transport._whole)
         if found is None:
-            transport._trace(lamps, progress)
+            transport._trace(plan.lamps, progress)
             cache.store(key, transport._recording())
         else:
             transport._take(found)
@@ -286,7 +241,7 @@ class LightTransport:
     @property
     def seed(self) -> int:
         """Seed of the present recording."""
-        return self._base_seed + 1_000_003 * self.epoch
+        return seeds.recording(self._base_seed, self.epoch)
 
     @property
     def choices(self) -> list[str]:
@@ -516,7 +471,7 @@ class LightTransport:
 
     def resolve(
         self,
-        envmap,
+        envmap: ArrayLike,
         tolerance: float | None = None,
         limit: int | None = None,
         lasting: np.ndarray | None = None,
@@ -565,7 +520,7 @@ class LightTransport:
         total = light.sum()
         return light / total if total > 0 else np.zeros_like(light)
 
-    def coarse_error(self, envmap) -> float:
+    def coarse_error(self, envmap: ArrayLike) -> float:
         """Predict the relative error of the coarse tier for a map, beside the columns that there are.
 
         Raises
@@ -575,7 +530,8 @@ class LightTransport:
         """
         require_radiance(envmap, "light transport")
         rest = self._exact.slot_of < 0
-        return bright_texels.error(*self._radiance(np.asarray(envmap)), self._samples, rest)
+        radiance, omega = self._radiance(np.asarray(envmap))
+        return bright_texels.error(radiance, omega, self._samples, rest)
 
     @property
     def _samples(self):
@@ -592,7 +548,8 @@ class LightTransport:
     def bright_texels(self, envmap: np.ndarray, tolerance: float | None = None) -> np.ndarray:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
         tolerance = self.tolerance if tolerance is None else tolerance
-        return bright_texels.brightest(*self._radiance(envmap), self._samples, tolerance)
+        radiance, omega = self._radiance(envmap)
+        return bright_texels.brightest(radiance, omega, self._samples, tolerance)
 
 
 def _under(arrays, part):

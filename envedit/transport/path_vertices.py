@@ -7,6 +7,7 @@ scene, the texels around its direction. A column then costs one shadow ray and o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -14,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.types import DrArray
 from envedit.scene import camera_paths
 from envedit.transport.recording import LANES, bsdf_weight, connect
 from envedit.transport.sparse_matrix import SLICE
@@ -70,7 +72,7 @@ class Block:
         return self.vertices * VERTEX_BYTES + self.escapes * ESCAPE_BYTES
 
 
-def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, seed: int):
+def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, seed: int) -> Iterator[Block]:
     """Trace the paths of a picture; yields a :class:`Block` for every few pixels.
 
     Parameters
@@ -237,7 +239,7 @@ def _of_leaves(like, leaves):
     return dr.reinterpret_array(kind, leaf) if kind.__name__.endswith("Ptr") else leaf
 
 
-def on_device(kind, values: np.ndarray):
+def on_device(kind: type[DrArray], values: np.ndarray) -> DrArray:
     """Copy an array to the device, with its first element repeated where there is but one.
 
     A copy, for numpy's memory is not aligned, and two elements at least, for one would be a scalar: either
@@ -246,7 +248,9 @@ def on_device(kind, values: np.ndarray):
     return dr.opaque(kind(np.ascontiguousarray(values if len(values) > 1 else np.repeat(values, 2))))
 
 
-def contributions(scene: mi.Scene, grid: Grid, block: Block, texels, count: int, seed: int):
+def contributions(
+    scene: mi.Scene, grid: Grid, block: Block, texels: np.ndarray, count: int, seed: int
+) -> tuple[mi.Color3f, mi.UInt32]:
     """Return what each of some texels adds to the pixels of a block by way of its vertices.
 
     Parameters

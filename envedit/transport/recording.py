@@ -15,8 +15,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import seeds
 from envedit.core.errors import InputError
+from envedit.core.types import Progress
 from envedit.scene import camera_paths
+from envedit.scene.scene import Scene
 from envedit.transport.sparse_matrix import SLICE, merge
 from envedit.transport.texel_sampling import Grid
 
@@ -51,7 +54,13 @@ class Recorded(NamedTuple):
     lost: int
 
 
-def connect(scene: mi.Scene, vertex: camera_paths.Vertex, direction, jacobian, sampled) -> mi.Color3f:
+def connect(
+    scene: mi.Scene,
+    vertex: camera_paths.Vertex,
+    direction: mi.Vector3f,
+    jacobian: mi.Float,
+    sampled: mi.Float,
+) -> mi.Color3f:
     """Evaluate throughput * BSDF * visibility towards a direction, times its balance-heuristic weight.
 
     Parameters
@@ -150,7 +159,9 @@ def record(scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: i
     return Recorded(*merged, lost)
 
 
-def record_all(scene, grid: Grid, spp: int, bounces: int, seed: int, progress=None) -> Recorded:
+def record_all(
+    scene: Scene, grid: Grid, spp: int, bounces: int, seed: int, progress: Progress | None = None
+) -> Recorded:
     """Record every pixel of a scene's film, block by block.
 
     Parameters
@@ -174,7 +185,7 @@ def record_all(scene, grid: Grid, spp: int, bounces: int, seed: int, progress=No
     return Recorded(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), sum(lost))
 
 
-def pilot(scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def pilot(scene: Scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Measure where light comes from under a white sky, from a few samples of some 4096 pixels.
 
     Returns
@@ -188,7 +199,9 @@ def pilot(scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     stride = max(1, int(np.sqrt(len(pixels) / 4096)))
     some = pixels.reshape(scene.height, scene.width)[::stride, ::stride].ravel()
     by_row, by_bounce = np.zeros(grid.height), np.zeros(MAX_BOUNCES + 1)
-    for bounce, _, texel, value in contributions(scene.mi, grid, some, PILOT_SPP, MAX_BOUNCES, seed + 104729):
+    for bounce, _, texel, value in contributions(
+        scene.mi, grid, some, PILOT_SPP, MAX_BOUNCES, seeds.pilot(seed)
+    ):
         # Summed on the host: atomics would give other bits, and so other samples, on every run.
         amount = np.nan_to_num(dr.mean(value).numpy().astype(np.float64), nan=0, posinf=0, neginf=0)
         by_row += np.bincount(texel.numpy() // grid.width, amount, minlength=grid.height)
@@ -201,7 +214,7 @@ def left_out(by_bounce: np.ndarray, bounces: int) -> float:
     return max(1 - float(by_bounce[: bounces + 1].sum() / by_bounce.sum()), 0.0)
 
 
-def choose_bounces(scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[int, list[str]]:
+def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[int, list[str]]:
     """Choose the surface points along a path from the light by bounce that :func:`pilot` found.
 
     Parameters
@@ -242,7 +255,7 @@ def choose_bounces(scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[
     return bounces, [f"path depth {bounces + 1}: {added}"]
 
 
-def choose_samples(scene, spp: int | str, texels: int, memory_gb: float) -> tuple[int, int, str]:
+def choose_samples(scene: Scene, spp: int | str, texels: int, memory_gb: float) -> tuple[int, int, str]:
     """Choose how many samples and exact columns fit into the memory allowed.
 
     Parameters
@@ -328,7 +341,7 @@ def row_mass(sphere: np.ndarray, by_row: np.ndarray) -> np.ndarray:
     return np.maximum(mass, 1e-6 * mass.sum())
 
 
-def other_light(scene, max_depth: int, seed: int) -> np.ndarray | None:
+def other_light(scene: Scene, max_depth: int, seed: int) -> np.ndarray | None:
     """Render all light that does not come from the environment, (h, w, 3); None where there is none.
 
     ``max_depth``: -1 for paths of any length.

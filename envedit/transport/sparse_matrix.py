@@ -33,7 +33,7 @@ class ColourMatrix:
         Number of rows and columns.
     """
 
-    def __init__(self, rows, columns, weights, shape):
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, shape: tuple[int, int]):
         self.shape = shape
         self.entries = len(rows)
         slices = -(-shape[0] // SLICE)
@@ -209,7 +209,9 @@ def scale_packets(packets: mi.Float, scale: mi.Float, count: int) -> mi.Float:
     return packets * dr.gather(mi.Float, scale, i >> 2)
 
 
-def merge(rows, columns, weights, width):
+def merge(
+    rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sum entries that share row and column.
 
     Parameters

@@ -39,7 +39,7 @@ class Grid:
         self.cdf = dr.opaque(mi.Float(np.concatenate([[0], np.cumsum(mass)]).astype(np.float32)))
         self.density = dr.opaque(mi.Float((mass / width / area).astype(np.float32)))
 
-    def choose(self, u: mi.Point2f):
+    def choose(self, u: mi.Point2f) -> tuple[mi.UInt32, mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Choose a texel and a direction in its tent.
 
         Parameters
@@ -70,7 +70,7 @@ class Grid:
         area = dr.gather(mi.Float, self.area, row)
         return row * self.width + column, direction, mass / self.width, area, jacobian
 
-    def direction(self, row: mi.UInt32, column: mi.UInt32, u: mi.Point2f):
+    def direction(self, row: mi.UInt32, column: mi.UInt32, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         """Return a world direction drawn from the tent of a texel, and d(solid angle) / d(u, v) there."""
         tent_x, tent_y = _tent(u.x), _tent(u.y)
         # The tents of the poles' rows are one-sided.
@@ -83,7 +83,7 @@ class Grid:
         local = mi.Vector3f(sin_theta * sin_phi, cos_theta, -sin_theta * cos_phi)
         return self.to_world @ local, 2 * dr.pi * dr.pi * dr.maximum(sin_theta, 0)
 
-    def locate(self, direction: mi.Vector3f):
+    def locate(self, direction: mi.Vector3f) -> tuple[list[tuple[mi.UInt32, mi.Float]], mi.Float, mi.Float]:
         """Find the four texels around a world direction, with the weights of Mitsuba's bilinear lookup.
 
         Parameters
@@ -127,7 +127,7 @@ class Grid:
         """Return the fractional row, 0 ... H - 1, of a world direction."""
         return self._row(self.to_world.T @ direction)
 
-    def locate_one(self, direction: mi.Vector3f, u: mi.Point2f):
+    def locate_one(self, direction: mi.Vector3f, u: mi.Point2f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Draw one of the four texels around a direction by its weight; returns texel, position, jacobian."""
         taps, position, jacobian = self.locate(direction)
         (top_left, w00), (top_right, w10), (bottom_left, w01), (bottom_right, _) = taps

@@ -69,9 +69,8 @@ def measure(
         there = f"input.envmap={config.quote(str(file))}"
         chosen = config.loads("", preset=preset, overrides=[*overrides, there])
         original, _ = load_map(chosen.input)
-        first, last = active_rows(chosen.input.rows, original.shape[0])
-        rows = first, len(original)
-        record["rows"].append(row := one_map(name, original[first : last + 1], rows, chosen))
+        rows = active_rows(chosen.input.rows, original.shape[0])
+        record["rows"].append(row := one_map(name, original[rows.slice], rows.place, chosen))
         if not quick:
             print(tables.fit_line(row), flush=True)
         if out:

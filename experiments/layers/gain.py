@@ -86,7 +86,9 @@ def one(lit, transport, original, true, picture, gain, from_search):
     crop = original[: height // 2]
     rows = (0, height)
     plain = Layers(rows)
-    begun, _ = light_search.start(plain, plain.encode(crop), transport, picture, None, original)
+    encoded = plain.encode(crop)
+    asked = light_search.SearchProblem(plain, transport, picture, None, original)
+    begun, _ = light_search.start(asked, encoded)
     layers = type("Variant", (Layers,), {"Gain": gain})(rows)
     params = layers.encode(crop)
     params |= {k: v for k, v in begun.items() if from_search or not k.startswith("gain")}

@@ -64,8 +64,7 @@ def main():
     start = time.perf_counter()
     source, _ = images.load_envmap(str(file))
     read = time.perf_counter() - start
-    first, last = inputs.active_rows(settings.input.rows, result.envmap.shape[0])
-    found, rows = result.found, (first, last - first + 1)
+    found, rows = result.found, inputs.active_rows(settings.input.rows, result.envmap.shape[0])
     original, edited = result.maps["initial"], result.envmap
     start = time.perf_counter()
     full = full_resolution.carry(

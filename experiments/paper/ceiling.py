@@ -20,10 +20,9 @@ from envedit import config, inputs
 from envedit.cli import doctor
 from envedit.core import latlong
 from envedit.core.errors import EnveditError, unwrapped
+from envedit.core.seeds import Seeds
 from envedit.losses import metrics
-from envedit.pipeline import JUDGE_SEED
 from envedit.scene import scene
-from envedit.targets.target import SEED
 from experiments import puresky
 
 from .kinds import ROUGHNESS
@@ -31,7 +30,8 @@ from .kinds import ROUGHNESS
 
 def twice(lit: scene.Scene, true: np.ndarray) -> dict:
     """Render a map with the target's and with the result's samples, and compare: ``metrics.compare``."""
-    target, result = (lit.sampled(true, "auto", seed)[0] for seed in (SEED, JUDGE_SEED + 1))
+    seeds = Seeds.of(0)
+    target, result = (lit.sampled(true, "auto", seed)[0] for seed in (seeds.target, seeds.judged))
     return metrics.compare(result, target)
 
 

@@ -110,9 +110,9 @@ def carry_out(folder: Path, store: str) -> None:
     settings = config.load(folder / "job.toml")
     mi.set_variant(settings.variant)
     original, _ = load_map(settings.input)
-    first, last = active_rows(settings.input.rows, original.shape[0])
-    crop, network = np.ascontiguousarray(original[first : last + 1]), settings.representation
-    shape, rows = crop.shape[:2], (first, original.shape[0])
+    active = active_rows(settings.input.rows, original.shape[0])
+    crop, network = np.ascontiguousarray(original[active.slice]), settings.representation
+    shape, rows = crop.shape[:2], active.place
     if store == "fits":
         found = fit.fit(
             crop, network, settings.fit, settings.seed, rows, folder=fit.default_folder(), progress=_tell

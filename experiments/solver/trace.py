@@ -43,11 +43,12 @@ def main():
     original, _ = inputs.load_map(settings.input, lit)
     wanted = target.make(settings, lit, original)
     transport = renderers.trace(settings, lit, original.shape[:2])
-    first, last = inputs.active_rows(settings.input.rows, original.shape[0])
-    rows = slice(first, last + 1)
-    layers = Layers((first, original.shape[0]))
+    active = inputs.active_rows(settings.input.rows, original.shape[0])
+    rows = active.slice
+    layers = Layers(active.place)
     params = layers.encode(original[rows])
-    params, _ = light_search.start(layers, params, transport, wanted.picture, None, original)
+    asked = light_search.SearchProblem(layers, transport, wanted.picture, None, original)
+    params, _ = light_search.start(asked, params)
 
     curves = {}
     for name in ("Gauss-Newton", "Adam"):
@@ -58,7 +59,7 @@ def main():
             if name == "Adam":
                 objective = adam_loop.Objective(settings.loss, wanted.picture, None, original[rows], 100)
                 adam_loop.READ_EVERY = 1
-                arguments = layers, params, transport, objective, original, first, settings.optimizer
+                arguments = layers, params, transport, objective, original, active.first, settings.optimizer
                 adam_loop.optimise(*arguments, after_step=seen.adam)
             else:
                 gauss_newton.solve(problem, params, after_step=seen.newton)

@@ -151,8 +151,7 @@ class Judge:
         return latlong.resize(envmap, self.width // 2, self.width)
 
     def _rows(self):
-        first, last = inputs.active_rows("upper", self.width // 2)
-        return slice(first, last + 1)
+        return inputs.active_rows("upper", self.width // 2).slice
 
     def _halves(self, cell, envmap, spp, seed):
         """Render twice with half of the samples each, (2, h, w, 3) float64."""

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from envedit import pipeline
 from envedit.cli.progress import Progress
 from envedit.core import array_cache, atomic_files
 from envedit.core.errors import InputError
+from envedit.core.seeds import Seeds
 from envedit.images import images, layered_exr
 from envedit.report import manifest, output_folder, preview
 from envedit.scene import scene
@@ -272,7 +272,7 @@ def stopping(sampled):
     """Press Ctrl-C when the result is to be rendered."""
 
     def stop(self, envmap, spp, seed, *rest):
-        if seed == pipeline.JUDGE_SEED + 1:
+        if seed == Seeds.of(0).judged:
             raise KeyboardInterrupt
         return sampled(self, envmap, spp, seed, *rest)
 

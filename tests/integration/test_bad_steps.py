@@ -12,6 +12,7 @@ import pytest
 
 from envedit import config, pipeline, representations
 from envedit.core.errors import NumericalError
+from envedit.core.seeds import Seeds
 from envedit.export import file_resolution
 from envedit.losses import losses, optimizer
 from envedit.report import manifest
@@ -366,7 +367,7 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
     sampled = scene.Scene.sampled
 
     def judged_fails(self, envmap, spp, seed, *rest):
-        return fails() if seed == pipeline.JUDGE_SEED + 1 else sampled(self, envmap, spp, seed, *rest)
+        return fails() if seed == Seeds.of(0).judged else sampled(self, envmap, spp, seed, *rest)
 
     if stage == "judged rendering":
         monkeypatch.setattr(scene.Scene, "sampled", judged_fails)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import config
-from envedit.cli import budget, run
+from envedit.cli import budget, run, run_options
 from envedit.cli.budget import LEVELS, Calibration, Work
 from envedit.core.errors import ConfigError
 from envedit.images import images
@@ -72,13 +72,13 @@ def test_a_slower_machine_is_expected_to_take_longer(slower):
     "text, value", [("30", 30), (" 30s ", 30), ("1.5m", 90), ("2 min", 120), (".5s", 0.5)]
 )
 def test_times_are_read(text, value):
-    assert run._seconds(text) == value
+    assert run_options.seconds(text) == value
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "s", "1h", "1e9", "nan", "30 40", "2ms"])
 def test_what_is_no_time_is_refused(text):
     with pytest.raises(ConfigError, match="--budget: got .*, expected seconds or minutes"):
-        run._seconds(text)
+        run_options.seconds(text)
 
 
 @pytest.mark.parametrize("table", [{"representation": {"kind": "pixels"}}, {"renderer": {"kind": "path"}}])

@@ -65,11 +65,11 @@ class Start:
     def __init__(self, transport, image, wanted, weight=None, initial=None):
         layers = Layers((0, HEIGHT))
         encoded = layers.encode(image[:ROWS])
+        asked = light_search.SearchProblem(layers, transport, wanted, weight, image, initial)
         if initial is None:
-            params, self.notes = light_search.start(layers, encoded, transport, wanted, weight, image)
+            params, self.notes = light_search.start(asked, encoded)
         else:
-            asked = initial, wanted, weight, image
-            params, self.notes = painted_change.start(layers, encoded, transport, *asked)
+            params, self.notes = painted_change.start(asked, encoded)
             assert not any(params[name].numpy().any() for name in params if name.startswith("gain"))
         assert params.keys() == encoded.keys()
         assert all(params[name].shape == encoded[name].shape for name in params)

@@ -90,7 +90,7 @@ def test_the_wheel_holds_every_module_and_scene(wheel):
     modules = {str(p.relative_to(ROOT)) for p in (ROOT / "envedit").rglob("*.py")}
     page = {str(p.relative_to(ROOT)) for p in (ROOT / "envedit/cli/paint/page").iterdir()}
     others = {name for name in held if not name.startswith("envedit/scenes/")}
-    assert len(modules) > 80 and len(page) > 5 and others == modules | page
+    assert len(modules) > 80 and len(page) > 5 and others == modules | page | {"envedit/py.typed"}
     scenes = {p for p in (ROOT / "scenes").rglob("*") if p.suffix in (".xml", ".ply", ".toml")}
     assert {f"envedit/{p.relative_to(ROOT)}" for p in scenes} <= held
 

@@ -10,7 +10,7 @@ from envedit.images import images
 from envedit.representations import LogPixels, Pixels
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
-from envedit.targets import painted_image, target
+from envedit.targets import initial_rendering, target
 from tests.oracles import ROOT, extremes
 from tests.oracles.extremes_stages import transport, write_plain
 from tests.oracles.runs import settings_of
@@ -119,7 +119,7 @@ def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
     m = extremes.sky(8, 16)
     settings = settings_of(tmp_path, m)
     lit = scene.load(settings.scene.file, settings.scene.width)
-    picture = painted_image.initial(lit, m, settings)
+    picture = initial_rendering.initial(lit, m, settings)
     picture[3, 4] = 3e38
     made = target.make(settings, lit, m, picture)
     assert any("target: 1 pixels are brighter than 1.27e+30" in line for line in made.warnings)

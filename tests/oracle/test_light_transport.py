@@ -10,7 +10,7 @@ from envedit.core.errors import InputError
 from envedit.images.images import load_envmap
 from envedit.scene import scene
 from envedit.transport import block_transport
-from envedit.transport.light_transport import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE
+from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE
 from tests.oracles.kernels import compiled
 from tests.oracles.scenes import (
     DEPTH,

@@ -369,7 +369,7 @@ def edited(m, folder):
     settle(traced, m, turned)
     wanted = traced.apply(single(turned)).numpy()
     if not same:
-        params, _ = light_search.start(made, params, traced, wanted, None, m)
+        params, _ = light_search.start(light_search.SearchProblem(made, traced, wanted, None, m), params)
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
     objective = adam_loop.Objective(weights, wanted, None, m, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.01)

@@ -6,6 +6,7 @@ import pytest
 
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
+from envedit.core.rows import Rows
 from envedit.export import full_resolution, texel_maps
 from envedit.images import images
 from envedit.representations import Pixels
@@ -73,7 +74,7 @@ def carried(made, params, working, source, rows=ROWS, free=None):
     edited = working.copy()
     edited[rows[0] : rows[0] + rows[1]] = made.decode(params).numpy()
     before = source.copy()
-    result = full_resolution.carry(made, params, working, edited, source, rows, free)
+    result = full_resolution.carry(made, params, working, edited, source, Rows(*rows, len(working)), free)
     np.testing.assert_array_equal(source, before)  # the caller's own
     assert result.shape == source.shape and result.dtype == np.float32
     assert np.isfinite(result).all() and (result >= 0).all()
@@ -295,7 +296,7 @@ def test_what_is_not_finite_is_refused(sunny):
 
 
 def ratio(working, edited, source, rows=ROWS, free=None):
-    result = full_resolution.carry(Pixels(), {}, working, edited, source, rows, free)
+    result = full_resolution.carry(Pixels(), {}, working, edited, source, Rows(*rows, len(working)), free)
     assert result.dtype == np.float32 and np.isfinite(result).all() and (result >= 0).all()
     return result
 
@@ -410,9 +411,9 @@ def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
 
 def test_shapes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"float32, got \(64, 128, 3\) float64"):
-        full_resolution.carry(Pixels(), {}, grey(1), grey(1), np.ones((64, 128, 3)), (0, 4))
+        full_resolution.carry(Pixels(), {}, grey(1), grey(1), np.ones((64, 128, 3)), Rows.of(32))
     with pytest.raises(ValueError, match="working maps have shapes"):
-        full_resolution.carry(Pixels(), {}, grey(1), grey(1, 4, 8), grey(1, 32, 64), (0, 4))
+        full_resolution.carry(Pixels(), {}, grey(1), grey(1, 4, 8), grey(1, 32, 64), Rows.of(32))
 
 
 # ---- real maps ---------------------------------------------------------------------------------------------
@@ -470,7 +471,7 @@ def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer):
     turn[0] = rotation_vector(made.lights.centres[0], toward(25.0, 90.0))
     params = params | {"turn": mi.TensorXf(np.float32(turn / made.scales["turn"]))}
     edited = made.decode(params).numpy()
-    full = full_resolution.carry(made, params, working, edited, source, (0, WORKING[0]))
+    full = full_resolution.carry(made, params, working, edited, source, Rows.of(WORKING[0]))
     assert full.shape == source.shape and np.isfinite(full).all()
     small = latlong.resize(full, *WORKING)
     low = slice(WORKING[0] // 2, None)

@@ -185,7 +185,7 @@ def test_losses_are_drawn_with_their_last_weights():
 def test_every_term_of_ours_in_the_report_is_in_the_glossary(tmp_path):
     """Words of metrics.json are in words; what only this program calls so is looked up."""
     glossary = (ROOT / "docs" / "glossary.md").read_text()
-    source = (ROOT / "envedit" / "report" / "html_report.py").read_text()
+    source = "".join(file.read_text() for file in (ROOT / "envedit" / "report").glob("html_*.py"))
     ours = {"background", "glow", "influence", "T", "column", "turn", "feasible", "frozen", "light", "view"}
     for term in ours:
         assert re.search(rf"^(.*, )?{term}\b.*\n:", glossary, re.M), f"{term} is not in the glossary"

@@ -11,8 +11,9 @@ import pytest
 from envedit import config
 from envedit.core.color import TONEMAPS, tonemap
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.seeds import Seeds
 from envedit.images import images
-from envedit.targets import painted_image
+from envedit.targets import initial_rendering, painted_image
 from tests.oracles.builders import exr
 
 SIZE = (60, 83)  # no multiple of a JPEG's blocks
@@ -582,7 +583,7 @@ def settings(**target):
 @pytest.mark.parametrize("name", TONEMAPS)
 def test_exported_and_painted_on(ending, name, initial, tmp_path):
     file = tmp_path / f"paint{ending}"
-    told_now = painted_image.export(file, initial, settings(tonemap=name))
+    told_now = initial_rendering.export(file, initial, settings(tonemap=name))
     pixels, info = images.read_stored(file)
     stored = info["metadata"]
     assert {k: str(stored[f"envedit.{k}"]) for k in ("scene", "envmap", "seed")} == {
@@ -635,7 +636,7 @@ def test_what_is_not_exported(initial, tmp_path):
         ("gone/a.exr", InputError, "folder does not exist"),
     ):
         with pytest.raises(error, match=says):
-            painted_image.export(tmp_path / file, initial, settings())
+            initial_rendering.export(tmp_path / file, initial, settings())
     assert (tmp_path / "there.png").read_bytes() == b"mine" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -647,6 +648,6 @@ def test_the_run_renders_the_exported_picture_again(monkeypatch):
         seen.append((spp, seed))
         return envmap, spp, None
 
-    monkeypatch.setattr(painted_image, "rendered", rendered)
-    assert painted_image.initial(None, "map", settings(spp=32)) == "map"
-    assert seen == [(32, 3 + painted_image.SEED)]
+    monkeypatch.setattr(initial_rendering, "rendered", rendered)
+    assert initial_rendering.initial(None, "map", settings(spp=32)) == "map"
+    assert seen == [(32, Seeds.of(3).exported)]

@@ -9,7 +9,7 @@ from envedit import config as cfg
 from envedit.config.stroke_schema import STROKES, StrokeList
 from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
 from envedit.core.errors import ConfigError, InputError
-from envedit.targets import strokes
+from envedit.targets import stroke_shapes, strokes
 from tests.oracles import ROOT
 from tests.oracles.builders import grey, refused
 
@@ -29,7 +29,7 @@ ALL = [
 def covered(height, across=None, **stroke):
     """Coverage (height, across) of one stroke; of a square without ``across``."""
     (full,) = StrokeList()([{"type": "shadow"} | stroke])
-    return strokes.coverage(full, height, across or height)[..., 0]
+    return stroke_shapes.coverage(full, height, across or height)[..., 0]
 
 
 def painted(picture, tonemap="gamma", **stroke):
@@ -117,7 +117,7 @@ def test_the_distance_to_an_ellipse_is_that_to_its_nearest_point(rng):
     nearest = np.array([np.sqrt(((edge - p) ** 2).sum(axis=1).min()) for p in points])
     inside = ((points / radii) ** 2).sum(axis=1) < 1
     np.testing.assert_allclose(
-        strokes._to_ellipse(points, radii), np.where(inside, -nearest, nearest), atol=1e-5
+        stroke_shapes._to_ellipse(points, radii), np.where(inside, -nearest, nearest), atol=1e-5
     )
 
 

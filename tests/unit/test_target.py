@@ -7,9 +7,10 @@ import pytest
 from envedit import config
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene import scene
-from envedit.targets import painted_image, target
+from envedit.targets import initial_rendering, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 
 SIZE = (12, 16)
@@ -41,7 +42,7 @@ def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     envmap = sky(rng)
     made = target.make(asking(5, rotate_degrees=40), ball, envmap)
     np.testing.assert_array_equal(made.envmap, latlong.rotate(envmap, 40).astype(np.float32))
-    expected = ball.render(made.envmap, spp=4, seed=5 + target.SEED)
+    expected = ball.render(made.envmap, spp=4, seed=Seeds.of(5).target)
     np.testing.assert_array_equal(made.picture, expected)
     assert made.picture.shape == (12, 16, 3) and made.picture.dtype == made.envmap.dtype == np.float32
     assert made.weight is None and made.warnings == () and "40 degrees" in made.source
@@ -68,7 +69,7 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
     made = target.make(asking(1, file=str(file)), ball, sky(rng))
     expected, info = images.load_envmap(file, 16)
     np.testing.assert_array_equal(made.envmap, expected)
-    np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=1 + target.SEED))
+    np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=Seeds.of(1).target))
     assert str(file) in made.source
     assert made.warnings == tuple(info["warnings"]) and "negative" in made.warnings[0]
 
@@ -107,7 +108,7 @@ def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
 @pytest.fixture(scope="module")
 def seen(ball):
     envmap = sky(np.random.default_rng(3))
-    return envmap, painted_image.initial(ball, envmap, asking())
+    return envmap, initial_rendering.initial(ball, envmap, asking())
 
 
 def a_stroke(**kwargs):

@@ -6,6 +6,7 @@ import argparse
 import sys
 import threading
 import webbrowser
+from typing import Any
 
 from envedit.cli.streams import steady
 
@@ -59,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def serve(server, uvicorn) -> None:
+def serve(server: Any, uvicorn: Any) -> None:
     """Serve until Ctrl-C, then wait for what is being computed."""
     from envedit.cli.paint.protocol import MOST_BYTES
 

@@ -136,7 +136,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
         white_balance=settings.output.white_balance,
     )
     painted = file is not None and file.name == NAME
-    folder = file.absolute().parent if painted else Path(settings.output.dir)
+    folder = file.absolute().parent if file and painted else Path(settings.output.dir)
     plain = _plain(settings, folder)
     if painted:
         return Project(plain, folder, base, document, True)

@@ -79,7 +79,7 @@ def document(value: Any) -> Document:
     """Read a document; raises BadMessageError."""
     if not isinstance(value, dict) or not value.keys() <= _CHECKS.keys():
         raise BadMessageError(f"document: got {show(value)[:80]}, expected keys among {', '.join(_CHECKS)}")
-    found = {}
+    found: dict[str, Any] = {}
     for name, given in value.items():
         try:
             found[name] = _CHECKS[name](given)
@@ -158,10 +158,10 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
                 raise BadMessageError(f"phase: got {show(phase)[:80]}, expected one of {', '.join(PHASES)}")
             return Edit(document(found.get("document")), phase, client, _count(found.get("number", 0)))
         if kind == "pick":
-            at = (Number(0, 1)(found.get(name)) for name in "xy")
+            x, y = (Number(0, 1)(found.get(name)) for name in "xy")
             light = int(Number(-1, 100)(found.get("light", -1)))
             view = _count(found.get("view", 0))
-            return Pick(*at, light, _count(found.get("number", 0)), client, view)
+            return Pick(x, y, light, _count(found.get("number", 0)), client, view)
         if kind == "open":
             name, envmap = String()(found.get("name")), String()(found.get("envmap", ""))
             if not name:

@@ -14,8 +14,9 @@ import secrets
 import socket
 from pathlib import Path
 
+import numpy as np
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -24,6 +25,7 @@ from envedit.cli.paint import project, protocol
 from envedit.cli.paint.session import Tell
 from envedit.cli.paint.worker import Again, Worker
 from envedit.core import shipped
+from envedit.core.types import Views
 from envedit.report import output_folder
 
 HOST = "127.0.0.1"
@@ -53,7 +55,7 @@ class Client:
         self.waiting: dict[str, bytes | dict] = {}
         self.event = asyncio.Event()
 
-    def put(self, key: str, value) -> None:
+    def put(self, key: str, value: bytes | dict) -> None:
         """Let something wait, in the place of what waits under that key."""
         self.waiting[key] = value
         self.event.set()
@@ -75,7 +77,7 @@ class Hub(Tell):
         self.last: dict[str, dict] = {}
         self.count = 0
 
-    def frame(self, kind, source, image, rows=(slice(None),)):
+    def frame(self, kind: str, source: str, image: np.ndarray, rows: Views = (slice(None),)) -> None:
         """Show an image, each view by itself, with the number of the frame in front."""
         if kind == "render":
             self.count += 1
@@ -83,7 +85,7 @@ class Hub(Tell):
             sent = protocol.frame(kind, source, self.count, image[part], view)
             self._send(f"frame {kind} {view}", sent)
 
-    def say(self, message):
+    def say(self, message: dict) -> None:
         """Send a message, of each type the latest; a status says which frame it is about."""
         kind = message["type"]
         if kind == "status":
@@ -168,7 +170,7 @@ class Server:
             lifespan=lifespan,
         )
 
-    def _known(self, request) -> bool:
+    def _known(self, request: HTTPConnection) -> bool:
         """Whether a request has the token, and comes to this machine's own name."""
         host = request.headers.get("host", "")
         own = [origin.removeprefix("http://") for origin in self.origins]

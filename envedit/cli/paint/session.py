@@ -7,6 +7,8 @@ new edit comes.
 While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
 target. The target is painted on T E_0. The edit that is saved is the pipeline's, which paints on Mitsuba's
 rendering, tries several starts, and judges its result.
+
+Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +26,8 @@ from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, NumericalError
+from envedit.core.seeds import Seeds
+from envedit.core.types import Views
 from envedit.export import adjustments
 from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
@@ -31,6 +36,7 @@ from envedit.representations.layers.layers import Layers, unseen_kept
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
+from envedit.solve.light_search import SearchProblem
 from envedit.targets import strokes
 from envedit.targets.target import pixel_weight
 
@@ -43,8 +49,6 @@ SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
-RENDER_SEED = 9_000_021
-"""Added to the run's seed."""
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
@@ -56,7 +60,7 @@ class SupersededError(Exception):
 class Tell:
     """What a session reports; :class:`.server.Hub` sends it to the pages."""
 
-    def frame(self, kind: str, source: str, image: np.ndarray, rows=(slice(None),)) -> None:
+    def frame(self, kind: str, source: str, image: np.ndarray, rows: Views = (slice(None),)) -> None:
         """Show an image (h, w, 3), with the rows of each view in it."""
 
     def say(self, message: dict) -> None:
@@ -80,7 +84,13 @@ class Session:
         self.project, self.tell, self.newer = project, tell, newer
         self.document, self.resting, self.phase = Document(), False, "done"
         self._shown = None  # the rendering by T that the pages show
-        self.status = {"reachable": None, "iterations": 0, "steps": 0, "number": 0, "client": ""}
+        self.status: dict[str, Any] = {
+            "reachable": None,
+            "iterations": 0,
+            "steps": 0,
+            "number": 0,
+            "client": "",
+        }
         settings = project.settings
         self._stage("loading the scene")
         self.lit = inputs.load_scene(settings.scene, project.base)
@@ -89,8 +99,7 @@ class Session:
         self.notes = self.given.warnings
         self.map = self.given.radiance
         height = len(self.map)
-        first, last = inputs.active_rows(settings.input.rows, height)
-        self.rows = slice(first, last + 1)
+        self.rows = inputs.active_rows(settings.input.rows, height)
         renderers.check(settings, self.lit, self.map.shape[:2])
         self._stage("tracing light transport")
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
@@ -131,8 +140,8 @@ class Session:
         """Take lights and turn of a document for the map that is painted on."""
         self.document, self._dragged = document, False
         self.origin = self._by_hand(document)
-        layers = Layers((self.rows.start, len(self.origin)), horizon=self._horizon())
-        params = layers.encode(self.origin[self.rows])
+        layers = Layers(self.rows.place, horizon=self._horizon())
+        params = layers.encode(self.origin[self.rows.slice])
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
@@ -260,8 +269,8 @@ class Session:
         """
         self._tell_doing("looking for other lights")
         layers, params = self.problem.layers, self.problem.params(self.still)
-        asked = layers, params, self._watched, self.base, self.target, self.weight, self.origin
-        starts = [painted_change.start(*asked, bold=bold)[0] for bold in (False, True)]
+        asked = SearchProblem(layers, self._watched, self.target, self.weight, self.origin, self.base)
+        starts = [painted_change.start(asked, params, bold)[0] for bold in (False, True)]
         if layers.separation.lights:
             starts.append(painted_change.softened(layers, params)[0])
         more = {"iterations": 0, "run": self.run, "trial": True, "sparing": False}
@@ -301,7 +310,7 @@ class Session:
             return False
         if self._sharp is None:
             self._sharp = self._sharper()
-        seed = (self.project.settings.seed + RENDER_SEED + done) % 2**32
+        seed = Seeds.of(self.project.settings.seed).pass_of_page(done)
         total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
         done += 1
         self._rendered = done, total

@@ -39,7 +39,7 @@ class Worker(threading.Thread):
         self._over = self._owed = False
         self.faults: list[Exception] = []  # of ours, no user's mistakes
 
-    def post(self, request) -> None:
+    def post(self, request: object) -> None:
         """Let a request wait, in the place of an earlier one of its kind."""
         with self._lock:
             self._waiting[type(request)] = request
@@ -76,7 +76,7 @@ class Worker(threading.Thread):
                 self._attempt(lambda request=request: self._carry_out(request))
                 busy = self.session is not None
             else:
-                busy = bool(self._attempt(self.session.advance))
+                busy = self.session is not None and bool(self._attempt(self.session.advance))
 
     def _carry_out(self, request):
         if isinstance(request, Open):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -10,6 +12,7 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import DrArray, FilePath
 from envedit.losses.perceptual import convolution, weights
 
 # --------------------------------------------------------------------------------------------------------
@@ -35,7 +38,8 @@ class Conv:
 
     def parts(self) -> dict[str, tuple[int, ...]]:
         """Name the tensors of the layer, with their shapes in torchvision's layout (O, I, kh, kw)."""
-        outputs, found = self.outputs // len(self.names), {}
+        outputs = self.outputs // len(self.names)
+        found: dict[str, tuple[int, ...]] = {}
         for name, k in zip(self.names, self.kernels or (self.kernel,), strict=True):
             found[name + ".weight"] = outputs, self.inputs, k, k
             found[name + ".bias"] = (outputs,)
@@ -135,7 +139,7 @@ class Backbone:
         ]
 
     @classmethod
-    def load(cls, kind: str, file) -> Backbone:
+    def load(cls, kind: str, file: FilePath) -> Backbone:
         """Read the weights from a ``safetensors`` or ``npz`` file that holds torchvision's state dict.
 
         Further tensors, such as those of the classifier, are ignored.
@@ -149,7 +153,7 @@ class Backbone:
         """
         title(kind)
         words, layers, model, original = KINDS[kind]
-        wanted = {}
+        wanted: dict[str, tuple[int, ...]] = {}
         for layer in layers():
             wanted |= layer.parts() if isinstance(layer, Conv) else {}
         source = f"torchvision.models.{model}, https://download.pytorch.org/models/{original}"
@@ -221,15 +225,26 @@ def _as_matrix(layer, tensors):
 class Stack:
     """A feature stack for images of one size; made by :meth:`Backbone.stack`."""
 
-    def __init__(self, layers, matrices, rows, columns, pooling):
-        self._steps, self._tapped, self.channels = [], [], []
+    def __init__(
+        self,
+        layers: Sequence[Conv | Pool],
+        matrices: Sequence[Any],
+        rows: Sequence[int],
+        columns: Sequence[int],
+        pooling: str,
+    ):
+        self._steps: list[convolution.Step] = []
+        self._tapped: list[tuple[int, int, int]] = []
+        self.channels: list[int] = []
         channels = 3
+        step: convolution.Step
         for i, layer in enumerate(layers):
             before, after = (rows[i], columns[i], channels), (rows[i + 1], columns[i + 1])
             if isinstance(layer, Conv):
                 channels = layer.outputs
+                matrix, bias = matrices[i]
                 sizes = layer.kernel, layer.stride, layer.padding
-                step = convolution.Convolution(*matrices[i], before, (*after, channels), *sizes)
+                step = convolution.Convolution(matrix, bias, before, (*after, channels), *sizes)
                 if layer.tap:
                     self._tapped.append((i + 1, after[0] * after[1], channels))
                     self.channels.append(channels)
@@ -239,7 +254,7 @@ class Stack:
                 step = convolution.MaxPool(layer.kernel, layer.stride, before, (*after, channels))
             self._steps.append(step)
 
-    def forward(self, x) -> list:
+    def forward(self, x: DrArray) -> list:
         """Evaluate all layers.
 
         Parameters
@@ -257,11 +272,11 @@ class Stack:
             tape.append(step.forward(tape[-1][0]))
         return tape
 
-    def taps(self, tape) -> list:
+    def taps(self, tape: list) -> list:
         """Pick the tapped features: a list of (N * C numbers, N, C), N pixels of C channels."""
         return [(tape[i][0], pixels, channels) for i, pixels, channels in self._tapped]
 
-    def backward(self, tape, gradients):
+    def backward(self, tape: list, gradients: list) -> DrArray:
         """Pull gradients of the taps back to the image.
 
         Parameters
@@ -277,11 +292,12 @@ class Stack:
             Gradient with respect to the image, H * W * 3 numbers.
         """
         at = {i: gradient for (i, _, _), gradient in zip(self._tapped, gradients, strict=True)}
-        gradient = None
+        gradient: DrArray = None
         for i in range(len(self._steps), 0, -1):
             own = at.get(i)
             if own is not None:
                 gradient = own if gradient is None else gradient + own
             if gradient is not None:
-                gradient = self._steps[i - 1].backward(tape[i - 1][0], *tape[i], gradient)
+                output, kept = tape[i]
+                gradient = self._steps[i - 1].backward(tape[i - 1][0], output, kept, gradient)
         return dr.zeros(type(tape[0][0]), len(tape[0][0])) if gradient is None else gradient

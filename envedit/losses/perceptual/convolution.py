@@ -16,8 +16,12 @@ flat arrays without derivatives attached.
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import drjit as dr
 import mitsuba as mi
+
+from envedit.core.types import DrArray, Shape, Tensor
 
 MOST_PATCHES = 2**24
 """Numbers in a matrix of patches, at most (64 MB in single precision), but for a single row of an image."""
@@ -34,7 +38,7 @@ class Divisor:
         self.value = dr.opaque(mi.Int32, value)
         self._inverse = dr.opaque(mi.Float64, 1 / value)
 
-    def split(self, i):
+    def split(self, i: DrArray) -> tuple[DrArray, DrArray]:
         """Return quotient and remainder of Int32 numbers that are not negative."""
         quotient = mi.Int32((mi.Float64(i) + 0.5) * self._inverse)
         return quotient, i - quotient * self.value
@@ -121,10 +125,31 @@ class _Windows:
         return place * self._c.value + c
 
 
+class Step(Protocol):
+    """A layer: what it makes of its input, and what its backward pass needs beside that."""
+
+    def forward(self, x: DrArray) -> tuple[DrArray, Any]:
+        """Return the output, and what to keep."""
+        ...
+
+    def backward(self, x: DrArray, y: DrArray, kept: Any, gradient: DrArray, /) -> DrArray:
+        """Pull a gradient of the output back to the input."""
+        ...
+
+
 class Convolution:
     """Convolution with zeros around the image, and ReLU."""
 
-    def __init__(self, matrix, bias, before, after, kernel, stride, padding):
+    def __init__(
+        self,
+        matrix: Tensor,
+        bias: DrArray,
+        before: Shape,
+        after: Shape,
+        kernel: int,
+        stride: int,
+        padding: int,
+    ):
         self._matrix, self._bias = matrix, bias
         self._before, self._after, self._outputs = before, after, after[2]
         self._kernel, self._stride, self._padding = kernel, stride, padding
@@ -134,7 +159,7 @@ class Convolution:
         self._rows = max(MOST_PATCHES // (after[1] * self._columns), 1)
         self._pointwise = kernel == 1 and self._rows >= after[0]
 
-    def forward(self, x):
+    def forward(self, x: DrArray) -> tuple[DrArray, None]:
         """Return max(W patches + bias, 0), and nothing to keep."""
         height, parts = self._after[0], []
         for first in range(0, height, self._rows):
@@ -147,7 +172,7 @@ class Convolution:
             dr.eval(parts[-1])
         return _joined(parts), None
 
-    def backward(self, x, y, _, gradient):
+    def backward(self, x: DrArray, y: DrArray, _: None, gradient: DrArray) -> DrArray:
         """Pull a gradient back; where the ReLU gave 0, its slope is 0."""
         gradient = dr.select(y <= 0, 0, gradient)
         dr.eval(gradient)
@@ -193,11 +218,11 @@ class Convolution:
 class MaxPool:
     """Max pooling; where several are largest, the first has the gradient, as in PyTorch."""
 
-    def __init__(self, kernel, stride, before, after):
+    def __init__(self, kernel: int, stride: int, before: Shape, after: Shape):
         self._kernel = kernel
         self._windows = _Windows(before, after, kernel, stride, 0, together=1)
 
-    def forward(self, x):
+    def forward(self, x: DrArray) -> tuple[DrArray, DrArray]:
         """Return the largest of every window, and under which tap it is."""
         windows, best, winner = self._windows, None, None
         _, row, column, c = windows.outputs()
@@ -212,7 +237,7 @@ class MaxPool:
         dr.eval(best, winner)
         return best, winner
 
-    def backward(self, x, y, winner, gradient):
+    def backward(self, x: DrArray, y: DrArray, winner: DrArray, gradient: DrArray) -> DrArray:
         """Give the gradient of a window to its largest."""
         windows, total = self._windows, 0
         dr.eval(gradient)
@@ -228,10 +253,10 @@ class MaxPool:
 class HanningPool:
     """L2 pooling of DISTS: sqrt(sum of w x^2 + 1e-12), w a 3 x 3 Hanning window, every second pixel."""
 
-    def __init__(self, before, after):
+    def __init__(self, before: Shape, after: Shape):
         self._windows = _Windows(before, after, 3, 2, 1)
 
-    def forward(self, x):
+    def forward(self, x: DrArray) -> tuple[DrArray, None]:
         """Return the root of every window, and nothing to keep."""
         windows, total = self._windows, 0
         i, row, column, c = windows.outputs()
@@ -243,7 +268,7 @@ class HanningPool:
         dr.eval(pooled)
         return pooled, None
 
-    def backward(self, x, y, _, gradient):
+    def backward(self, x: DrArray, y: DrArray, _: None, gradient: DrArray) -> DrArray:
         """Pull a gradient back: w x / root, summed over the windows."""
         windows, total = self._windows, 0
         quotient = gradient / y

@@ -13,55 +13,27 @@ Weights are not part of the package: see `features.Backbone.load`, `DISTS_SOURCE
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import DrArray, FilePath, Shape, Tensor
 from envedit.losses.perceptual import weights
 from envedit.losses.perceptual.backbones import Backbone, title
 from envedit.losses.perceptual.convolution import Divisor
-from envedit.losses.ssim import KnownGradient, check_image
+from envedit.losses.perceptual.measure import DEVIATION, Measure, by_channel, normalised, single
 
 DISTS_SOURCE = "https://github.com/dingkeyan93/DISTS, DISTS_pytorch/weights.pt"
 LPIPS_SOURCE = "https://github.com/richzhang/PerceptualSimilarity, lpips/weights/v0.1/{}.pth"
-
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of the images that the networks were trained on, in [0, 1]; LPIPS says the same of images in [-1, 1]."""
 
 C1 = C2 = 1e-6
 """Constants of DISTS, of its texture and of its structure."""
 NORM_EPS = 1e-10
 """What LPIPS adds to the length of a feature before it divides by it."""
-
-
-class _Measure:
-    """A distance to a fixed image: value, and gradient by hand."""
-
-    def __init__(self, backbone: Backbone, reference, pooling: str, name: str):
-        _check(reference, f"{name}: reference")
-        if dr.grad_enabled(reference):
-            raise InputError(
-                f"{name}: gradients of the reference are not available: swap the two, or detach it."
-            )
-        self.name, self.shape = name, tuple(reference.shape)
-        self._stack = backbone.stack(*self.shape[:2], pooling)
-
-    def __call__(self, x):
-        """Return the distance of the image ``(H, W, 3)`` as a size-1 array, differentiable in ``x``.
-
-        Raises
-        ------
-        InputError
-            If its shape is not the reference's.
-        """
-        if tuple(x.shape) != self.shape:
-            raise InputError(
-                f"{self.name}: image {tuple(x.shape)} and reference {self.shape} differ in shape."
-            )
-        if not dr.grad_enabled(x):
-            return self._evaluate(dr.detach(x.array), False)[0]
-        return dr.custom(KnownGradient, x.array, self)
 
 
 # --------------------------------------------------------------------------------------------------------
@@ -104,7 +76,7 @@ class Dists:
         If the file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
     """
 
-    def __init__(self, backbone: Backbone, weights_file):
+    def __init__(self, backbone: Backbone, weights_file: FilePath):
         if backbone.kind != "vgg":
             raise ConfigError(f"DISTS needs the features of VGG16, not those of {backbone.title}")
         self.backbone = backbone
@@ -123,7 +95,7 @@ class Dists:
             for a, b in zip(np.split(alpha / mass, ends), np.split(beta / mass, ends), strict=True)
         ]
 
-    def against(self, reference):
+    def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
         """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``.
 
         Raises
@@ -133,7 +105,7 @@ class Dists:
         """
         return _DistsTo(self, reference)
 
-    def __call__(self, x, reference):
+    def __call__(self, x: Tensor, reference: Tensor) -> DrArray:
         """Return the distance of two images ``(H, W, 3)`` as a size-1 array, differentiable in ``x``.
 
         Raises
@@ -144,7 +116,7 @@ class Dists:
         return self.against(reference)(x)
 
 
-class _DistsTo(_Measure):
+class _DistsTo(Measure):
     def __init__(self, dists, reference):
         super().__init__(dists.backbone, reference, "hanning", "DISTS")
         self._weights = dists.weights
@@ -157,7 +129,7 @@ class _DistsTo(_Measure):
             self._reference.append((y, mean, variance))
 
     def _features(self, x):
-        tape = self._stack.forward(_normalised(x))
+        tape = self._stack.forward(normalised(x))
         dr.eval(x)
         return [(x, self.shape[0] * self.shape[1], 3), *self._stack.taps(tape)], tape
 
@@ -185,7 +157,7 @@ class _DistsTo(_Measure):
         score = type(x)(score)
         if not with_gradient:
             return score, None
-        gradient = self._stack.backward(tape, gradients[1:]) / _by_channel(type(x), len(x), DEVIATION)
+        gradient = self._stack.backward(tape, gradients[1:]) / by_channel(type(x), len(x), DEVIATION)
         gradient += gradients[0]
         dr.eval(score, gradient)
         return score, gradient
@@ -279,19 +251,20 @@ class Lpips:
         If a file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
     """
 
-    def __init__(self, kind: str, backbone_file, heads_file):
+    def __init__(self, kind: str, backbone_file: FilePath | Backbone, heads_file: FilePath):
         words = title(kind)
-        given = isinstance(backbone_file, Backbone)
-        self.kind, self.backbone = kind, backbone_file if given else Backbone.load(kind, backbone_file)
+        self.kind, self.backbone = kind, _backbone(kind, backbone_file)
         if self.backbone.kind != kind:
             raise ConfigError(
                 f"LPIPS '{kind}' needs the features of {words}, not those of {self.backbone.title}"
             )
-        wanted = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)}
+        wanted: dict[str, Shape] = {
+            f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)
+        }
         read = weights.read(heads_file, wanted, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
         self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in wanted]
 
-    def against(self, reference):
+    def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
         """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``.
 
         Raises
@@ -301,7 +274,7 @@ class Lpips:
         """
         return _LpipsTo(self, reference)
 
-    def __call__(self, a, b) -> float:
+    def __call__(self, a: Any, b: Any) -> float:
         """Compare two images ``(H, W, 3)``, arrays or tensors, in single precision.
 
         Raises
@@ -310,24 +283,28 @@ class Lpips:
             If they differ in shape, are too small for the network, or hold values that are not finite or so
             large that their features are not.
         """
-        a, b = (_single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
+        a, b = (single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
         found = float(self.against(b)(a)[0])
         if not np.isfinite(found):
             raise InputError("LPIPS: the images hold values too large to compare; give display values.")
         return found
 
 
-class _LpipsTo(_Measure):
+def _backbone(kind: str, given: FilePath | Backbone) -> Backbone:
+    return given if isinstance(given, Backbone) else Backbone.load(kind, given)
+
+
+class _LpipsTo(Measure):
     def __init__(self, lpips, reference):
         super().__init__(lpips.backbone, reference, "max", "LPIPS")
         self._heads = lpips.heads
-        tape = self._stack.forward(_normalised(dr.detach(reference.array)))
+        tape = self._stack.forward(normalised(dr.detach(reference.array)))
         self._reference = [_unit(*tap)[0] for tap in self._stack.taps(tape)]
         dr.eval(self._reference)
 
     def _evaluate(self, x, with_gradient):
         F, score, gradients = type(x), 0, []
-        tape = self._stack.forward(_normalised(x))
+        tape = self._stack.forward(normalised(x))
         for (value, pixels, channels), y, head in zip(
             self._stack.taps(tape), self._reference, self._heads, strict=True
         ):
@@ -344,7 +321,7 @@ class _LpipsTo(_Measure):
         score = F(score)
         if not with_gradient:
             return score, None
-        gradient = self._stack.backward(tape, gradients) / _by_channel(F, len(x), DEVIATION)
+        gradient = self._stack.backward(tape, gradients) / by_channel(F, len(x), DEVIATION)
         dr.eval(score, gradient)
         return score, gradient
 
@@ -367,36 +344,3 @@ def _rowwise(values, factors, channels):
     tensor = dr.tensor_t(type(values))
     rows = tensor(values, (len(values) // channels, channels))
     return dr.matmul(rows, tensor(factors, (channels, 1))).array
-
-
-# --------------------------------------------------------------------------------------------------------
-# Images
-# --------------------------------------------------------------------------------------------------------
-
-
-def _check(image, name):
-    check_image(image, name)
-    if image.shape[2] != 3:
-        raise InputError(f"{name}: expected an image of shape (H, W, 3), got {tuple(image.shape)}.")
-
-
-def _single(image, name):
-    image = np.ascontiguousarray(image, np.float32)
-    _check(image, name)
-    bad = ~np.isfinite(image).all(axis=2)
-    if bad.any():
-        where = f"the first at {place_of(bad)}"
-        raise InputError(f"{name}: {bad.sum()} pixel(s) are not finite, {where}; repair the image first.")
-    return mi.TensorXf(image)
-
-
-def _normalised(x):
-    F = type(x)
-    return (x - _by_channel(F, len(x), MEAN)) / _by_channel(F, len(x), DEVIATION)
-
-
-def _by_channel(F, length, values):
-    """Repeat three constants along an image."""
-    channel = dr.arange(mi.UInt32, length) % 3
-    red, green, blue = (F(value) for value in values)
-    return dr.select(channel == 0, red, dr.select(channel == 1, green, blue))

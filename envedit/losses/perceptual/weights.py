@@ -17,6 +17,7 @@ import numpy as np
 
 from envedit.config.validators import show
 from envedit.core.errors import EnveditError, InputError
+from envedit.core.types import FilePath
 
 MOST_HEADER = 2**24
 """Bytes of a safetensors header, at most; that of VGG16 has 3 kB."""
@@ -29,7 +30,7 @@ _SAFETENSORS = {
 }
 
 
-def read(file, wanted: dict[str, tuple[int, ...]], what: str, source: str) -> dict[str, np.ndarray]:
+def read(file: FilePath, wanted: dict[str, tuple[int, ...]], what: str, source: str) -> dict[str, np.ndarray]:
     """Read named tensors, and nothing else, from a ``safetensors`` or ``npz`` file.
 
     Parameters

@@ -49,7 +49,7 @@ def sky_rows(total: int) -> int:
 
 def kind_of(envmap: np.ndarray) -> str:
     """Detect what a map (H, W, 3) shows below the horizon: a "mirror" of the sky, or ground to "keep"."""
-    low = np.float64(envmap[sky_rows(len(envmap)) :]) @ LUMINANCE
+    low = envmap[sky_rows(len(envmap)) :].astype(np.float64) @ LUMINANCE
     if not low.size or not low.max() > 0:
         return "keep"
     logs = np.log(np.maximum(low, 1e-6 * low.max()))

@@ -8,7 +8,9 @@ Finer ones are added where they are identifiable from the picture.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -41,7 +43,7 @@ def grid_size(cycles: float, share: float) -> tuple[int, int]:
     return max(2, round(columns / 2 * share) + 1), columns
 
 
-def splines(size, shape) -> tuple[np.ndarray, np.ndarray]:
+def splines(size: tuple[int, int], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of a grid's rows (height, rows) and columns (width, columns) at texel centres.
 
     Quadratic B-splines: a field has no kinks. Beyond the first and the last row nodes go on along a straight
@@ -106,9 +108,9 @@ class GridGain:
         self.poles = [row for row, there in ((0, top), (-1, top and share == 1)) if there]
         """Rows of nodes that lie at a pole: the first of each counts for all."""
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
-        self._units = [0.5**level for level in range(LEVELS)]
+        self._units: list[Any] = [0.5**level for level in range(LEVELS)]
 
-    def refine(self, octaves) -> None:
+    def refine(self, octaves: Sequence[Octave]) -> None:
         """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
         for octave in octaves:
             self.sizes.append(octave.size)
@@ -122,7 +124,7 @@ class GridGain:
         """Return what a unit of each parameter is: a number, or an array (rows, columns, 3)."""
         return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
 
-    def hats(self, level: int, shape) -> list[tuple[np.ndarray, np.ndarray]]:
+    def hats(self, level: int, shape: tuple[int, int]) -> list[tuple[np.ndarray, np.ndarray]]:
         """List the nodes around every texel of an image (rows, W), nine at most: (index of the node, weight).
 
         Each is an array (rows * W,); the same map as :meth:`prepare` has as matrices.
@@ -143,7 +145,7 @@ class GridGain:
                 taps.append((node.ravel(), weight.ravel()))
         return taps
 
-    def prepare(self, shape, rows=None) -> list:
+    def prepare(self, shape: tuple[int, int], rows: object = None) -> list:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
         found = []
         for size in self.sizes:
@@ -157,12 +159,12 @@ class GridGain:
             found.append([tensor(m) for m in (down, wide[0], at_pole, wide[1])])
         return found
 
-    def evaluate(self, params: dict, prepared) -> mi.Color3f:
+    def evaluate(self, params: dict, prepared: Sequence) -> mi.Color3f:
         """Return the log gain at every texel.
 
         Products of matrices and not gathers, whose adjoint adds in the order in which threads come.
         """
-        g = 0
+        g: Any = 0
         for level, (down, across, at_pole, around) in enumerate(prepared):
             rows, columns = self.sizes[level]
             nodes = dr.reshape(params[f"gain.{level}"], (rows, 3 * columns))

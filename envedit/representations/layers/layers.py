@@ -122,7 +122,7 @@ class Layers:
         self.below = self._below(low) if low is not None and len(low) else None
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1], self.rows[0] == 0)
         self.scales = SCALES | self.gain.scales()
-        self._prepared = {}
+        self._prepared: dict = {}
         n = self.lights.count
         flux = np.zeros((n, 3), np.float32)
         flux[n - SPARE :] = DARK / SCALES["flux"]
@@ -172,7 +172,8 @@ class Layers:
 
         Rows that follow have the resolution of the image.
         """
-        shape = tuple(shape or self.shape)
+        height, width = shape or self.shape
+        shape = height, width
         if self.below is not None and shape != self.shape:
             raise ValueError(f"rows below the horizon follow at {self.whole} texels only, asked for {shape}")
         rows = self._at(shape)[0]

@@ -9,6 +9,8 @@ all of it: no blur; turned about the vertical, a light is interpolated as any tu
 
 The shares are piecewise linear in the place, so their derivatives are exact everywhere but on the lines
 through texel centres, where they jump. Sums run in integers: the order in which threads add does not matter.
+
+Longer than 400 lines: the shares of a point and their derivatives by hand are read side by side.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.types import ArrayLike
 from envedit.representations.layers.separation import GLOW_DEGREES, Light
 
 SPARE = 2
@@ -108,7 +111,14 @@ class Lights:
         """Whether any light has a glow."""
         return any(glow is not None for glow in self._glow)
 
-    def core(self, turn, log_flux, log_size, shape: tuple[int, int], rows: tuple[int, int]) -> mi.TensorXf:
+    def core(
+        self,
+        turn: mi.TensorXf,
+        log_flux: mi.TensorXf,
+        log_size: mi.TensorXf,
+        shape: tuple[int, int],
+        rows: tuple[int, int],
+    ) -> mi.TensorXf:
         """Render the cores.
 
         Parameters
@@ -138,7 +148,7 @@ class Lights:
         places = placed(self._point, centre, turn, size, self._sine, finer, (rows[1], shape[1]))
         return shared_out(*places, flux, spread, shape, rows)
 
-    def glow(self, turn, log_flux, d: mi.Vector3f) -> mi.Color3f:
+    def glow(self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.
 
         s_l is the factor of the light's flux: a glow is put out with its light.
@@ -148,7 +158,7 @@ class Lights:
             factor *= self.glow_of(i, turn, log_flux, d)
         return factor
 
-    def glow_of(self, i: int, turn, log_flux, d: mi.Vector3f) -> mi.Color3f:
+    def glow_of(self, i: int, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate 1 + s_i G_i of light ``i`` alone; 1 if it has no glow."""
         if i >= len(self._glow) or self._glow[i] is None:
             return mi.Color3f(1)
@@ -157,7 +167,15 @@ class Lights:
         return 1 + interpolated_glow(self._glow[i], dr.dot(d, centre)) * _exp(_colour(log_flux, index))
 
 
-def placed(point, centre, turn, size, sine, finer: float, grid: tuple[int, int]):
+def placed(
+    point: mi.Vector3f,
+    centre: mi.Vector3f,
+    turn: mi.Vector3f,
+    size: mi.Float,
+    sine: mi.Float,
+    finer: float,
+    grid: tuple[int, int],
+) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Return where points of lights come to lie: row, column and half-width in columns, each Float (n,).
 
     Parameters
@@ -188,7 +206,15 @@ def placed(point, centre, turn, size, sine, finer: float, grid: tuple[int, int])
     return row, column, half
 
 
-def shared_out(row, column, half, flux, half_row: float, shape, rows) -> mi.TensorXf:
+def shared_out(
+    row: mi.Float,
+    column: mi.Float,
+    half: mi.Float,
+    flux: mi.Color3f,
+    half_row: float,
+    shape: tuple[int, int],
+    rows: tuple[int, int],
+) -> mi.TensorXf:
     """Share points out among the texels around them.
 
     Parameters
@@ -253,7 +279,7 @@ def rotation_vector(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return 2 * math.atan2(sine, q[0]) * q[1:] / sine if sine > 1e-12 else np.zeros(3)
 
 
-def lobe():
+def lobe() -> tuple[np.ndarray, np.ndarray, float]:
     """Return the points of a cut Gaussian lobe: directions around the zenith, weights, spacing in radians."""
     k = np.arange(LOBE_POINTS) + 0.5
     radius = math.radians(LOBE_DEGREES)
@@ -282,7 +308,7 @@ def flux_factor(log_flux: np.ndarray) -> np.ndarray:
     return np.where(log_flux <= DARK, 0, np.exp(np.minimum(log_flux, MOST_LOG_FLUX)))
 
 
-def size_factor(log_size) -> np.ndarray:
+def size_factor(log_size: ArrayLike) -> np.ndarray:
     """Return what a size is multiplied by; likewise."""
     return np.exp(np.clip(log_size, *LOG_SIZES))
 

@@ -7,6 +7,7 @@ radiance falls off as a Gaussian of the angle, and its sum over the texels' soli
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class PlacedLights:
 
     def __init__(self, envmap: np.ndarray, horizon: str = "auto"):
         self.envmap = envmap
-        kind = below_horizon.kind_of(envmap) if horizon == "auto" else horizon
+        kind: Any = below_horizon.kind_of(envmap) if horizon == "auto" else horizon
         self.layers = Layers(horizon=kind)
         self._still = self.layers.encode(envmap)
         self.lights = self.layers.separation.lights

@@ -7,6 +7,8 @@ changes. What is left is the background B, the map as it would be without its li
 
 All steps are in angles and shares of the light, not in texels or radiance: they mean the same for a map of
 any resolution and exposure.
+
+Longer than 400 lines: one algorithm, whose thresholds are set against each other.
 """
 
 from __future__ import annotations
@@ -150,7 +152,8 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separati
     base = small.upsampled(found.below, height, width)
     core = np.where(lit[..., None], np.maximum(image - base * glow, 0), 0)
     background = np.where(lit[..., None], (image - core) / glow, image / glow)
-    lights, kept = [], np.full(len(found.centres) + 1, -1)
+    lights: list[Light] = []
+    kept = np.full(len(found.centres) + 1, -1)
     for i, centre in enumerate(found.centres):
         texels = np.flatnonzero((here == i).ravel() & (core > 0).any(axis=2).ravel())
         if len(texels):
@@ -253,11 +256,11 @@ def _reduced(image, first, total):
     return _Small(small, toward, omega, first, total, (start, h))
 
 
-def _find(small: _Small):
+def _find(small: _Small) -> tuple[np.ndarray, int, list[float]]:
     """Label the texels of each light: (label or -1, count, shares), the light with most flux first."""
     lum = small.image @ LUMINANCE
     total = (lum * small.omega).sum()
-    nothing = np.full(lum.shape, -1), 0, []
+    nothing: tuple[np.ndarray, int, list[float]] = np.full(lum.shape, -1), 0, []
     if not total > 0:
         return nothing
     base = _local_median(lum, *small.rows)
@@ -342,21 +345,21 @@ def _components(mask):
 # Glow and background
 
 
-def _glow(image, small: _Small, cores, centre):
+def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarray) -> np.ndarray | None:
     """Measure the glow around a centre: a table as :attr:`Light.glow`; None where none is believed."""
     angle = np.degrees(np.arccos(np.clip(small.directions @ centre, -1, 1)))
     lum = image @ LUMINANCE
     ring = np.digitize(angle, _RINGS) - 1
-    middle, colour = [], []
+    middles, colours = [], []
     for i in range(len(_RINGS) - 1):
         inside = (ring == i) & ~cores
         if inside.sum() < 4:
             continue
         values = lum[inside]
         low, high = np.quantile(values, RING_SHARE)
-        middle.append((_RINGS[i] + _RINGS[i + 1]) / 2)
-        colour.append(image[inside][(values >= low) & (values <= high)].mean(axis=0))
-    middle, colour = np.array(middle), np.array(colour).reshape(-1, 3)
+        middles.append((_RINGS[i] + _RINGS[i + 1]) / 2)
+        colours.append(image[inside][(values >= low) & (values <= high)].mean(axis=0))
+    middle, colour = np.array(middles), np.array(colours).reshape(-1, 3)
     bright = colour @ LUMINANCE
     for last in range(_end(middle, bright), 2, -1):
         far = np.maximum(colour[last], 1e-3 * colour[last].max())

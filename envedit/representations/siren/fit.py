@@ -62,7 +62,7 @@ class Normalisation:
         """Map radiance to [0, 1], in float64 (Eq. 1)."""
         return (np.log(np.asarray(image, np.float64) + EPSILON) - self.low) / self.span
 
-    def decode(self, values):
+    def decode(self, values: mi.TensorXf) -> mi.TensorXf:
         """Map network output in (0, 1) to finite radiance >= 0 (Eq. 2-3), on tensors and arrays."""
         # dr.exp is infinite from 88.38 on. Below 0, where a flat or black map can lead, the slope is kept.
         radiance = dr.exp(dr.minimum(values * self.span + self.low, 88)) - EPSILON
@@ -193,7 +193,7 @@ class Objective:
         self.radiance = tensor(image)
         self.ssim = ssim.Ssim(self.logs)
 
-    def gradient(self, y: mi.TensorXf, only_ssim: bool = False):
+    def gradient(self, y: mi.TensorXf, only_ssim: bool = False) -> tuple[mi.Float, mi.TensorXf]:
         """Return the loss (size-1 array) and its gradient with respect to y."""
         y = mi.TensorXf(y)
         dr.enable_grad(y)
@@ -225,7 +225,7 @@ class Perturbation:
     def __init__(self, params: siren.Params, gamma: float):
         self.gamma, self.names = gamma, siren.weight_names(params)
         self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
-        self._direction = None
+        self._direction: siren.Params | None = None
 
     def update(self, grads: siren.Params, lr: float) -> None:
         """Set the direction of ascent from a gradient of the loss that is to be made worse."""

@@ -35,7 +35,9 @@ class Siren:
     ):
         self.network, self.settings, self.folder, self.progress = network, settings, folder, progress
         self.fitted: fit.Fitted | None = None
-        self._rows, self._shape, self._points = rows, None, {}
+        self._rows = rows
+        self._shape: tuple[int, int] | None = None
+        self._points: dict[tuple[int, int], mi.TensorXf] = {}
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Fit the network, or take an earlier fit of the same image from disk."""
@@ -48,7 +50,8 @@ class Siren:
 
     def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:
         """Evaluate the network at the resolution of the image, or at any other ``shape``."""
-        shape = tuple(shape or self._shape)
+        height, width = shape or self._shape
+        shape = height, width
         if shape not in self._points:
             first, total = self._rows or (0, self._shape[0])
             finer = shape[0] / self._shape[0]

@@ -1,0 +1,141 @@
+"""The options of ``envedit run``, and what they stand for in a configuration."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+
+from envedit.core import shipped
+
+
+def parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
+    made = argparse.ArgumentParser(
+        prog="envedit run",
+        description="Edit an HDR environment map so that a scene renders like a target.",
+        epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n"
+        "  envedit run scene.xml --envmap sky.hdr --rotate 90\n"
+        "  envedit run scene.xml --export-initial paint_me.png\n"
+        "  envedit run scene.xml --paint paint_me.png\n"
+        "  envedit run edits/move_shadow --out shadow --preset draft\n\n"
+        f"shipped configurations: {', '.join(shipped.configurations())}\n"
+        f"shipped scenes, for [scene] file: {', '.join(shipped.scenes())}\n\n"
+        "exit codes: 0 done; 2 bad configuration or usage; 3 bad image or scene file; 4 this machine cannot\n"
+        "run it; 5 the optimisation could not proceed; 130 interrupted, after writing a checkpoint",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument(
+        "config",
+        metavar="CONFIG",
+        nargs="?",
+        help="a file, CONFIG.toml, or the name of a shipped one; or SCENE.xml, or the name of a shipped "
+        "scene, with the options of the next group",
+    )
+    quick = made.add_argument_group(
+        "edits of a scene without a configuration",
+        "config.toml among the results says what was run; without a target the map is turned by 60 degrees",
+    )
+    quick.add_argument(
+        "--envmap", metavar="MAP", help="map to edit: a file, scene or sunsky (default: the scene's own)"
+    )
+    target = quick.add_mutually_exclusive_group()
+    target.add_argument("--paint", metavar="PICTURE", help="the rendering, painted over")
+    target.add_argument("--target", metavar="MAP", help="the rendering shall be as under this map")
+    target.add_argument("--rotate", metavar="DEGREES", type=float, help="... as under the map, turned")
+    made.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder for the results (default: CONFIG_out beside the configuration; "
+        "for a shipped one runs/NAME in the working folder)",
+    )
+    made.add_argument(
+        "--preset",
+        choices=("draft", "standard", "paper"),
+        help="named set of defaults: standard; draft, in a third of the time; paper, the paper's method",
+    )
+    made.add_argument(
+        "--set",
+        metavar="table.key=value",
+        action="append",
+        default=[],
+        dest="overrides",
+        help="change one key of the configuration, such as optimizer.iterations=50; may be repeated",
+    )
+    instead = made.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--resume", action="store_true", help="continue an interrupted run from its checkpoint"
+    )
+    instead.add_argument(
+        "--export-initial",
+        metavar="FILE",
+        help="only write the initial rendering, to paint on: linear .exr, or 16-bit .png under "
+        "[target] tonemap, or under reinhard where that would clip",
+    )
+    instead.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="only write the target, dry_run.png and dry_run.exr in the folder of the results: no edit",
+    )
+    instead.add_argument(
+        "--budget",
+        metavar="TIME",
+        help="choose widths, steps and samples so that the run ends within 30, 30s or 2m",
+    )
+    made.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    made.add_argument(
+        "--json",
+        action="store_true",
+        help="print one JSON object at the end: folder, files, metrics, or error",
+    )
+    made.add_argument(
+        "--progress",
+        choices=("text", "json"),
+        default="text",
+        help="progress on stderr as text or JSON lines",
+    )
+    return made
+
+
+def is_scene(name: str) -> bool:
+    """Distinguish a scene from a configuration: an XML file, or the name of a shipped scene."""
+    plain = not os.path.isfile(name) and name in shipped.scenes() and name not in shipped.configurations()
+    return name.lower().endswith(".xml") or plain
+
+
+def quick(arguments: argparse.Namespace) -> list[str]:
+    """Return the overrides that --envmap, --paint, --target and --rotate stand for.
+
+    Raises
+    ------
+    ConfigError
+        They are given beside a configuration, which says the same.
+    """
+    from envedit import config
+    from envedit.core.errors import ConfigError
+
+    asked = {
+        "envmap": (("input.envmap", arguments.envmap),),
+        "paint": (("target.kind", "image"), ("target.file", arguments.paint)),
+        "target": (("target.file", arguments.target),),
+        "rotate": (("target.rotate_degrees", arguments.rotate),),
+    }
+    given = [name for name in asked if getattr(arguments, name) is not None]
+    if given and not is_scene(arguments.config):
+        key = asked[given[0]][-1][0]
+        raise ConfigError(
+            f"--{given[0]}: got it beside a configuration, expected it beside a scene: "
+            f"set {key} in {arguments.config}, or --set {key}=..."
+        )
+    return [f"{key}={config.quote(value)}" for name in given for key, value in asked[name]]
+
+
+def seconds(text: str) -> float:
+    """Read --budget."""
+    from envedit.core.errors import ConfigError
+
+    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
+    value = float(found[1]) * (60 if found[2].startswith("m") else 1) if found else 0
+    if not 0 < value < 1e6:
+        raise ConfigError(f"--budget: got {text!r}, expected seconds or minutes, such as 30s or 2m")
+    return value

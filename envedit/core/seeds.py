@@ -1,0 +1,87 @@
+"""What every random choice of a run is seeded with: one table, all from the run's ``seed``.
+
+What is judged shares no samples with what was optimised through, and one rendering none with another. Random
+signs (:data:`SIGNS`) and the calibration of a budget are the same in every run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SIGNS = 0
+"""Seed of random signs, by which sums over many texels are estimated."""
+_WORDS = 2**32  # where a seed is a setting of its own, or goes to Mitsuba as it is
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """The seeds of a run; made by :meth:`of`.
+
+    Attributes
+    ----------
+    fit : int
+        A network and its fit.
+    transport : int
+        T's recording, and the light of other lamps; further ones by :func:`recording`, :func:`pilot` and
+        :func:`columns`. Of a path tracer, ``sample_tea_32(2 step, transport)``: rendering and gradient.
+    second_recording : int
+        T once more, to see what in it is noise.
+    step_check, turn_check : int
+        Renderings that decide about the solver's steps, and about the turn of the sky.
+    target : int
+        The target, rendered under another map.
+    exported : int
+        The rendering that is painted on.
+    painted_initial : int
+        The initial rendering where the target is painted, or there is none.
+    judged : int
+        The rendering of the result, and the initial one that it is compared with: the same samples.
+    page : int
+        The rendering that the painting page shows; further passes count on from it.
+    """
+
+    fit: int
+    transport: int
+    second_recording: int
+    step_check: int
+    turn_check: int
+    target: int
+    exported: int
+    painted_initial: int
+    judged: int
+    page: int
+
+    @classmethod
+    def of(cls, seed: int) -> Seeds:
+        """Derive all seeds from that of the configuration."""
+        return cls(
+            fit=seed,
+            transport=seed,
+            second_recording=(seed + 500_009) % _WORDS,
+            step_check=(seed + 700_001) % _WORDS,
+            turn_check=(seed + 800_011) % _WORDS,
+            target=seed + 7_000_003,
+            exported=seed + 8_000_009,
+            painted_initial=seed + 9_000_011,
+            judged=seed + 9_000_012,
+            page=seed + 9_000_021,
+        )
+
+    def pass_of_page(self, i: int) -> int:
+        """Return the seed of pass ``i`` of :attr:`page`."""
+        return (self.page + i) % _WORDS
+
+
+def recording(transport: int, epoch: int) -> int:
+    """Return the seed of T's recording after so many refreshes."""
+    return transport + 1_000_003 * epoch
+
+
+def pilot(transport: int) -> int:
+    """Return the seed of the few samples by which T's path depth and rows are chosen."""
+    return transport + 104_729
+
+
+def columns(transport: int) -> int:
+    """Return the seed of the paths of T's exact columns."""
+    return transport + 7_919

@@ -1,0 +1,142 @@
+"""How T is sampled: chosen from a few paths under a white sky, before anything of it is traced."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.array_cache import DiskCache, holds
+from envedit.scene.scene import Scene
+from envedit.transport.recording import (
+    MAX_BOUNCES,
+    choose_bounces,
+    choose_samples,
+    gigabytes,
+    left_out,
+    pilot,
+    row_mass,
+)
+from envedit.transport.texel_sampling import Grid
+
+COLUMN_TOLERANCE = 0.03
+"""Relative error of the coarse tier above which columns are added."""
+COLUMN_PATHS = (8, 48, 320)
+"""Paths a pixel of a column, by its texel's share of the picture's light (``COLUMN_SHARES``)."""
+FEW_PATHS, FEW_TOLERANCE = (8, 16, 48), 0.08
+"""Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingPlan:
+    """How T is sampled; made by :func:`choose`.
+
+    Attributes
+    ----------
+    spp, bounces, capacity : int
+        Paths a pixel of the coarse tier, surface points along a path, most exact columns.
+    mass : ndarray (H,)
+        Share of the samples by row of the map, up to a factor.
+    lamps : int
+        Path depth of the light of other lamps; 0: there are none; -1: any.
+    depth_error : float
+        Share of the picture under a white sky that comes from deeper paths.
+    paths, tolerance : (int, int, int), float
+        Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
+    paths_bytes : int
+        Memory for camera paths that are kept for further columns.
+    choices : tuple of str
+        What was chosen automatically, with the measurement that decided.
+    """
+
+    spp: int
+    bounces: int
+    capacity: int
+    mass: np.ndarray
+    lamps: int
+    depth_error: float
+    paths: tuple[int, int, int]
+    tolerance: float
+    paths_bytes: int
+    choices: tuple[str, ...]
+
+    def key(self) -> dict[str, Any]:
+        """Return what a recording depends on, for its place on disk."""
+        rows = hashlib.sha256(self.mass.tobytes()).hexdigest()
+        return {"samples": self.spp, "bounces": self.bounces, "lamps": self.lamps, "rows": rows}
+
+
+def white_sky(
+    cache: DiskCache, key: dict[str, Any], scene: Scene, shape: tuple[int, int], seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measure the light by row of a map (H, W) and by bounce, or take it from disk; see :func:`pilot`."""
+    height, width = shape
+    known = {"by_row": ("f8", (height,)), "by_bounce": ("f8", (None,))}
+    light = cache.load(
+        key,
+        lambda found: (
+            holds(found, known)
+            and len(found["by_bounce"]) == MAX_BOUNCES + 1
+            and min(a.min() for a in found.values()) >= 0 < found["by_bounce"].sum()
+        ),
+    )
+    if light is None:
+        sphere = latlong.solid_angles(height, width)
+        by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
+        light = {"by_row": by_row, "by_bounce": by_bounce}
+        cache.store(key, light)
+    return light["by_row"], light["by_bounce"]
+
+
+def choose(
+    scene: Scene,
+    shape: tuple[int, int],
+    light: tuple[np.ndarray, np.ndarray],
+    spp: int | str,
+    max_depth: int | str,
+    memory_gb: float,
+    few: bool = False,
+) -> SamplingPlan:
+    """Choose how T is sampled.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene, camera and film.
+    shape : (int, int)
+        Rows and columns of the map.
+    light : (ndarray (H,), ndarray (MAX_BOUNCES + 1,))
+        Of :func:`white_sky`.
+    spp, max_depth, few
+        As of :meth:`.LightTransport.build`.
+    memory_gb : float
+        Memory allowed, GB.
+
+    Raises
+    ------
+    InputError
+        As of :func:`.recording.choose_bounces` and :func:`.recording.choose_samples`.
+    """
+    by_row, by_bounce = light[0], light[1].copy()
+    if scene.max_depth > 0:
+        by_bounce[scene.max_depth :] = 0
+    bounces, choices = choose_bounces(scene, max_depth, by_bounce)
+    samples, capacity, choice = choose_samples(scene, spp, shape[0] * shape[1], memory_gb)
+    left = memory_gb - gigabytes(scene.width * scene.height, samples, capacity)
+    # The light of other lamps is constant: it need not be cut where no path depth is asked for.
+    most = scene.max_depth if max_depth == "auto" else bounces + 1
+    return SamplingPlan(
+        spp=samples,
+        bounces=bounces,
+        capacity=capacity,
+        mass=row_mass(latlong.solid_angles(*shape), by_row),
+        lamps=most if len(scene.mi.emitters()) > 1 else 0,
+        depth_error=left_out(by_bounce, bounces),
+        paths=FEW_PATHS if few else COLUMN_PATHS,
+        tolerance=FEW_TOLERANCE if few else COLUMN_TOLERANCE,
+        paths_bytes=int(1e9 * max(left, 0)),
+        choices=(*choices, choice),
+    )

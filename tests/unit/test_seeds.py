@@ -1,0 +1,40 @@
+"""The table of seeds: the values that results were made with, no two alike, and no seed made elsewhere."""
+
+import re
+from dataclasses import asdict
+from pathlib import Path
+
+from envedit.core import seeds
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_seeds_are_those_that_results_were_made_with():
+    """Another number here makes other bytes of every result."""
+    expected = {
+        "fit": 5, "transport": 5, "second_recording": 500_014, "step_check": 700_006,
+        "turn_check": 800_016, "target": 7_000_008, "exported": 8_000_014, "painted_initial": 9_000_016,
+        "judged": 9_000_017, "page": 9_000_026,
+    }  # fmt: skip
+    assert asdict(seeds.Seeds.of(5)) == expected
+    assert (seeds.recording(5, 0), seeds.recording(5, 2)) == (5, 2_000_011)
+    assert (seeds.pilot(5), seeds.columns(5), seeds.SIGNS) == (104_734, 7_924, 0)
+
+
+def test_no_two_purposes_share_samples():
+    found = asdict(seeds.Seeds.of(0))
+    del found["fit"]  # a network's weights are no samples of a rendering
+    own = [*found.values(), seeds.pilot(0), seeds.columns(0), *(seeds.recording(0, i) for i in range(1, 10))]
+    assert len(set(own)) == len(own)
+
+
+def test_the_largest_seed_stays_one_where_it_goes_to_mitsuba_or_a_configuration():
+    most = seeds.Seeds.of(2**32 - 1)
+    wrapped = most.second_recording, most.step_check, most.turn_check, most.pass_of_page(3)
+    assert wrapped == (500_008, 700_000, 800_010, 9_000_023)
+
+
+def test_no_other_module_adds_to_a_seed():
+    adds = re.compile(r"seed\)? *\+ *[A-Z_\d]|_SEED\b|default_rng\(\d")
+    files = [file for file in (ROOT / "envedit").rglob("*.py") if file.name != "seeds.py"]
+    assert [f"{file.name}: {line}" for file in files for line in adds.findall(file.read_text())] == []

@@ -1,0 +1,72 @@
+"""Signatures: every public one is annotated, and mypy finds nothing at the level of ``pyproject.toml``."""
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def unannotated(source):
+    """List the parameters and returns of public functions without a type, as "line name"."""
+    found = []
+
+    def visit(node, public):
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.ClassDef):
+                visit(child, public and not child.name.startswith("_"))
+            elif isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                name = child.name
+                if public and (not name.startswith("_") or name.startswith("__")):
+                    a = child.args
+                    every = [*a.posonlyargs, *a.args, *a.kwonlyargs, a.vararg, a.kwarg]
+                    taken = [one for one in every if one and one.arg not in ("self", "cls")]
+                    found.extend(f"{child.lineno} {one.arg}" for one in taken if one.annotation is None)
+                    if child.returns is None and name != "__init__":
+                        found.append(f"{child.lineno} {name} ->")
+                visit(child, False)  # a function in a function is not public
+            else:
+                visit(child, public)
+
+    visit(ast.parse(source), True)
+    return found
+
+
+def test_the_count_sees_what_lacks_a_type():
+    source = """
+def a(x, *rest, y: int = 0, **more) -> None: ...
+def _private(x): ...
+class B:
+    def __init__(self, z): ...
+    def c(self):
+        def inner(w): ...
+    @property
+    def d(self) -> int: ...
+class _C:
+    def e(self, x): ...
+if True:
+    async def f(v) -> int: ...
+"""
+    assert unannotated(source) == ["2 x", "2 rest", "2 more", "5 z", "6 c ->", "13 v"]
+
+
+def test_no_public_parameter_or_return_is_unannotated():
+    files = sorted((ROOT / "envedit").rglob("*.py"))
+    assert len(files) > 100
+    found = [f"{file.relative_to(ROOT)}:{one}" for file in files for one in unannotated(file.read_text())]
+    assert found == []
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (ROOT / "envedit" / "py.typed").is_file()  # test_wheel.py looks for it in the wheel
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mypy") is None, reason="mypy is not installed: envedit[dev]")
+def test_mypy_finds_nothing(tmp_path):
+    mypy = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path)]
+    done = subprocess.run(mypy, cwd=ROOT, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stdout + done.stderr

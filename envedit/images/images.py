@@ -17,7 +17,7 @@ from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import replacing, write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError
 from envedit.core.quiet_libraries import quiet_libraries
-from envedit.core.types import ArrayLike, FilePath
+from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, rgbe
 from envedit.images.headers import MAX_SIDE, damaged, head_of
 
@@ -117,7 +117,7 @@ def _in_rec709(pixels, info):
 def _decode(path, stored):
     name = os.fsdecode(path)
     head = head_of(name)
-    info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
+    info: Info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
     info["chromaticities"] = None
     for kind, magic, reader in FORMATS:
         if head.startswith(magic):

@@ -281,8 +281,8 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
 def _lights(original, edited, to_world, degrees=0.0):
     """Match the lights of both maps, and return the edited one's alone as well."""
     found = [separate(envmap) for envmap in (original, edited)]
-    lists = [light_list.listed(one, to_world) for one in found]
-    return light_list.matched(*lists, degrees), np.minimum(found[1].core, edited).astype(np.float32)
+    before, after = (light_list.listed(one, to_world) for one in found)
+    return light_list.matched(before, after, degrees), np.minimum(found[1].core, edited).astype(np.float32)
 
 
 @contextlib.contextmanager

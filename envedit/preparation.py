@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -205,7 +206,7 @@ class Preparation:
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
             horizon, said = self._horizon()
             notes += said
-            representation = representations.make(
+            representation: Any = representations.make(
                 settings,
                 fit.default_folder(),
                 lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),

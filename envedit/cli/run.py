@@ -227,9 +227,8 @@ def _export_initial(settings, arguments):
     with _progress(arguments) as progress:
         progress.stage("rendering the picture to paint on")
         lit = inputs.load_scene(settings.scene, arguments.base)
-        files = output_folder.of_views(file.name, lit.rows)
-        files = files[1:] or files
-        files = [(file.with_name(name), rows) for name, rows in files]
+        named = output_folder.of_views(file.name, lit.rows)
+        files = [(file.with_name(name), rows) for name, rows in named[1:] or named]
         for one, _ in files:
             initial_rendering.check_export(one)
         envmap, warnings = inputs.load_map(settings.input, lit)

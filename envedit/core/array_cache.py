@@ -114,6 +114,7 @@ class DiskCache:
         return [p for p in sorted(self.folder.iterdir()) if _OURS.fullmatch(p.name) and p.is_file()]
 
     def _path(self, key):
+        assert self.folder is not None  # without one nothing is read or written
         return self.folder / f"{hashlib.sha256(_text(key).encode()).hexdigest()[:32]}.arrays"
 
     def _make_room(self, size, replaced):

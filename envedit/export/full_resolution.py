@@ -183,7 +183,7 @@ class _LayersAt:
     def collect(self, source):
         """Gather the texels of lights that move, and place them."""
         own = self.layers.lights.count - lights.SPARE
-        found = {i: [] for i in np.flatnonzero(self.moved[:own])}
+        found: dict[int, list] = {int(i): [] for i in np.flatnonzero(self.moved[:own])}
         for start, fresh, size in self.grid.bands() if found else ():
             if not self._any_label(start, size):
                 continue
@@ -209,9 +209,9 @@ class _LayersAt:
             for k in range(0, len(row), POINTS_AT_ONCE):
                 part = slice(k, k + POINTS_AT_ONCE)
                 self._place_texels(i, row[part], column[part], flux[part], omega[row[part]])
-        for i in range(own, self.layers.lights.count):
-            if (self.flux[i] > lights.DARK).any():
-                self._place_lobe(i)
+        for spare in range(own, self.layers.lights.count):
+            if (self.flux[spare] > lights.DARK).any():
+                self._place_lobe(spare)
         self._level()
 
     def band(self, source, start):
@@ -264,10 +264,10 @@ class _LayersAt:
         total, density = 0, None
         for p in self.points:
             if p.light == light and p.first < start + size and p.last >= start:
-                where = p.half_row, (size, self.width), (start, self.height)
-                total += lights.shared_out(*p.places, p.flux, *where)
+                (row, column, half), shape, rows = p.places, (size, self.width), (start, self.height)
+                total += lights.shared_out(row, column, half, p.flux, p.half_row, shape, rows)
                 if p.omega is not None:
-                    part = lights.shared_out(*p.places, p.omega, *where)
+                    part = lights.shared_out(row, column, half, p.omega, p.half_row, shape, rows)
                     density = part if density is None else density + part
         return total, 1 if density is None else dr.clip(density, 0.5, 2)
 

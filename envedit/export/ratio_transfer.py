@@ -64,11 +64,11 @@ class Ratio:
         )
         few = height < 2 * total
         low, high = np.floor(edges[:-1] + 0.5 + 1e-9), np.ceil(edges[1:] - 0.5 - 1e-9)
-        self.rows = [np.int64(self.grid.row if few else v) for v in (low, high)]
+        self.rows = [np.asarray(self.grid.row if few else v, np.int64) for v in (low, high)]
         across = np.arange(width + 1) * (columns / width)
         few = width < 2 * columns
         low, high = np.floor(across[:-1] + 1e-9), np.ceil(across[1:] - 1e-9) - 1
-        self.columns = [np.int64(self.grid.column if few else v) for v in (low, high)]
+        self.columns = [np.asarray(self.grid.column if few else v, np.int64) for v in (low, high)]
         v = latlong.row_edges(height)
         target = latlong.row_edges(total)[rows.start : rows.stop + 1]
         cap = np.sin(np.pi / 2 * np.clip(v, target[:-1, None], target[1:, None])) ** 2

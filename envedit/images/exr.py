@@ -100,7 +100,7 @@ def _choose_channels(name, headers, info):
             continue
         channels = {c.name: c for c in header["channels"]}
         seen.extend(channels)
-        layers = {}
+        layers: dict[str, dict[str, str]] = {}
         for full in channels:
             layer, _, short = full.rpartition(".")
             layers.setdefault(layer, {})[short.upper()] = full

@@ -119,7 +119,7 @@ def _in_rec709(pixels, info):
 def _decode(path, stored):
     name = os.fsdecode(path)
     head = head_of(name)
-    info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
+    info: Info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
     info["chromaticities"] = None
     for kind, magic, reader in FORMATS:
         if head.startswith(magic):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import zlib
+from typing import Literal
 
 import numpy as np
 
@@ -118,7 +119,7 @@ def _inflated(data, most=1 << 22):
 
 def _orientation(exif):
     """Return tag 274 of the first directory of EXIF data; 1, upright, where it has none."""
-    order = {b"II": "little", b"MM": "big"}.get(exif[:2], "big")
+    order: Literal["little", "big"] = "little" if exif[:2] == b"II" else "big"
     at = int.from_bytes(exif[4:8], order)
     for entry in range(at + 2, at + 2 + 12 * int.from_bytes(exif[at : at + 2], order), 12):
         if int.from_bytes(exif[entry : entry + 2], order) == 274:

@@ -11,6 +11,7 @@ import re
 import stat
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -129,7 +130,7 @@ def _ply(path):
         if place + count * dtype.itemsize > size:
             raise damaged(path, f"the file ends before its {count} {name} elements")
         if indices:
-            order = ">" if form == "binary_big_endian" else "<"
+            order: Literal["<", ">"] = ">" if form == "binary_big_endian" else "<"
             rows = np.fromfile(path, dtype.newbyteorder(order), count, offset=place)
             for key, _ in lists:
                 _triangles(path, rows[f"{key} count"])
@@ -140,7 +141,8 @@ def _ply(path):
 
 def _ply_header(path, text):
     """Return [(element, count, [(property, type or (type of count, type))])] and the format."""
-    elements, form = [], None
+    elements: list = []
+    form = None
     for line in text.splitlines()[1:]:
         match line.split():
             case ["comment" | "obj_info", *_] | []:

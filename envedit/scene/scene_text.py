@@ -176,7 +176,7 @@ class _Reader:
                 raise wrong("a DOCTYPE is not read; remove it" if doctype else "a tag is not well formed")
 
     def _tag(self, tag, attributes, name, folders, above):
-        values = {}
+        values: dict[str, str] = {}
         for key, double, single in _ATTRIBUTE.findall(attributes):
             raw = html.unescape(double or single)
             values.setdefault(key, self._filled(raw) if "$" in raw else raw)
@@ -203,7 +203,8 @@ class _Reader:
             name, filling = "$" + key, self.parameters[key]
             if name not in value:
                 continue
-            parts, place, size = [], 0, 0
+            parts: list[str] = []
+            place, size = 0, 0
             for piece in value.split(name)[:-1]:
                 escaped = (piece or (parts[-1] if parts else "")).endswith("\\")
                 parts += [piece, name if escaped else filling]

@@ -287,9 +287,9 @@ class Job:
             rendered = self.wanted.coverage is None  # paint is no noisy picture, and asks for what it shows
             more = {"most_added": SPARE, "judge": self._display_error} if rendered else {"sparing": False}
             asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
-            found = gauss_newton.solve(*asked, **more)
-        self.posterior, self.note = found.posterior, found.note
-        return found.params, adam_loop.State(step=len(found.history), history=found.history)
+            made = gauss_newton.solve(*asked, **more)
+        self.posterior, self.note = made.posterior, made.note
+        return made.params, adam_loop.State(step=len(made.history), history=made.history)
 
     def _display_error(self, envmap):
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""

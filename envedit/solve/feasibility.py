@@ -277,7 +277,7 @@ def _cells(transport, shape):
     flat, rng = cell.ravel(), np.random.default_rng(SIGNS)
     square = np.zeros((height, width))
     for _ in range(PROBES):
-        signs = rng.choice(np.float32([-1, 1]), size=(*transport.shape, 3))
+        signs = rng.choice(np.array([-1, 1], np.float32), size=(*transport.shape, 3))
         square += (transport.adjoint(tensor(signs)).numpy().astype(np.float64) ** 2).mean(axis=2)
     total = np.bincount(flat, transport.influence.ravel().astype(np.float64))
     samples = transport.spp * np.bincount(flat, square.ravel() / PROBES) / np.maximum(total, 1e-30)
@@ -425,7 +425,7 @@ def _around_light(question, model, x, found):
     light = more.mean(axis=2) * influence
     size = _size(width)
     beyond = _around(light, 2 * size) - _around(light, 4 * size) / 4  # the surroundings taken off
-    row, column = np.unravel_index(np.argmax(beyond), beyond.shape)
+    row, column = (int(i) for i in np.unravel_index(np.argmax(beyond), beyond.shape))
     room = transport.capacity - len(transport.columns)
     if not beyond[row, column] > LIGHT * total or room < 2 * light_search.PROBES:
         return model, x

@@ -184,13 +184,14 @@ def find(
 
 def _trusted(envmap, recordings, wanted):
     """Weigh a rendered target's pixels by what is known of them; returns weights, or None, and a note."""
-    pictures, both = [], (recordings.transport, recordings.second)
-    for one in both:
+    pictures = []
+    for one in (recordings.transport, recordings.second):
         one.resolve(envmap)
         pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
+    first, second = pictures
     asked = wanted.picture, wanted.noise, recordings.views
-    weight = pixel_confidence.weights(*pictures, share, *asked)
+    weight = pixel_confidence.weights(first, second, share, *asked)
     if weight is None:
         return None, ""
     noisy = 100 * float((weight < 0.5).mean())
@@ -216,4 +217,5 @@ def _searched(layers, params, transport, wanted, original, only_own=False):
 
 def _same(one, other):
     """Say whether two starts place the lights alike, in turn and flux, to a thousandth of their units."""
-    return all(np.allclose(*(p[name].numpy() for p, _ in (one, other)), 0, 1e-3) for name in ("turn", "flux"))
+    (a, _), (b, _) = one, other
+    return all(np.allclose(a[name].numpy(), b[name].numpy(), 0, 1e-3) for name in ("turn", "flux"))

@@ -492,7 +492,7 @@ class Problem:
         # In double precision: products of three radiances leave the range of the other.
         slopes = np.maximum(np.float64(point.edited[self.rows]) - core, 0)
         own = self.layers.shape[0]
-        sky, base = slopes[:own], np.float64(self.layers.base)
+        sky, base = slopes[:own], self.layers.base.astype(np.float64)
         gain = np.exp(np.float64(self.layers.log_gain(self.params(point.state))))
         grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
         more = base + (gain - 1) * grey

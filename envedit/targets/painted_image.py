@@ -290,7 +290,7 @@ def _recognised(file, values, alpha, initial, declared, warnings):
     if not where.any():
         return declared
     error = {name: _median_error(values, initial, name, where) for name in TONEMAPS}
-    best = min(error, key=error.get)
+    best = min(error, key=error.__getitem__)
     if error[best] > min(3 / 255, error[declared] / 4):
         if error[declared] > 3 / 255:
             warnings.append(f"{file}: names no tonemap: read under '{declared}', that of [target] tonemap")

@@ -161,7 +161,7 @@ def _painted_strokes(scene, initial, chosen):
     numbers = [
         scene.view(s.get("view", 0), f"target.strokes[{i}].view") for i, s in enumerate(chosen.strokes)
     ]
-    warnings = []
+    warnings: list[str] = []
 
     def of_view(k, before):
         own = [i for i, number in enumerate(numbers) if number == k]
@@ -192,10 +192,11 @@ def _of_views(scene, initial, painted, of_view):
             parts.append(painted_image.Painted(
                 before, np.zeros((*shape, 1), np.float32), np.zeros(shape, bool), ()
             ))  # fmt: skip
-    joined = (
+    picture, coverage, excluded = (
         np.concatenate([getattr(p, name) for p in parts]) for name in ("picture", "coverage", "excluded")
     )
-    return painted_image.Painted(*joined, tuple(line for part in parts for line in part.warnings))
+    said = tuple(line for part in parts for line in part.warnings)
+    return painted_image.Painted(picture, coverage, excluded, said)
 
 
 def _seen(target, hidden):
@@ -245,10 +246,11 @@ def _rendered(settings, scene, envmap, other):
     picture, spp, noise = rendered(
         scene, true, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
     )
-    weight = np.ones((*picture.shape[:2], 1), np.float32) if chosen.masks else None
+    weights = np.ones((*picture.shape[:2], 1), np.float32)
     for view, mask in zip(chosen.views, chosen.masks, strict=True):
         rows = scene.rows[scene.view(view, "target.view")]
-        weight[rows] = painted_image.read_mask(mask, weight[rows].shape[:2])
+        weights[rows] = painted_image.read_mask(mask, weights[rows].shape[:2])
+    weight = weights if chosen.masks else None
     asked = (true,) if weight is None else (true, weight)
     source += f", {spp} samples a pixel"
     return Target(picture, weight, true, source, warnings, asked=asked, noise=noise)

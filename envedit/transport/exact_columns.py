@@ -10,7 +10,6 @@ kernels, not a part of them: more columns compile nothing.
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -67,7 +66,7 @@ class ExactColumns:
         self._count = dr.opaque(mi.UInt32, 0)
         self._lost = dr.opaque(mi.UInt32, 0)
         self.paths_bytes = paths_bytes
-        self._kept: dict[str, Any] = {}
+        self._kept: dict[tuple[int, int], list[path_vertices.Block]] = {}
         dr.make_opaque(self._store, self._texel_of, self.mask)
 
     @property

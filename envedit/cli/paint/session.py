@@ -34,6 +34,7 @@ from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers, unseen_kept
 from envedit.representations.layers.placed_lights import PlacedLights, angles
+from envedit.scene.scene import Scene
 from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.solve.light_search import SearchProblem
@@ -83,7 +84,8 @@ class Session:
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
         self.project, self.tell, self.newer = project, tell, newer
         self.document, self.resting, self.phase = Document(), False, "done"
-        self._shown = None  # the rendering by T that the pages show
+        self._rendered: tuple[int, Any] | None = None  # passes and their sum
+        self._shown: np.ndarray | None = None  # the rendering by T that the pages show
         self.status: dict[str, Any] = {
             "reachable": None,
             "iterations": 0,
@@ -105,11 +107,13 @@ class Session:
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
-        self._watched, self._quick = _Watched(self.transport, newer), self.transport
+        self._watched: Any = _Watched(self.transport, newer)  # a transport in all it does
+        self._quick = self.transport
         if self.transport.spp > QUICK_SPP:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
             self._quick = renderers.trace(fewer, self.lit, self.map.shape[:2], self._progress)
-        self._sharp, self._recorded = None, self._quick is self.transport
+        self._sharp: Scene | None = None
+        self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
         self._aim(project.document)
@@ -273,8 +277,7 @@ class Session:
         starts = [painted_change.start(asked, params, bold)[0] for bold in (False, True)]
         if layers.separation.lights:
             starts.append(painted_change.softened(layers, params)[0])
-        more = {"iterations": 0, "run": self.run, "trial": True, "sparing": False}
-        best = gauss_newton.solve(self.problem, params, **more)
+        best = gauss_newton.solve(self.problem, params, iterations=0, run=self.run, trial=True, sparing=False)
         least, found = best.loss - LIKELIER, None
         for start in [params, *starts]:
             tried = self._tried(start)
@@ -291,9 +294,9 @@ class Session:
 
     def _tried(self, start):
         """Return the solution after a few steps from a start; None where it cannot begin."""
-        more = {"iterations": NEWTON_TRIAL, "after_step": self._unless_newer, "trial": True, "sparing": False}
+        steps: dict[str, Any] = {"iterations": NEWTON_TRIAL, "after_step": self._unless_newer}
         try:
-            return gauss_newton.solve(self.problem, start, **more)
+            return gauss_newton.solve(self.problem, start, trial=True, sparing=False, **steps)
         except NumericalError:
             return None
 
@@ -324,9 +327,9 @@ class Session:
         """Return the scene with more pixels; of a cropped film, which takes no other size, as it is."""
         chosen = self.project.settings.scene
         height = self.lit.height if len(self.lit.views) == 1 else chosen.height
-        more = {"width": SHARPER * self.lit.width, "height": SHARPER * height}
+        sharper = replace(chosen, width=SHARPER * self.lit.width, height=SHARPER * height)
         try:
-            return inputs.load_scene(replace(chosen, **more), self.project.base)
+            return inputs.load_scene(sharper, self.project.base)
         except ConfigError:
             return self.lit
 

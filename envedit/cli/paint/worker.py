@@ -33,7 +33,8 @@ class Worker(threading.Thread):
 
     def __init__(self, tell: Tell, opened: project.Project | None = None):
         super().__init__(name="envedit-paint", daemon=True)
-        self.tell, self.session, self._opened = tell, None, opened
+        self.tell, self._opened = tell, opened
+        self.session: Session | None = None
         self._waiting: dict[type, object] = {}
         self._lock = threading.Condition()
         self._over = self._owed = False

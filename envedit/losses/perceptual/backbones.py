@@ -56,7 +56,8 @@ class Pool:
 
 
 def _vgg16():
-    layers, index, channels = [], 0, 3
+    layers: list[Conv | Pool] = []
+    index, channels = 0, 3
     for block, (width, count) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)]):
         if block:
             layers.append(Pool(2))
@@ -70,7 +71,7 @@ def _vgg16():
 def _alexnet():
     sizes = [(0, 3, 64, 11, 4, 2), (3, 64, 192, 5, 1, 2), (6, 192, 384, 3, 1, 1)]
     sizes += [(8, 384, 256, 3, 1, 1), (10, 256, 256, 3, 1, 1)]
-    convs = [Conv((f"features.{i}",), *size, tap=True) for i, *size in sizes]
+    convs = [Conv((f"features.{i}",), a, b, k, s, p, tap=True) for i, a, b, k, s, p in sizes]
     return [convs[0], Pool(3), convs[1], Pool(3), *convs[2:]]
 
 

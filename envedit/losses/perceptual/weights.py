@@ -12,6 +12,7 @@ import math
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from envedit.core.types import FilePath
 MOST_HEADER = 2**24
 """Bytes of a safetensors header, at most; that of VGG16 has 3 kB."""
 
-_SAFETENSORS = {
+_SAFETENSORS: dict[str, np.dtype] = {
     "F16": np.dtype("<f2"),
     "F32": np.dtype("<f4"),
     "F64": np.dtype("<f8"),
@@ -94,7 +95,8 @@ def _read_safetensors(name, stream, wanted, what, source):
     _check_names(name, header, wanted, what, source)
     for tensor, shape in wanted.items():
         entry = header[tensor] if isinstance(header[tensor], dict) else {}
-        kind, declared, place = (entry.get(key) for key in ("dtype", "shape", "data_offsets"))
+        kind, declared = entry.get("dtype"), entry.get("shape")
+        place: Any = entry.get("data_offsets")
         if not (_are_sizes(declared) and _are_sizes(place) and len(place) == 2):
             raise _damaged(name, f"the entry of '{tensor}' in its header")
         if not isinstance(kind, str) or kind not in _SAFETENSORS:

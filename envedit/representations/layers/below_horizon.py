@@ -115,7 +115,7 @@ class Below:
         omega = latlong.solid_angles(total, sky.shape[1])[sky.shape[0] :]
 
         def varying(image):
-            logs = np.log(np.float64(image) @ LUMINANCE + self._faint)
+            logs = np.log(image.astype(np.float64) @ LUMINANCE + self._faint)
             return logs - logs.mean(axis=1, keepdims=True)
 
         shown, errors = varying(radiance), []

@@ -276,12 +276,12 @@ class Layers:
         if (first, total) != (0, height):
             rows = round(first * finer), round(total * finer)
         d = latlong.directions(rows[1], shape[1])[rows[0] : rows[0] + shape[0]]
-        base, behind = self._finer(self.base, shape, d), self.behind
-        if behind is not None:
+        base, behind = self._finer(self.base, shape, d), None
+        if self.behind is not None:
             glow = self._finer(self.separation.glow, shape, d)
-            smooth = (self._finer(field, shape, d) for field in (behind.offset, behind.slope))
-            behind = BehindGlow(*smooth, behind.faint).log_change(base / glow)
-            behind = dr.opaque(mi.Color3f(np.ascontiguousarray(behind.reshape(-1, 3).T, np.float32)))
+            smooth = [self._finer(field, shape, d) for field in (self.behind.offset, self.behind.slope)]
+            change = BehindGlow(smooth[0], smooth[1], self.behind.faint).log_change(base / glow)
+            behind = dr.opaque(mi.Color3f(np.ascontiguousarray(change.reshape(-1, 3).T, np.float32)))
         d = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)))
         n, before = self.lights.count, mi.Color3f(1)
         if self.lights.glowing:

@@ -259,7 +259,7 @@ def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
 def _train(image, normalisation, x, network, settings, seed, begun, progress):
     params = siren.init(seed, network.hidden, network.depth, network.omega, inputs=x.shape[1])
     grids = _grids(image, normalisation, x, settings)
-    rng, order = np.random.default_rng(seed), []
+    rng, order = np.random.default_rng(seed), list[int]()
     adam = optimizer.Adam(params, settings.lr, (0.9, settings.beta2))
     perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
     first, refused = begun.restore(adam)

@@ -3,6 +3,8 @@
 An image is a float32 array ``(H, W, 3)`` of linear radiance with Rec.709 primaries. Problems that a user can
 mend raise ``InputError`` with the file's name; what is merely odd goes to ``info["warnings"]``, a list of
 sentences.
+
+Longer than 400 lines: reading takes files and arrays, with the same checks.
 """
 
 from __future__ import annotations

@@ -10,6 +10,8 @@ for the best strength of the light, beside all other unknowns.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from envedit.core import latlong
@@ -103,7 +105,10 @@ class _Model:
         """Return the same for pictures (n, pixels, 3)."""
         normal, count = self.normal, len(pictures)
         known = normal.pictures.reshape(len(normal.pictures), pictures.shape[1], 3)
-        mixed, seen, pull, power = [], 0.0, 0.0, 0.0
+        mixed: list[np.ndarray] = []
+        seen: Any = 0.0
+        pull: Any = 0.0
+        power: Any = 0.0
         for c, j in enumerate(normal.blocks.jacobian):
             mine = np.ascontiguousarray(pictures[..., c])
             slope, robust, residual, profile = (

@@ -214,7 +214,8 @@ def sweep(
 
 def _drive(todo, engine, board):
     """Submit jobs and yield outcomes as they come; what another call holds is looked at again and again."""
-    running, held = {engine.submit(job): job for job in todo}, []
+    running = {engine.submit(job): job for job in todo}
+    held: list[Any] = []
     while running or held:
         for future in [future for future in running if future.done()]:
             job = running.pop(future)

@@ -43,7 +43,7 @@ class Lock:
         self._beaten = time.monotonic()
         self.holder = ""
 
-    def __enter__(self):
+    def __enter__(self) -> Lock:
         self.add(os.getpid())
         now = self._path.stat().st_mtime  # by the clock of whoever keeps the files
         for other in set(self._path.parent.glob("lock-*")) - {self._path}:
@@ -53,7 +53,7 @@ class Lock:
             other.unlink(missing_ok=True)
         return self
 
-    def __exit__(self, *exception):
+    def __exit__(self, *exception: object) -> None:
         self._path.unlink(missing_ok=True)
 
     def add(self, pid: int) -> None:

@@ -199,7 +199,8 @@ def _supervise(argv, folder, threads, stop, lock):
             if process.poll() is None:
                 _signal(process, signal.SIGKILL)
                 process.wait()
-            process.stderr.close()
+            if process.stderr:
+                process.stderr.close()
     lines = [line.strip() for line in tail.decode(errors="replace").splitlines() if line.strip()]
     return ended, lines[-1] if lines else ""
 

@@ -32,7 +32,7 @@ CHECKED_SPP = 64
 """Samples a pixel of renderings by which start and solution are compared."""
 TRIAL_STEPS, NEWTON_TRIAL = 30, 6
 """Steps of Adam and of Gauss-Newton after which the better of two starts is chosen."""
-TRIAL_GAIN, LIKELIER = 0.05, 20.0
+TRIAL_GAIN, LIKELIER = 0.05, gauss_newton.WORTH
 """By which share of the loss it must be better with Adam, and by how much lower with Gauss-Newton: twice the
 logarithm of the places that a light could have had, some 20,000."""
 

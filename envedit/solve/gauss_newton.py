@@ -28,9 +28,10 @@ TRIES = 5
 NEAR, CLEARLY = 2.0, 0.95
 """Noise of the start over that of the solution up to which their renderings are compared, and the share of
 the start's squared error that the solution's must be below."""
-WORTH, ADDED_STEPS = 8.0, 6
-"""By how much a further light must lower F to be tried and to be kept: a likelihood of e^4; and the steps
-after which that is asked, by which a solution with one more light may be longer."""
+WORTH, ADDED_STEPS = 20.0, 6
+"""By how much a further light must lower F to be tried and to be kept: twice the logarithm of the places that
+it could have had, some 20,000, of which the best has been chosen; and the steps after which that is asked, by
+which a solution with one more light may be longer."""
 PLACINGS = 3
 """Most times that the map's light is placed, each time with the noise that the last has left."""
 SAME_PLACE = np.cos(np.radians(1.0))

@@ -255,7 +255,7 @@ class Pursuit:
             for c in range(3):
                 lit = mi.TensorXf(shine[c], size) * tensor(self.background[:, c : c + 1])
                 found[c] += dr.matmul(tensor(matrix[c]), lit).numpy()
-        return found * np.float32(self.weight[:, None])
+        return found * self.weight[:, None]
 
     def atom_of(
         self, cells: np.ndarray, flux: np.ndarray, centre: np.ndarray, glow: np.ndarray | None

@@ -456,7 +456,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
         picture[2, 5] = 1e6
     tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
     monkeypatch.setattr(edit_job, "SPARE", 0)
-    monkeypatch.setattr(gauss_newton, "NEAR", 0)  # a solution that is no better is not exchanged for its start
+    monkeypatch.setattr(gauss_newton, "NEAR", 0)  # a solution that is no better stays, too
     settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     steps = len(whole.history)

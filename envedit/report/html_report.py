@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from envedit import config
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.latlong import solid_angles
@@ -39,35 +41,18 @@ from envedit.report.manifest import plain
 from envedit.report.preview import checked
 from envedit.representations.layers.separation import Separation
 from envedit.scene.scene import View
+from envedit.solve import feasibility
+
+if TYPE_CHECKING:
+    from envedit.results import Result
 
 
-def write_report(
-    path: FilePath,
-    *,
-    title: str,
-    config_toml: str,
-    metrics: dict,
-    manifest: dict,
-    history: list[dict],
-    renders: Mapping[str, np.ndarray | None],
-    maps: Mapping[str, np.ndarray | None],
-    influence: np.ndarray | None = None,
-    frozen: np.ndarray | None = None,
-    identified: np.ndarray | None = None,
-    separation: Separation | None = None,
-    unreachable: np.ndarray | None = None,
-    warnings: Sequence[str] = (),
-    notes: Sequence[str] = (),
-    tonemap: str = "gamma",
-    views: Sequence[View] = (),
-    ramps: tuple[dict[str, tuple[float, float]], int] | None = None,
-) -> None:
-    """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
+@dataclass(frozen=True)
+class Report:
+    """What a report shows.
 
-    Parameters
+    Attributes
     ----------
-    path : path
-        File to write.
     title : str
         Heading of the page.
     config_toml : str
@@ -92,8 +77,54 @@ def write_report(
         A name of `envedit.core.color.TONEMAPS`, for the pictures.
     views : sequence of `scene.View`
         Name and rows of each view, where the renderings are of several.
-    ramps : (dict of str to (float, float), int), optional
+    ramps : (dict of str to (float, float), int)
         First and last weight of each loss in the history, and the iterations between them.
+    """
+
+    title: str
+    config_toml: str
+    metrics: dict
+    manifest: dict
+    history: list[dict]
+    renders: Mapping[str, np.ndarray | None]
+    maps: Mapping[str, np.ndarray | None]
+    influence: np.ndarray | None = None
+    frozen: np.ndarray | None = None
+    identified: np.ndarray | None = None
+    separation: Separation | None = None
+    unreachable: np.ndarray | None = None
+    warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    tonemap: str = "gamma"
+    views: Sequence[View] = ()
+    ramps: tuple[dict[str, tuple[float, float]], int] = ({}, 1)
+
+    @classmethod
+    def of(cls, result: Result, settings: config.Config, manifest: dict) -> Report:
+        """Make the report of a run from what it found, what was carried out, and its manifest."""
+        weights = {key: value for key, value in asdict(settings.loss).items() if value}
+        ends = {key: value if isinstance(value, tuple) else (value, value) for key, value in weights.items()}
+        return cls(
+            title=f"{Path(result.given.source).stem}, {Path(settings.scene.file).stem}",
+            config_toml=config.to_toml(settings),
+            manifest=manifest,
+            identified=None if result.posterior is None else result.posterior.identified,
+            unreachable=None if result.reach is None else feasibility.unreachable(result.reach),
+            tonemap=settings.output.tonemap,
+            ramps=(ends, max(settings.optimizer.iterations, 1)),
+            **{name: getattr(result, name) for name in _OF_RESULT},
+        )
+
+
+_OF_RESULT = (
+    "metrics", "history", "renders", "maps", "views", "influence", "frozen", "separation",
+    "warnings", "notes",
+)  # fmt: skip
+"""What a report shows as the result has it."""
+
+
+def write_report(path: FilePath, report: Report) -> None:
+    """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
 
     Raises
     ------
@@ -102,54 +133,31 @@ def write_report(
     ConfigError
         If there is no such tonemap.
     """
-    # Input: pictures as arrays, and what is wrong with them or with the numbers
-    names = list(dict.fromkeys([*renders, *maps]))
-    shown = _Pictures(
-        names,
-        {name: checked(image, name) for name, image in renders.items() if image is not None},
-        {name: checked(image, name) for name, image in maps.items() if image is not None},
-        _parts(views),
-        tonemap,
-    )
     lost: list[str] = []
-    metrics = plain(metrics, "metrics: ", lost)
-    plain(history, "history", lost)
-    said = [*map(str, warnings), *_not_finite(lost, shown)]
-    # Pictures
+    metrics = plain(report.metrics, "metrics: ", lost)
+    plain(report.history, "history", lost)
+    shown = _Pictures.of(report)
     differences, unlike = shown.differences()
-    said += unlike
-    painted = (metrics.get("painted") or {}).get("reachable")
-    asked = [] if unreachable is None else [
-        unreachable_figure(unreachable[part.rows], painted) for part in shown.parts
-    ]  # fmt: skip
-    seen = []
-    if influence is not None:
-        seen = [influence_figure(influence, frozen), *identified_figure(identified)]
-    parts = separation_figures(separation, tonemap)
-    # Curves
-    drawn, about = normalised(history, *(ramps or ({}, 1)))
-    curves = curves_svg(drawn) or f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
-    curves += f'<p class="soft">{escape(about)}</p>' if "<svg" in curves and about else ""
-    # The page
-    manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
+    said = [*map(str, report.warnings), *_not_finite(lost, shown), *unlike]
+    manifest_text = json.dumps(plain(report.manifest, "", []), indent=1, ensure_ascii=False)
     page = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
-        f"<h1>{escape(title)}</h1>{_verdict(metrics)}",
+        f"<title>{escape(report.title)}</title><style>{STYLE}</style></head><body>",
+        f"<h1>{escape(report.title)}</h1>{_verdict(metrics)}",
         f'<div class="warnings"><strong>Warnings</strong>{listing(said)}</div>' if said else "",
         shown.html(),
-        f"<h2>Differences</h2>{grid(differences, 2)}" if differences else "",
-        f"<h2>Lights and background</h2>{grid(parts)}" if parts else "",
-        f"<h2>What this view determines</h2>{grid(seen)}" if seen else "",
-        f"<h2>What was painted</h2>{grid(asked)}" if asked else "",
-        f"<h2>Losses</h2>{curves}",
-        _quality(metrics, tonemap),
+        _section("Differences", differences, 2),
+        _section("Lights and background", separation_figures(report.separation, report.tonemap)),
+        _section("What this view determines", _determined(report)),
+        _section("What was painted", _painted(report, metrics, shown.parts)),
+        f"<h2>Losses</h2>{_curves(report)}",
+        _quality(metrics, report.tonemap),
         _numbers(metrics),
         _map_table(shown),
         _timing(metrics),
-        f"<h2>Choices made</h2>{listing(notes)}" if notes else "",
-        f"<h2>Configuration</h2><pre>{escape(config_toml)}</pre>",
+        f"<h2>Choices made</h2>{listing(report.notes)}" if report.notes else "",
+        f"<h2>Configuration</h2><pre>{escape(report.config_toml)}</pre>",
         f"<h2>Manifest</h2><details><summary>Versions, machine, seeds, inputs</summary>"
         f"<pre>{escape(manifest_text)}</pre></details>",
         "</body></html>\n",
@@ -157,8 +165,36 @@ def write_report(
     write_atomically(path, "\n".join(part for part in page if part).encode("utf-8", "backslashreplace"))
 
 
+def _section(heading: str, figures: list[str], *columns: int) -> str:
+    return f"<h2>{heading}</h2>{grid(figures, *columns)}" if figures else ""
+
+
 # ----------------------------------------------------------------------------------------------------------
 # Pictures
+
+
+def _determined(report: Report) -> list[str]:
+    """Draw what the picture says of the sky."""
+    if report.influence is None:
+        return []
+    return [influence_figure(report.influence, report.frozen), *identified_figure(report.identified)]
+
+
+def _painted(report: Report, metrics: dict, parts: list[_Part]) -> list[str]:
+    """Draw what of the paint no light can do."""
+    if report.unreachable is None:
+        return []
+    reachable = (metrics.get("painted") or {}).get("reachable")
+    return [unreachable_figure(report.unreachable[part.rows], reachable) for part in parts]
+
+
+def _curves(report: Report) -> str:
+    """Draw the losses."""
+    drawn, about = normalised(report.history, *report.ramps)
+    curves = curves_svg(drawn)
+    if not curves:
+        curves = f'<p class="soft">No loss to draw in {len(report.history)} rows of history.</p>'
+    return curves + (f'<p class="soft">{escape(about)}</p>' if "<svg" in curves and about else "")
 
 
 class _Part(NamedTuple):
@@ -185,7 +221,17 @@ class _Pictures:
     parts: list[_Part]
     tonemap: str
 
-    def of(self, part: _Part) -> dict[str, np.ndarray]:
+    @classmethod
+    def of(cls, report: Report) -> _Pictures:
+        """Take the pictures of a report, checked."""
+        renders, maps = (
+            {name: checked(image, name) for name, image in pictures.items() if image is not None}
+            for pictures in (report.renders, report.maps)
+        )
+        names = list(dict.fromkeys([*report.renders, *report.maps]))
+        return cls(names, renders, maps, _parts(report.views), report.tonemap)
+
+    def shown_in(self, part: _Part) -> dict[str, np.ndarray]:
         """Return the renderings of a view."""
         return {name: image[part.rows] for name, image in self.renders.items()}
 
@@ -194,7 +240,7 @@ class _Pictures:
         if not self.names:
             return ""
         rows = [
-            grid([figure_of(self.of(part), name, part.what, self.tonemap) for name in self.names])
+            grid([figure_of(self.shown_in(part), name, part.what, self.tonemap) for name in self.names])
             for part in self.parts
         ]
         maps = [figure_of(self.maps, name, "environment map", self.tonemap) for name in self.names]
@@ -206,7 +252,7 @@ class _Pictures:
     def differences(self) -> tuple[list[str], list[str]]:
         """Draw the edited pictures less others; also return what to warn of."""
         figures, warnings = [], []
-        pairs = [(self.of(part), "target", part.prefix) for part in self.parts]
+        pairs = [(self.shown_in(part), "target", part.prefix) for part in self.parts]
         for pictures, other, prefix in (*pairs, (self.maps, "initial", ""), (self.maps, "target", "")):
             if "edited" not in pictures or other not in pictures:
                 continue

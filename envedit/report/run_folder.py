@@ -54,8 +54,7 @@ def write(
         result.warnings += map_files.write_scene(settings, folder, base)
     timing["full_s"] = round(time.perf_counter() - start, 3)
     start = time.perf_counter()
-    text = config.to_toml(settings)
-    atomic_files.write_atomically(folder / "config.toml", text.encode())
+    atomic_files.write_atomically(folder / "config.toml", config.to_toml(settings).encode())
     manifest.write_history(folder / "history.csv", result.history)
     weights = dataclasses.asdict(settings.perceptual)
     del weights["network"]  # the only one that is no file
@@ -74,26 +73,8 @@ def write(
         views = [view.rows for view in result.views]
         drawn = result.renders, result.maps, settings.output.tonemap
         preview.preview(folder / "preview.png", *drawn, views=views)
-        html_report.write_report(
-            folder / "report.html",
-            title=f"{Path(result.given.source).stem}, {Path(settings.scene.file).stem}",
-            config_toml=text,
-            metrics=result.metrics,
-            manifest=facts,
-            history=result.history,
-            renders=result.renders,
-            views=result.views,
-            maps=result.maps,
-            influence=result.influence,
-            frozen=result.frozen,
-            identified=None if result.posterior is None else result.posterior.identified,
-            separation=result.separation,
-            unreachable=None if result.reach is None else feasibility.unreachable(result.reach),
-            warnings=result.warnings,
-            notes=result.notes,
-            tonemap=settings.output.tonemap,
-            ramps=_ramps(settings),
-        )
+        report = html_report.Report.of(result, settings, facts)
+        html_report.write_report(folder / "report.html", report)
     timing["report_s"] = round(time.perf_counter() - start, 3)
     timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full", "report")), 3)
     lost = manifest.write_metrics(folder / "metrics.json", result.metrics)
@@ -130,13 +111,6 @@ def write_given(
         target = replace(settings.target, file=str(file), mask=str(mask) if mask else "")
         settings = replace(settings, target=target)
     return settings
-
-
-def _ramps(settings):
-    """Return first and last weight of each loss, and the iterations between them."""
-    weights = {key: value for key, value in dataclasses.asdict(settings.loss).items() if value}
-    ends = {key: value if isinstance(value, tuple) else (value, value) for key, value in weights.items()}
-    return ends, max(settings.optimizer.iterations, 1)
 
 
 def _roles(name, files):

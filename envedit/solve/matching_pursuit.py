@@ -42,6 +42,8 @@ UNEXPLAINED = 0.003
 """Share of the squared picture that must be left unexplained before a light is added."""
 FAINT = 0.2
 """Pixels count by 1 / (brightness + this share of the mean brightness)."""
+ROUNDING = 1e-12
+"""Cosine between a column and what is left unexplained below which the column does not explain it."""
 NEAR, NEARLY = 1.6, 0.8
 """A light lies between cells at most so many cells from the best one, diagonal neighbours among them, that
 explain more than this share of what it does."""
@@ -326,14 +328,34 @@ def products(d: np.ndarray, order: int) -> np.ndarray:
 
 
 def not_negative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve min |a x - b| with x >= 0 (Lawson and Hanson 1974, by leaving out what turns negative)."""
+    """Solve min |a x - b| with x >= 0: the active-set method of Lawson and Hanson (1974), chapter 23.
+
+    A column that was taken out comes in again where its gradient asks for it, so that the result is optimal.
+    """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    keep = np.ones(a.shape[1], bool)
-    for _ in range(a.shape[1]):
-        x = np.zeros(a.shape[1])
-        if keep.any():
-            x[keep] = np.linalg.lstsq(a[:, keep], b, rcond=None)[0]
-        if (x >= 0).all():
-            return x
-        keep &= x > 0
-    return np.maximum(x, 0)
+    x, used = np.zeros(a.shape[1]), np.zeros(a.shape[1], bool)
+    least = ROUNDING * np.linalg.norm(a, axis=0) * np.linalg.norm(b)
+    barred = np.zeros_like(used)  # columns that would come in with a negative value, by rounding
+    for _ in range(3 * len(x)):
+        descent = a.T @ (b - a @ x)
+        usable = ~used & ~barred & (descent > least)
+        if not usable.any():
+            break
+        new = int(np.argmax(np.where(usable, descent, -np.inf)))
+        used[new] = True
+        while used.any():
+            best = np.zeros_like(x)
+            best[used] = np.linalg.lstsq(a[:, used], b, rcond=None)[0]
+            if best[new] <= 0 and x[new] == 0:
+                used[new], barred[new] = False, True
+                break
+            if (best[used] > 0).all():
+                x, barred = best, np.zeros_like(used)
+                break
+            below = used & (best <= 0)
+            share = x[below] / (x[below] - best[below])
+            x[used] += share.min() * (best - x)[used]
+            used &= x > 0
+            used[np.flatnonzero(below)[np.argmin(share)]] = False
+            x[~used] = 0
+    return x

@@ -72,7 +72,7 @@ def write(path, **changes):
         "notes": ["renderer.spp = 64"],
     }
     assert not set(changes) - set(settings)
-    html_report.write_report(path, **{**settings, **changes})
+    html_report.write_report(path, html_report.Report(**{**settings, **changes}))
     return Page(path)
 
 

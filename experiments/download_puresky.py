@@ -93,7 +93,7 @@ class Connection:
         self._asked = True
         try:
             response = self._session.get(url, stream=True, timeout=self.timeout)
-        except (OSError, ValueError) as error:  # requests' own errors are OSErrors
+        except (OSError, ValueError, Refused) as error:  # requests' own errors are OSErrors
             raise Refused(f"{url}: {error}") from None
         with response:
             if response.status_code != 200:

@@ -185,7 +185,8 @@ def test_retry_after_is_honoured_in_seconds_and_as_a_date(there, waits, tmp_path
     waits.clear()
     (tmp_path / FILE).unlink()
     there.does[MAP] = [(429, {"Retry-After": "86400"})]
-    assert "Retry-After: 86400" in get(there, tmp_path)[2][0] and waits == []
+    failed = get(there, tmp_path)[2][0]
+    assert MAP in failed and "Retry-After: 86400" in failed and waits == []
 
 
 @pytest.mark.parametrize("status", [408, 425, 429, 502])

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.report import html_report
+from envedit.report import html_report, html_tables
 from envedit.report.curves import normalised
 from tests.oracles import ROOT
 from tests.oracles.builders import grey
@@ -203,7 +203,7 @@ def test_report_of_nothing(tmp_path):
 def test_map_statistics_weight_the_mean_by_solid_angle():
     image = grey(0.0, 33, 64)
     image[:8] = 2.0
-    cells = html_report._map_statistics(image)
+    cells = html_tables._map_statistics(image)
     # Eight of 33 rows aligned to the corners are a cap of angle pi * 7.5 / 32 around the pole.
     mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
     assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"]
@@ -215,7 +215,7 @@ def test_map_statistics_of_a_real_map(data):
     image = np.array(mi.Bitmap(str(source)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
     light = image.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
     row, column = np.unravel_index(light.argmax(), light.shape)
-    cells = html_report._map_statistics(image)
+    cells = html_tables._map_statistics(image)
     assert float(cells[1]) == pytest.approx(light.max(), rel=1e-3) and cells[2] == f"{row}, {column}"
 
 

@@ -133,13 +133,13 @@ class Preparation:
             if noise > 0 and self._still(turn, wanted) <= TO_NOISE * noise:
                 said = "the target shows what is there already, to its noise: nothing is changed"
                 said += f" (T's own display residual {noise:.4f})"
-                return idle._prepared(wanted, 0.0, [said], search=False)
+                return idle._prepared(wanted, 0.0, [said], search=False, ask=False)
             return self._prepared(wanted, 0.0, [])
         said = f"the sky is turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
         if self._explained(turn, noise):
             said += ", which is its noise: nothing else is changed"
-            return idle._prepared(wanted, turn.degrees, [said], search=False)
+            return idle._prepared(wanted, turn.degrees, [said], search=False, ask=False)
         turned = self._prepared(wanted, turn.degrees, [said], search=False)
         if settings.representation.turn is True or not turned.job.newton:
             return turned
@@ -160,7 +160,8 @@ class Preparation:
             return None
         with self.clock("start_s"):
             self.watch.stage("turning the sky")
-            return turning.find(transport, self.original, wanted.picture, wanted.weight)
+            seen = self.original, wanted.picture, wanted.weight
+            return turning.find(transport, *seen, thorough=asked is True)
 
     def _noise(self, wanted, turn):
         """Return the residual of T against Mitsuba's rendering of the map; 0 where an edit is made anyway.
@@ -196,7 +197,8 @@ class Preparation:
             shown = self.lit.render(turned, CHECKED_SPP, Seeds.of(self.settings.seed).turn_check)
             return turn.error <= TO_NOISE * turning.residual(self.renderer.transport, turned, shown)
 
-    def _prepared(self, wanted, degrees, notes, search=True):
+    def _prepared(self, wanted, degrees, notes, search=True, ask=True):
+        """Prepare the edit of the turned map; ``ask``: how fine its gain may be."""
         settings = self.settings
         original = latlong.rotate(self.original, degrees)
         rows = self.rows.slice
@@ -215,7 +217,7 @@ class Preparation:
             )
             params = representation.encode(crop, settings.seed)
         with self.clock("transport_s"):
-            recordings = self._recorded(representation, wanted)
+            recordings = self._recorded(representation, wanted) if ask else None
         traced = self.renderer.transport
         job = Job(
             settings=settings,

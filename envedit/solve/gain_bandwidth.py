@@ -24,8 +24,9 @@ from envedit.losses import display_curve
 from envedit.representations.layers.gain import Octave, grid_size, splines
 from envedit.transport.light_transport import LightTransport
 
-PROBES = 12
-"""Random z; what is averaged over them, three patterns and the nodes of a patch is within a third."""
+PROBES, FEW_PROBES = 12, 4
+"""Random z; what is averaged over them, three patterns and the nodes of a patch is within a third. After the
+second number no more are drawn where the share is below half of what is asked for."""
 NOISE = 0.01
 """What a picture's display values are known to: its own noise and that of T together."""
 CONTRAST = 0.3
@@ -79,16 +80,20 @@ def octaves(
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
         down, across = splines(size, (height, width))
+        least = LEAST_SHARE if found else FIRST_SHARE
+        around = down.T @ omega
         told = np.zeros(size)
         # Drawn anew for each octave: of a large map all of them together would take gigabytes.
-        for pair in _pulled_back(transport, second, slope, background, rows[0]):
+        for drawn, pair in enumerate(_pulled_back(transport, second, slope, background, rows[0]), 1):
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
             told += _alternating(*on_nodes)
-        # Where nothing is identifiable, a product of two estimates may well be negative.
-        told = np.maximum(_smooth(told / PROBES), 0) * CONTRAST**2
-        known = told**2 / (told**2 + ENOUGH**2)
-        share = float((known.mean(axis=1) * (around := down.T @ omega)).sum() / around.sum())
-        if share < (LEAST_SHARE if found else FIRST_SHARE):
+            # Where nothing is identifiable, a product of two estimates may well be negative.
+            mean = np.maximum(_smooth(told / drawn), 0) * CONTRAST**2
+            known = mean**2 / (mean**2 + ENOUGH**2)
+            share = float((known.mean(axis=1) * around).sum() / around.sum())
+            if drawn >= FEW_PROBES and share < least / 2:
+                break
+        if share < least:
             break
         found.append(Octave(size, known, share))
         cycles *= 2

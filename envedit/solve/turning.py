@@ -16,8 +16,12 @@ from envedit.core.arrays import tensor
 from envedit.losses import display_curve
 from envedit.transport.light_transport import LightTransport
 
-CANDIDATES, APART = 3, 4
-"""Turns that are refined, and by how many texels they differ at least."""
+CANDIDATES, APART, SURE = 3, 4, 0.5
+"""Turns that are tried through T, by how many texels they differ at least, and the share of the residual
+below which the first leaves no doubt."""
+LITTLE, BEYOND = 0.8, 2.0
+"""A turn explains nothing where the best one leaves more than the first share of the block residual, and
+more than so many times the block transport's own error."""
 COLUMNS = 64
 """Exact columns that are traced for one map, at most."""
 TENTH = 0.1
@@ -42,7 +46,11 @@ class Turn:
 
 
 def find(
-    transport: LightTransport, envmap: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None
+    transport: LightTransport,
+    envmap: np.ndarray,
+    picture: np.ndarray,
+    weight: np.ndarray | None = None,
+    thorough: bool = True,
 ) -> Turn:
     """Find the turn of a map that explains a picture best.
 
@@ -56,10 +64,17 @@ def find(
         What is wanted, linear radiance.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts.
+    thorough : bool
+        Refine through T in any case; otherwise only where the block transport shows that a turn explains
+        something (:data:`LITTLE`, :data:`BEYOND`), and no turn is found elsewhere.
     """
     width = envmap.shape[1]
-    count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
-    known: dict[float, float] = {}
+    rendering = _rendered(transport, envmap)
+    known = {0.0: apart(rendering, picture, weight)}
+    misfit, least = _at_a_glance(transport, envmap, picture, weight, rendering)
+    explains = misfit.min() <= max(LITTLE**2 * misfit[0], BEYOND**2 * least)
+    if not (thorough or explains):
+        return Turn(0.0, known[0.0], known[0.0])
 
     def error(texels):
         texels = round(texels % width / TENTH) * TENTH % width
@@ -68,17 +83,26 @@ def find(
             known[texels] = residual(transport, turned, picture, weight)
         return known[texels]
 
-    misfit = _at_a_glance(transport, envmap, picture, count)
     best: list[int] = []
     for shift in np.argsort(misfit, kind="stable"):
-        apart = [min(abs(shift - other), width - abs(shift - other)) for other in best]
-        if len(best) < CANDIDATES and (not apart or min(apart) >= APART):
+        apart_by = [min(abs(shift - other), width - abs(shift - other)) for other in best]
+        if len(best) < CANDIDATES and (not apart_by or min(apart_by) >= APART):
             best.append(int(shift))
-    texels: float = min(best, key=error)
-    for step in (4.0, 2.0, 1.0, 0.5, 0.3, TENTH):
+    sure = error(best[0]) < SURE * known[0.0]
+    texels: float = best[0] if sure else min(best, key=error)
+    for step in (2.0,) if sure else (4.0, 2.0):
+        texels = min((texels, texels - step, texels + step), key=error)
+    while (nearer := min((texels, texels - 1, texels + 1), key=error)) != texels:
+        texels = nearer
+    for step in (0.5, 0.3, TENTH):
         texels = min((texels, texels - step, texels + step), key=error)
     texels = round(texels / TENTH) * TENTH % width
     return Turn(360 * texels / width, error(texels), error(0.0))
+
+
+def _rendered(transport, envmap):
+    transport.resolve(envmap, limit=COLUMNS)
+    return transport.apply(tensor(envmap)).numpy()
 
 
 def residual(
@@ -88,8 +112,7 @@ def residual(
 
     Parameters are those of :func:`find`.
     """
-    transport.resolve(envmap, limit=COLUMNS)
-    return apart(transport.apply(tensor(envmap)).numpy(), picture, weight)
+    return apart(_rendered(transport, envmap), picture, weight)
 
 
 def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
@@ -101,12 +124,18 @@ def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None 
     return float(mean) if np.isfinite(mean) else np.inf
 
 
-def _at_a_glance(transport, envmap, picture, count):
-    """Return the squared display residual of blocks under each turn by whole texels, (W,)."""
+def _at_a_glance(transport, envmap, picture, weight, rendering):
+    """Return the squared display residual of blocks under each turn by whole texels, (W,).
+
+    And that of the map as it is from its own rendering: the error of the block transport.
+    """
+    count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
     overview = transport.overview()
     height, width, _ = envmap.shape
-    wanted = display_curve.to_display(tensor(picture)).numpy()
-    wanted, share = overview.to_blocks(wanted), overview.to_blocks(count)
+    wanted, own = (
+        overview.to_blocks(display_curve.to_display(tensor(one)).numpy()) for one in (picture, rendering)
+    )
+    share = overview.to_blocks(count)
     lamps = overview.to_blocks(transport.apply(tensor(np.zeros_like(envmap))).numpy())
     omega = np.repeat(latlong.lookup_solid_angles(height, width), width).reshape(height, width)
     total = np.bincount(overview.cell_of, omega.ravel())
@@ -118,7 +147,7 @@ def _at_a_glance(transport, envmap, picture, count):
     tile = -(-width // across)
     band = np.zeros((first.max() // across + 1, width, 3))
     np.add.at(band, first // across, envmap * omega[..., None])
-    result = np.zeros(width)
+    result, least = np.zeros(width), 0.0
     starts = np.arange(0, width, tile)
     for c in range(3):
         turned = np.stack([np.add.reduceat(np.roll(band[..., c], -k, 1), starts, 1) for k in range(width)], 2)
@@ -126,4 +155,5 @@ def _at_a_glance(transport, envmap, picture, count):
         blocks = overview.matrix[c] @ means.astype(np.float32) + lamps[:, c : c + 1]
         shown = display_curve.to_display(tensor(blocks)).numpy()
         result += (share * np.square(shown - wanted[:, c : c + 1])).sum(axis=0)
-    return np.where(np.isfinite(result), result, np.inf)
+        least += float((share[:, 0] * np.square(shown[:, 0] - own[:, c])).sum())
+    return np.where(np.isfinite(result), result, np.inf), least

@@ -46,7 +46,8 @@ def test_a_glance_shows_what_t_does_where_blocks_are_pixels_and_cells_texels(tra
     """Against every turn rendered through T itself."""
     image, picture = sky(rng), rendered(traced, sky(np.random.default_rng(5)))
     count = 0.5 + rng.random((*FILM, 1))
-    glance = turning._at_a_glance(traced, image, picture, count)
+    own = rendered(traced, image)
+    glance, least = turning._at_a_glance(traced, image, picture, count, own)
     shown = np.float64(turning.display_curve.to_display(tensor(picture)).numpy())
     plain = []
     for k in range(GRID[1]):
@@ -54,12 +55,22 @@ def test_a_glance_shows_what_t_does_where_blocks_are_pixels_and_cells_texels(tra
         made = np.float64(turning.display_curve.to_display(tensor(made)).numpy())
         plain.append((count * (made - shown) ** 2).sum())
     np.testing.assert_allclose(glance, plain, rtol=1e-3)
+    assert least < 1e-6 * min(plain)
 
 
 def test_a_sky_that_is_not_there_under_any_turn(traced, rng):
     image = sky(rng)
     found = turning.find(traced, image, rendered(traced, 4 * sky(np.random.default_rng(7))))
     assert found.error > 0.5 * found.still
+
+
+def test_a_turn_that_explains_nothing_is_not_looked_for(traced, rng):
+    """What the block transport shows decides; a turn that is there is found all the same."""
+    image = sky(rng)
+    found = turning.find(traced, image, rendered(traced, 4 * image), thorough=False)
+    assert found.degrees == 0 and found.error == found.still
+    picture = rendered(traced, np.roll(image, -9, axis=1))
+    assert turning.find(traced, image, picture, thorough=False) == turning.find(traced, image, picture)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e30])

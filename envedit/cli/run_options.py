@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
         "--out",
         metavar="DIR",
         help="folder for the results (default: CONFIG_out beside the configuration; "
-        "for a shipped one runs/NAME in the working folder)",
+        "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out)",
     )
     made.add_argument(
         "--preset",

@@ -4,7 +4,9 @@ Unknowns x: the log gain g of every node, and of every light that is lit its log
 direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and
 E(x) the map that the layers compose, minimised is
 
-    F(x) = 1/A sum_p w_p rho_s(|d((T E(x))_p) - d(t_p)|) / sigma^2  +  x' K x
+    F(x) = 3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  x' K x
+
+r_p is the root mean square over the channels of d(T E(x))_p - d(t)_p.
 
 * rho_s is Huber's loss: quadratic up to s, linear beyond. Pixels that no light can explain (caustics, shadow
   edges, paint) then do not outvote the others.

@@ -44,7 +44,7 @@ result = envedit.edit(settings, target=picture)
 asked = result.metrics["painted"]
 print("\n".join(result.notes))
 reached, within = 100 * asked["towards"], 100 * asked["reachable"]
-print(f"{reached:.0f} % of the way to the paint; {within:.0f} % is feasible under any light")
+print(f"{reached:.0f} % of the painted change reached; {within:.0f} % is feasible under any map")
 print(f"the rest changed by {asked['elsewhere']:.4f} on average (display values)")
 
 # %% The edited map, linear radiance, and the rendering that Mitsuba makes of it with fresh samples.

@@ -2,8 +2,8 @@
 
 ``envedit.edit(config)`` carries out an edit, ``envedit.fit(image, ...)`` fits a SIREN,
 ``envedit.LightTransport.build(scene)`` traces a light transport; ``load_scene``, ``load_map`` and ``sunsky``
-make what they take. Errors that a user can mend are ``EnveditError``s. All are imported on first use, so that
-``import envedit`` is quick and works without LLVM.
+make what they take. Errors that a user can fix are subclasses of ``EnveditError``. All are imported on first
+use, so that ``import envedit`` is quick and works without LLVM.
 """
 
 from __future__ import annotations

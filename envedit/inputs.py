@@ -142,7 +142,10 @@ class InputMap:
             back = np.linalg.inv(primaries.to_rec709(self.chromaticities))
             found = np.maximum(primaries.converted(found, back), 0)
         if not np.isfinite(found).all():
-            raise NumericalError(f"the edited map over the scene's scale, {self.scale:g}, leaves float32")
+            raise NumericalError(
+                f"the edited map divided by the scene's scale {self.scale:g} overflows float32: "
+                "raise the emitter's scale"
+            )
         same = (edited == latlong.rotate(self.radiance, degrees)).all(axis=2, keepdims=True)
         return np.where(same, latlong.rotate(self.stored, degrees), found)
 
@@ -223,8 +226,9 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
     if settings.lights:
         placed = PlacedLights(given.radiance, settings.horizon)
         if lacking := missing(settings.lights, len(placed.lights)):
-            had = f"the map has {len(placed.lights)} lights"
-            warnings.append(f"input.lights: {had}, none with number {lacking[0]}: nothing is done to it")
+            count = len(placed.lights)
+            had = f"the map has {count} light{'s' if count != 1 else ''}"
+            warnings.append(f"input.lights: got light = {lacking[0]}, but {had}; the entry is ignored")
         found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
     turned = latlong.rotate(found.stored, settings.rotate_degrees)
     return replace(given, stored=turned, warnings=warnings, placed=placed)
@@ -238,7 +242,8 @@ def _read(source, width, repair, scale):
     if found.outside > 0:
         space = primaries.name_of(found.chromaticities)
         share = f"{100 * found.outside:.2g} % of its texels have colours of {space} outside Rec. 709"
-        found.warnings.append(f"{share}: a channel of theirs counts as 0; those not edited keep their colour")
+        kept = "their negative channels are set to 0 while editing; unedited texels keep their colour"
+        found.warnings.append(f"{share}: {kept}")
     return found
 
 

@@ -106,7 +106,8 @@ def run(
     dists, lpips = _perceptual(settings)
     if settings.loss.dists and dists is None:
         warnings.append(
-            "loss.dists is off: it needs weights, [perceptual] vgg and dists; docs/architecture.md says whose"
+            "DISTS is off: set [perceptual] vgg and dists to weight files (sources: docs/architecture.md), "
+            "or loss.dists to 0"
         )
 
     # ---- Scene, map and target
@@ -191,12 +192,13 @@ def run(
     if measured["worse"]:
         after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
-            f"the result is farther from the target than the input: {after}, {before} before{rate}"
+            f"the result is farther from the target than the input: {after} now, {before} before; "
+            f"the edited map is kept anyway{rate}"
         )
     if state.bad_steps:
         warnings.append(
-            f"{state.bad_steps} of {state.step} iterations were not finite: they were taken back, and the "
-            f"learning rate was lowered for a while{rate}"
+            f"{state.bad_steps} of {state.step} iterations had a non-finite loss or gradient and were "
+            f"undone, and the learning rate was lowered for a while{rate}"
         )
     measured |= {
         "fit": _of_fit(representation.fitted),

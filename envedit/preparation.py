@@ -29,19 +29,19 @@ from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
 TURNED, CLOSER = 0.5, 0.8
-"""A turn is thought of where it leaves at most this share of the residual without; the second share is where
-the turn alone explains the target to its noise."""
+"""A turn is considered if it leaves at most the first share of the residual, or if it leaves at most the
+second share and only noise."""
 TO_NOISE, DOUBTFUL = 1.25, 4.0
 """Residual of a map over that of T against Mitsuba's rendering of the same map up to which nothing is left to
 explain (renderings of one map differ by 0.5 to 1.1 of it on four scenes, under a light 5 % brighter by 1.7
 and more); and up to which the turned map is rendered to ask, as T's errors depend on where the sun stands."""
 NOISIEST, QUIET = 0.03, 0.008
-"""Display residual of T beyond which noise would hide what is asked for (four scenes have at most 0.016), and
-what is taken for T's error then."""
+"""Display residual of T above which it is not used as the noise level (four scenes: at most 0.016), and the
+level used instead."""
 CHECKED_SPP = 256
 """Samples a pixel of these renderings."""
 PREFERRED = 0.05
-"""By this share the residual of the sky as it is must be smaller: where it turns, nothing is made up."""
+"""The unturned sky is chosen only if its residual is smaller by this share: a turn adds no content."""
 
 
 @dataclass(frozen=True)
@@ -131,14 +131,14 @@ class Preparation:
         )
         if not worth:
             if noise > 0 and self._still(turn, wanted) <= TO_NOISE * noise:
-                said = "the target shows what is there already, to its noise: nothing is changed"
-                said += f" (T's own display residual {noise:.4f})"
+                said = "nothing changed: the map already renders to the target within noise"
+                said += f" (display residual of the stored transport {noise:.4f})"
                 return idle._prepared(wanted, 0.0, [said], search=False, ask=False)
             return self._prepared(wanted, 0.0, [])
-        said = f"the sky is turned by {turn.degrees:.2f} degrees"
+        said = f"sky turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
         if self._explained(turn, noise):
-            said += ", which is its noise: nothing else is changed"
+            said += "; the rest is noise, nothing else changed"
             return idle._prepared(wanted, turn.degrees, [said], search=False, ask=False)
         turned = self._prepared(wanted, turn.degrees, [said], search=False)
         if settings.representation.turn is True or not turned.job.newton:
@@ -148,7 +148,7 @@ class Preparation:
             loss, other = _loss(turned), _loss(still)
             still.job.begun = None  # lights are added before the first step too
         chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
-        chosen.notes.append(f"likelihood (AIC) with the sky turned {loss:.5g}, as it is {other:.5g}")
+        chosen.notes.append(f"AIC (lower is better): {loss:.5g} with the sky turned, {other:.5g} without")
         return chosen
 
     def _turn(self, wanted):
@@ -159,7 +159,7 @@ class Preparation:
         if asked == "auto" and wanted.coverage is not None:  # most of a painted picture is to stay
             return None
         with self.clock("start_s"):
-            self.watch.stage("turning the sky")
+            self.watch.stage("testing turns of the sky")
             seen = self.original, wanted.picture, wanted.weight
             return turning.find(transport, *seen, thorough=asked is True)
 

@@ -133,7 +133,8 @@ class Result:
     def plot(self) -> Figure:
         """Draw renderings and maps: initial, target and edited; maps over azimuth and elevation, degrees.
 
-        Display values under ``[output] tonemap``. Needs matplotlib: ``pip install 'envedit[report]'``.
+        Display values under ``[output] tonemap``. Needs matplotlib (in a checkout:
+        ``pip install '.[report]'``).
 
         Returns
         -------
@@ -148,7 +149,7 @@ class Result:
         try:
             from matplotlib.figure import Figure
         except ImportError:
-            how = "pip install 'envedit[report]'"
+            how = "run pip install '.[report]' in the checkout"
             raise MachineError(f"Result.plot: needs matplotlib, which is not installed: {how}") from None
         figure, curve = Figure(figsize=(12, 6.5), layout="constrained"), self._settings.output.tonemap
         axes = figure.subplots(2, 3, squeeze=False)

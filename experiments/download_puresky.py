@@ -63,7 +63,8 @@ class Connection:
             import requests
             from urllib3.util import Retry
         except ImportError as error:
-            raise MachineError(f"needs {error.name}: pip install 'envedit[dev]', or pooch alone") from None
+            how = "run pip install '.[dev]', or pip install pooch"
+            raise MachineError(f"needs {error.name}: {how}") from None
 
         class BoundedRetry(Retry):
             def get_retry_after(self, response):

@@ -43,8 +43,9 @@ def main(argv: list[str] | None = None) -> int:
         _tell(arguments, "error", str(error))
         code = error.exit_code
     except KeyboardInterrupt:
-        goes_on = "a fit under way goes on where it was last kept"
-        _tell(arguments, "error", f"interrupted; there is no checkpoint to resume from ({goes_on})")
+        fit = "an unfinished SIREN fit continues from its last saved state"
+        before = f"interrupted before the first checkpoint; --resume would start anew ({fit})"
+        _tell(arguments, "error", before)
         code = 130
     if arguments.json:
         print(json.dumps({"ok": code == 0, "exit_code": code, **arguments.facts}))
@@ -247,7 +248,8 @@ def _export_initial(settings, arguments):
     if under not in ("linear", declared):
         _say(
             arguments,
-            f"{file}: '{declared}' would clip highlights, so it is under '{under}'; the file says so",
+            f"{file}: tonemap '{under}' is used, because '{declared}' would clip highlights; "
+            "the file's metadata names it",
         )
     under = "linear" if under == "linear" else f"under the '{under}' tonemap"
     for k, (one, rows) in enumerate(files):
@@ -345,19 +347,21 @@ def _verdict(measured):
     def change(before, after):
         pair = measured[before], measured[after]
         first, last = (metrics.score(one, pair) for one in pair)
-        what = ", of which a display shows little" if metrics.saturated(pair) else ""
+        beyond = " (most of the difference is outside the display's range)"
+        what = beyond if metrics.saturated(pair) else ""
         return f"{first.rpartition(' ')[0]} -> {last}{what}"
 
     painted = measured["painted"]
     if painted and painted["towards"] is not None:
-        line = f"{100 * painted['towards']:.0f} % of the way to the paint"
+        line = f"{100 * painted['towards']:.0f} % of the painted change reached"
         if painted["reachable"] is not None:
-            line += f" ({100 * painted['reachable']:.0f} % are feasible)"
-        line += (
-            f", changed elsewhere by {painted['elsewhere']:.3f}" if painted["elsewhere"] is not None else ""
-        )
+            line += f" ({100 * painted['reachable']:.0f} % feasible)"
+        if painted["elsewhere"] is not None:
+            line += f", mean change elsewhere {painted['elsewhere']:.3f}"
     elif not measured["iterations"] and measured["initial"]["log_rmse"] == 0:
-        line = f"no target, rendering changed: {metrics.score(measured['render'], [])} from the initial one"
+        measure = "log RMSE" if metrics.saturated([measured["render"]]) else "PSNR"
+        line = f"no target; {measure} of the rendering against the initial one "
+        line += metrics.score(measured["render"], [])
     else:
         line = f"rendering {change('initial', 'render')}"
         if measured["envmap"]:

@@ -34,20 +34,26 @@ def parser() -> argparse.ArgumentParser:
     )
     quick = made.add_argument_group(
         "edits of a scene without a configuration",
-        "config.toml among the results says what was run; without a target the map is turned by 60 degrees",
+        "config.toml among the results records the run; without a target option the target is the map "
+        "turned by 60 degrees",
     )
     quick.add_argument(
         "--envmap", metavar="MAP", help="map to edit: a file, scene or sunsky (default: the scene's own)"
     )
     target = quick.add_mutually_exclusive_group()
-    target.add_argument("--paint", metavar="PICTURE", help="the rendering, painted over")
-    target.add_argument("--target", metavar="MAP", help="the rendering shall be as under this map")
-    target.add_argument("--rotate", metavar="DEGREES", type=float, help="... as under the map, turned")
+    target.add_argument("--paint", metavar="PICTURE", help="target: the rendering, painted over")
+    target.add_argument("--target", metavar="MAP", help="target: the rendering under this map")
+    target.add_argument(
+        "--rotate",
+        metavar="DEGREES",
+        type=float,
+        help="target: the rendering under the map turned by DEGREES about the vertical",
+    )
     made.add_argument(
         "--out",
         metavar="DIR",
         help="folder for the results (default: CONFIG_out beside the configuration; "
-        "for a shipped one runs/NAME in the working folder)",
+        "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out)",
     )
     made.add_argument(
         "--preset",

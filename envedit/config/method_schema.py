@@ -132,9 +132,15 @@ class Optimizer(Table):
     kind: str = key(
         "auto",
         Choice("auto", "gauss-newton", "adam"),
-        "gauss-newton (layers through a stored transport) or adam; auto: the first where it can be had",
+        "gauss-newton (layers through a stored transport) or adam; "
+        "auto: gauss-newton where it is possible, otherwise adam",
     )
-    iterations: int = key(100, Integer(0, 10**7), "most steps of the edit", "steps")
+    iterations: int = key(
+        100,
+        Integer(0, 10**7),
+        "most steps; Gauss-Newton ends after 16, or later where a light was added or moved",
+        "steps",
+    )
     lr: float | str = key(
         "auto",
         OrAuto(Number(0, positive=True)),

@@ -52,13 +52,15 @@ def _reason(config: Config, when: When, solver: str | None) -> str:
     for other, values in when.items():
         if other == "solver":
             if solver is not None and solver not in values:
-                return 'not used by Gauss-Newton steps; [optimizer] kind = "adam" uses them'
+                return 'no effect with Gauss-Newton; needs [optimizer] kind = "adam"'
             continue
         table, _, key = other.partition(".")
         value = getattr(getattr(config, table), key)
         if value in values if values else value:
             continue
-        return f"not used, as {other} is {quote(value)}; it is where that is {_values(other, values)}"
+        expected = _values(other, values)
+        sign = "" if not values or expected.startswith("other than ") else "= "
+        return f"no effect: needs {other} {sign}{expected}, got {quote(value)}"
     return ""
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class EnveditError(ValueError):
-    """Base of every error whose cause a user can mend."""
+    """Base of every error whose cause a user can fix."""
 
     exit_code = 5
 

@@ -71,9 +71,9 @@ NUMBERS = {
     "natural colours_outside": "share of the sky in colours that neither map has",
     "natural seam": "step at the horizon over the original's",
     "natural high_frequency": "detail of the sky over the original's",
-    "painted towards": "share of the way to the paint",
+    "painted towards": "share of the painted change that is reached",
     "painted elsewhere": "change of what was not painted (display values)",
-    "painted reachable": "feasible share of the way to the paint",
+    "painted reachable": "share of the painted change that is feasible",
     "fit log_psnr": "fit of the network, log-PSNR (dB)",
     "fit peak_ratio": "fit, peak over the map's",
     "fit epochs": "fit, epochs",
@@ -214,8 +214,8 @@ def separation_figures(separation: Separation | None, tonemap: str) -> list[str]
 
 
 def unreachable_figure(pixels: np.ndarray, share: float | None) -> str:
-    """Show what no light can do, display values (h, w, 3); ``share`` of the request is feasible."""
-    within = "" if share is None else f"; {100 * share:.0f} % of the request is feasible"
+    """Show what no light can do, display values (h, w, 3); ``share`` of the painted change is feasible."""
+    within = "" if share is None else f"; {100 * share:.0f} % of the painted change is feasible"
     ends = '<div class="ends"><span>red: stays darker than asked</span><span>blue: brighter</span></div>'
     return figure(
         np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), f"what no light can do{within}", ends

@@ -298,8 +298,8 @@ def _verdict(metrics):
     painted = metrics.get("painted") or {}
     towards, elsewhere = number(painted.get("towards")), number(painted.get("elsewhere"))
     if towards is not None:
-        parts[0] = f"<strong>{100 * towards:.0f} %</strong> of the way to the paint"
-        parts += [f"the rest changed by {elsewhere:.3f} of white"] if elsewhere is not None else []
+        parts[0] = f"<strong>{100 * towards:.0f} %</strong> of the painted change reached"
+        parts += [f"mean change elsewhere {elsewhere:.3f}"] if elsewhere is not None else []
     parts += [f"{total:.1f} s in total"] if total is not None else []
     line = f'<p class="verdict">{" · ".join(parts)}</p>'
     if towards is not None and towards < 0:

@@ -3,7 +3,7 @@
 The loop knows neither what the parameters mean nor how the picture is made: it decodes, renders, compares,
 pulls the gradient back, and lets Adam step. Where loss or gradient is not finite no step is taken: the
 parameters go back to the last ones that had both, as the step from there may have been too long, the
-learning rate is halved, and the bad step is counted. Good steps win the learning rate back.
+learning rate is halved, and the bad step is counted. The learning rate recovers after good steps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from envedit.representations.base import Representation
 MOST_BAD_STEPS = 20
 """Non-finite steps in a row after which the loop gives up."""
 RECOVERY = 10
-"""Good steps that win back one halving of the learning rate: a rare bad sample must not end all progress."""
+"""Good steps after which one halving of the learning rate is undone, as bad samples may be rare."""
 READ_EVERY, READ_SECONDS = 10, 1.0
 """Losses are read back after so many steps or seconds: every read-back waits for the device."""
 

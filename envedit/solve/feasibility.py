@@ -45,9 +45,9 @@ SHARP = 4.0
 PROBES = 8
 """Random pictures by which these samples are counted."""
 STEPS, LOOK = 40, 10
-"""Most steps of each of the two solutions, and steps between looks at the progress."""
+"""Most steps of each of the two solutions, and steps between checks of the progress."""
 ENOUGH = 0.005
-"""A solution ends when its bound, or its progress between two looks, is below this share of the request."""
+"""A solution ends when its bound, or its progress between two checks, is below this share of the request."""
 FLOOR = 0.1
 """Share of the mean that the metric takes every cell to have at least: what is dark can grow."""
 LIGHT, SPAN = 0.02, 1
@@ -77,7 +77,7 @@ class Reach:
         Display values of the target less those of the closest picture: positive where no light is bright
         enough without brightening what must stay, negative where none is dark enough.
     envmap : ndarray (H, W, 3) float32
-        A map that makes the picture: an answer of this question only, and no sky.
+        A map that renders to the picture; it answers this question only and does not look like a sky.
     bound : float
         How much the weighted squared difference could still fall in the last solution, at most, as a share
         of the initial one. Loose where few texels see a pixel: up to 0.7 where 300 steps instead of 80 gain
@@ -99,20 +99,17 @@ class Reach:
     @property
     def note(self) -> str:
         """One sentence for the report."""
-        return f"{_percent(self.share)} % of the request is feasible: some map gives it"
+        return f"{_percent(self.share)} % of the painted change is feasible under some map"
 
     @property
     def warning(self) -> str | None:
         """One sentence if less than half is within reach, else None."""
         if self.share >= HALF:
             return None
-        if self.too_dark >= HALF:
-            left = "is asked to be brighter than any light makes it without brightening what is to stay"
-        else:
-            left = "is asked to be darker than any light leaves it without darkening what is to stay"
+        left = "brighter without brightening" if self.too_dark >= HALF else "darker without darkening"
         return (
-            f"only {_percent(self.share)} % of the request is feasible under any map: "
-            f"most of the rest {left}; see unreachable.png"
+            f"only {_percent(self.share)} % of the painted change is feasible under any map: "
+            f"most of the rest cannot become {left} pixels that are held; see unreachable.png"
         )
 
 
@@ -121,9 +118,9 @@ def _percent(share):
 
 
 def unreachable(reach: Reach) -> np.ndarray:
-    """Show what cannot be had, as display values (h, w, 3) in [0, 1].
+    """Show the infeasible rest as display values (h, w, 3) in [0, 1].
 
-    White: had. Red: must stay darker than asked. Blue: must stay brighter. Full colour is a difference of
+    White: feasible. Red: stays darker than painted. Blue: stays brighter. Full colour is a difference of
     :data:`FULL` in display values, whatever the request, so that pictures can be compared. Shown is the
     channel that differs most.
     """

@@ -34,8 +34,8 @@ CONTRAST = 0.3
 ENOUGH = 2.0
 """The F of detail of that contrast at which it counts as half known, F^2 / (F^2 + ENOUGH^2)."""
 FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
-"""Share of the sky's solid angle in which the first octave must be identifiable, for detail at all, and a
-further one: what a glossy object determines of half of the sky is not worth a third of a run's time."""
+"""Shares of the sky's solid angle: below the first, no octave is returned; below the second, no further one.
+Whether detail is used is decided by :data:`.initialization.MIRRORED` (0.8)."""
 
 
 def octaves(

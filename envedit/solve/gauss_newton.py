@@ -1,8 +1,7 @@
 """Gauss-Newton steps with Levenberg's and Marquardt's damping, for the problem of ``map_problem.py``.
 
 A step solves the normal equations, and is kept if it lowers F. Huber's threshold s and sigma are at first as
-large as the residual, and at most halved at every step: a start that is far away is not judged by its
-outliers.
+large as the residual, and at most halved at every step, so that a distant start is not dominated by outliers.
 
 Longer than 400 lines: the steps, their damping and the trials of added lights share the state of a run.
 """
@@ -30,8 +29,8 @@ NEAR, CLEARLY = 2.0, 0.95
 the start's squared error that the solution's must be below."""
 WORTH, ADDED_STEPS = 20.0, 6
 """By how much a further light must lower F to be tried and to be kept: twice the logarithm of the places that
-it could have had, some 20,000, of which the best has been chosen; and the steps after which that is asked, by
-which a solution with one more light may be longer."""
+it could have had, some 20,000, of which the best has been chosen; and the steps after which that is decided,
+by which a solution with one more light may be longer."""
 PLACINGS = 3
 """Most times that the map's light is placed, each time with the noise that the last has left."""
 SAME_PLACE = np.cos(np.radians(1.0))
@@ -40,13 +39,13 @@ SAME_PLACE = np.cos(np.radians(1.0))
 
 @dataclass
 class Run:
-    """Where a solution is between two steps; all that it goes on from.
+    """State of a solution between two steps: all that is needed to continue.
 
     Attributes
     ----------
     state, start : dict of str to ndarray
-        Unknowns now, and where lights are drawn to: ``gain`` (nodes, 3), ``turn``, ``flux`` (lights, 3) and
-        ``size`` (lights, 1), logarithms and radians.
+        Unknowns now, and the centre of the prior of lights: ``gain`` (nodes, 3), ``turn``, ``flux``
+        (lights, 3) and ``size`` (lights, 1), logarithms and radians.
     damping, scale : float
         Of the next step; the threshold s.
     finished : bool
@@ -55,7 +54,7 @@ class Run:
         A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
         taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
     asked : int
-        How often it has been asked, where steps had ended, whether lights are to be added or moved.
+        Rounds of adding and moving lights that were made after convergence.
     most : int
         Steps after which it ends; more once a light was added or moved.
     """
@@ -180,9 +179,10 @@ def solve(
         least = _unlikeliness(problem, before, first, sigma)
         near = problem.noise(first.residual, sigma) < NEAR * problem.noise(point.residual, sigma)
         if least <= loss:
-            note = f"kept the initialisation: {normal.determined:.0f} parameters would only fit noise"
+            note = "kept the initialisation: the lower residual does not justify "
+            note += f"{normal.determined:.0f} parameters (AIC)"
         elif judge is not None and near and CLEARLY * judge(first.edited) <= judge(point.edited):
-            note = "kept the initialisation: path traced, it is as close to the target"
+            note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
             run, point, loss = before, first, least
             normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
@@ -231,7 +231,7 @@ class _Search:
         run = Run(start, start)
         point = problem.evaluate(start)
         if point.residual is None:
-            raise NumericalError("the edit cannot begin: the map that the search found is not finite")
+            raise NumericalError("the initial map is not finite: check the input map for extreme values")
         if not self.iterations:
             return run, point
         if self.most_added:
@@ -270,9 +270,9 @@ class _Search:
                 return run, point
 
     def _placed_again(self, run, point):
-        """Ask of every added light where it would be added now: it goes there, or out, if F says so.
+        """Place every added light where it would be added now, or remove it, if that lowers F.
 
-        It was placed where the sky was still as it had been.
+        :meth:`_better` decides. The light was placed under the sky before these steps.
         """
         problem = self.problem
         for i in problem.added(run.state) if run.history and self.most_added else ():

@@ -127,11 +127,12 @@ def recordings(
     )
     asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
     told = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
-    shares = ", ".join(f"{100 * octave.share:.0f} % of {octave.cycles} cycles" for octave in told)
-    notes = [f"share of the sky whose detail beyond {CYCLES} cycles is identifiable: {shares or 'none'}"]
+    shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in told)
+    least = f"below {100 * gain_bandwidth.FIRST_SHARE:.0f} % at {2 * CYCLES} cycles"
+    notes = [f"sky area with identifiable detail: {shares or least}"]
     if told and told[0].share < MIRRORED:
         told = []
-        notes[0] += f"; gain limited to {CYCLES} cycles, as less than {100 * MIRRORED:.0f} % is"
+        notes[0] += f"; gain limited to {CYCLES} cycles ({100 * MIRRORED:.0f} % needed)"
     if told and traced and settings.renderer.spp == "auto":
         most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:

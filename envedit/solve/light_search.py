@@ -1,4 +1,4 @@
-"""Where lights must be, and how bright the sky, for a picture to look as wanted: the start of an edit.
+"""Initialise an edit: where lights are and how bright the sky is, estimated from the target.
 
 Three steps, from far to near, all through T and none from where a light was:
 
@@ -7,7 +7,7 @@ Three steps, from far to near, all through T and none from where a light was:
 3. multiplicative updates (Richardson 1972, Lucy 1974) of the lights' flux and of the gain of the sky, from a
    coarse grid to a fine one.
 
-What comes out is most of the way.
+The result is close to the solution. With Gauss-Newton steps only 1 and 2 run (``only_own``).
 
 Longer than 400 lines: the three steps share one :class:`Question`, and are read in their order.
 """

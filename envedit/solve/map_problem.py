@@ -4,10 +4,12 @@ Unknowns x: the log gain g of every node, and of every light that is lit its log
 direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and
 E(x) the map that the layers compose, minimised is
 
-    F(x) = 1/A sum_p w_p rho_s(|d((T E(x))_p) - d(t_p)|) / sigma^2  +  x' K x
+    F(x) = 3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  x' K x
+
+r_p is the root mean square over the channels of d(T E(x))_p - d(t)_p.
 
 * rho_s is Huber's loss: quadratic up to s, linear beyond. Pixels that no light can explain (caustics, shadow
-  edges, paint) then do not outvote the others.
+  edges, paint) therefore have limited weight.
 * A is the number of pixels whose errors go together, a share of the picture (:data:`INDEPENDENT`).
 * K is the inverse covariance of a sky's change (:class:`Prior`): luminance, blue-amber and green-magenta each
   with their standard deviation, smaller by half for every finer grid; of lights flux, size and direction.
@@ -64,8 +66,8 @@ class Prior:
     tint : float
         Of its green-magenta difference, which skies hardly have.
     flux : float
-        Of a light's mean log flux; that of the map's own is drawn to what it was. Its colour changes as the
-        sky's does.
+        Of a light's mean log flux; for the map's own lights around their original flux. Its colour changes as
+        the sky's does.
     turn : float
         Of a light's direction, radians from where the search has put it.
     size, added_size : float
@@ -257,9 +259,9 @@ class Problem:
         return found
 
     def clear(self, state: dict) -> None:
-        """Take back what a search found by explaining the picture alone, far from any sky.
+        """Reset what the search found without a prior.
 
-        That is the gain, the colour of the map's own lights, and their flux beyond a factor of e.
+        The gain becomes zero, own lights get their colour back and at most a factor of e of their flux.
         """
         state["gain"][:] = 0
         own = [i for i in self.lit(state) if i < self.layers.lights.count - SPARE]

@@ -2,8 +2,8 @@
 
 The atoms are pictures of a light in each cell of the sphere, its glow taken along; the background may
 meanwhile take on any gain of low order. The strongest light is placed first, each where it explains most of
-what is left (orthogonal matching pursuit: Mallat and Zhang 1993, Pati et al. 1993). Nothing depends on where
-a light was, but that it stays where that explains as much.
+what is left (orthogonal matching pursuit: Mallat and Zhang 1993, Pati et al. 1993). The result does not
+depend on where a light was, with one exception: a light stays where it is if that explains 98 % as much.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ square anywhere, stays as it is."""
 UNEXPLAINED = 0.003
 """Share of the squared picture that must be left unexplained before a light is added."""
 FAINT = 0.2
-"""Pixels count by 1 / (brightness + this share of the mean brightness)."""
+"""Pixels are weighted by 1 / (brightness + this share of the mean brightness)."""
 ROUNDING = 1e-12
 """Cosine between a column and what is left unexplained below which the column does not explain it."""
 NEAR, NEARLY = 1.6, 0.8

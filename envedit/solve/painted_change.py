@@ -1,7 +1,7 @@
-"""Where the edit of a painted picture starts: which lights explain the change that was painted.
+"""Initialise the edit of a painted picture: find the lights that explain the painted change.
 
-Nothing has to be explained that is there already, and errors of the overview of T, a fifth of a block's
-light, are errors of the change alone. Otherwise as :mod:`.matching_pursuit` and :mod:`.light_search`.
+Only the change is explained, so that errors of the overview (a fifth of a block's light) are errors of the
+change. Otherwise as :mod:`.matching_pursuit` and :mod:`.light_search`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ ADDED_BESIDE, ADDED_ASKED = 0.3, 0.1
 """For a painted change a light is added where it explains the first share of what is left unexplained, and
 the second of the squared change."""
 BOLD = 0.01
-"""The first of these shares where it will be tried out which start is better."""
+"""Used in place of the first of these shares for a second start, which is compared with the first."""
 TAKEN = 0.3
-"""A light that loses this share of its strength where another is added has moved there."""
+"""Where another light is added, a light that loses more than this share of its strength is taken to have
+moved there."""
 CHANGE_ORDER = 0
 """Order of the background's gains for a painted change: an extreme gain explains any small stroke."""
 BESIDE = 8.0
@@ -108,12 +109,12 @@ def place(
     spare_flux: np.ndarray,
     bold: bool = False,
 ) -> list[Place]:
-    """Find which lights a painted change asks for; parameters as for :func:`.matching_pursuit.place`.
+    """Find which lights a painted change requires; parameters as for :func:`.matching_pursuit.place`.
 
     ``difference`` (h, w, 3) is what was painted less what was there, 0 beside the paint. Beside a gain of the
     background, lights that are there may become stronger or weaker, and lights are added. If one is added
-    while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``: be
-    content with :data:`BOLD` of what is left unexplained.
+    while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``:
+    :data:`BOLD` of what is left unexplained is enough.
     """
     overview, search = given.overview, Pursuit(given, difference, CHANGE_ORDER)
     stays = []

@@ -11,7 +11,7 @@ killed at any time: only the jobs in flight are lost. Two calls may work on one 
 each other's jobs.
 
 Every job is a process. One at a time needs nothing but envedit; several are tasks of Dask
-(``pip install 'envedit[cluster]'``), of a cluster inside this process or of a scheduler's. On Linux a job
+(``pip install '.[cluster]'``), of a cluster inside this process or of a scheduler's. On Linux a job
 dies with whoever started it; on macOS an orphan runs on, under its lock.
 """
 

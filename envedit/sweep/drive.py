@@ -60,7 +60,7 @@ class _Dask:
         try:
             from distributed import Client, LocalCluster
         except ImportError:
-            missing = "dask.distributed is missing: pip install 'envedit[cluster]'"
+            missing = "dask.distributed is missing: run pip install '.[cluster]' in the checkout"
             raise ConfigError(f"{asked}: {missing}") from None
         # Its tracebacks when a scheduler is gone.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)

@@ -1,4 +1,6 @@
-"""The light transport at a glance: blocks of pixels against cells of texels, few enough to look at them all.
+"""The light transport between blocks of pixels and cells of texels.
+
+It is small enough to evaluate every place of a light.
 
 Samples that are too few for a texel are many for a cell of some degrees: the overview shows, for a light
 anywhere on the sphere, roughly what it does to the picture.

@@ -1,8 +1,8 @@
 """Light transport T: a rendering is linear in the environment map, I = T E + I_0.
 
 T is traced once for a scene, its camera and a texel grid, without looking at any map; then rendering is a
-matrix product and its adjoint is exact. Nothing changes from step to step, so no Monte Carlo noise bends the
-objective (see docs/light_transport.md).
+matrix product and its adjoint is exact. Nothing changes from step to step, so that the objective has no Monte
+Carlo noise (see docs/light_transport.md).
 
 Two tiers, both unbiased:
 
@@ -65,7 +65,7 @@ _RECORDING = 1  # raise when the same scene, grid and seed give another recordin
 class LightTransport:
     """T for one scene, camera and texel grid, I = T E + I_0; built by :meth:`build`.
 
-    What it is and how it is measured is said in docs/light_transport.md.
+    See docs/light_transport.md.
 
     Attributes
     ----------
@@ -399,7 +399,7 @@ class LightTransport:
         return self.apply(envmap)
 
     def _look(self, envmap):
-        """Resolve a map that will change: a light on its way is not worth the paths of one that stays."""
+        """Trace columns for a map that will still change: moving lights get fewer paths than lasting ones."""
         is_main = self._shares(envmap) > COLUMN_SHARES[-1]
         self._looks = np.where(is_main, np.minimum(self._looks, LASTING_LOOKS) + 1, 0).astype(np.uint8)
         self.resolve(envmap, limit=COLUMNS_A_LOOK, lasting=self._looks >= LASTING_LOOKS)

@@ -153,8 +153,8 @@ def main(arguments, folder):
     mi.set_variant("llvm_ad_rgb")
     if (file := file_of(arguments.map)) is None:
         raise SystemExit(f"{arguments.map}: ENVEDIT_DATA has no puresky/{arguments.map}_puresky_1k.hdr")
-    lines = ["| edit | strokes | in the page, s | saving, s | of the paint | reachable | change elsewhere |",
-             "|---" * 7 + "|"]  # fmt: skip
+    lines = ["| edit | strokes | painting + solving, s | saving, s | painted change reached | feasible "
+             "| mean change elsewhere |", "|---" * 7 + "|"]  # fmt: skip
     listed, rows, folder = [], [], own_folder(folder, arguments.map)
     for edit in arguments.edits:
         done = folder / edit / "figure10.json"

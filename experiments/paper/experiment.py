@@ -35,7 +35,7 @@ def draw(made, out, to, given):
     try:
         from . import sheets
     except ImportError:
-        raise ConfigError("no sheets: matplotlib is missing: pip install 'envedit[report]'") from None
+        raise ConfigError("no sheets: matplotlib is missing: run pip install '.[report]'") from None
     return sheets.draw(given.name, out, [plan.cell(*one) for one in made], to)
 
 

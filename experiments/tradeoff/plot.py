@@ -155,7 +155,7 @@ def draw(results: dict, folder: Path) -> list[Path]:
     try:
         import matplotlib
     except ImportError:
-        raise ConfigError("no pictures: matplotlib is missing: pip install 'envedit[report]'") from None
+        raise ConfigError("no pictures: matplotlib is missing: run pip install '.[report]'") from None
     files = []
     matplotlib.use("agg")
     rows = means(compared)

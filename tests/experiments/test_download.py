@@ -319,5 +319,5 @@ def test_without_pooch_one_line_names_what_to_install(tmp_path, capsys, monkeypa
     assert fetch.main([str(tmp_path)]) == 4
     assert (
         capsys.readouterr().err
-        == "download_puresky: needs pooch: pip install 'envedit[dev]', or pooch alone\n"
+        == "download_puresky: needs pooch: run pip install '.[dev]', or pip install pooch\n"
     )

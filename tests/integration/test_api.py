@@ -87,7 +87,7 @@ def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path
 
 def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(envedit.MachineError, match=r"pip install 'envedit\[report\]'"):
+    with pytest.raises(envedit.MachineError, match=r"pip install '\.\[report\]'"):
         envedit.Result.plot(object())
 
 

@@ -172,7 +172,7 @@ def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
     images.write_png(tmp_path / "map.png", sky(rng) / 3)
     assert call(path, "--quiet", *changed(input__envmap="map.png")) == 0
     out, err = capsys.readouterr()
-    (said,) = [line for line in err.splitlines() if "not used, as" not in line]
+    (said,) = [line for line in err.splitlines() if "no effect: needs" not in line]
     assert out == "" and said.startswith("envedit: warning: ") and "not HDR" in said
     assert "not HDR" in (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
 

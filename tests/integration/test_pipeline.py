@@ -74,7 +74,7 @@ def test_a_run_without_a_folder_writes_nothing_and_returns_everything(tmp_path, 
     assert all(picture.shape == (18, 24, 3) for picture in found.renders.values())
     assert found.influence.shape == (HEIGHT, WIDTH) and found.influence.max() > 0
     assert len(found.history) == found.metrics["iterations"] == 3
-    assert all("not used, as" in line for line in found.warnings)
+    assert all("no effect: needs" in line for line in found.warnings)
     assert any("60 degrees" in note for note in found.notes)
     assert any("light transport" in note for note in found.notes)
 
@@ -738,7 +738,7 @@ def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng, monkeypatch
     again = pipeline.run(settings)
     assert again.envmap.tobytes() == drawn.tobytes()
     for one in (found, again):
-        assert any("what is there already, to its noise: nothing is changed" in line for line in one.notes)
+        assert any("nothing changed: the map already renders to the target" in line for line in one.notes)
         assert one.metrics["render"] == one.metrics["initial"] and one.metrics["worse"] is False
 
     images.write_exr(tmp_path / "brighter.exr", 1.2 * picture)
@@ -750,7 +750,7 @@ def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng, monkeypatch
 def test_keys_that_gauss_newton_does_not_use_are_named(tmp_path, rng):
     asked = {"optimizer": {"iterations": 1, "lr": 0.1}, "loss": {"ssim": 0.5}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **asked))
-    (said,) = [line for line in found.warnings if "not used by Gauss-Newton" in line]
+    (said,) = [line for line in found.warnings if "no effect with Gauss-Newton" in line]
     assert "loss.ssim, optimizer.lr" in said and "renderer" not in said
     asked["optimizer"]["kind"] = "adam"
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **asked))

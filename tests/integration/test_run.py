@@ -356,7 +356,7 @@ def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, 
 
     monkeypatch.setattr(pipeline.metrics, "compare", worse)
     assert call(path, "--quiet", "--out", tmp_path / "out") == 0
-    says = "warning: the result is farther from the target than the input: 20.00 dB, 21.50 dB before"
+    says = "warning: the result is farther from the target than the input: 20.00 dB now, 21.50 dB before"
     assert says in capsys.readouterr().err
     assert measured(tmp_path / "out")["worse"] is True
 
@@ -369,7 +369,7 @@ def test_what_a_display_does_not_show_is_judged_in_stops(tmp_path, rng, capsys):
     found, out = measured(tmp_path / "c_out"), capsys.readouterr().out
     first, last = (found[key]["log_rmse"] for key in ("initial", "render"))
     assert found["initial"]["psnr"] > 60 and found["initial"]["beyond_display"] > 0.9 and 0.1 < first == last
-    shown = f"{first:.2f} -> {last:.2f} stops, of which a display shows little"
+    shown = f"{first:.2f} -> {last:.2f} stops (most of the difference is outside the display's range)"
     assert f"rendering {shown}, map" in out
     page = (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
     assert f"{first:.2f} stops" in page and "log RMSE (stops)" in page

@@ -727,7 +727,7 @@ def test_a_real_run_is_made(tmp_path):
 @pytest.mark.parametrize("where", [["--scheduler", "tcp://127.0.0.1:1"], ["--workers", "2"]])
 def test_without_dask_the_option_says_what_to_install(where, stub, capsys):
     assert main([str(stub.written(2)), "--out", str(stub.out), *where], stub.command) == 2
-    assert "pip install 'envedit[cluster]'" in capsys.readouterr().err
+    assert "pip install '.[cluster]'" in capsys.readouterr().err
 
 
 @pytest.fixture

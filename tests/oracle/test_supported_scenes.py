@@ -156,7 +156,7 @@ def test_what_is_written_has_the_units_of_the_file_and_the_bits_of_what_stays(rn
     np.testing.assert_allclose(found[2, 3], 2 * stored[2, 3], rtol=1e-6)
     found[2, 3] = stored[2, 3]
     assert found.tobytes() == stored.tobytes()
-    with pytest.raises(NumericalError, match="over the scene's scale, 1e-30, leaves float32"):
+    with pytest.raises(NumericalError, match="divided by the scene's scale 1e-30 overflows float32"):
         inputs.InputMap("a.exr", stored, 1e-30, (16, 8), []).as_stored(stored * np.float32(1e12))
 
 

@@ -127,5 +127,5 @@ def test_a_run_without_a_target(tmp_path, isolated, capsys):
     ratio = pixels(out / "render_edited.exr").mean() / pixels(out / "render_initial.exr").mean()
     assert ratio == pytest.approx(2, rel=0.02) and found["transport"] is None and found["iterations"] == 0
     assert "exposure of the map changed by +1 stops" in found["choices"]
-    assert "no target, rendering changed" in capsys.readouterr().out
+    assert "no target; log RMSE of the rendering against the initial one 0." in capsys.readouterr().out
     assert (out / "report.html").exists() and (out / "edited.xml").exists()

@@ -61,7 +61,7 @@ def test_an_added_light_has_its_flux_at_any_size_resolution_and_place(size, elev
 def test_what_the_map_does_not_have_is_told(sky):
     settings = config.Input(envmap="sunsky", width=64, lights=[{"light": 5, "flux": [0, 0, 0]}])
     given = inputs.read_map(settings, None, 64)
-    assert missing(settings.lights, 1) == [5] and "none with number 5" in given.warnings[-1]
+    assert missing(settings.lights, 1) == [5] and "got light = 5, but the map has" in given.warnings[-1]
     assert np.array_equal(given.radiance, sky)
 
 

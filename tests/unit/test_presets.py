@@ -155,7 +155,7 @@ def test_a_target_file_changes_no_other_key():
     painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5")
     assert painted.target.file == "/b.exr" and painted.target.rotate_degrees == 5
     assert cfg.unused(painted) == [
-        'target.rotate_degrees: not used, as target.kind is "image"; it is where that is "envmap"'
+        'target.rotate_degrees: no effect: needs target.kind = "envmap", got "image"'
     ]
 
 

@@ -24,7 +24,8 @@ def main(argv: list[str] | None = None) -> int:
         import uvicorn
         import websockets  # noqa: F401
     except ImportError as error:
-        print(f"envedit: paint needs {error.name}: pip install 'envedit[paint]'", file=sys.stderr)
+        how = "run pip install '.[paint]' in the checkout"
+        print(f"envedit: paint needs the package {error.name}: {how}", file=sys.stderr)
         return 4
     from envedit.cli.paint import project
     from envedit.cli.paint.server import HOST, Server
@@ -90,7 +91,7 @@ def _parser():
         epilog="examples:\n  envedit paint\n  envedit paint sphere --envmap sky.hdr\n"
         "  envedit paint edit.toml\n  envedit paint edit_out/painted.toml\n\n"
         "Results and painted.toml, which `envedit run` carries out as well, go to the folder of the results\n"
-        "that `envedit run` would write to. Needs envedit[paint].",
+        "that `envedit run` would write to. Needs the extra paint: pip install '.[paint]' in a checkout.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(

@@ -32,7 +32,7 @@ from envedit.representations.layers.separation import Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
 UNSEEN = 1 / 512
-"""Relative change of radiance that nobody sees: a display with 256 steps has steps twice as large."""
+"""Relative change of radiance below a display's resolution: a step of 8 bits is twice as large."""
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
 

@@ -39,7 +39,7 @@ SOFT = 1 / 12
 FLAT = 1.05
 """A glow ends where its ring is at most this many times as bright as the darkest ring farther out."""
 LEAST_EXPLAINED = 0.2
-"""Share of the variance of log luminance that a glow must explain to be believed."""
+"""A glow is used only if it explains this share of the variance of log luminance."""
 GLOW_DEGREES = np.arange(0.0, 121.0)
 """Angles at which a glow is tabulated; 0 from the last on."""
 _RINGS = np.concatenate(

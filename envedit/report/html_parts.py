@@ -35,6 +35,8 @@ p { margin: .4rem 0; } .soft, figcaption { color: var(--soft); font-size: .87rem
 ul { margin: .4rem 0; padding-left: 1.2rem; }
 .grid { display: grid; gap: 1rem; align-items: end; }
 figure { margin: 0; } figcaption { margin: .3rem 0 0; }
+.over { position: relative; } .over svg { position: absolute; inset: 0; width: 100%; height: 100%; }
+svg.lights { stroke-width: .7; fill: none; font-size: 6px; paint-order: stroke; }
 figure img { display: block; width: 100%; border-radius: 3px; }
 img.small { image-rendering: pixelated; }
 .unknown { min-height: 4rem; background: #e9e9ee; border-radius: 3px; color: var(--soft);
@@ -62,6 +64,8 @@ summary { cursor: pointer; }
 @media (max-width: 640px) { .grid { grid-template-columns: 1fr !important; } }
 """.replace("RISING", ", ".join(f"rgb({r},{g},{b})" for r, g, b in RISING))
 
+MOST_DRAWN = 20
+"""Lights that :func:`lights_figure` draws."""
 NUMBERS = {
     "iterations": "iterations",
     "non_finite_steps": "steps that were not finite, and not taken",
@@ -138,13 +142,14 @@ def table(head: Iterable[object], body: Iterable[Sequence[str]]) -> str:
     return f'<div class="scroll"><table><thead><tr>{cells}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
-def figure(pixels: np.ndarray, caption: str, below: str = "") -> str:
-    """Show pixels (H, W, 3) uint8 over a caption, with HTML of its own between them."""
+def figure(pixels: np.ndarray, caption: str, below: str = "", over: str = "") -> str:
+    """Show pixels (H, W, 3) uint8 over a caption; ``below`` is HTML between them, ``over`` on the pixels."""
     picture = base64.b64encode(png(pixels)).decode("ascii")
     caption = escape(caption)
     small = ' class="small"' if pixels.shape[1] < 400 else ""  # texels with edges where they are enlarged
     return (
-        f'<figure><img{small} alt="{caption}" src="data:image/png;base64,{picture}">{below}'
+        f'<figure><div class="over"><img{small} alt="{caption}" src="data:image/png;base64,{picture}">{over}'
+        f"</div>{below}"
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
@@ -211,6 +216,52 @@ def separation_figures(separation: Separation | None, tonemap: str) -> list[str]
         "the light" if count == 1 else f"the {count} lights": separation.core,
     }
     return [figure(shrunk(image, tonemap), caption) for caption, image in pictures.items()]
+
+
+def lights_figure(envmap: np.ndarray, lights: Mapping[str, list[dict]], tonemap: str) -> list[str]:
+    """Draw on the edited map where its lights are and were; nothing without any.
+
+    ``lights`` are those of :func:`.light_list.matched`, of which the first :data:`MOST_DRAWN` are drawn.
+    """
+    before, after = ({one["id"]: one for one in lights.get(when, [])} for when in ("before", "after"))
+    drawn: list[str] = []
+    for which in list(before | after)[:MOST_DRAWN]:
+        start, end = before.get(which), after.get(which)
+        if start and end:
+            drawn += _way(_on_map(start), _on_map(end))
+        if start:
+            drawn.append(_circle(_on_map(start), 3, "#fff", dashed=end is None))
+        if end:
+            drawn.append(_circle(_on_map(end), 4.5, "#fff" if start else "#ffb000"))
+        x, y = _on_map(end or before[which])
+        at = f'x="{min(x + 5, 350):.1f}" y="{max(y - 4, 7):.1f}"'
+        drawn.append(f'<text {at} fill="#fff" stroke="#000">{which}</text>')
+    if not drawn:
+        return []
+    over = f'<svg class="lights" viewBox="0 0 360 180" preserveAspectRatio="none">{"".join(drawn)}</svg>'
+    caption = (
+        "lights of the edited map, numbered as in lights.json; a small circle is where a light was "
+        "(dashed: it is gone), a large one where it is (orange: it is new)"
+    )
+    return [figure(shrunk(envmap, tonemap), caption, over=over)]
+
+
+def _on_map(light):
+    """Return where a light is on a map of 360 by 180 units."""
+    return light["azimuth"], 90 - light["elevation"]
+
+
+def _way(start, end):
+    """Draw the line from one place to another, the shorter way, over the edge of the map if need be."""
+    near = start[0] + (end[0] - start[0] + 180) % 360 - 180
+    ends = [(start[0] + shift, near + shift) for shift in (0, end[0] - near)]
+    heights = f'y1="{start[1]:.1f}" y2="{end[1]:.1f}" stroke="#fff"'
+    return [f'<line x1="{a:.1f}" x2="{b:.1f}" {heights}/>' for a, b in ends]
+
+
+def _circle(centre, radius, colour, dashed=False):
+    dash = ' stroke-dasharray="1.2"' if dashed else ""
+    return f'<circle cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" r="{radius}" stroke="{colour}"{dash}/>'
 
 
 def unreachable_figure(pixels: np.ndarray, share: float | None) -> str:

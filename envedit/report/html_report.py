@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,6 +27,7 @@ from envedit.report.html_parts import (
     grid,
     identified_figure,
     influence_figure,
+    lights_figure,
     listing,
     separation_figures,
     unreachable_figure,
@@ -61,6 +62,8 @@ class Report:
         As for `envedit.report.preview.influence_image`.
     identified : array (H, W), optional
         Share of the prior's variance of the sky's gain that the target removes.
+    lights : dict
+        Of :func:`.light_list.matched`.
     separation : separation.Separation, optional
         Lights and background of the rows that were edited.
     unreachable : array (h, w, 3), optional
@@ -85,6 +88,7 @@ class Report:
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
     identified: np.ndarray | None = None
+    lights: Mapping[str, list[dict]] = field(default_factory=dict)
     separation: Separation | None = None
     unreachable: np.ndarray | None = None
     warnings: Sequence[str] = ()
@@ -112,7 +116,7 @@ class Report:
 
 
 _OF_RESULT = (
-    "metrics", "history", "renders", "maps", "views", "influence", "frozen", "separation",
+    "metrics", "history", "renders", "maps", "views", "influence", "frozen", "lights", "separation",
     "warnings", "notes",
 )  # fmt: skip
 """What a report shows as the result has it."""
@@ -143,7 +147,8 @@ def write_report(path: FilePath, report: Report) -> None:
         f'<div class="warnings"><strong>Warnings</strong>{listing(said)}</div>' if said else "",
         shown.html(),
         _section("Differences", differences, 2),
-        _section("Lights and background", separation_figures(report.separation, report.tonemap)),
+        _section("Lights and background", _lights(report, shown.maps), 1),
+        _section("", separation_figures(report.separation, report.tonemap)),
         _section("What this view determines", _determined(report)),
         _section("What was painted", _painted(report, metrics, shown.parts)),
         f"<h2>Losses</h2>{_curves(report)}",
@@ -161,7 +166,13 @@ def write_report(path: FilePath, report: Report) -> None:
 
 
 def _section(heading: str, figures: list[str], *columns: int) -> str:
-    return f"<h2>{heading}</h2>{grid(figures, *columns)}" if figures else ""
+    title = f"<h2>{heading}</h2>" if heading else "<p></p>"
+    return title + grid(figures, *columns) if figures else ""
+
+
+def _lights(report: Report, maps: Mapping[str, np.ndarray]) -> list[str]:
+    """Draw where lights were and are."""
+    return lights_figure(maps["edited"], report.lights, report.tonemap) if "edited" in maps else []
 
 
 # ----------------------------------------------------------------------------------------------------------

@@ -244,7 +244,7 @@ def entry(text, arrays, description=None):
     head = array_cache._header(text, arrays)
     if description is not None:
         told = json.dumps(description(json.loads(head[array_cache._START :].rstrip(b"\0")))).encode()
-        head = b"envedit2" + len(told).to_bytes(8, "little") + hashlib.sha256(told).digest() + told
+        head = array_cache._MAGIC + len(told).to_bytes(8, "little") + hashlib.sha256(told).digest() + told
         head = head.ljust(-(-len(head) // 64) * 64, b"\0")
     return head + b"".join(a.tobytes().ljust(-(-a.nbytes // 64) * 64, b"\0") for a in arrays.values())
 
@@ -263,6 +263,20 @@ def test_exchanged_words_pages_and_bits_are_seen(tmp_path, rng):
         assert cache.load(KEY) is None
     path.write_bytes(good)
     assert same(cache.load(KEY), arrays)
+
+
+def test_exchanged_parts_of_a_large_array_are_seen(tmp_path, rng, monkeypatch):
+    """Arrays of several parts, whose digests all cores work out."""
+    monkeypatch.setattr(array_cache, "_PART", 4096)
+    cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(40_000), "b": np.zeros((0, 3))}
+    cache.store(KEY, arrays)
+    path = only_file(tmp_path)
+    assert same(cache.load(KEY), arrays)
+    data = bytearray(path.read_bytes())
+    one, other = slice(-8192, -4096), slice(-16384, -12288)
+    data[one], data[other] = data[other], data[one]
+    path.write_bytes(data)
+    assert cache.load(KEY) is None
 
 
 def test_a_header_is_not_believed(tmp_path, rng):

@@ -68,6 +68,7 @@ def write(path, **changes):
         "influence": None,
         "frozen": None,
         "unreachable": None,
+        "lights": {},
         "warnings": [],
         "notes": ["renderer.spp = 64"],
     }
@@ -88,6 +89,25 @@ def test_report_is_one_file_that_says_the_verdict(tmp_path, monkeypatch):
     assert "further from the target" not in page.text and "Warnings" not in page.text
     assert "−0.1 0 +0.1" in page.text, "0.66 - 0.73, rounded up"
     assert "+1 stops" in page.text
+
+
+def light(which, azimuth, elevation, **more):
+    return {"id": which, "azimuth": azimuth, "elevation": elevation, **more}
+
+
+def test_report_draws_which_lights_moved_stayed_came_and_went(tmp_path):
+    assert "numbered as in lights.json" not in write(tmp_path / "a.html").text
+    before = [light(1, 350, 40, removed=False), light(2, 90, 10, removed=True)]
+    after = [light(1, 20, 30, added=False), light(3, 180, 60, added=True)]
+    page = write(tmp_path / "b.html", lights={"before": before, "after": after})
+    source = (tmp_path / "b.html").read_text()
+    assert "numbered as in lights.json" in page.text
+    assert page.tags.count("circle") == 4
+    # Over the edge of the map, from both sides of it.
+    assert 'x1="350.0" x2="380.0" y1="50.0" y2="60.0"' in source
+    assert 'x1="-10.0" x2="20.0" y1="50.0" y2="60.0"' in source
+    assert source.count("stroke-dasharray") == 1 and 'cx="90.0" cy="80.0" r="3"' in source
+    assert 'cx="180.0" cy="30.0" r="4.5" stroke="#ffb000"' in source
 
 
 def test_report_shows_what_the_view_determines(tmp_path):

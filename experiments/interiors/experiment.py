@@ -1,0 +1,154 @@
+"""Edit maps with several lights, rooms, a studio, a street at night: which of them moved, and which stayed.
+
+The maps of ENVEDIT_DATA/hdri and a room whose lamps are known: turned; painted on; of the room one lamp
+somewhere else, off, and one more, without a turn.
+"""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.color import tonemap
+from envedit.images import images
+from experiments.harness import Case, Done, Experiment, edit_panels, make, number
+
+WIDTH = 256
+LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
+"""Azimuth and elevation of the room's lamps, degrees."""
+ROOMS = {
+    "as it is": LAMPS,
+    "desk lamp moved": LAMPS | {"desk": (240, 8)},
+    "corner lamp off": {name: place for name, place in LAMPS.items() if name != "corner"},
+    "one lamp more": LAMPS | {"new": (20, 40)},
+}
+EXPECTED = {
+    "60": (0, 0, 0, 60),
+    "desk lamp moved": (1, 0, 0, 0),
+    "corner lamp off": (0, 1, 0, 0),
+    "one lamp more": (0, 0, 1, 0),
+}
+"""Lamps that moved by themselves, are gone, are new, and the turn of the whole room in degrees."""
+LAMP_DEGREES, LAMP_RADIANCE = 3.0, 300.0
+STAYED = 3.0
+"""Degrees up to which a lamp counts as one that stayed."""
+PAINT = [
+    {
+        "type": "light",
+        "ellipse": [0.38, 0.32, 0.1, 0.08],
+        "amount": 0.3,
+        "color": "#ffd9a6",
+        "softness": 0.05,
+    },
+    {"type": "shadow", "ellipse": [0.68, 0.82, 0.15, 0.06], "amount": 0.4, "softness": 0.05},
+]
+"""A warm light on the sphere, and a shadow on the ground."""
+
+
+def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
+    """Return a room of matte walls, with a window and lamps: linear radiance (WIDTH / 2, WIDTH, 3)."""
+    d = latlong.directions(WIDTH // 2, WIDTH)
+    box = np.array([2.0, 1.2, 3.0])
+    hit = d * (box / np.maximum(np.abs(d), 1e-9)).min(axis=-1, keepdims=True)
+    wall = np.abs(hit / box).argmax(axis=-1)
+    paint = np.array([[0.5, 0.4, 0.3], [0.6, 0.6, 0.55], [0.35, 0.4, 0.5]])
+    tiles = np.floor(2 * hit).sum(axis=-1, keepdims=True) % 2
+    envmap = 0.3 * paint[wall] * np.where((wall == 1)[..., None], 0.5 + 0.3 * tiles, 1)
+    window = (wall == 0) & (hit[..., 0] > 0) & (np.abs(hit[..., 2]) < 0.8) & (np.abs(hit[..., 1] - 0.2) < 0.5)
+    envmap[window] = [6.0, 7.0, 9.0]
+    for azimuth, elevation in lamps.values():
+        a, e = math.radians(azimuth), math.radians(elevation)
+        towards = [math.cos(e) * math.sin(a), math.sin(e), -math.cos(e) * math.cos(a)]
+        lamp = d @ np.array(towards) > math.cos(math.radians(LAMP_DEGREES))
+        envmap[lamp] = LAMP_RADIANCE * np.array([1.0, 0.8, 0.55])
+    return envmap.astype(np.float32)
+
+
+def cases(given):
+    folder, data = make(given.out / "maps").absolute(), Path(os.environ["ENVEDIT_DATA"])
+    rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
+    for name, file in rooms.items():
+        if not file.exists():
+            images.write_exr(file, room(ROOMS[name]))
+    maps = {file.stem.removesuffix("_1k"): file for file in sorted((data / "hdri").glob("*_1k.hdr"))}
+    found = []
+    for name, file in (maps | {"room": rooms["as it is"]}).items():
+        targets = {"60": {"rotate_degrees": 60}, "painted": {"kind": "strokes", "strokes": PAINT}}
+        if name == "room":
+            targets |= {other: {"file": str(rooms[other])} for other in list(ROOMS)[1:]}
+        for label, target in targets.items():
+            tables = {
+                "input": {"envmap": str(file), "width": WIDTH},
+                "scene": {"file": "sphere", "width": 128, "parameters": {"roughness": 0.3}},
+                "target": target,
+            }
+            if "file" in target:
+                tables["representation"] = {"turn": False}
+            found.append(Case(f"{name}-{label}".replace(" ", "_"), tables, {"map": name, "label": label}))
+    return [case for case in found if not given.only or any(text in case.name for text in given.only)]
+
+
+def measure(done: Done) -> dict:
+    lights = json.loads((done.folder / "lights.json").read_bytes())
+    found, painted = done.metrics, done.metrics["painted"]
+    turn = found["turn_degrees"]
+    gone = sum(one["removed"] for one in lights["before"])
+    new = sum(one["added"] for one in lights["after"])
+    both = [one for one in lights["after"] if not one["added"]]
+    moved = 0 if turn else sum(one["moved_degrees"] > STAYED for one in both)
+    # The lights of the photographs are not known one by one: only what a whole turn does to them is.
+    expected = EXPECTED.get(done.case.about["label"]) if done.case.about["map"] == "room" else None
+    right = expected is None or (moved, gone, new) == expected[:3] and abs(turn - expected[3]) < 1
+    return {
+        "render": found["render"]["psnr"],
+        "initial": found["initial"]["psnr"],
+        "psnr": found["envmap"]["psnr"] if found["envmap"] else None,
+        "unedited": found["initial_envmap"]["psnr"] if found["envmap"] else None,
+        "towards": painted["towards"] if painted else None,
+        "reachable": painted["reachable"] if painted else None,
+        "turn": turn,
+        "lights": len(lights["before"]),
+        "moved": moved,
+        "gone": gone,
+        "new": new,
+        "right": "-" if expected is None else "yes" if right else "no",
+        "outside": found["natural"]["colours_outside"],
+        "seam": found["natural"]["seam"],
+    }
+
+
+def panels(done: Done):
+    """Return original, true and edited map; what was asked for, and the edited rendering."""
+    shown = edit_panels(done)
+    if done.maps[2] is None:  # painted: what it was painted on
+        shown[1] = tonemap(done.picture("render_initial"), "gamma")
+    return shown
+
+
+def share(value):
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+EXPERIMENT = Experiment(
+    "interiors",
+    "Edit maps with several lights: which of them moved, and which stayed.",
+    cases,
+    measure,
+    {
+        "map": "{map}",
+        "target": "{label}",
+        "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
+        "map (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['unedited'])})",
+        "of the paint (feasible)": lambda m: f"{share(m['towards'])} ({share(m['reachable'])})",
+        "turn, degrees": lambda m: number(m["turn"]),
+        "lights": "{lights}",
+        "moved, gone, new": "{moved}, {gone}, {new}",
+        "as it was made": "{right}",
+        "colours outside": lambda m: share(m["outside"]),
+        "seam": lambda m: number(m["seam"]),
+    },
+    panels=panels,
+)

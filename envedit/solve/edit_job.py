@@ -162,7 +162,8 @@ class Job:
         for params, _ in starts:
             self.begun = None
             try:
-                loss = self.tried(params, crop)
+                loss = self.tried(params, crop, SPARE if self.newton and self._rendered else 0)
+                loss += LIKELIER * self._moved(params)
             except NumericalError:  # a start that goes nowhere is no reason to stop
                 loss = np.inf
             reached.append(loss if np.isfinite(loss) else np.inf)
@@ -185,11 +186,21 @@ class Job:
         """Say whether one start is so much better than the usual one that it is to be taken."""
         return loss < usual - LIKELIER if self.newton else loss < (1 - TRIAL_GAIN) * usual
 
-    def tried(self, params: Params, crop: np.ndarray) -> float:
-        """Return the loss after a few steps from a start."""
+    def _moved(self, params):
+        """Count the lights that a start has moved, of a rendered target: each could have had many places."""
+        return np.any(params["turn"].numpy(), axis=1).sum() if self.newton and self._rendered else 0
+
+    @property
+    def _rendered(self):
+        """Whether the target is a rendering, and not painted."""
+        return self.wanted.coverage is None
+
+    def tried(self, params: Params, crop: np.ndarray, most_added: int = 0) -> float:
+        """Return the loss after a few steps from a start, beside which so many lights may be added."""
         steps = self.trials
         if self.newton:
-            found = gauss_newton.solve(self._problem(), params, self._sigma, steps, trial=True)
+            asked = self._problem(), params, self._sigma, steps
+            found = gauss_newton.solve(*asked, trial=True, most_added=most_added)
             self.begun = found.run
             return found.loss
         few = replace(self.settings.optimizer, iterations=steps)
@@ -284,8 +295,10 @@ class Job:
                 if interrupt.is_set():
                     raise Interrupted(point.edited, done)
 
-            rendered = self.wanted.coverage is None  # paint is no noisy picture, and asks for what it shows
-            more = {"most_added": SPARE, "judge": self._display_error} if rendered else {"sparing": False}
+            # Paint is no noisy picture, and asks for what it shows.
+            more: dict[str, Any] = {"sparing": False}
+            if self._rendered:
+                more = {"most_added": SPARE, "judge": self._display_error}
             asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
             made = gauss_newton.solve(*asked, **more)
         self.posterior, self.note = made.posterior, made.note

@@ -146,7 +146,8 @@ def solve(
     run : Run, optional
         To continue an earlier solution, in place of ``params``.
     trial : bool
-        Only :attr:`Solution.loss` is asked for: no posterior is computed.
+        Only :attr:`Solution.loss` is asked for: no posterior is computed, and no lights are added where steps
+        end.
     most_added : int
         Most lights that may be added.
     sparing : bool
@@ -167,7 +168,10 @@ def solve(
         point = problem.evaluate(run.state, resolve=False)
         if after_step:
             after_step(run, point)
-    run, point = search.solved(run, point)
+    if trial:
+        point = search._descended(run, point, min(iterations, run.most), after_step)
+    else:
+        run, point = search.solved(run, point)
     normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     loss, note = _unlikeliness(problem, run, point, sigma), ""
     loss += 2 * normal.determined if run.history else 0
@@ -207,6 +211,13 @@ def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, st
 
 def _copy(state):
     return {name: value.copy() for name, value in state.items()}
+
+
+def _without(state, k):
+    """Return a state in which a light is out."""
+    state = _copy(state)
+    state["flux"][k] = DARK
+    return state
 
 
 def _unlikeliness(problem, run, point, sigma):
@@ -278,8 +289,7 @@ class _Search:
         for i in problem.added(run.state) if run.history and self.most_added else ():
             if i not in problem.added(run.state):  # it went out for another's sake
                 continue
-            without = _copy(run.state)
-            without["flux"][i] = DARK
+            without = _without(run.state, i)
             dark = problem.evaluate(without, resolve=False)
             noise = problem.noise(point.residual, self.sigma)
             found = added_light.best(problem, dark, problem.normal(dark, run.start, noise), i)
@@ -307,26 +317,38 @@ class _Search:
         return max(own, key=lambda k: flux[k].sum(), default=None)
 
     def _placed(self, run, point):
-        """Put the map's strongest light where it would be added were it not there, if noise is halved by it.
+        """Place the map's lights anew, that first without which there is least noise.
 
-        The search has placed it for the picture alone, without a prior on the sky.
+        The search has placed them for the picture alone, without a prior on the sky, and of several one may
+        have made up for another. Only the strongest is placed where there is more noise without it.
         """
-        problem, k = self.problem, self._strongest(run)
-        least = problem.noise(point.residual, self.sigma) / 2
-        if k is None or least < self.sigma:  # no noise is below sigma
+        problem, strongest, dark = self.problem, self._strongest(run), {}
+        own = [k for k in problem.lit(run.state) if k not in problem.added(run.state)]
+        if self._noise_of(point) / 2 < self.sigma:  # no noise is below sigma
             return run, point
-        dark, last, began = _copy(run.state), problem.direction(run.state, k), run
-        dark["flux"][k] = DARK
-        without = problem.evaluate(dark, resolve=False)
-        noise = problem.noise(without.residual, self.sigma)
+        for k in own if len(own) > 1 else ():
+            dark[k] = self._noise_of(problem.evaluate(_without(run.state, k), resolve=False))
+        for k in sorted(own, key=lambda k: dark.get(k, 0.0)):
+            if k == strongest or dark[k] < self._noise_of(point):
+                run, point = self._placed_one(run, point, k)
+        return run, point
+
+    def _placed_one(self, run, point, k):
+        """Put a light out, or where it would be added were it not there, if noise is halved by it."""
+        problem, least = self.problem, self._noise_of(point) / 2
+        last, began = problem.direction(run.state, k), run
+        without = problem.evaluate(_without(run.state, k), resolve=False)
+        noise = self._noise_of(without)
+        if noise < least:
+            run, least = Run(without.state, without.state), noise
         for _ in range(PLACINGS):
-            found = added_light.best(problem, without, problem.normal(without, run.start, noise), k)
+            found = added_light.best(problem, without, problem.normal(without, began.start, noise), k)
             if found is None or problem.direction(found[0], k) @ last > SAME_PLACE:
                 break
-            state, last = _copy(run.state), problem.direction(found[0], k)
+            state, last = _copy(began.state), problem.direction(found[0], k)
             state["turn"][k] = found[0]["turn"][k]
             there = problem.evaluate(state, resolve=False)  # the columns that it was found by will do
-            left = np.inf if there.residual is None else problem.noise(there.residual, self.sigma)
+            left = self._noise_of(there)
             if left < least:
                 run, least = Run(state, state), left
             if left >= noise:
@@ -349,12 +371,11 @@ class _Search:
         for one in (moved, alone):
             one["flux"][problem.added(one)], one["gain"][:] = DARK, 0
         moved["flux"][k] = 0
-        if self._noise(moved) >= self._noise(alone):
+        if self._noise_of(problem.evaluate(moved)) >= self._noise_of(problem.evaluate(alone)):
             return None
         return moved, [k]
 
-    def _noise(self, state):
-        point = self.problem.evaluate(state)
+    def _noise_of(self, point):
         return np.inf if point.residual is None else self.problem.noise(point.residual, self.sigma)
 
     def _better(self, run, point, *rivals):

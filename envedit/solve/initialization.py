@@ -207,7 +207,11 @@ def _searched(layers, params, transport, wanted, original, only_own=False):
     """List the starts of the searches, (parameters, notes)."""
     problem = light_search.SearchProblem(layers, transport, wanted.picture, wanted.weight, original)
     if wanted.coverage is None:
-        return [light_search.start(problem, params, only_own)]
+        searched = light_search.start(problem, params, only_own)
+        several = only_own and len(layers.separation.lights) > 1 and searched[0]["turn"].numpy().any()
+        # Of several lights one may have changed, and the search have moved others to make up for it.
+        still = (params, ["all lights initialised at their places in the map"])
+        return [still, searched] if several else [searched]
     problem = replace(problem, initial=wanted.initial)
     daring = (False, True) if (wanted.coverage < 1).any() else (False,)
     found = [painted_change.start(problem, params, bold) for bold in daring]

@@ -107,7 +107,8 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
             direction = found.direction
             notes.append(f"{name}: placed to a few degrees; renderer.memory_gb is too small to refine it")
         elif found.direction is not None:
-            direction, flux = scene.refine(found.direction, layers.lights.flux[i], light.glow)
+            others = list(scene.cores(places, i)) if len(lights) > 1 else []
+            direction, flux = scene.refine(found.direction, layers.lights.flux[i], light.glow, others)
             angle = np.degrees(np.arccos(np.clip(direction @ light.direction, -1, 1)))
             notes.append(f"{name}: initialised {angle:.1f} degrees from its place in the map")
         else:
@@ -233,16 +234,28 @@ class Question:
 
     def light(self, i: int, found: Place) -> np.ndarray:
         """Picture of one light as it is placed, through exact columns."""
+        core = np.zeros(self.shape, np.float32)
+        core[self.rows] = self._core(i, found)
+        self.transport.resolve(core + self.background.reshape(self.shape))
+        return self.render(core)
+
+    def _core(self, i, found):
+        """Radiance (rows, W, 3) of one light as it is placed."""
         dark = [Place(None, np.zeros(3))] * self.layers.lights.count
         dark[i] = found
         turn, flux = self.parameters(dark)
         size = tensor(np.zeros((len(turn), 1)))
-        core = np.zeros(self.shape, np.float32)
-        core[self.rows] = self.layers.lights.core(
-            tensor(turn), tensor(flux), size, self.layers.shape, self.layers.rows
-        ).numpy()
-        self.transport.resolve(core + self.background.reshape(self.shape))
-        return self.render(core)
+        asked = tensor(turn), tensor(flux), size, self.layers.shape, self.layers.rows
+        return self.layers.lights.core(*asked).numpy()
+
+    def cores(self, places: Sequence[Place], without: int) -> np.ndarray:
+        """Pictures (n, h, w, 3) of all lights but one as they are placed, without their glow."""
+        cores = []
+        for i, found in enumerate(places):
+            if i != without and found.flux.max() > 0:
+                cores.append(self._core(i, found))
+        rows = slice(self.rows.start, self.rows.stop)
+        return self.transport.pictures(np.stack(cores), rows) if cores else np.zeros((0, *self.known.shape))
 
     def hats(self, level: int) -> np.ndarray:
         """Radiance of what a gain adds, times each hat of a grid, in cells: (3, cells, nodes)."""

@@ -8,7 +8,8 @@ depend on where a light was, with one exception: a light stays where it is if th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,17 +126,18 @@ def place(
     overview, search = given.overview, Pursuit(given, picture)
     directions: list[np.ndarray | None] = []
     atoms: list[np.ndarray] = []
-    for light in lights:
-        flux = given.flux(light)
-        atom = search.atoms(flux.sum(axis=0), light.glow)
-        stay = search.atom_of(given.cells(light), flux, light.direction, light.glow)
-        score = search.scores(atom)
+    stays = [search.atom_of(given.cells(one), given.flux(one), one.direction, one.glow) for one in lights]
+    for i, light in enumerate(lights):
+        atom, stay = search.atoms(given.flux(light).sum(axis=0), light.glow), stays[i]
+        # Those that are not placed yet may be where they were: one that moves does not stand in for them.
+        rest = search.beside(other[..., 0] for other in stays[i + 1 :])
+        score = rest.scores(atom)
         unseen = np.abs(stay).sum() < SEEN * search.light and score.max() < UNWANTED * search.asked()
         if unseen:  # nothing is known of it, and no other place explains more
             directions.append(None)
             atoms.append(None)
             continue
-        if search.scores(stay)[0] >= STAY * score.max():
+        if rest.scores(stay)[0] >= STAY * score.max():
             directions.append(None)
             chosen = stay[..., 0]
         else:
@@ -297,6 +299,14 @@ class Pursuit:
             if size > 1e-6 * whole:
                 self.spans[c] = np.concatenate([self.spans[c], (new / size)[:, None]], axis=1)
                 self.residual[c] = self._off(c, self.residual[c])
+
+    def beside(self, atoms: Iterable[np.ndarray]) -> Pursuit:
+        """Return a pursuit in which these atoms have explained what they can; this one stays as it is."""
+        other = copy.copy(self)
+        other.spans, other.residual = list(self.spans), list(self.residual)
+        for atom in atoms:
+            other.explain(atom)
+        return other
 
     def left(self) -> float:
         """Squared residual."""

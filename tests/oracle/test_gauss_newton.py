@@ -820,7 +820,7 @@ def test_a_near_start_stays_unless_path_tracing_says_that_the_solution_is_closer
     found = solve(problem, params, 0.02, judge=judge)
     assert stays == (not problem.state(found.params)["gain"].any())
     np.testing.assert_array_equal(asked[0], image)
-    assert len(asked) == 2 and ("path traced" in found.note) == stays
+    assert len(asked) == 2 and ("path-traced" in found.note) == stays
 
 
 def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(case):

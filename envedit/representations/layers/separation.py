@@ -26,6 +26,9 @@ SURROUNDINGS = 20.0
 """Radius of the surroundings, degrees: more than that of a sun's aureole or a softbox."""
 LEAST_SHARE = 0.005
 """Share of the map's irradiance below which something bright is no light."""
+AS_BRIGHT, MOST_CUT = 0.8, 0.1
+"""What is bright is no light by itself where more than the second share of the texels around it are brighter
+than the first of its own mean luminance: it is the edge of a window that is larger than the surroundings."""
 MOST_LIGHTS = 8
 """Most lights that are separated, those with most flux; weaker ones stay in the background."""
 DETECT_WIDTH = 512
@@ -268,13 +271,22 @@ def _find(small: _Small) -> tuple[np.ndarray, int, list[float]]:
     excess = np.maximum(lum - base, 0) * small.omega
     names, inverse = np.unique(parts, return_inverse=True)
     flux = np.bincount(inverse.ravel(), excess.ravel()) / total
-    order = [i for i in np.argsort(-flux) if names[i] >= 0 and flux[i] >= LEAST_SHARE][:MOST_LIGHTS]
+    order = [i for i in np.argsort(-flux) if names[i] >= 0 and flux[i] >= LEAST_SHARE]
+    order = [i for i in order if not _cut_off(parts == names[i], lum, small.omega)][:MOST_LIGHTS]
     label = nothing[0]
     for i, part in enumerate(order):
         # One texel more to every side: a lens and a resampling spread light.
         grown = _grown(parts == names[part])
         label = np.where(grown & (label < 0), i, label)
     return label, len(order), [flux[i] for i in order]
+
+
+def _cut_off(part, lum, omega):
+    """Say whether a part is the edge of a larger area as bright, which is its own surroundings: a window."""
+    weight = lum[part] * omega[part]
+    mean = (lum[part] * weight).sum() / max(weight.sum(), 1e-300)
+    around = _grown(part) & ~part
+    return bool((lum[around] > AS_BRIGHT * mean).sum() > MOST_CUT * around.sum())
 
 
 def _local_median(lum, first, total):

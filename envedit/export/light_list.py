@@ -14,7 +14,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.representations.layers.separation import Separation
 
-FARTHEST = math.pi**2 + 1
+FARTHEST = math.pi + 1
 """Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
 MOST_TOLD = 8
 """Lights that :func:`told` names."""
@@ -84,8 +84,9 @@ def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
 def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict[str, list[dict]]:
     """Find which light of a map has become which light of the edited map.
 
-    Of all ways to pair them, the one with the least sum of angle^2 + ln(flux ratio)^2 (radians; fluxes are
-    means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`.
+    Of all ways to pair them, the one with the least sum of angle + abs(ln(flux ratio)) (radians; fluxes are
+    means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`. Not
+    of squares, so that few lights have changed much rather than many a little.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
     start, end = (np.array([_toward(light) for light in lights]).reshape(-1, 3) for lights in (before, after))
     flux = [np.log([max(np.mean(light["flux"]), 1e-30) for light in lights]) for lights in (before, after)]
     apart = np.arccos(np.clip(_turned(start, degrees) @ end.T, -1, 1))
-    partner = _paired(apart**2 + (flux[0][:, None] - flux[1]) ** 2)
+    partner = _paired(apart + np.abs(flux[0][:, None] - flux[1]))
     moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))
     removed = [j is None for j in partner]
     numbered = [{"id": i + 1, "removed": removed[i], **light} for i, light in enumerate(before)]

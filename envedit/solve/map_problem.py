@@ -35,7 +35,7 @@ from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
 from envedit.solve.block_jacobian import BlockJacobian
-from envedit.transport.light_transport import LightTransport
+from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
@@ -519,7 +519,10 @@ class Problem:
         """
         state, unknowns, pictures = point.state, [], []
         sky = np.maximum(point.edited[self.rows] - self._core(state, state["flux"]), 0)
-        for i in self.lit(state):
+        # Columns of one light must not take the place of another's.
+        lit = self.lit(state)
+        most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
+        for i in lit:
             alone = state["flux"].copy()
             alone[np.arange(len(alone)) != i] = DARK
             now, glow = self._core(state, alone), self.layers.glow_of(i, state["turn"], state["flux"])
@@ -538,7 +541,7 @@ class Problem:
                 unknowns.append(("turn", i, axis))
             larger = {**state, "size": state["size"] + 0.1}
             cores.append((self._core(larger, alone) - now) / 0.1)
-            seen = self.transport.pictures(np.stack(cores), self.rows).reshape(4, -1, 3)
+            seen = self.transport.pictures(np.stack(cores), self.rows, most).reshape(4, -1, 3)
             if glow is not None:
                 seen[:3] += self.blocks.pictures(np.stack(shone)) * profile.reshape(-1, 3)
             pictures.append(seen)

@@ -93,6 +93,7 @@ class LightTransport:
         self.cached, self.depth_error = False, plan.depth_error
         self.paths, self.tolerance = plan.paths, plan.tolerance
         self._looks = np.zeros(grid.texels, np.uint8)
+        self._bright: np.ndarray = np.zeros(0, np.int64)
         self._overview: overviews.Overview | None = None
         self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
         self._exact = ExactColumns(scene, grid, plan.bounces, plan.capacity, plan.paths_bytes)
@@ -334,7 +335,7 @@ class LightTransport:
         _check(envmap, (self.grid.height, self.grid.width, 3), "map")
         return self._apply(envmap, offset=False)
 
-    def pictures(self, maps: np.ndarray, rows: slice) -> np.ndarray:
+    def pictures(self, maps: np.ndarray, rows: slice, most: int = COLUMNS_A_LOOK) -> np.ndarray:
         """Render maps that are black but for few texels, without the light of other lamps.
 
         Costs what their texels cost, not what T does. The texels with most light get exact columns.
@@ -345,6 +346,8 @@ class LightTransport:
             Radiance in some rows, of any sign.
         rows : slice
             Which rows.
+        most : int
+            Texels that get columns, at most.
 
         Returns
         -------
@@ -354,7 +357,7 @@ class LightTransport:
         flat = maps.reshape(len(maps), -1, 3)
         some = np.flatnonzero(flat.any(axis=(0, 2)))
         texels, values = some + rows.start * self.grid.width, flat[:, some]
-        self._trace_main(texels, values)
+        self._trace_main(texels, values, most)
         exact = self._exact.slot_of[texels] >= 0
         total = self.reverse.transposed(texels[~exact], values[:, ~exact])
         if exact.any():
@@ -363,15 +366,18 @@ class LightTransport:
                 total[..., c] += values[:, exact, c] @ columns[..., c]
         return total.reshape(len(maps), *self.shape, 3)
 
-    def _trace_main(self, texels, values):
-        """Trace columns, with the fewest paths, of the main texels of maps (k, texels, 3) that have none."""
+    def _trace_main(self, texels, values, most):
+        """Trace columns, with the fewest paths, of the main texels of maps (k, texels, 3) that have none.
+
+        None takes the place of a texel that is bright in the map that was resolved last.
+        """
         exact = self._exact
         light = np.abs(values).sum(axis=(0, 2), dtype=np.float64) * self.influence.ravel()[texels]
-        main = np.argsort(-light, kind="stable")[:COLUMNS_A_LOOK]
-        main = texels[main[light[main] > light.max(initial=0) * LEAST_LIGHT]]
+        order = np.argsort(-light, kind="stable")[:most]
+        main = texels[order[light[order] > light.max(initial=0) * LEAST_LIGHT]]
         todo = main[exact.slot_of[main] < 0]
         lasting = exact.texels[exact.paths_of[exact.texels] > self.paths[0]]
-        keep = np.union1d(main, lasting)
+        keep = np.union1d(main, np.union1d(lasting, self._bright))
         todo = todo[: max(exact.capacity - len(np.setdiff1d(keep, todo)), 0)]
         if len(todo):
             exact.trace(todo, self.paths[0], self.seed, keep)
@@ -499,7 +505,7 @@ class LightTransport:
             any more make room for those that are.
         """
         envmap, exact = np.asarray(envmap), self._exact
-        wanted = self.bright_texels(envmap, tolerance)[: exact.capacity]
+        wanted = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
         tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1
         tier = np.maximum(tier, 0)
         if lasting is not None:

@@ -49,7 +49,7 @@ class DenseTransport:
 
     linear = apply  # no other lamps
 
-    def pictures(self, maps, rows):
+    def pictures(self, maps, rows, most=0):
         whole = np.zeros((len(maps), *self.grid, 3))
         whole[:, rows] = maps
         found = np.einsum("cpt,ktc->kpc", self.weights, whole.reshape(len(maps), -1, 3), optimize=True)

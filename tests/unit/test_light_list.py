@@ -42,7 +42,7 @@ def test_a_light_that_is_turned_with_its_map_is_the_same_light():
     """Two lights of one flux a turn apart: the first comes to where the second was."""
     before = [light(10, 20), light(50, 20)]
     after = [light(90, 20), light(50, 20)]
-    (first, second) = numbers(light_list.matched(before, after, 40.0))
+    (first, second) = numbers(light_list.matched(before, after, -40.0))
     expected = math.degrees(2 * math.asin(math.sin(math.radians(20)) * math.cos(math.radians(20))))
     assert (first[0], second[0]) == (2, 1)
     assert first[2] == pytest.approx(expected) and second[2] == pytest.approx(expected)

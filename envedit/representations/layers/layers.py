@@ -28,7 +28,7 @@ from envedit.representations.layers.behind_glow import BehindGlow, behind_glow
 from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
 from envedit.representations.layers.lights import DARK, SPARE, Lights
-from envedit.representations.layers.separation import Separation, separate
+from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
 UNSEEN = 1 / 512
@@ -109,7 +109,7 @@ class Layers:
         if self._horizon != "free" and self.rows == (0, len(image)):
             up = sky_rows(len(image))
             image, low = np.ascontiguousarray(image[:up]), image[up:]
-        self.separation = separate(image, self.rows)
+        self.separation = separate(image, self.rows, MOVABLE)
         self.lights = Lights(self.separation.lights, self.rows, image.shape[1])
         self.shape = image.shape[:2]
         core = self.separation.core

@@ -29,8 +29,9 @@ LEAST_SHARE = 0.005
 AS_BRIGHT, MOST_CUT = 0.8, 0.1
 """What is bright is no light by itself where more than the second share of the texels around it are brighter
 than the first of its own mean luminance: it is the edge of a window that is larger than the surroundings."""
-MOST_LIGHTS = 8
-"""Most lights that are separated, those with most flux; weaker ones stay in the background."""
+MOST_LIGHTS, MOVABLE = 8, 4
+"""Most lights that are separated, and of these, those with most flux, that an edit may move: each costs
+time, and what is weaker is part of the background and its gain."""
 DETECT_WIDTH = 512
 """Lights are looked for in a copy of at most this width: what is smaller has no flux."""
 RING_SHARE = (0.1, 0.5)
@@ -121,7 +122,9 @@ class Survey:
     shares: list[float]
 
 
-def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separation:
+def separate(
+    image: np.ndarray, rows: tuple[int, int] | None = None, most: int = MOST_LIGHTS
+) -> Separation:
     """Separate the lights of a map from its background.
 
     Parameters
@@ -130,6 +133,8 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separati
         Linear radiance, finite and not negative.
     rows : (int, int), optional
         First row of the image in its map, and the rows of that map; None: the image is a whole map.
+    most : int
+        Most lights, those with most flux; weaker ones stay in the background.
 
     Returns
     -------
@@ -140,7 +145,7 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separati
     first, total = rows or (0, image.shape[0])
     height, width = image.shape[:2]
     small = _reduced(image, first, total)
-    found = _survey(small)
+    found = _survey(small, most)
     if found is None:
         return Separation(image, np.ones_like(image), np.zeros_like(image), [])
 
@@ -169,9 +174,9 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None) -> Separati
     return Separation(background, glow, core, lights, found)
 
 
-def _survey(small: _Small) -> Survey | None:
+def _survey(small: _Small, most: int) -> Survey | None:
     """Find lights, the background under them and the glow of each on the small copy; None without lights."""
-    label, count, shares = _find(small)
+    label, count, shares = _find(small, most)
     if not count:
         return None
     cores = label >= 0
@@ -259,7 +264,7 @@ def _reduced(image, first, total):
     return _Small(small, toward, omega, first, total, (start, h))
 
 
-def _find(small: _Small) -> tuple[np.ndarray, int, list[float]]:
+def _find(small: _Small, most: int) -> tuple[np.ndarray, int, list[float]]:
     """Label the texels of each light: (label or -1, count, shares), the light with most flux first."""
     lum = small.image @ LUMINANCE
     total = (lum * small.omega).sum()
@@ -272,7 +277,7 @@ def _find(small: _Small) -> tuple[np.ndarray, int, list[float]]:
     names, inverse = np.unique(parts, return_inverse=True)
     flux = np.bincount(inverse.ravel(), excess.ravel()) / total
     order = [i for i in np.argsort(-flux) if names[i] >= 0 and flux[i] >= LEAST_SHARE]
-    order = [i for i in order if not _cut_off(parts == names[i], lum, small.omega)][:MOST_LIGHTS]
+    order = [i for i in order if not _cut_off(parts == names[i], lum, small.omega)][:most]
     label = nothing[0]
     for i, part in enumerate(order):
         # One texel more to every side: a lens and a resampling spread light.

@@ -89,7 +89,7 @@ def cases(given):
 
 
 def lamps_found(about: dict, after: list[dict]) -> str:
-    """Say how many lamps of the true room have a light of the edited map, and how many lights have no lamp."""
+    """Say how many lamps of the true room have a light of the edited map, and how many lights are not one."""
     if about["map"] != "room" or about["label"] == "painted":
         return "-"
     turned = 60 if about["label"] == "60" else 0

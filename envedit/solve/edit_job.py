@@ -182,7 +182,7 @@ class Job:
     @property
     def trials(self) -> int:
         """Steps after which two starts are compared."""
-        return NEWTON_TRIAL if self.newton else TRIAL_STEPS
+        return min(NEWTON_TRIAL, self.settings.optimizer.iterations) if self.newton else TRIAL_STEPS
 
     def better(self, loss: float, usual: float) -> bool:
         """Say whether one start is so much better than the usual one that it is to be taken."""

@@ -339,6 +339,8 @@ class _Search:
         last, began = problem.direction(run.state, k), run
         without = problem.evaluate(_without(run.state, k), resolve=False)
         noise = self._noise_of(without)
+        if not np.isfinite(noise):
+            return run, point
         if noise < least:
             run, least = Run(without.state, without.state), noise
         for _ in range(PLACINGS):

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import flat
 from envedit.core.rows import Rows
 from envedit.core.types import DrArray
 
@@ -118,6 +119,11 @@ def _between(values, place):
     part = (place - top)[:, None, None]
     bottom = np.minimum(top + 1, len(values) - 1)
     return (values[top] + (values[bottom] - values[top]) * part).astype(np.float32)
+
+
+def as_colours(rows: np.ndarray) -> mi.Color3f:
+    """Return the texels of rows (n, W, 3), flat, as colours."""
+    return dr.unravel(mi.Color3f, flat(mi.Float, rows))
 
 
 def as_image(colour: mi.Color3f, size: int, width: int) -> mi.TensorXf:

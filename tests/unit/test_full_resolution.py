@@ -7,7 +7,7 @@ import pytest
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
 from envedit.core.rows import Rows
-from envedit.export import full_resolution, texel_maps
+from envedit.export import full_resolution, moved_lights, texel_maps
 from envedit.images import images
 from envedit.representations import Pixels
 from envedit.representations.layers import layers
@@ -115,7 +115,7 @@ def test_bands_do_not_show(sunny, rng, monkeypatch):
     whole = carried(made, params, working, source)[0]
     for band, points in ((512 * 7, 1 << 20), (512 * 50, 40)):
         monkeypatch.setattr(texel_maps, "BAND_TEXELS", band)
-        monkeypatch.setattr(full_resolution, "POINTS_AT_ONCE", points)
+        monkeypatch.setattr(moved_lights, "POINTS_AT_ONCE", points)
         # Points are added up in units of the brightest of their chunk.
         np.testing.assert_allclose(carried(made, params, working, source)[0], whole, rtol=1e-4)
 

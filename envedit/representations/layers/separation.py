@@ -122,9 +122,7 @@ class Survey:
     shares: list[float]
 
 
-def separate(
-    image: np.ndarray, rows: tuple[int, int] | None = None, most: int = MOST_LIGHTS
-) -> Separation:
+def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int = MOST_LIGHTS) -> Separation:
     """Separate the lights of a map from its background.
 
     Parameters

@@ -119,13 +119,21 @@ def test_every_experiment_makes_its_cases(tmp_path, monkeypatch, capsys):
     ):  # fmt: skip
         (tmp_path / "puresky" / f"{name}_puresky_1k.hdr").write_text(name)
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
-    counts = {"first_edit": 12, "layers": 40, "levels": 24, "natural": 330, "painted_edits": 18, "views": 18}
+    counts = {
+        "first_edit": 12,
+        "interiors": 5,
+        "layers": 40,
+        "levels": 24,
+        "natural": 330,
+        "painted_edits": 18,
+        "views": 18,
+    }
     for name, count in counts.items():
         asked = [name, "run", "--dry-run", "--out", str(tmp_path / "out" / name)]
         assert command.main(asked) == 0
         assert capsys.readouterr().out.endswith(f"{count} jobs: {count} missing\n")
     assert command.main(["layer"]) == 2
-    assert "expected one of first_edit, layers" in capsys.readouterr().err
+    assert "expected one of first_edit, interiors, layers" in capsys.readouterr().err
 
 
 def test_the_same_options_everywhere():

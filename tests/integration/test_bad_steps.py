@@ -222,16 +222,34 @@ def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
     assert not work.newton
     check_trials(work)
 
-    def solved(problem, params, *_, trial):
+    def solved(problem, params, *_, trial, most_added):
         if ends[params] is lost:
             raise NumericalError("it cannot begin")
         return types.SimpleNamespace(loss=ends[params], run=None)
+
+    wanted.coverage = np.ones((1, 1, 1))  # of paint several starts are tried
 
     monkeypatch.setattr(edit_job.Job, "newton", True)
     monkeypatch.setattr(edit_job.Job, "_sigma", 0.01)
     monkeypatch.setattr(edit_job.Job, "_problem", lambda self: None)
     monkeypatch.setattr(edit_job.gauss_newton, "solve", solved)
     check_trials(work)
+
+
+@pytest.mark.parametrize(("loss", "taken"), [(-100.0, 1), (-160.0, 1), (-190.0, 2)])
+def test_moved_lights_must_explain_more_than_those_that_stay(loss, taken, monkeypatch):
+    """A residual 10 % smaller, 146, and 20 for each light that has moved: here two."""
+    ends = iter((0.0, loss))
+    wanted = types.SimpleNamespace(coverage=None)
+    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, edit_job.Watch())
+    found = lambda *_, **more: types.SimpleNamespace(loss=next(ends), run=None)  # noqa: E731
+    monkeypatch.setattr(edit_job.Job, "newton", True)
+    monkeypatch.setattr(edit_job.Job, "_sigma", 0.01)
+    monkeypatch.setattr(edit_job.Job, "_problem", lambda self: None)
+    monkeypatch.setattr(edit_job.gauss_newton, "solve", found)
+    turns = np.zeros((3, 3), np.float32), np.float32([[0, 1, 0], [0, 0, 0], [1, 0, 0]])
+    _, notes = work.best([({"turn": mi.TensorXf(turn)}, []) for turn in turns], None)
+    assert f"start {taken} of 2" in notes[-1]
 
 
 def check_trials(work):

@@ -164,8 +164,8 @@ class _LayersAt:
             if not self.cores.any(start, size):
                 continue
             row, column = self.grid.texels(size)
-            image = as_colours(source[start : start + size])
-            light, share, core = self.cores.of(image, row, column, start, size)
+            d, image = self.cores.directions(start, row, column), as_colours(source[start : start + size])
+            light, share, core = self.cores.of(image, row, column, d, start, size)
             light, share = (v.numpy().reshape(size, self.grid.shape[1]) for v in (light, share))
             core = as_image(core, size, self.grid.shape[1]).numpy()
             light[: fresh - start] = -1
@@ -193,13 +193,12 @@ class _LayersAt:
             log *= self.grid.across(mi.Float, inner, row, column, corners=True)
         factor = dr.exp(log)
         same = factor == 1
-        base, core = image, None
+        base, core, d = image, None, self.cores.directions(start, row, column)
         if self.cores.any(start, size):
-            light, _, core = self.cores.of(image, row, column, start, size)
+            light, _, core = self.cores.of(image, row, column, d, start, size)
             base = image - core
         sky = brightened(base, factor)
         if self.relit:
-            d = self.cores.directions(start, row, column)
             before = self.cores.glow(d)
             ratio = self.layers.lights.glow(self.placed["turn"], self.placed["flux"], d) / before
             ratio = dr.select(self.cores.follow(start, row), 1, ratio)

@@ -70,9 +70,9 @@ class SourceCores:
         return bool((self.label[near[0] : near[1] + 1] >= 0).any())
 
     def of(
-        self, image: mi.Color3f, row: mi.UInt32, column: mi.UInt32, start: int, size: int
+        self, image: mi.Color3f, row: mi.UInt32, column: mi.UInt32, d: mi.Vector3f, start: int, size: int
     ) -> tuple[mi.Int32, mi.Float, mi.Color3f]:
-        """Return of the texels of a band: light, or -1; how far inside it they lie, 0 to 1; core in them."""
+        """Return of texels at directions ``d``: light, or -1; how far inside it, 0 to 1; core in them."""
         at, survey = self.surveyed, self.survey
         label = self.label[at.row[start : start + size]].astype(np.int32)
         light = at.nearest(mi.Int32, flat(mi.Int32, label), row, column)
@@ -83,7 +83,7 @@ class SourceCores:
         table = flat(mi.Float, at.along_rows(survey.below, start, size))
         below = at.across(mi.Color3f, table, row, column)
         if self.lights.glowing:
-            below *= self.glow(self.directions(start, row, column))
+            below *= self.glow(d)
         light = dr.select(self.follow(start, row), -1, light)
         core = dr.select(light >= 0, dr.maximum(image - below, 0) * (1 - share[1]), 0)
         return light, share[0], core

@@ -254,7 +254,7 @@ def _on_map(light):
 def _way(start, end):
     """Draw the line from one place to another, the shorter way, over the edge of the map if need be."""
     near = start[0] + (end[0] - start[0] + 180) % 360 - 180
-    ends = [(start[0] + shift, near + shift) for shift in (0, end[0] - near)]
+    ends = dict.fromkeys((start[0] + shift, near + shift) for shift in (0, end[0] - near))
     heights = f'y1="{start[1]:.1f}" y2="{end[1]:.1f}" stroke="#fff"'
     return [f'<line x1="{a:.1f}" x2="{b:.1f}" {heights}/>' for a, b in ends]
 

@@ -322,12 +322,13 @@ class _Search:
         The search has placed them for the picture alone, without a prior on the sky, and of several one may
         have made up for another. Only the strongest is placed where there is more noise without it.
         """
-        problem, strongest, dark = self.problem, self._strongest(run), {}
+        problem, strongest = self.problem, self._strongest(run)
+        dark: dict[int, float] = {}
         own = [k for k in problem.lit(run.state) if k not in problem.added(run.state)]
         if self._noise_of(point) / 2 < self.sigma:  # no noise is below sigma
             return run, point
-        for k in own if len(own) > 1 else ():
-            dark[k] = self._noise_of(problem.evaluate(_without(run.state, k), resolve=False))
+        if len(own) > 1:
+            dark = {k: self._noise_of(problem.evaluate(_without(run.state, k), resolve=False)) for k in own}
         for k in sorted(own, key=lambda k: dark.get(k, 0.0)):
             if k == strongest or dark[k] < self._noise_of(point):
                 run, point = self._placed_one(run, point, k)

@@ -21,6 +21,7 @@ from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
+from envedit.representations.layers.lights import SPARE
 from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.scene.renderings import rendered
@@ -146,7 +147,6 @@ class Preparation:
         still = self._prepared(wanted, 0.0, [])
         with self.clock("start_s"):
             loss, other = _loss(turned), _loss(still)
-            still.job.begun = None  # lights are added before the first step too
         chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
         chosen.notes.append(f"AIC (lower is better): {loss:.5g} with the sky turned, {other:.5g} without")
         return chosen
@@ -206,8 +206,7 @@ class Preparation:
         with self.clock("fit_s"):
             kind = settings.representation.kind
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
-            horizon, said = self._horizon()
-            notes += said
+            horizon = self._horizon()
             representation: Any = representations.make(
                 settings,
                 fit.default_folder(),
@@ -216,6 +215,8 @@ class Preparation:
                 horizon,
             )
             params = representation.encode(crop, settings.seed)
+            if kind == "layers" and representation.below is not None:
+                notes.append(f"rows below the horizon {representation.below.said}")
         with self.clock("transport_s"):
             recordings = self._recorded(representation, wanted) if ask else None
         traced = self.renderer.transport
@@ -273,25 +274,22 @@ class Preparation:
             return params, ready.notes + placed
 
     def _horizon(self):
-        """Return what the rows below the horizon do, and a note on it."""
+        """Return what the rows below the horizon do."""
         chosen = self.settings.input.horizon
         if self.settings.representation.kind != "layers" or self.settings.input.rows != "all":
-            return "free", []
-        if chosen != "auto":
-            return chosen, []
-        chosen = below_horizon.kind_of(self.original)
-        said = (
-            "follow the sky as its mirror" if chosen == "mirror" else "are ground and keep their brightness"
-        )
-        return chosen, [f"rows below the horizon {said}"]
+            return "free"
+        return below_horizon.kind_of(self.original) if chosen == "auto" else chosen
 
     def _count(self, done, total):
         self.watch.progress(done, total, "")
 
 
 def _loss(edit: Edit) -> float:
-    """Return the loss after the first steps from where an edit starts; inf if it cannot begin."""
+    """Return the loss after the first steps from where an edit starts; inf if it cannot begin.
+
+    Its lights are placed, and others added, before the first step: the edit goes on from there.
+    """
     try:
-        return edit.job.tried(edit.params, edit.crop)
+        return edit.job.tried(edit.params, edit.crop, SPARE)
     except NumericalError:
         return np.inf

@@ -38,8 +38,8 @@ class Input(Table):
     horizon: str = key(
         "auto",
         Choice("auto", "mirror", "keep", "free"),
-        'rows below the horizon follow the sky as its blurred "mirror", "keep" but for a fade, or are "free" '
-        'as the sky is; "auto" detects which',
+        'rows below the horizon follow the sky as its blurred "mirror", "keep" their texture and go by '
+        'the light that falls on them, or are "free" as the sky is; "auto" detects which',
         when=LAYERS | {"input.rows": ("all",)},
     )
     azimuth: float = key(90.0, Number(-360, 360), "sunsky: azimuth of the sun", "degrees", _SUNSKY)

@@ -40,6 +40,9 @@ class BlockJacobian:
             for node, share in layers.hats(level):
                 one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
             hats.append(one.reshape(cells, nodes) / light[:, None])
+            if layers.lit.any():
+                lit = np.repeat(layers.lit, shape[1]) * sky
+                hats[-1] += np.outer(np.bincount(self._cell, lit, cells) / light, layers.lighting(level))
         used = np.bincount(self._cell, minlength=cells) > 0
         self._used = np.flatnonzero(used)
         self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)

@@ -1,7 +1,8 @@
 """Gauss-Newton steps with Levenberg's and Marquardt's damping, for the problem of ``map_problem.py``.
 
 A step solves the normal equations, and is kept if it lowers F. Huber's threshold s and sigma are at first as
-large as the residual, and at most halved at every step, so that a distant start is not dominated by outliers.
+large as the residual, never rise, and are at most halved at every step, so that a distant start is not
+dominated by outliers.
 
 Longer than 400 lines: the steps, their damping and the trials of added lights share the state of a run.
 """
@@ -335,14 +336,17 @@ class _Search:
         return run, point
 
     def _placed_one(self, run, point, k):
-        """Put a light out, or where it would be added were it not there, if noise is halved by it."""
-        problem, least = self.problem, self._noise_of(point) / 2
-        last, began = problem.direction(run.state, k), run
+        """Put a light out, or where it would be added were it not there, if noise is halved by it.
+
+        Where it is lower by less, steps from there decide (:meth:`_better`).
+        """
+        problem, now = self.problem, self._noise_of(point)
+        last, began, least = problem.direction(run.state, k), run, now
         without = problem.evaluate(_without(run.state, k), resolve=False)
         noise = self._noise_of(without)
         if not np.isfinite(noise):
             return run, point
-        if noise < least:
+        if noise < least / 2:
             run, least = Run(without.state, without.state), noise
         for _ in range(PLACINGS):
             found = added_light.best(problem, without, problem.normal(without, began.start, noise), k)
@@ -357,7 +361,11 @@ class _Search:
             if left >= noise:
                 break
             noise = left
-        return run, point if run is began else problem.evaluate(run.state)
+        if run is began:
+            return run, point
+        if least >= now / 2:
+            return self._better(began, point, (run.state, [k]))
+        return run, problem.evaluate(run.state)
 
     def _moved(self, run, state, i):
         """Return the state in which the map's strongest light is where a state has light i, and its number.
@@ -421,7 +429,7 @@ class _Search:
         while len(run.history) < most and not run.finished:
             began = time.perf_counter()
             halved = run.scale / 2 if np.isfinite(run.scale) else 0
-            run.scale = max(problem.noise(point.residual, sigma), halved)
+            run.scale = min(run.scale, max(problem.noise(point.residual, sigma), halved))
             before = problem.loss(point, run.start, run.scale)
             normal = problem.normal(point, run.start, run.scale)
             better = None

@@ -23,7 +23,7 @@ Longer than 400 lines: objective, normal equations and posterior share the layou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -116,10 +116,14 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Point:
-    """A state with its map, rendering and residual of display values; the last two None if not finite."""
+    """A state with its map, rendering and residual of display values; the last two None if not finite.
+
+    ``sky`` is the map's active rows without the cores of its lights, (rows, W, 3).
+    """
 
     state: dict
     edited: np.ndarray
+    sky: np.ndarray
     rendering: np.ndarray | None
     residual: np.ndarray | None
 
@@ -232,7 +236,7 @@ class Problem:
         self.target = display_curve.to_display(tensor(picture)).numpy()
         self.weight = np.ones((*picture.shape[:2], 1), np.float32) if weight is None else np.float32(weight)
         shown = display_curve.to_display(tensor(point.rendering)).numpy()
-        found = Point(point.state, point.edited, point.rendering, np.float64(shown) - self.target)
+        found = replace(point, residual=np.float64(shown) - self.target)
         if self._linear is not None and self._linear[0] is point:
             self._linear = found, *self._linear[1:]
         return found
@@ -299,18 +303,19 @@ class Problem:
 
     def evaluate(self, state: dict, resolve: bool = True) -> Point:
         """Compose and render the map of a state; ``resolve``: trace columns for texels that became bright."""
-        crop = self.layers.decode(self.params(state)).numpy()
-        edited = self.envmap.copy()
+        sky, core = (part.numpy() for part in self.layers.parts(self.params(state)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            crop, edited = sky + core, self.envmap.copy()
         edited[self.rows] = crop
         if not np.isfinite(crop).all():
-            return Point(state, edited, None, None)
+            return Point(state, edited, sky, None, None)
         if resolve:
             self.transport.resolve(edited, limit=32)
         rendering = self.transport.apply(tensor(edited))
         shown = display_curve.to_display(rendering).numpy()
         if not np.isfinite(shown).all():
-            return Point(state, edited, None, None)
-        return Point(state, edited, rendering.numpy(), np.float64(shown) - self.target)
+            return Point(state, edited, sky, None, None)
+        return Point(state, edited, sky, rendering.numpy(), np.float64(shown) - self.target)
 
     def noise(self, residual: np.ndarray, least: float) -> float:
         """Return the standard error under which the misfit is what independent residuals of it have.
@@ -369,7 +374,11 @@ class Problem:
     # ---- normal equations ----------------------------------------------------------------------------------
 
     def normal(self, point: Point, start: dict, sigma: float) -> Normal:
-        """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2."""
+        """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2.
+
+        The gain's part of the gradient is exact, through T; its part of the Hessian, and what it has in
+        common with lights, is that of the block transport.
+        """
         state, n = point.state, self.nodes
         size = _sizes(point.residual)
         robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
@@ -379,12 +388,13 @@ class Problem:
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         squared = blocks.summed((slope * profile) ** 2 * robust)
         pulled = blocks.summed(slope * profile * robust * point.residual)
+        pulled_back = self._pulled_back(point, slope * robust * point.residual)
         seen, lit = np.zeros((len(lights.pictures), n * 3)), []
         for c, j in enumerate(jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
-            gradient[part] = j.T @ pulled[:, c]
+            gradient[part] = pulled_back[:, c]
             if len(lights.pictures):
                 weighted = lights.pictures[..., c] * (slope**2 * profile * robust)[..., c]
                 in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
@@ -402,6 +412,19 @@ class Problem:
         pixels = robust, slope, point.residual, profile, lights.pictures
         parts = Blocks(jacobian, squared, pulled, lit)
         return Normal(hessian, gradient, precision, lights.unknowns, parts, *pixels)
+
+    def _pulled_back(self, point, picture):
+        """Return the derivative by every node's log gain (n, 3) of the sum of a picture times T E."""
+        light = self.transport.adjoint(np.float32(picture)).numpy()[self.rows]
+        params = self.params(point.state)
+        grids = [params[f"gain.{i}"] for i in range(len(self.sizes))]
+        with dr.isolate_grad():
+            dr.enable_grad(grids)
+            sky, _ = self.layers.parts(params)
+            dr.backward(dr.sum(sky.array * tensor(light).array))
+            found = [dr.grad(grid).numpy().reshape(-1, 3) for grid in grids]
+        units = [_numpy(self.layers.scales[f"gain.{i}"]) for i in range(len(grids))]
+        return np.concatenate([np.float64(g) / u for g, u in zip(found, units, strict=True)])
 
     def _linearised(self, point):
         """Pictures of lights and Jacobian of the gain, which no weight changes: kept of the last point."""
@@ -490,9 +513,8 @@ class Problem:
 
     def _slopes(self, point):
         """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        core = self._core(point.state, point.state["flux"])
         # In double precision: products of three radiances leave the range of the other.
-        slopes = np.maximum(np.float64(point.edited[self.rows]) - core, 0)
+        slopes = point.sky.astype(np.float64)
         own = self.layers.shape[0]
         sky, base = slopes[:own], self.layers.base.astype(np.float64)
         gain = np.exp(np.float64(self.layers.log_gain(self.params(point.state))))
@@ -509,7 +531,7 @@ class Problem:
         What a node changes is taken to spread so over a block: by texture, shading and outlines.
         """
         sky = self.envmap.copy()
-        sky[self.rows] = np.maximum(point.edited[self.rows] - self._core(point.state, point.state["flux"]), 0)
+        sky[self.rows] = point.sky
         return self.blocks.profile(self.transport.linear(tensor(sky)).numpy())
 
     def _lights(self, point: Point, profile: np.ndarray) -> _Lights:
@@ -518,35 +540,51 @@ class Problem:
         A light's core is seen through T, its glow through the block transport.
         """
         state, unknowns, pictures = point.state, [], []
-        sky = np.maximum(point.edited[self.rows] - self._core(state, state["flux"]), 0)
+        layers, sky = self.layers, point.sky
         # Columns of one light must not take the place of another's.
         lit = self.lit(state)
         most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
         for i in lit:
-            alone = state["flux"].copy()
-            alone[np.arange(len(alone)) != i] = DARK
-            now, glow = self._core(state, alone), self.layers.glow_of(i, state["turn"], state["flux"])
-            cores, shone = [now], [None if glow is None else sky * (1 - 1 / glow)]
-            for axis in self._tangents(state, i):
-                ends = []
+            turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])
+            axes, turns = self._tangents(state, i), [turn]
+            for axis in axes:
                 for sign in (1, -1):
                     there = _rotated(self.direction(state, i), sign * ANGLE * axis)
-                    turn = state["turn"].copy()
-                    turn[i] = rotation_vector(self.layers.lights.centres[i], there)
-                    moved = {**state, "turn": turn}
-                    ends.append((self._core(moved, alone), self.layers.glow_of(i, turn, state["flux"])))
-                (ahead, glow_ahead), (back, glow_back) = ends
-                cores.append((ahead - back) / (2 * ANGLE))
-                shone.append(None if glow is None else sky * np.log(glow_ahead / glow_back) / (2 * ANGLE))
-                unknowns.append(("turn", i, axis))
-            larger = {**state, "size": state["size"] + 0.1}
-            cores.append((self._core(larger, alone) - now) / 0.1)
+                    turns.append(rotation_vector(layers.lights.centres[i], there))
+            ways = [(one, flux, size) for one in turns] + [(turn, flux, size + 0.1)]
+            now, *ends, larger = layers.lights.cores_of(i, ways, layers.whole)
+            cores = [now, *_differences(ends), (larger - now) / 0.1]
             seen = self.transport.pictures(np.stack(cores), self.rows, most).reshape(4, -1, 3)
+            glow, *ends = (self._log_glow(state, i, one) for one in turns)
+            shone = None
             if glow is not None:
-                seen[:3] += self.blocks.pictures(np.stack(shone)) * profile.reshape(-1, 3)
+                shone = np.stack([sky * -np.expm1(-glow), *(sky * d for d in _differences(ends))])
+            shone = self._with_lit_ground(point, np.stack(cores[:3]), shone)
+            if shone is not None:
+                seen[:3] += self.blocks.pictures(shone) * profile.reshape(-1, 3)
             pictures.append(seen)
-            unknowns += [("size", i, 0), *(("flux", i, c) for c in range(3))]
+            unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
+            unknowns += [("flux", i, c) for c in range(3)]
         return _Lights(self._apart(pictures), unknowns)
+
+    def _with_lit_ground(
+        self, point: Point, cores: np.ndarray, shone: np.ndarray | None
+    ) -> np.ndarray | None:
+        """Add to changes of the sky (k, rows, W, 3), None for none, those of the ground that it lights."""
+        below, up = self.layers.below, self.layers.shape[0]
+        if below is None or below.light is None:
+            return shone
+        whole = np.zeros_like(cores) if shone is None else shone
+        light = np.maximum(below.light.irradiance(point.edited[self.rows][:up]), 1e-30)
+        for k, core in enumerate(cores):
+            more = below.light.irradiance(whole[k, :up] + core[:up]) / light
+            whole[k, up:] += point.sky[up:] * np.float32(below.lit[:, None, None] * more)
+        return whole
+
+    def _log_glow(self, state, i, turn):
+        turns = state["turn"].copy()
+        turns[i] = turn
+        return self.layers.log_glow_of(i, turns, state["flux"])
 
     def _apart(self, pictures):
         """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
@@ -568,10 +606,10 @@ class Problem:
         across = across / length if length > 1e-6 else np.array([1.0, 0, 0])
         return across, np.cross(across, centre)
 
-    def _core(self, state, flux):
-        return self.layers.lights.core(
-            tensor(state["turn"]), tensor(flux), tensor(state["size"]), self.layers.whole, self.layers.rows
-        ).numpy()
+
+def _differences(ends):
+    """Return derivatives by two angles of what is given ahead and back along each."""
+    return [(ends[k] - ends[k + 1]) / (2 * ANGLE) for k in (0, 2)]
 
 
 def _sizes(residual):

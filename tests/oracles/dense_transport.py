@@ -49,6 +49,11 @@ class DenseTransport:
 
     linear = apply  # no other lamps
 
+    def adjoint(self, image):
+        flat = np.asarray(image, np.float32).reshape(-1, 3)
+        rgb = [w.T @ flat[:, c] for c, w in enumerate(self.weights)]
+        return mi.TensorXf(np.ascontiguousarray(np.stack(rgb, axis=1).reshape(*self.grid, 3)))
+
     def pictures(self, maps, rows, most=0):
         whole = np.zeros((len(maps), *self.grid, 3))
         whole[:, rows] = maps

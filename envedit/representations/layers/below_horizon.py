@@ -3,16 +3,20 @@
 On PureSky maps they are a blurred mirror of the sky; on others they are photographed ground. Either way they
 are the original's, times a smooth factor, the change of the sky above:
 
-    E_low = E0_low * R^f,    log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
+    E_low = E0_low * R^f * (H / H_0)^(1 - f),
+    log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
 S and S_0 are the sky, without cores of lights, after the edit and before, in every channel with some of its
 luminance (:data:`.VEIL`; a ratio to a channel that is black says nothing), m is the mirrored direction, K a
 Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
 :data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio. f is 1 for
-a mirror; for ground it falls off with the angle (:data:`FADE`): what was photographed keeps its brightness.
+a mirror; for ground it falls off with the angle (:data:`FADE`). Farther down ground follows H, the light that
+falls on it (``ground_light.py``), or keeps its brightness where its albedo would be none that there is.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +26,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.gain import VEIL
+from envedit.representations.layers.ground_light import GroundLight
 
 KINDS = "mirror", "keep"
 SMOOTH, BOX = 0.0125, 7.0
@@ -37,7 +42,7 @@ WIDEST = 3.0, 6.0, 10.0, 15.0, 20.0
 BLENDED = 5.0
 """Degrees below the horizon over which the blur sets in."""
 FADE = 10.0
-"""Degrees below the horizon at which ground follows by 1/e."""
+"""Degrees below the horizon at which ground follows what it would mirror by 1/e."""
 COLUMNS, COARSE = 96, 48
 """Columns of the grid on which K is applied, and on which its width is chosen."""
 
@@ -74,11 +79,15 @@ class Below:
         The original's rows above, without cores of lights.
     kind : str
         "mirror" or "keep".
+    above : ndarray (sky_rows, W, 3), optional
+        The original's rows above, with cores; the ground is lit by them. None: it keeps its brightness.
 
     Attributes
     ----------
     image : ndarray (rows, W, 3)
         The radiance as given.
+    light : GroundLight or None
+        What falls on ground that it lights; None of a mirror, and of ground that keeps its brightness.
     mirrored : ndarray of int64 (rows,)
         The row of the sky that each row mirrors.
     fade : ndarray (rows,)
@@ -87,7 +96,7 @@ class Below:
         Greatest standard deviation of K, degrees.
     """
 
-    def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str):
+    def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str, above: np.ndarray | None = None):
         (up, width, _), low = sky.shape, len(radiance)
         total = up + low
         self.kind, self.shape, self.image = kind, radiance.shape[:2], radiance
@@ -108,6 +117,25 @@ class Below:
         self._blur.widen(self.widest)
         before = _veiled(tensor(sky))
         self._before, self._before_soft = before, self._blur(before)
+        self.light: GroundLight | None = None
+        if kind == "keep" and above is not None:
+            light = GroundLight(above, radiance)
+            self.light = light if light.plausible else None
+        self._lit, self._around = tensor(self.lit[:, None]), tensor(np.tile(np.eye(3), width))
+
+    @property
+    def said(self) -> str:
+        """What the rows do, in words."""
+        if self.kind == "mirror":
+            return "follow the sky as its mirror"
+        if self.light is None:
+            return "are ground and keep their brightness: no albedo explains it by the light from above"
+        return f"are ground and follow the light that falls on it (albedo {self.light.albedo:.2g})"
+
+    @property
+    def lit(self) -> np.ndarray:
+        """How far each row follows the light that falls on it, (rows,)."""
+        return np.zeros_like(self.fade) if self.light is None else 1 - self.fade
 
     def _best_width(self, radiance, sky, total):
         """Choose the widest K by how well K S_0 explains the variation of each row around the horizon."""
@@ -133,18 +161,24 @@ class Below:
         """
         self._behind = tensor(log_change * self._blend[:, None, None])
 
-    def log_factor(self, sky: mi.TensorXf, gone: mi.Float | None = None) -> mi.TensorXf:
-        """Return log R^f (rows, W, 3) under a sky (sky_rows, W, 3) without cores.
+    def log_factor(
+        self, sky: mi.TensorXf, gone: mi.Float | None = None, core: mi.TensorXf | None = None
+    ) -> mi.TensorXf:
+        """Return the log factor (rows, W, 3) of the rows under a sky (sky_rows, W, 3) without cores.
 
+        ``core`` is the cores' radiance in the whole map, for what falls on ground: without, it is as before.
         With what is to be revealed, ``gone`` (sky_rows * W) is the share of a texel's light above the horizon
         that was a glow's and is gone.
         """
+        lit: Any = 0.0
+        if core is not None and self.light is not None:
+            lit = dr.matmul(self._lit, dr.matmul(self.light.log_change(sky, core), self._around))
         sky = _veiled(sky)
         soft = dr.log((self._blur(sky) + self._faint) / (self._before_soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
         sharp = dr.log((sky.array + self._faint) / (self._before.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
-        factor = dr.reshape(sharp * self._sharp + soft * self._soft, (*self.shape, 3))
+        factor = dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3))
         if self._behind is None or gone is None:
             return factor
         gone = dr.gather(mi.Float, gone, self._mirrored // 3)

@@ -119,16 +119,16 @@ class Layers:
         if self.lights.glowing:
             told = self.separation.background, self.separation.glow, self._away()
             self.behind = behind_glow(*told, self.rows)
-        self.below = self._below(low) if low is not None and len(low) else None
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1], self.rows[0] == 0)
         self.scales = SCALES | self.gain.scales()
         self._prepared: dict = {}
         n = self.lights.count
         flux = np.zeros((n, 3), np.float32)
         flux[n - SPARE :] = DARK / SCALES["flux"]
-        params = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
-        params |= self.gain.init()
-        return {name: tensor(value) for name, value in params.items()}
+        given = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
+        params = {name: tensor(value) for name, value in given.items()}
+        self.below = self._below(low, self._unmoved(params)) if low is not None and len(low) else None
+        return params | {name: tensor(value) for name, value in self.gain.init().items()}
 
     def _away(self):
         """Degrees from each texel to the nearest light that has a glow, (rows, W)."""
@@ -137,9 +137,9 @@ class Layers:
         glowing = [light.direction for light in self.separation.lights if light.glow is not None]
         return np.degrees(np.arccos(np.clip((toward @ np.transpose(glowing)).max(axis=2), -1, 1)))
 
-    def _below(self, low):
+    def _below(self, low, above):
         """Rows that follow, and what they show where the reflection of a glow has gone."""
-        below = Below(low, self.base, self._horizon)
+        below = Below(low, self.base, self._horizon, above)
         if self.behind is None or self._horizon != "mirror":
             return below
         background, glow = self.separation.background, self.separation.glow
@@ -172,6 +172,11 @@ class Layers:
 
         Rows that follow have the resolution of the image.
         """
+        sky, core = self.parts(params, shape)
+        return sky + core
+
+    def parts(self, params: dict, shape: tuple[int, int] | None = None) -> tuple[mi.TensorXf, mi.TensorXf]:
+        """Compose the map as :meth:`decode` does, its lights' cores apart: the sky, and cores."""
         height, width = shape or self.shape
         shape = height, width
         if self.below is not None and shape != self.shape:
@@ -179,12 +184,20 @@ class Layers:
         rows = self._at(shape)[0]
         real = {name: value * self.scales[name] for name, value in params.items()}
         sky, gone = self._sky(real, shape)
-        if self.below is not None:
-            shape = self.whole
-            factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky, gone)).array)
-            low = dr.ravel(brightened(self.below.radiance, factor))
-            sky = mi.TensorXf(dr.concat((sky.array, low)), (*shape, 3))
-        return sky + self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
+        if self.below is None:
+            return sky, self._core(real, shape, rows)
+        core = self._core(real, self.whole, rows)
+        factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky, gone, core)).array)
+        low = dr.ravel(brightened(self.below.radiance, factor))
+        return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
+
+    def _unmoved(self, params):
+        """Rows above the horizon as :meth:`decode` composes them where nothing has changed."""
+        real = {name: value * SCALES[name] for name, value in params.items()}
+        return self.base + self._core(real, self.shape, self.rows).numpy()
+
+    def _core(self, real, shape, rows):
+        return self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
 
     def _sky(self, real, shape):
         """Background and glow (rows, W, 3); share of a texel's radiance that was a glow's and is gone."""
@@ -203,7 +216,8 @@ class Layers:
         if self.below is None:
             return np.zeros((0, self.shape[1], 3), np.float32)
         real = {name: value * self.scales[name] for name, value in params.items()}
-        return self.below.log_factor(*self._sky(real, self.shape)).numpy()
+        sky, gone = self._sky(real, self.shape)
+        return self.below.log_factor(sky, gone, self._core(real, self.whole, self.rows)).numpy()
 
     @property
     def active(self) -> slice:
@@ -226,6 +240,24 @@ class Layers:
         """How far each row of the image goes by lights and gain, (rows,): 1, less where ground is kept."""
         own = np.ones(self.shape[0])
         return own if self.below is None else np.concatenate([own, self.below.fade])
+
+    @property
+    def lit(self) -> np.ndarray:
+        """How far each row of the image follows the light that falls on ground, (rows,)."""
+        own = np.zeros(self.shape[0])
+        return own if self.below is None else np.concatenate([own, self.below.lit])
+
+    def lighting(self, level: int) -> np.ndarray:
+        """Return the share of the ground's irradiance that comes from the sky around each node, (nodes,)."""
+        rows, columns = self.gain.sizes[level]
+        if self.below is None or self.below.light is None:
+            return np.zeros(rows * columns)
+        total = float(self.below.light.initial @ LUMINANCE)
+        light = (self.base @ LUMINANCE * self.below.light.cosine / total).ravel()
+        part = np.zeros(rows * columns)
+        for node, share in self.gain.hats(level, self.shape):
+            part += np.bincount(node, share * light, rows * columns)
+        return part
 
     def background(self) -> np.ndarray:
         """Return the image without its lights and their glow, (rows, W, 3)."""
@@ -252,16 +284,18 @@ class Layers:
         field = self.gain.evaluate(real, self.gain.prepare(self.shape, self.rows))
         return mi.TensorXf(dr.ravel(field), (*self.shape, 3)).numpy()
 
-    def glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
-        """Return 1 + s_i G_i (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
+    def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
+        """Return log(1 + s_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
 
         ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.
         """
         if i >= len(self.separation.lights) or self.separation.lights[i].glow is None:
             return None
         factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._at(self.shape)[1])
-        found = mi.TensorXf(dr.ravel(factor), (*self.shape, 3)).numpy()[self.followed]
-        return found if self.below is None else found ** self.follows[:, None, None]
+        found = mi.TensorXf(dr.ravel(dr.log(factor)), (*self.shape, 3)).numpy()
+        if self.below is None:
+            return found
+        return np.concatenate([found, found[self.below.mirrored] * self.below.fade[:, None, None]])
 
     def _at(self, shape):
         if shape not in self._prepared:

@@ -16,6 +16,7 @@ Longer than 400 lines: the shares of a point and their derivatives by hand are r
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -74,6 +75,7 @@ class Lights:
     def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
         first, total = rows
         self.count, self.width, self.total = len(lights) + SPARE, width, total
+        self._rows = rows
         omega = latlong.lookup_solid_angles(total, width)
         directions, fluxes, which, sines = [], [], [], []
         for i, light in enumerate(lights):
@@ -96,6 +98,8 @@ class Lights:
         self._point = dr.opaque(mi.Vector3f(np.concatenate(directions).T.astype(np.float32)))
         self._flux = dr.opaque(mi.Color3f(np.concatenate(fluxes).T.astype(np.float32)))
         self._which = dr.opaque(mi.UInt32(np.concatenate(which).astype(np.uint32)))
+        many = [len(w) for w in which]
+        self._points_of = list(zip(np.cumsum([0, *many[:-1]]).tolist(), many, strict=True))
         # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
         owner = np.concatenate(which)[:, None] == np.arange(self.count)
         self._owner = tensor(owner)
@@ -147,6 +151,39 @@ class Lights:
         spread = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
         places = placed(self._point, centre, turn, size, self._sine, finer, (rows[1], shape[1]))
         return shared_out(*places, flux, spread, shape, rows)
+
+    def cores_of(
+        self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], shape: tuple[int, int]
+    ) -> np.ndarray:
+        """Render the core of light ``i`` alone as it is placed in one way and another.
+
+        Parameters
+        ----------
+        i : int
+            Which light.
+        placements : sequence of (ndarray (3,), ndarray (3,), float)
+            Turn, log flux and log size, as of :meth:`core`.
+        shape : (int, int)
+            Rows and columns wanted, from the first row that the lights were given for, at their resolution.
+
+        Returns
+        -------
+        ndarray (k, rows, W, 3)
+            Linear radiance; not differentiable.
+        """
+        first, count = self._points_of[i]
+        lane = dr.arange(mi.UInt32, count * len(placements))
+        page = lane // dr.opaque(mi.UInt32, count)
+        point = lane - page * dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        turns, fluxes, sizes = (np.float32(one) for one in zip(*placements, strict=True))
+        turn, flux = (dr.gather(mi.Vector3f, tensor(values).array, page) for values in (turns, fluxes))
+        size = dr.exp(dr.clip(dr.gather(mi.Float, tensor(sizes).array, page), *LOG_SIZES))
+        position, sine = dr.gather(mi.Vector3f, self._point, point), dr.gather(mi.Float, self._sine, point)
+        centre = dr.gather(mi.Vector3f, self._centre, dr.opaque(mi.UInt32, i))
+        places = placed(position, centre, turn, size, sine, 1.0, (self.total, shape[1]))
+        flux = dr.gather(mi.Color3f, self._flux, point) * _exp(mi.Color3f(flux))
+        rows = self._rows
+        return shared_out(*places, flux, 1.0, shape, rows, mi.Int32(page), len(placements)).numpy()
 
     def glow(self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.
@@ -214,6 +251,8 @@ def shared_out(
     half_row: float,
     shape: tuple[int, int],
     rows: tuple[int, int],
+    page: mi.Int32 | int = 0,
+    pages: int = 1,
 ) -> mi.TensorXf:
     """Share points out among the texels around them.
 
@@ -227,13 +266,16 @@ def shared_out(
         Half-width of a tent in rows, at least 1.
     shape, rows : (int, int)
         As in :meth:`Lights.core`.
+    page, pages : Int32 (n,), int
+        Which of several images each point is of, and how many there are.
 
     Returns
     -------
-    TensorXf (rows, W, 3)
+    TensorXf (rows, W, 3), or (pages, rows, W, 3) where there are several
         Linear radiance; what falls on rows that are not wanted is lost.
     """
-    return dr.custom(_Share, row, column, half, flux, half_row, shape, rows)
+    page = dr.opaque(mi.Int32, 0) if pages == 1 else page
+    return dr.custom(_Share, row, column, half, flux, half_row, shape, rows, page, pages)
 
 
 def points(row: np.ndarray, column: np.ndarray, total: int, width: int) -> np.ndarray:
@@ -341,7 +383,7 @@ def interpolated_glow(table: mi.Float, cosine: mi.Float) -> mi.Color3f:
 class _Share(dr.CustomOp):
     """Share points out among texels; see the module's docstring."""
 
-    def eval(self, row, column, half, flux, half_row, shape, rows):
+    def eval(self, row, column, half, flux, half_row, shape, rows, page, pages):
         first, total = rows
         self.args = row, column, half, flux
         omega = latlong.lookup_solid_angles(total, shape[1]).astype(np.float32)
@@ -352,9 +394,9 @@ class _Share(dr.CustomOp):
             dr.opaque(mi.Int32, first),
             dr.opaque(mi.Int32, shape[0]),
             dr.opaque(mi.Int32, total),
+            page,
         )
-        self.shape = shape
-        texels = shape[0] * shape[1]
+        texels = pages * shape[0] * shape[1]
         # Of the largest radiance that can come about, so many bits are kept.
         most = dr.max(dr.maximum(dr.maximum(flux.x, flux.y), flux.z)) * float(1 / omega.min())
         most = dr.minimum(most, dr.largest(mi.Float))  # infinite, it would put all lights out
@@ -365,7 +407,7 @@ class _Share(dr.CustomOp):
         lit = mi.Float(mi.Float64(sums) * dr.select(scale > 0, 1 / mi.Float64(scale), 0))
         # Summed in double precision: many bright points are no infinity.
         bad = ~dr.isfinite(dr.sum(mi.Float64(flux.x) + flux.y + flux.z + row + column + half))
-        return mi.TensorXf(dr.select(bad, dr.nan, lit), (*shape, 3))
+        return mi.TensorXf(dr.select(bad, dr.nan, lit), (*((pages,) if pages > 1 else ()), *shape, 3))
 
     def backward(self):
         row, column, half, flux = _pull(self.grad_out().array, *self.args, *self.geometry)
@@ -403,7 +445,7 @@ def _total(place, half, low, high):
 
 
 @dr.syntax
-def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, first, height, total):
+def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, first, height, total, page):
     rows, _, _ = _total(row, half_row, mi.Int32(0), total - 1)
     columns, _, _ = _total(column, half, mi.Int32(-1 << 20), mi.Int32(1 << 20))
     r = dr.maximum(mi.Int32(dr.ceil(row - half_row)), first)
@@ -415,7 +457,7 @@ def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, f
         while c <= stop:
             # The scale first: of a light of 1e-30 it is larger than a share leaves room for.
             value = flux * scale * (share * (1 - dr.abs(mi.Float(c) - column) / half) / columns)
-            place = ((r - first) * width + (c % width + width) % width) * 3
+            place = ((page * height + r - first) * width + (c % width + width) % width) * 3
             for channel in range(3):
                 v = value[channel]
                 dr.scatter_add(sums, mi.Int64(v), mi.UInt32(place + channel), v != 0)
@@ -424,7 +466,7 @@ def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, f
 
 
 @dr.syntax
-def _pull(grad, row, column, half, flux, per_omega, half_row, width, first, height, total):
+def _pull(grad, row, column, half, flux, per_omega, half_row, width, first, height, total, page):
     rows, rows_slope, _ = _total(row, half_row, mi.Int32(0), total - 1)
     columns, columns_slope, columns_widening = _total(column, half, mi.Int32(-1 << 20), mi.Int32(1 << 20))
     all_, d_row, d_column, d_half = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
@@ -440,7 +482,7 @@ def _pull(grad, row, column, half, flux, per_omega, half_row, width, first, heig
         stop = mi.Int32(dr.floor(column + half))
         while c <= stop:
             x = mi.Float(c) - column
-            place = mi.UInt32((r - first) * width + (c % width + width) % width)
+            place = mi.UInt32((page * height + r - first) * width + (c % width + width) % width)
             pulled = dr.gather(mi.Color3f, grad, place) * per
             part = (1 - dr.abs(x) / half) / columns
             d_flux += pulled * (share * part)

@@ -1,0 +1,86 @@
+"""The light that falls on photographed ground, by which its brightness follows an edit of the sky.
+
+Ground under an open sky, and a floor under lamps, reflect what falls on them: with H the irradiance of a
+horizontal plane from all rows above the horizon and A the albedo, radiance is A H / pi. A does not change
+with the light, so that the radiance goes by H / H_0. Whether a map's lower half is lit in that way at all is
+measured: pi times its median luminance over H_0 is the albedo of a real surface, or it is not.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
+from envedit.representations.layers.gain import VEIL
+
+ALBEDO = 0.02, 1.0
+"""Least and greatest albedo of ground that is lit by what is above. Four photographs with ground or floor
+have 0.07 to 0.15, the maps of two public scenes 0.1 and 0.34, and the analytic sky, whose ground is lit by
+it, 0.20 with its sun at 5 to 80 degrees. Ground that shines itself has more."""
+_LEAST = 1e-30
+
+
+class GroundLight:
+    """Irradiance of a horizontal plane under the rows above the horizon.
+
+    Parameters
+    ----------
+    above : ndarray (rows, W, 3)
+        Those rows of the original, with the cores of lights.
+    ground : ndarray (low, W, 3)
+        The rows below.
+
+    Attributes
+    ----------
+    initial : ndarray (3,)
+        H_0.
+    albedo : float
+        Median of pi times the ground's luminance over that of H_0; 0 of black.
+    cosine : ndarray (rows, 1)
+        What a texel's radiance is multiplied by in H: its solid angle times the cosine.
+    """
+
+    def __init__(self, above: np.ndarray, ground: np.ndarray):
+        (up, width, _), total = above.shape, len(above) + len(ground)
+        cosine = np.maximum(np.cos(np.pi * np.arange(up) / max(total - 1, 1)), 0)
+        self.cosine = (latlong.lookup_solid_angles(total, width)[:up] * cosine)[:, None]
+        self.initial = self.irradiance(above)
+        light = float(self.initial @ LUMINANCE)
+        self.albedo = np.pi * float(np.median(ground @ LUMINANCE)) / light if light > _LEAST else 0.0
+        # Products of matrices: their sums, and those of their adjoints, have one order. Every channel gets
+        # some of the luminance, as a ratio to a channel that is black says nothing.
+        mixed = (1 - VEIL) * np.eye(3) + VEIL * np.asarray(LUMINANCE)[:, None]
+        self._rows, self._columns = tensor(self.cosine.T), tensor(np.tile(mixed, (width, 1)))
+        self._size = up * width * 3
+        self._before = self._log_light(tensor(above))
+
+    @property
+    def plausible(self) -> bool:
+        """Whether the ground's albedo is one that surfaces have."""
+        return ALBEDO[0] <= self.albedo <= ALBEDO[1]
+
+    def irradiance(self, above: np.ndarray) -> np.ndarray:
+        """Return H (3,) under rows above the horizon (rows, W, 3)."""
+        return np.asarray(np.einsum("rwc,rk->c", above, self.cosine, optimize=True), np.float64)
+
+    def log_change(self, sky: mi.TensorXf, core: mi.TensorXf) -> mi.TensorXf:
+        """Return log H / H_0, (1, 3), differentiably.
+
+        Parameters
+        ----------
+        sky : TensorXf (rows, W, 3)
+            The rows above the horizon, without cores of lights.
+        core : TensorXf (rows or more, W, 3)
+            The cores; rows beyond those of the sky do not count.
+        """
+        core = dr.gather(mi.Float, core.array, dr.arange(mi.UInt32, self._size))
+        return self._log_light(mi.TensorXf(sky.array + core, sky.shape)) - self._before
+
+    def _log_light(self, above):
+        flat = dr.reshape(above, (above.shape[0], 3 * above.shape[1]))
+        light = dr.matmul(dr.matmul(self._rows, flat), self._columns)
+        return dr.log(dr.maximum(light, _LEAST))

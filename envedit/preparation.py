@@ -25,7 +25,7 @@ from envedit.representations.layers.lights import SPARE
 from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.scene.renderings import rendered
-from envedit.solve import initialization, map_problem, turning
+from envedit.solve import gauss_newton, initialization, map_problem, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
@@ -285,11 +285,11 @@ class Preparation:
 
 
 def _loss(edit: Edit) -> float:
-    """Return the loss after the first steps from where an edit starts; inf if it cannot begin.
+    """Return the loss where the steps of an edit end; inf if it cannot begin.
 
     Its lights are placed, and others added, before the first step: the edit goes on from there.
     """
     try:
-        return edit.job.tried(edit.params, edit.crop, SPARE)
+        return edit.job.tried(edit.params, edit.crop, SPARE, gauss_newton.ITERATIONS)
     except NumericalError:
         return np.inf

@@ -199,9 +199,12 @@ class Job:
         """Whether the target is a rendering, and not painted."""
         return self.wanted.coverage is None
 
-    def tried(self, params: Params, crop: np.ndarray, most_added: int = 0) -> float:
-        """Return the loss after a few steps from a start, beside which so many lights may be added."""
-        steps = self.trials
+    def tried(self, params: Params, crop: np.ndarray, most_added: int = 0, steps: int | None = None) -> float:
+        """Return the loss after some steps from a start, beside which so many lights may be added.
+
+        ``steps``: :attr:`trials` by default.
+        """
+        steps = min(steps or self.trials, self.settings.optimizer.iterations)
         if self.newton:
             asked = self._problem(), params, self._sigma, steps
             found = gauss_newton.solve(*asked, trial=True, most_added=most_added)

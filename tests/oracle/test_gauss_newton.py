@@ -879,23 +879,58 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(rng):
         assert np.abs(lights.pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
 
 
-def test_gradient_where_rows_below_the_horizon_follow(rng):
-    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
-    layers = Layers((0, GRID[0]), cycles=3, horizon="mirror")
+@pytest.mark.parametrize("horizon", ["mirror", "keep"])
+def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
+    """The blur of a mirror, and what falls on ground: by the sky, and by a light's flux and place."""
+    image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
+    layers = Layers((0, GRID[0]), cycles=3, horizon=horizon)
     params = layers.encode(image)
+    assert (layers.below.light is not None) == (horizon == "keep")
     target = shown(transport, image) * np.exp(rng.normal(0, 0.3, (*FILM, 3))).astype(np.float32)
     problem = Problem(layers, transport, image, target)
     start = problem.state(params)
-    point = problem.evaluate(start)
+    state = copy(start)
+    state["gain"] = rng.normal(0, 0.3, state["gain"].shape)
+    off_centre = map_problem._rotated(layers.lights.centres[0], np.array([0.03, 0.05, -0.04]))
+    state["turn"][0] = rotation_vector(layers.lights.centres[0], off_centre)
+    point = problem.evaluate(state)
     normal = problem.normal(point, start, 1.0)
+    names = names_of(problem, normal)
 
     def f(x):
         return problem.misfit(problem.evaluate(x).residual, 1.0) + problem.penalty(x, start)
 
-    some = range(0, 3 * problem.nodes, 4)
-    slope = [
-        (f(moved(problem, start, [], k, 0.01)) - f(moved(problem, start, [], k, -0.01))) / 0.04 for k in some
-    ]
-    # The blur of the mirror is not in the Jacobian: nodes of rows that follow are those that they mirror.
-    got = normal.gradient[some]
-    assert np.dot(got, slope) > 0.95 * np.linalg.norm(got) * np.linalg.norm(slope)
+    for kind in ("gain", "flux", "turn"):
+        some = [k for k, name in enumerate(names) if name == kind][:: 4 if kind == "gain" else 1]
+        ends = [
+            [f(moved(problem, state, normal.unknowns, k, s * STEPS[kind])) for s in (1, -1)] for k in some
+        ]
+        slope = np.array([ahead - back for ahead, back in ends]) / (4 * STEPS[kind])
+        close = {"gain": 2e-3, "flux": 0.05, "turn": 0.05}[kind] * np.abs(slope).max()
+        np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=close, err_msg=kind)
+
+
+def test_gradient_by_the_sky_is_exact_where_a_block_is_not(rng):
+    """Pixels of a block that each see another sky: the gradient goes through T, not through their mean."""
+    film, sigma = (8, 64), 0.2
+    image, transport = clouds(rng), DenseTransport.random(rng, film, GRID)
+    target = shown(transport, image) * np.exp(rng.normal(0, 0.5, (*film, 3))).astype(np.float32)
+    problem, params = problem_of(image, transport, target)
+    start = problem.state(params)
+    state = copy(start)
+    state["gain"] = rng.normal(0, 0.3, state["gain"].shape)
+    normal = problem.normal(problem.evaluate(state), start, sigma)
+    assert problem.blocks.count == 8 * 64 // 4
+
+    def f(x):
+        return problem.misfit(problem.evaluate(x).residual, sigma)
+
+    some = range(0, 3 * problem.nodes, 5)
+    ends = [[f(moved(problem, state, [], k, s * STEPS["gain"])) for s in (1, -1)] for k in some]
+    slope = np.array([ahead - back for ahead, back in ends]) / (4 * STEPS["gain"])
+    prior = normal.precision @ problem._from_prior(state, start, normal.unknowns)
+    got = (normal.gradient - prior)[some]
+    np.testing.assert_allclose(got, slope, rtol=0, atol=5e-3 * np.abs(slope).max())
+    # Negative control: the block transport's own gradient is another one.
+    columns = [j.T @ normal.blocks.pulled[:, c] for c, j in enumerate(normal.blocks.jacobian)]
+    assert np.abs(np.concatenate(columns)[some] - slope).max() > 0.05 * np.abs(slope).max()

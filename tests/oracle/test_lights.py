@@ -246,6 +246,20 @@ def test_core_is_the_plain_one(shape, rng):
     assert np.abs(got - plain_core(light, turn, flux, size + 0.3, shape)).max() > 0.01 * expected.max()
 
 
+def test_cores_of_one_light_are_those_of_all_with_the_others_out(rng):
+    """In several images at once, to rounding: as a solver's finite differences take them."""
+    made = Lights([patch(rng, 4, 5), patch(rng, 9, 20)], (0, H), W)
+    for i in (0, 1, 2):
+        ways = [(random_turn(rng) * 0.1, rng.normal(0, 0.3, 3), rng.normal(0, 0.2)) for _ in range(3)]
+        found = made.cores_of(i, ways, (H, W))
+        assert found.shape == (3, H, W, 3) and found.any(axis=(1, 2, 3)).all()
+        for one, (turn, flux, size) in zip(found, ways, strict=True):
+            at = [np.zeros((made.count, n)) for n in (3, 3, 1)]
+            at[0][i], at[1][:], at[1][i], at[2][i] = turn, DARK, flux, size
+            alone = made.core(*(mi.TensorXf(np.float32(v)) for v in at), (H, W), (0, H)).numpy()
+            np.testing.assert_allclose(one, alone, rtol=3e-6, atol=1e-5)
+
+
 def centred_at(light, elevation, azimuth):
     return rotation_vector(light.direction, direction(azimuth, elevation))
 

@@ -15,12 +15,13 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
-from envedit.representations.layers.gain import VEIL
 
 ALBEDO = 0.02, 1.0
 """Least and greatest albedo of ground that is lit by what is above. Four photographs with ground or floor
 have 0.07 to 0.15, the maps of two public scenes 0.1 and 0.34, and the analytic sky, whose ground is lit by
 it, 0.20 with its sun at 5 to 80 degrees. Ground that shines itself has more."""
+MIXED = 0.01
+"""Share of its luminance in every channel of H: a ratio to a channel that is black says nothing."""
 _LEAST = 1e-30
 
 
@@ -51,9 +52,8 @@ class GroundLight:
         self.initial = self.irradiance(above)
         light = float(self.initial @ LUMINANCE)
         self.albedo = np.pi * float(np.median(ground @ LUMINANCE)) / light if light > _LEAST else 0.0
-        # Products of matrices: their sums, and those of their adjoints, have one order. Every channel gets
-        # some of the luminance, as a ratio to a channel that is black says nothing.
-        mixed = (1 - VEIL) * np.eye(3) + VEIL * np.asarray(LUMINANCE)[:, None]
+        # Products of matrices: their sums, and those of their adjoints, have one order.
+        mixed = (1 - MIXED) * np.eye(3) + MIXED * np.asarray(LUMINANCE)[:, None]
         self._rows, self._columns = tensor(self.cosine.T), tensor(np.tile(mixed, (width, 1)))
         self._size = up * width * 3
         self._before = self._log_light(tensor(above))

@@ -82,9 +82,13 @@ class Prior:
     size: float = 0.3
     added_size: float = 1.0
 
-    def gain_precisions(self, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
-        """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n)."""
+    def gain_precisions(self, sizes: Sequence[tuple[int, int]], ground: bool = False) -> np.ndarray:
+        """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n).
+
+        ``ground``: the last is the factor of ground, which changes as a coarse node of the sky.
+        """
         fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
+        fall = np.append(fall, 1.0) if ground else fall
         return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
 
     @property
@@ -223,9 +227,10 @@ class Problem:
         self.weight = np.ones((*shape, 1), np.float32) if weight is None else np.float32(weight)
         self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
         self.sizes = layers.gain.sizes
-        self.nodes = sum(rows * columns for rows, columns in self.sizes)
+        self._ground = bool(layers.lit.any())
+        self.nodes = sum(rows * columns for rows, columns in self.sizes) + self._ground
         self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
-        self._precisions = self.prior.gain_precisions(self.sizes)
+        self._precisions = self.prior.gain_precisions(self.sizes, self._ground)
         self._linear: tuple | None = None
 
     def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:
@@ -241,22 +246,31 @@ class Problem:
             self._linear = found, *self._linear[1:]
         return found
 
+    @property
+    def _grids(self):
+        """Names of the parameters that are nodes of the gain."""
+        return [f"gain.{i}" for i in range(len(self.sizes))] + ["ground"] * self._ground
+
     # ---- unknowns ------------------------------------------------------------------------------------------
 
     def state(self, params: dict) -> dict[str, np.ndarray]:
-        """Return the parameters in their own units: logarithms and radians, float64."""
+        """Return the parameters in their own units: logarithms and radians, float64.
+
+        The factor of ground, where there is one, is the last of the gain's nodes.
+        """
         real = {k: np.float64(v.numpy()) * _numpy(self.layers.scales[k]) for k, v in params.items()}
-        grids = [real.pop(f"gain.{i}").reshape(-1, 3) for i in range(len(self.sizes))]
+        grids = [real.pop(name).reshape(-1, 3) for name in self._grids]
         return real | {"gain": np.concatenate(grids)}
 
     def params(self, state: dict) -> dict:
         """Return the layers' parameters of a state."""
         found, start = {}, 0
-        for i, size in enumerate(self.sizes):
-            stop = start + size[0] * size[1]
-            grid = state["gain"][start:stop].reshape(*size, 3)
-            unit = _numpy(self.layers.scales[f"gain.{i}"])
-            found[f"gain.{i}"] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
+        shapes = [(*size, 3) for size in self.sizes] + [(1, 3)] * self._ground
+        for name, shape in zip(self._grids, shapes, strict=True):
+            stop = start + int(np.prod(shape[:-1]))
+            grid = state["gain"][start:stop].reshape(shape)
+            unit = _numpy(self.layers.scales[name])
+            found[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
             start = stop
         for name in ("turn", "flux", "size"):
             found[name] = tensor(state[name] / self.layers.scales[name])
@@ -417,13 +431,13 @@ class Problem:
         """Return the derivative by every node's log gain (n, 3) of the sum of a picture times T E."""
         light = self.transport.adjoint(np.float32(picture)).numpy()[self.rows]
         params = self.params(point.state)
-        grids = [params[f"gain.{i}"] for i in range(len(self.sizes))]
+        grids = [params[name] for name in self._grids]
         with dr.isolate_grad():
             dr.enable_grad(grids)
             sky, _ = self.layers.parts(params)
             dr.backward(dr.sum(sky.array * tensor(light).array))
             found = [dr.grad(grid).numpy().reshape(-1, 3) for grid in grids]
-        units = [_numpy(self.layers.scales[f"gain.{i}"]) for i in range(len(grids))]
+        units = [_numpy(self.layers.scales[name]) for name in self._grids]
         return np.concatenate([np.float64(g) / u for g, u in zip(found, units, strict=True)])
 
     def _linearised(self, point):

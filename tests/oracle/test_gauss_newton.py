@@ -900,8 +900,12 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
     def f(x):
         return problem.misfit(problem.evaluate(x).residual, 1.0) + problem.penalty(x, start)
 
+    n, grids = problem.nodes, sum(rows * columns for rows, columns in problem.sizes)
+    assert n == grids + (horizon == "keep") and ("ground" in params) == (horizon == "keep")
     for kind in ("gain", "flux", "turn"):
-        some = [k for k, name in enumerate(names) if name == kind][:: 4 if kind == "gain" else 1]
+        some = [k for k, name in enumerate(names) if name == kind]
+        if kind == "gain":  # and the last node, which is the ground's
+            some = some[::4] + [n - 1, 2 * n - 1, 3 * n - 1]
         ends = [
             [f(moved(problem, state, normal.unknowns, k, s * STEPS[kind])) for s in (1, -1)] for k in some
         ]

@@ -3,7 +3,7 @@
 On PureSky maps they are a blurred mirror of the sky; on others they are photographed ground. Either way they
 are the original's, times a smooth factor, the change of the sky above:
 
-    E_low = E0_low * R^f * (H / H_0)^(1 - f),
+    E_low = E0_low * R^f * (a H / H_0)^(1 - f),
     log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
 S and S_0 are the sky, without cores of lights, after the edit and before, in every channel with some of its
@@ -11,7 +11,8 @@ luminance (:data:`.VEIL`; a ratio to a channel that is black says nothing), m is
 Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
 :data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio. f is 1 for
 a mirror; for ground it falls off with the angle (:data:`FADE`). Farther down ground follows H, the light that
-falls on it (``ground_light.py``), or keeps its brightness where its albedo would be none that there is.
+falls on it (``ground_light.py``), or keeps its brightness where its albedo would be none that there is. a is
+an unknown of the edit, 1 where the picture does not determine it: light from the side, or another ground.
 """
 
 from __future__ import annotations
@@ -162,17 +163,24 @@ class Below:
         self._behind = tensor(log_change * self._blend[:, None, None])
 
     def log_factor(
-        self, sky: mi.TensorXf, gone: mi.Float | None = None, core: mi.TensorXf | None = None
+        self,
+        sky: mi.TensorXf,
+        gone: mi.Float | None = None,
+        core: mi.TensorXf | None = None,
+        ground: mi.TensorXf | None = None,
     ) -> mi.TensorXf:
         """Return the log factor (rows, W, 3) of the rows under a sky (sky_rows, W, 3) without cores.
 
         ``core`` is the cores' radiance in the whole map, for what falls on ground: without, it is as before.
+        ``ground`` (1, 3) is the logarithm of a factor beyond that, for light that does not come from above.
         With what is to be revealed, ``gone`` (sky_rows * W) is the share of a texel's light above the horizon
         that was a glow's and is gone.
         """
         lit: Any = 0.0
         if core is not None and self.light is not None:
-            lit = dr.matmul(self._lit, dr.matmul(self.light.log_change(sky, core), self._around))
+            change = self.light.log_change(sky, core)
+            change = change if ground is None else change + ground
+            lit = dr.matmul(self._lit, dr.matmul(change, self._around))
         sky = _veiled(sky)
         soft = dr.log((self._blur(sky) + self._faint) / (self._before_soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)

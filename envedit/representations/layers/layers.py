@@ -120,7 +120,6 @@ class Layers:
             told = self.separation.background, self.separation.glow, self._away()
             self.behind = behind_glow(*told, self.rows)
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1], self.rows[0] == 0)
-        self.scales = SCALES | self.gain.scales()
         self._prepared: dict = {}
         n = self.lights.count
         flux = np.zeros((n, 3), np.float32)
@@ -128,6 +127,9 @@ class Layers:
         given = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
         params = {name: tensor(value) for name, value in given.items()}
         self.below = self._below(low, self._unmoved(params)) if low is not None and len(low) else None
+        if self.lit.any():
+            params["ground"] = tensor(np.zeros((1, 3), np.float32))
+        self.scales = self._units()
         return params | {name: tensor(value) for name, value in self.gain.init().items()}
 
     def _away(self):
@@ -155,8 +157,7 @@ class Layers:
         """Give the gain finer grids and ``params``, of :meth:`encode`, what these start from: zero."""
         self.gain.refine(octaves)
         self.scales = {
-            name: unit if np.ndim(unit) == 0 else tensor(unit)
-            for name, unit in (SCALES | self.gain.scales()).items()
+            name: unit if np.ndim(unit) == 0 else tensor(unit) for name, unit in self._units().items()
         }
         self._prepared = {}
         new = {k: tensor(v) for k, v in self.gain.init().items() if k not in params}
@@ -187,9 +188,15 @@ class Layers:
         if self.below is None:
             return sky, self._core(real, shape, rows)
         core = self._core(real, self.whole, rows)
-        factor = dr.unravel(mi.Color3f, dr.exp(self.below.log_factor(sky, gone, core)).array)
+        factor = dr.unravel(
+            mi.Color3f, dr.exp(self.below.log_factor(sky, gone, core, real.get("ground"))).array
+        )
         low = dr.ravel(brightened(self.below.radiance, factor))
         return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
+
+    def _units(self):
+        """Return what a unit of each parameter is; the factor of lit ground is a logarithm, as the gain."""
+        return SCALES | self.gain.scales() | ({"ground": 1.0} if self.lit.any() else {})
 
     def _unmoved(self, params):
         """Rows above the horizon as :meth:`decode` composes them where nothing has changed."""
@@ -217,7 +224,8 @@ class Layers:
             return np.zeros((0, self.shape[1], 3), np.float32)
         real = {name: value * self.scales[name] for name, value in params.items()}
         sky, gone = self._sky(real, self.shape)
-        return self.below.log_factor(sky, gone, self._core(real, self.whole, self.rows)).numpy()
+        core = self._core(real, self.whole, self.rows)
+        return self.below.log_factor(sky, gone, core, real.get("ground")).numpy()
 
     @property
     def active(self) -> slice:

@@ -226,7 +226,7 @@ def test_a_light_moves_and_what_this_view_does_not_determine_stays(tmp_path):
     x = latlong.directions(32, 64)[..., 0]
     change = np.abs(np.log(found.envmap / found.maps["initial"])).max(axis=2)
     assert change[x < -0.5].mean() < min(0.7 * change[x > 0.5].mean(), 0.12)
-    known = found.posterior.identified
+    known, x = found.posterior.identified[:16], x[:16]  # the ground follows what lights it on either side
     assert known[x < -0.5].mean() < 0.8 * known[x > 0.5].mean()
     assert any("bit for bit" in line for line in found.metrics["choices"])
     assert found.envmap[10, 12].max() < 3

@@ -146,6 +146,7 @@ class Preparation:
             return turned
         still = self._prepared(wanted, 0.0, [])
         with self.clock("start_s"):
+            self.watch.stage("comparing the edits of the turned and of the unturned sky")
             loss, other = _loss(turned), _loss(still)
         chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
         chosen.notes.append(f"AIC (lower is better): {loss:.5g} with the sky turned, {other:.5g} without")

@@ -34,15 +34,15 @@ class BlockJacobian:
         # Hats are weighed by the sky's luminance: what is bright in a cell determines its gain.
         sky = np.maximum(layers.background().reshape(-1, 3) @ LUMINANCE, 1e-12) * self._omega
         light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
-        lit = np.bincount(self._cell, np.repeat(layers.lit, shape[1]) * sky, cells) / light
         hats = []
         for level, (rows, columns) in enumerate(layers.gain.sizes):
             nodes, one = rows * columns, np.zeros(())
             for node, share in layers.hats(level):
                 one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
             hats.append(one.reshape(cells, nodes) / light[:, None])
-            hats[-1] += np.outer(lit, layers.lighting(level))
-        if lit.any():  # the factor of ground
+        if layers.ground_light:  # what the sky does to it, and its own factor
+            lit = np.bincount(self._cell, np.repeat(layers.lit, shape[1]) * sky, cells) / light
+            hats = [one + np.outer(lit, layers.lighting(level)) for level, one in enumerate(hats)]
             hats.append(lit[:, None])
         used = np.bincount(self._cell, minlength=cells) > 0
         self._used = np.flatnonzero(used)

@@ -204,7 +204,7 @@ class Job:
 
         ``steps``: :attr:`trials` by default.
         """
-        steps = min(steps or self.trials, self.settings.optimizer.iterations)
+        steps = self.trials if steps is None else min(steps, self.settings.optimizer.iterations)
         if self.newton:
             asked = self._problem(), params, self._sigma, steps
             found = gauss_newton.solve(*asked, trial=True, most_added=most_added)

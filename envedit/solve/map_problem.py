@@ -227,7 +227,7 @@ class Problem:
         self.weight = np.ones((*shape, 1), np.float32) if weight is None else np.float32(weight)
         self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
         self.sizes = layers.gain.sizes
-        self._ground = bool(layers.lit.any())
+        self._ground = layers.ground_light is not None
         self.nodes = sum(rows * columns for rows, columns in self.sizes) + self._ground
         self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
         self._precisions = self.prior.gain_precisions(self.sizes, self._ground)
@@ -585,14 +585,14 @@ class Problem:
         self, point: Point, cores: np.ndarray, shone: np.ndarray | None
     ) -> np.ndarray | None:
         """Add to changes of the sky (k, rows, W, 3), None for none, those of the ground that it lights."""
-        below, up = self.layers.below, self.layers.shape[0]
-        if below is None or below.light is None:
+        falls, lit, up = self.layers.ground_light, self.layers.lit, self.layers.shape[0]
+        if falls is None:
             return shone
         whole = np.zeros_like(cores) if shone is None else shone
-        light = np.maximum(below.light.irradiance(point.edited[self.rows][:up]), 1e-30)
+        light = np.maximum(falls.irradiance(point.edited[self.rows][:up]), 1e-30)
         for k, core in enumerate(cores):
-            more = below.light.irradiance(whole[k, :up] + core[:up]) / light
-            whole[k, up:] += point.sky[up:] * np.float32(below.lit[:, None, None] * more)
+            more = falls.irradiance(whole[k, :up] + core[:up]) / light
+            whole[k, up:] += point.sky[up:] * np.float32(lit[up:, None, None] * more)
         return whole
 
     def _log_glow(self, state, i, turn):

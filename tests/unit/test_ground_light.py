@@ -28,7 +28,7 @@ def whole(above):
 
 @pytest.mark.parametrize("elevation", [5, 20, 50, 65, 80])
 def test_the_analytic_ground_goes_by_its_irradiance(elevation):
-    """Mitsuba's sky lights its ground itself: another elevation of the sun is another brightness of it."""
+    """``analytic_sky`` lays a ground of one albedo under every sky, from an irradiance of its own making."""
     above, ground = halves(analytic_sky.sunsky(256, 90.0, 35.0))
     other, lit = halves(analytic_sky.sunsky(256, 90.0, float(elevation)))
     change = GroundLight(above, ground).log_change(tensor(other), whole(other)).numpy()[0]

@@ -18,8 +18,8 @@ from envedit.core.color import LUMINANCE
 
 ALBEDO = 0.02, 1.0
 """Least and greatest albedo of ground that is lit by what is above. Four photographs with ground or floor
-have 0.07 to 0.15, the maps of two public scenes 0.1 and 0.34, and the analytic sky, whose ground is lit by
-it, 0.20 with its sun at 5 to 80 degrees. Ground that shines itself has more."""
+have 0.06 to 0.16, the maps of two public scenes 0.1 and 0.3; ``analytic_sky.py`` lays a ground of 0.2 below
+its sky. Ground that shines itself has more."""
 MIXED = 0.01
 """Share of its luminance in every channel of H: a ratio to a channel that is black says nothing."""
 _LEAST = 1e-30
@@ -47,8 +47,8 @@ class GroundLight:
 
     def __init__(self, above: np.ndarray, ground: np.ndarray):
         (up, width, _), total = above.shape, len(above) + len(ground)
-        cosine = np.maximum(np.cos(np.pi * np.arange(up) / max(total - 1, 1)), 0)
-        self.cosine = (latlong.lookup_solid_angles(total, width)[:up] * cosine)[:, None]
+        up_part = np.maximum(latlong.directions(total, width)[:up, :1, 1], 0)
+        self.cosine = latlong.lookup_solid_angles(total, width)[:up, None] * up_part
         self.initial = self.irradiance(above)
         light = float(self.initial @ LUMINANCE)
         self.albedo = np.pi * float(np.median(ground @ LUMINANCE)) / light if light > _LEAST else 0.0

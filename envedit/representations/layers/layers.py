@@ -27,6 +27,7 @@ from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.representations.layers.behind_glow import BehindGlow, behind_glow
 from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
+from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.lights import DARK, SPARE, Lights
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
@@ -131,8 +132,8 @@ class Layers:
         flux[n - SPARE :] = DARK / SCALES["flux"]
         given = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
         params = {name: tensor(value) for name, value in given.items()}
-        self.below = self._below(low, self._unmoved(params)) if low is not None and len(low) else None
-        if self.lit.any():
+        self.below = self._below(low, params) if low is not None and len(low) else None
+        if self.ground_light:
             params["ground"] = tensor(np.zeros((1, 3), np.float32))
         self.scales = self._units()
         return params | {name: tensor(value) for name, value in self.gain.init().items()}
@@ -144,8 +145,9 @@ class Layers:
         glowing = [light.direction for light in self.separation.lights if light.glow is not None]
         return np.degrees(np.arccos(np.clip((toward @ np.transpose(glowing)).max(axis=2), -1, 1)))
 
-    def _below(self, low, above):
+    def _below(self, low, params):
         """Rows that follow, and what they show where the reflection of a glow has gone."""
+        above = self._unmoved(params) if self._horizon == "keep" else None
         below = Below(low, self.base, self._horizon, above)
         if self.behind is None or self._horizon != "mirror":
             return below
@@ -201,7 +203,7 @@ class Layers:
 
     def _units(self):
         """Return what a unit of each parameter is; the factor of lit ground is a logarithm, as the gain."""
-        return SCALES | self.gain.scales() | ({"ground": GROUND} if self.lit.any() else {})
+        return SCALES | self.gain.scales() | ({"ground": GROUND} if self.ground_light else {})
 
     def _unmoved(self, params):
         """Rows above the horizon as :meth:`decode` composes them where nothing has changed."""
@@ -255,18 +257,24 @@ class Layers:
         return own if self.below is None else np.concatenate([own, self.below.fade])
 
     @property
+    def ground_light(self) -> GroundLight | None:
+        """What falls on ground that goes by it; None where no row does."""
+        return None if self.below is None else self.below.light
+
+    @property
     def lit(self) -> np.ndarray:
         """How far each row of the image follows the light that falls on ground, (rows,)."""
         own = np.zeros(self.shape[0])
         return own if self.below is None else np.concatenate([own, self.below.lit])
 
     def lighting(self, level: int) -> np.ndarray:
-        """Return the share of the ground's irradiance that comes from the sky around each node, (nodes,)."""
+        """Return the share of the ground's irradiance that comes from the sky around each node, (nodes,).
+
+        Of a map with a :attr:`ground_light`.
+        """
         rows, columns = self.gain.sizes[level]
-        if self.below is None or self.below.light is None:
-            return np.zeros(rows * columns)
-        total = float(self.below.light.initial @ LUMINANCE)
-        light = (self.base @ LUMINANCE * self.below.light.cosine / total).ravel()
+        falls = self.ground_light
+        light = (self.base @ LUMINANCE * falls.cosine / float(falls.initial @ LUMINANCE)).ravel()
         part = np.zeros(rows * columns)
         for node, share in self.gain.hats(level, self.shape):
             part += np.bincount(node, share * light, rows * columns)

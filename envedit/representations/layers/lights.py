@@ -182,8 +182,8 @@ class Lights:
         centre = dr.gather(mi.Vector3f, self._centre, dr.opaque(mi.UInt32, i))
         places = placed(position, centre, turn, size, sine, 1.0, (self.total, shape[1]))
         flux = dr.gather(mi.Color3f, self._flux, point) * _exp(mi.Color3f(flux))
-        rows = self._rows
-        return shared_out(*places, flux, 1.0, shape, rows, mi.Int32(page), len(placements)).numpy()
+        found = shared_out(*places, flux, 1.0, shape, self._rows, mi.Int32(page), len(placements)).numpy()
+        return found.reshape(-1, *shape, 3)
 
     def glow(self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.

@@ -1,18 +1,23 @@
 """The paper's renderer: Mitsuba's differentiable path tracer, with fresh samples at every step.
 
 Unbiased, but its noise bends any non-linear loss (docs/light_transport.md): it is here as the reference that
-the paper used, not for speed.
+the paper used, not for speed. The same seed gives the same bits with any number of threads: pictures are
+summed by :mod:`.film`, and gradients, which Mitsuba adds in the order in which threads come to a texel, are
+traced by one thread.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from envedit.core import installed_plugins, latlong
 from envedit.core.errors import ConfigError
+from envedit.scene import film
 from envedit.scene.scene import Scene
 
 AUTO_SPP = 16
@@ -35,6 +40,8 @@ class PathTracer:
     seed : int
         Base seed; every step draws two seeds of its own from it, one for the picture and one for the
         gradient.
+    one_thread : bool
+        Trace gradients by one thread, so that their sums have a fixed order; else by all.
 
     Raises
     ------
@@ -44,8 +51,15 @@ class PathTracer:
 
     transport = None
 
-    def __init__(self, scene: Scene, spp: int | str = "auto", max_depth: int | str = "auto", seed: int = 0):
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        spp: int | str = "auto",
+        max_depth: int | str = "auto",
+        seed: int = 0,
+        one_thread: bool = True,
+    ):
+        self.scene, self.one_thread = scene, one_thread
         self.spp = _whole(scene, AUTO_SPP if isinstance(spp, str) else spp)
         if self.spp * scene.width * scene.height > _MOST_SAMPLES:
             raise ConfigError(
@@ -58,7 +72,7 @@ class PathTracer:
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
         installed_plugins.come_first()
         asked = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": scene.hide_emitters}
-        self._integrator = mi.load_dict({"type": "prb", **asked})
+        self._integrators = [mi.load_dict({"type": kind, **asked}) for kind in ("path", "prb")]
         self._index: mi.UInt32 | None = None
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
@@ -66,20 +80,33 @@ class PathTracer:
         height, width, _ = envmap.shape
         if self._index is None:
             self._index = dr.opaque(mi.UInt32(latlong.halo_index(height, width)))
-        data = dr.gather(mi.Float, envmap.array, self._index)
-        params = self.scene.params
-        params[self.scene.envmap_key] = mi.TensorXf(data, (height, width + 2, 3))
-        params.update()
-        seed = mi.sample_tea_32(2 * step, self.seed)
-        picture = mi.render(
-            self.scene.mi,
-            params,
-            integrator=self._integrator,
-            spp=self.spp,
-            seed=int(seed[0]),
-            seed_grad=int(seed[1]),
-        )
-        return picture[..., :3] if self.scene.hide_emitters else picture
+        data = mi.TensorXf(dr.gather(mi.Float, envmap.array, self._index), (height, width + 2, 3))
+        seeds = [int(seed) for seed in mi.sample_tea_32(2 * step, self.seed)]
+        return dr.custom(_Rendering, data, self, seeds)
+
+    def picture(self, data: mi.TensorXf, seed: int) -> mi.TensorXf:
+        """Render the map as Mitsuba holds it, (H, W + 2, 3), without derivatives."""
+        self._set(data)
+        found = film.render(self.scene.mi, self._integrators[0], self.spp, seed)[..., :3]
+        return mi.TensorXf(found.astype(np.float32))
+
+    def gradient(self, data: mi.TensorXf, seed: int, picture: mi.TensorXf) -> mi.TensorXf:
+        """Pull a picture back to the map as Mitsuba holds it: the adjoint of rendering."""
+        data = mi.TensorXf(data)
+        dr.enable_grad(data)
+        self._set(data)
+        with dr.resume_grad(), _threads(1) if self.one_thread else contextlib.nullcontext():
+            self._integrators[1].render_backward(
+                self.scene.mi, self.scene.params, picture, seed=seed, spp=self.spp
+            )
+            found = dr.grad(data)
+            dr.eval(found)
+            dr.sync_thread()
+        return found
+
+    def _set(self, data):
+        self.scene.params[self.scene.envmap_key] = data
+        self.scene.params.update()
 
     def state(self) -> dict:
         """Return what a checkpoint must hold: nothing, the seeds follow from the step."""
@@ -87,6 +114,32 @@ class PathTracer:
 
     def restore(self, state: dict) -> None:
         """Continue from :meth:`state`."""
+
+
+class _Rendering(dr.CustomOp):
+    """Pictures and gradients of a path tracer, from seeds of their own."""
+
+    def eval(self, data, tracer, seeds):
+        self.data, self.tracer, self.seeds = data, tracer, seeds
+        return tracer.picture(data, self.seeds[0])
+
+    def backward(self):
+        found = self.tracer.gradient(self.data, self.seeds[1], self.grad_out())
+        self.set_grad_in("data", found)
+
+    def name(self):
+        return "path tracing"
+
+
+@contextlib.contextmanager
+def _threads(count):
+    """Let Dr.Jit work with so many threads."""
+    before = dr.thread_count()
+    dr.set_thread_count(count)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 def _whole(scene, spp):

@@ -1,13 +1,15 @@
 r"""What do the checks of files, caches and plugins cost? Runs with and without them, in turn.
 
     python -m experiments.engine.cost_of_checks [--pairs 15] [--parts checks film] [--out FOLDER]
+    python -m experiments.engine.cost_of_checks --path [--pairs 15]
 
 Two runs: ``quickstart`` with empty caches, and ``quickstart --preset standard`` with full ones. A pair is one
 run with the checks and one without, in a process each, in an order that alternates. Shown are the medians of
 the seconds from start to end of the process, and of the quotient within pairs with its quartiles; exits with
 1 if a median quotient is above 1.03. Without ``checks``: digests of cache entries and their types, shapes and
 ranges; meshes, textures and volumes; references, required properties and names of plugins; the metrics of log
-radiance. Without ``film``: Mitsuba's own film in place of sums in a fixed order. On a quiet machine only.
+radiance. Without ``film``: Mitsuba's own film in place of sums in a fixed order. ``--path``: a path-traced
+step with gradients by one thread, whose sums have a fixed order, and by all. On a quiet machine only.
 """
 
 import argparse
@@ -41,11 +43,11 @@ def without(part: str) -> None:
         film.render = _own_film
 
 
-def _own_film(scene, integrator, spp, seed, medium=None):
+def _own_film(scene, integrator, spp, seed, medium=None, view=0):
     import mitsuba as mi
     import numpy as np
 
-    picture = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), np.float64)
+    picture = np.array(mi.render(scene, sensor=view, integrator=integrator, spp=spp, seed=seed), np.float64)
     return np.concatenate([picture[..., :3], np.ones_like(picture[..., :1])], axis=2)
 
 
@@ -90,6 +92,29 @@ def compare(parts: list[str], options: list[str], warm: bool, pairs: int, folder
     return found
 
 
+def path_steps(pairs: int) -> dict:
+    """Time path-traced steps on a statue of 128 x 128 pixels, by one thread and by all in turn."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    mi.set_variant("llvm_ad_rgb")
+    from envedit.scene import scene
+    from envedit.scene.path_tracer import PathTracer
+    from experiments.engine.timing import side_by_side
+    from experiments.engine.transport import gradient
+
+    lit = scene.load("statue", 128, 128)
+    envmap = dr.opaque(mi.TensorXf(np.random.default_rng(0).random((128, 256, 3), dtype=np.float32)))
+    weight = dr.opaque(mi.TensorXf, 1, (lit.height, lit.width, 3))
+
+    def step(one_thread):
+        tracer = PathTracer(lit, one_thread=one_thread)
+        return lambda: gradient(lambda e: tracer.render(e, 0), envmap, weight)
+
+    return side_by_side({"one thread": step(True), "all threads": step(False)}, pairs)
+
+
 def main(argv=None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m experiments.engine.cost_of_checks", description=__doc__.splitlines()[0]
@@ -97,7 +122,12 @@ def main(argv=None) -> int:
     parser.add_argument("--pairs", type=int, default=15)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=["checks"], help="what is switched off")
     parser.add_argument("--out", type=Path, help="folder for runs and caches (default: a temporary one)")
+    parser.add_argument("--path", action="store_true", help="time path-traced steps instead")
     chosen = parser.parse_args(argv)
+    if chosen.path:
+        for name, times in path_steps(chosen.pairs).items():
+            print(f"gradient by {name}: {1000 * times['median_s']:.0f} ms a step")
+        return 0
     print("| run | pairs | with, s | without, s | with / without | quartiles |\n|---|---|---|---|---|---|")
     worst = 0.0
     with tempfile.TemporaryDirectory() as temporary:

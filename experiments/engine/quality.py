@@ -92,7 +92,7 @@ def one_sun(lit, transport: LightTransport, sky: np.ndarray, spp: int, quick: bo
     wanted, noise = reference(lit, sky, spp)
     rmse = relative(transport.apply(env).numpy(), wanted)
     depth = max(AUTO_DEPTH, transport.bounces + 1)
-    tracer, steps = PathTracer(lit, PRB_SPP, depth), itertools.count()
+    tracer, steps = PathTracer(lit, PRB_SPP, depth, one_thread=False), itertools.count()
     weight = dr.opaque(mi.TensorXf, 1, (*transport.shape, 3))
     times = side_by_side(
         {
@@ -178,7 +178,7 @@ def curve(name: str, pixels: int, sky: np.ndarray, spp: int, quick: bool = False
         add("T", samples, transport.apply, transport.apply(env).numpy())
     depth = max(AUTO_DEPTH, transport.bounces + 1)
     for samples in CURVE_SPP[:2] if quick else CURVE_SPP:
-        tracer, steps = PathTracer(lit, samples, depth), itertools.count()
+        tracer, steps = PathTracer(lit, samples, depth, one_thread=False), itertools.count()
         picture = tracer.render(env, next(steps)).numpy()
         add("prb", samples, lambda e, t=tracer, s=steps: t.render(e, next(s)), picture)
     return rows

@@ -89,7 +89,7 @@ def one_scene(name, parameters, pixels, width, spp, read, quick=False) -> dict:
     transport.resolve(sky)
     resolve = time.perf_counter() - start
     depth = transport.bounces + 1
-    tracer = PathTracer(lit, PRB_SPP, depth)
+    tracer = PathTracer(lit, PRB_SPP, depth, one_thread=False)
     steps, bare = itertools.count(), bare_prb(lit.path, parameters, pixels, sky, depth, weight)
     times = side_by_side(
         {

@@ -22,6 +22,7 @@ from envedit.representations.base import Representation
 from envedit.representations.layers import lights
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.layers import Layers, gone_of, unseen_kept
+from envedit.representations.layers.saturation import saturated
 
 
 def carry(
@@ -130,6 +131,8 @@ class _LayersAt:
         Working row from which rows follow.
     relit : bool
         The glow has changed; then ``behind`` and ``faint`` are what it had hidden.
+    exponent : Float or None
+        k of ``saturation.py``, where the sky's colours change by it.
     strength : Float
         Of lights that stay, what their cores are multiplied by; of those that move, nothing is left.
     """
@@ -138,6 +141,9 @@ class _LayersAt:
         self.layers, self.grid = layers, grid
         self.placed = {name: params[name] * layers.scales[name] for name in ("turn", "flux", "size")}
         turn, flux, size = (value.numpy() for value in self.placed.values())
+        self.exponent = None
+        if "saturation" in params:
+            self.exponent = dr.opaque(mi.Float, float(np.exp(params["saturation"].numpy()[0, 0])))
         self.gain = np.concatenate([layers.log_gain(params), layers.log_below(params)])
         self.edge = None if layers.below is None else layers.shape[0]
         self.free = layers.free
@@ -197,7 +203,11 @@ class _LayersAt:
         if self.cores.any(start, size):
             light, _, core = self.cores.of(image, row, column, d, start, size)
             base = image - core
-        sky = brightened(base, factor)
+        colours = base
+        if self.exponent is not None:
+            kept = self.cores.follow(start, row) & (not self.layers.mirrored)
+            colours, same = dr.select(kept, base, saturated(base, self.exponent)), same & kept
+        sky = brightened(colours, factor)
         if self.relit:
             before = self.cores.glow(d)
             ratio = self.layers.lights.glow(self.placed["turn"], self.placed["flux"], d) / before

@@ -259,7 +259,9 @@ class Job:
 
     def _problem(self):
         wanted = self.wanted.aim, self.wanted.weight, self.representation.free
-        return map_problem.Problem(self.representation, self.renderer.transport, self.original, *wanted)
+        asked = self.representation, self.renderer.transport, self.original, *wanted
+        whole = self._rendered and self.representation.free is None
+        return map_problem.Problem(*asked, saturates=whole)
 
     @property
     def _sigma(self):
@@ -309,6 +311,9 @@ class Job:
             asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
             made = gauss_newton.solve(*asked, **more)
         self.posterior, self.note = made.posterior, made.note
+        if "saturation" in made.params:
+            kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))
+            self.note = f"saturation of the sky's colours: {kept:.0f} % of the original's"
         return made.params, adam_loop.State(step=len(made.history), history=made.history)
 
     def _display_error(self, envmap):

@@ -192,7 +192,7 @@ def solve(
             run, point, loss = before, first, least
             normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
     posterior = None if trial else problem.posterior(normal)
-    return Solution(problem.params(run.state), run.history, loss, whole, posterior, note)
+    return Solution(problem.found(run.state), run.history, loss, whole, posterior, note)
 
 
 def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, steps: int = 1) -> Point:
@@ -380,7 +380,7 @@ class _Search:
         moved["turn"][k] = rotation_vector(lights.centres[k], problem.direction(state, i))
         # What has made up for the light is in the gain and in other lights that were added.
         for one in (moved, alone):
-            one["flux"][problem.added(one)], one["gain"][:] = DARK, 0
+            one["flux"][problem.added(one)], one["gain"][:], one["saturation"][:] = DARK, 0, 0
         moved["flux"][k] = 0
         if self._noise_of(problem.evaluate(moved)) >= self._noise_of(problem.evaluate(alone)):
             return None

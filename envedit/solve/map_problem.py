@@ -43,11 +43,15 @@ INDEPENDENT = 256
 """Residuals of a picture that count as independent, per channel: neighbouring pixels err together."""
 ANGLE = np.radians(0.7)
 """Rotation of the finite difference by a light's direction."""
-LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7}
+LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
 """Largest step of an unknown: beyond it the linear model does not hold."""
 SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
 """Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
 larger lobe would be seen."""
+SATURATIONS = (-3.0, 0.0)
+"""Logarithms of the sky's saturation that are looked for: from grey to twice as saturated."""
+FURTHER = 0.05
+"""Step of the finite difference by it."""
 ROWS = 64
 """Rows of a triangular matrix that are solved for together."""
 _AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
@@ -72,6 +76,8 @@ class Prior:
         Of a light's direction, radians from where the search has put it.
     size, added_size : float
         Of a light's log size: of the map's own, and of a light that is added, which may be haze or a sun.
+    saturation : float
+        Of the log saturation of the sky's colours.
     """
 
     luminance: float = 1.0
@@ -81,6 +87,7 @@ class Prior:
     turn: float = np.radians(10.0)
     size: float = 0.3
     added_size: float = 1.0
+    saturation: float = 1.0
 
     def gain_precisions(self, sizes: Sequence[tuple[int, int]], ground: bool = False) -> np.ndarray:
         """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n).
@@ -207,6 +214,8 @@ class Problem:
         Active texels whose gain is free, as given to :meth:`.Layers.keep`; None: all.
     prior : Prior
         How far a sky changes.
+    saturates : bool
+        The saturation of its colours is an unknown.
     """
 
     def __init__(
@@ -218,9 +227,10 @@ class Problem:
         weight: np.ndarray | None = None,
         free: np.ndarray = None,
         prior: Prior = None,
+        saturates: bool = False,
     ):
         self.layers, self.transport, self.envmap, self.free = layers, transport, envmap, free
-        self.prior = prior or Prior()
+        self.prior, self.saturates = prior or Prior(), saturates
         self.rows = layers.active
         self.target = display_curve.to_display(tensor(picture)).numpy()
         shape = picture.shape[:2]
@@ -260,10 +270,10 @@ class Problem:
         """
         real = {k: np.float64(v.numpy()) * _numpy(self.layers.scales[k]) for k, v in params.items()}
         grids = [real.pop(name).reshape(-1, 3) for name in self._grids]
-        return real | {"gain": np.concatenate(grids)}
+        return {"saturation": np.zeros((1, 1))} | real | {"gain": np.concatenate(grids)}
 
     def params(self, state: dict) -> dict:
-        """Return the layers' parameters of a state."""
+        """Return the layers' parameters of a state; where it is an unknown, with the saturation."""
         found, start = {}, 0
         shapes = [(*size, 3) for size in self.sizes] + [(1, 3)] * self._ground
         for name, shape in zip(self._grids, shapes, strict=True):
@@ -272,16 +282,26 @@ class Problem:
             unit = _numpy(self.layers.scales[name])
             found[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
             start = stop
-        for name in ("turn", "flux", "size"):
+        names = ["turn", "flux", "size"]
+        if self.saturates or state["saturation"].any():
+            names.append("saturation")
+        for name in names:
             found[name] = tensor(state[name] / self.layers.scales[name])
         return found
+
+    def found(self, state: dict) -> dict:
+        """Return the layers' parameters of a state that is a solution: colours that stay keep their bits."""
+        params = self.params(state)
+        if not state["saturation"].any():
+            params.pop("saturation", None)
+        return params
 
     def clear(self, state: dict) -> None:
         """Reset what the search found without a prior.
 
         The gain becomes zero, own lights get their colour back and at most a factor of e of their flux.
         """
-        state["gain"][:] = 0
+        state["gain"][:], state["saturation"][:] = 0, 0
         own = [i for i in self.lit(state) if i < self.layers.lights.count - SPARE]
         state["flux"][own] = np.clip(state["flux"][own].mean(axis=1, keepdims=True), -1, 1)
 
@@ -358,6 +378,7 @@ class Problem:
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
         total = (self._precisions * (_AXES @ state["gain"].T) ** 2).sum()
+        total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
         for i in self.lit(state):
             change = self._flux_change(state, start, i)
             total += change @ self.prior.flux_precision @ change
@@ -464,9 +485,9 @@ class Problem:
         return precision
 
     def _deviation(self, name, i):
-        """Return the standard deviation of a light's direction or size."""
-        if name == "turn":
-            return self.prior.turn
+        """Return the standard deviation of a light's direction or size, or of the saturation."""
+        if name in ("turn", "saturation"):
+            return getattr(self.prior, name)
         return self.prior.size if i < self.layers.lights.count - SPARE else self.prior.added_size
 
     def _from_prior(self, state, start, unknowns):
@@ -475,6 +496,8 @@ class Problem:
         for name, i, axis in unknowns:
             if name == "flux":
                 found.append([self._flux_change(state, start, i)[axis]])
+            elif name == "saturation":
+                found.append(state[name][i])
             elif name == "turn":
                 found.append([_between(self.direction(start, i), self.direction(state, i)) @ axis])
             else:
@@ -487,6 +510,8 @@ class Problem:
         damped[np.diag_indices_from(damped)] *= 1 + damping
         try:
             step = -_solved(np.linalg.cholesky(damped), normal.gradient)
+            if self.saturates:
+                step = self._within(step, state["saturation"][0, 0], damped, normal)
         except np.linalg.LinAlgError:  # radiance beyond what squares of single precision hold
             return None
         if not np.isfinite(step).all():
@@ -500,6 +525,7 @@ class Problem:
             else:
                 found[name][i, axis] += np.clip(value, -LARGEST[name], LARGEST[name])
         own = self.layers.lights.count - SPARE
+        found["saturation"] = np.clip(found["saturation"], *SATURATIONS)
         found["size"][:own] = np.clip(found["size"][:own], *SIZES)
         found["size"][own:] = np.clip(found["size"][own:], *LOBE_SIZES)
         for i, turn in turns.items():
@@ -507,6 +533,18 @@ class Problem:
             there = _rotated(self.direction(state, i), turn)
             found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
         return found
+
+    def _within(self, step, now, damped, normal):
+        """Return a step, solved anew for all else where it takes the saturation out of its bounds."""
+        k = 3 * self.nodes + normal.unknowns.index(("saturation", 0, 0))
+        to = np.clip(now + step[k], *SATURATIONS) - now
+        if to == step[k]:
+            return step
+        rest = np.arange(len(step)) != k
+        gradient = normal.gradient[rest] + damped[rest, k] * to
+        step[rest] = -_solved(np.linalg.cholesky(damped[np.ix_(rest, rest)]), gradient)
+        step[k] = to
+        return step
 
     def posterior(self, normal: Normal) -> Posterior:
         """Return what the normal equations at the solution say of the log luminance gain."""
@@ -530,8 +568,9 @@ class Problem:
         # In double precision: products of three radiances leave the range of the other.
         slopes = point.sky.astype(np.float64)
         own = self.layers.shape[0]
-        sky, base = slopes[:own], self.layers.base.astype(np.float64)
-        gain = np.exp(np.float64(self.layers.log_gain(self.params(point.state))))
+        params = self.params(point.state)
+        sky, base = slopes[:own], self.layers.sky_base(params).astype(np.float64)
+        gain = np.exp(np.float64(self.layers.log_gain(params)))
         grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
         more = base + (gain - 1) * grey
         slopes[:own] = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
@@ -579,7 +618,21 @@ class Problem:
             pictures.append(seen)
             unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
             unknowns += [("flux", i, c) for c in range(3)]
-        return _Lights(self._apart(pictures), unknowns)
+        whole = []
+        if self.saturates:
+            unknowns.append(("saturation", 0, 0))
+            whole.append(self._by_saturation(point))
+        return _Lights(self._apart(pictures, whole), unknowns)
+
+    def _by_saturation(self, point):
+        """Return the derivative of the rendering by the log saturation, (h, w, 3)."""
+        back = point.state["saturation"] + FURTHER > SATURATIONS[1]
+        step = -FURTHER if back else FURTHER
+        further = self.params(point.state | {"saturation": point.state["saturation"] + step})
+        sky = self.layers.parts(further)[0].numpy()
+        change = np.zeros_like(self.envmap)
+        change[self.rows] = (sky - point.sky) / np.float32(step)
+        return self.transport.linear(tensor(change)).numpy()
 
     def _with_lit_ground(
         self, point: Point, cores: np.ndarray, shone: np.ndarray | None
@@ -600,16 +653,20 @@ class Problem:
         turns[i] = turn
         return self.layers.log_glow_of(i, turns, state["flux"])
 
-    def _apart(self, pictures):
+    def _apart(self, pictures, whole):
         """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
 
-        By direction, size, and flux per channel; in memory channel by channel.
+        By direction, size, and flux per channel; in memory channel by channel. Pictures (h, w, 3) of
+        unknowns that are no light's come last.
         """
-        found = np.zeros((3, len(pictures), 6, self.target[..., 0].size), np.float32)
+        lights = 6 * len(pictures)
+        found = np.zeros((3, lights + len(whole), self.target[..., 0].size), np.float32)
         for k, seen in enumerate(pictures):
             for c in range(3):
-                found[c, k, :3] = seen[1:, :, c]
-                found[c, k, 3 + c] = seen[0, :, c]
+                found[c, 6 * k : 6 * k + 3] = seen[1:, :, c]
+                found[c, 6 * k + 3 + c] = seen[0, :, c]
+        for k, one in enumerate(whole, lights):
+            found[:, k] = one.reshape(-1, 3).T
         return found.reshape(3, -1, *self.target.shape[:2]).transpose(1, 2, 3, 0)
 
     def _tangents(self, state, i):

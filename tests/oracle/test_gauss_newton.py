@@ -94,7 +94,7 @@ def case():
 
 # ---- derivatives -------------------------------------------------------------------------------------------
 
-STEPS = {"gain": 0.01, "flux": 0.01, "turn": ANGLE, "size": 0.002}
+STEPS = {"gain": 0.01, "flux": 0.01, "turn": ANGLE, "size": 0.002, "saturation": 0.02}
 # Display values are good to 1e-7, differences of F over a step to 1e-4 of its slope. A light's direction is
 # differentiated over 0.7 degrees, a twentieth of a texel, and its size forwards, over 10 %.
 CLOSE = {"gain": 2e-3, "flux": 2e-3, "turn": 0.05, "size": 0.2}
@@ -117,7 +117,8 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
     def f(x):
         return problem.misfit(problem.evaluate(x).residual, sigma) + problem.penalty(x, start)
 
-    for kind, h in STEPS.items():
+    for kind in CLOSE:
+        h = STEPS[kind]
         some = [k for k, name in enumerate(names) if name == kind][:: 4 if kind == "gain" else 1]
         slope = [
             f(moved(problem, state, normal.unknowns, k, h)) - f(moved(problem, state, normal.unknowns, k, -h))
@@ -887,10 +888,11 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
     params = layers.encode(image)
     assert (layers.below.light is not None) == (horizon == "keep")
     target = shown(transport, image) * np.exp(rng.normal(0, 0.3, (*FILM, 3))).astype(np.float32)
-    problem = Problem(layers, transport, image, target)
+    problem = Problem(layers, transport, image, target, saturates=True)
     start = problem.state(params)
     state = copy(start)
     state["gain"] = rng.normal(0, 0.3, state["gain"].shape)
+    state["saturation"][:] = -0.4
     off_centre = map_problem._rotated(layers.lights.centres[0], np.array([0.03, 0.05, -0.04]))
     state["turn"][0] = rotation_vector(layers.lights.centres[0], off_centre)
     point = problem.evaluate(state)
@@ -902,7 +904,7 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
 
     n, grids = problem.nodes, sum(rows * columns for rows, columns in problem.sizes)
     assert n == grids + (horizon == "keep") and ("ground" in params) == (horizon == "keep")
-    for kind in ("gain", "flux", "turn"):
+    for kind in ("gain", "flux", "turn", "saturation"):
         some = [k for k, name in enumerate(names) if name == kind]
         if kind == "gain":  # and the last node, which is the ground's
             some = some[::4] + [n - 1, 2 * n - 1, 3 * n - 1]
@@ -910,7 +912,7 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
             [f(moved(problem, state, normal.unknowns, k, s * STEPS[kind])) for s in (1, -1)] for k in some
         ]
         slope = np.array([ahead - back for ahead, back in ends]) / (4 * STEPS[kind])
-        close = {"gain": 2e-3, "flux": 0.05, "turn": 0.05}[kind] * np.abs(slope).max()
+        close = {"gain": 2e-3, "flux": 0.05, "turn": 0.05, "saturation": 0.05}[kind] * np.abs(slope).max()
         np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=close, err_msg=kind)
 
 
@@ -938,3 +940,63 @@ def test_gradient_by_the_sky_is_exact_where_a_block_is_not(rng):
     # Negative control: the block transport's own gradient is another one.
     columns = [j.T @ normal.blocks.pulled[:, c] for c, j in enumerate(normal.blocks.jacobian)]
     assert np.abs(np.concatenate(columns)[some] - slope).max() > 0.05 * np.abs(slope).max()
+
+
+# ---- saturation --------------------------------------------------------------------------------------------
+
+
+def colourful(rng):
+    """Clouds of luminance as :func:`clouds`, blue and amber side by side."""
+    hue = np.where(rng.random((*GRID, 1)) < 0.5, [0.3, 0.8, 2.0], [1.6, 1.0, 0.4])
+    return (clouds(rng) * hue).astype(np.float32)
+
+
+def saturating(rng, kept):
+    """A problem whose target is the sky with its colours' saturation times ``kept``, and its start."""
+    image, transport = colourful(rng), DenseTransport.random(rng, FILM, GRID)
+    layers = Layers(cycles=3)
+    params = layers.encode(image)
+    grey = params | {"saturation": mi.TensorXf(np.full((1, 1), np.log(kept), np.float32))}
+    target = shown(transport, layers.decode(grey).numpy())
+    return Problem(layers, transport, image, target, saturates=True), params
+
+
+def test_saturation_of_the_target_is_found(rng):
+    problem, params = saturating(rng, 0.3)
+    found = solve(problem, params, sigma=0.002)
+    kept = np.exp(found.params["saturation"].numpy()[0, 0])
+    assert kept == pytest.approx(0.3, abs=0.05)
+    assert np.abs(found.params["gain.0"].numpy()).max() < 0.1
+    # Without the unknown a gain has to make up for it.
+    problem.saturates = False
+    other = solve(problem, params, sigma=0.002)
+    assert "saturation" not in other.params
+    assert other.history[-1]["loss"] > 2 * found.history[-1]["loss"]
+
+
+def test_a_sky_gets_no_more_saturated_and_the_rest_of_a_step_makes_up_for_it(rng):
+    problem, params = saturating(rng, 2.0)
+    state = problem.state(params)
+    point = problem.evaluate(state)
+    normal = problem.normal(point, state, 0.1)
+    k = len(normal.gradient) - 1
+    assert normal.unknowns[-1] == ("saturation", 0, 0)
+    assert np.linalg.solve(normal.hessian, -normal.gradient)[k] > 0.05  # it would
+    moved_by = problem.step(state, normal, 0.0)
+    assert moved_by["saturation"][0, 0] == 0
+    gain = moved_by["gain"].T.ravel()
+    left = normal.hessian[: len(gain), : len(gain)] @ gain + normal.gradient[: len(gain)]
+    np.testing.assert_allclose(left, 0, atol=1e-6 * np.abs(normal.gradient).max())
+    found = solve(problem, params)
+    assert "saturation" not in found.params
+
+
+def test_saturation_comes_back_from_a_checkpoint_of_its_state(rng):
+    problem, params = saturating(rng, 0.3)
+    state = problem.state(params)
+    assert state["saturation"].tolist() == [[0.0]] and "saturation" not in problem.found(state)
+    state["saturation"][:] = -0.7
+    again = problem.state(problem.params(state))
+    np.testing.assert_allclose(again["saturation"], -0.7, rtol=1e-6)
+    run = Run.of_arrays(Run(state, state).arrays(), [])
+    assert run.state["saturation"].tolist() == state["saturation"].tolist()

@@ -459,7 +459,8 @@ def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
 
 @pytest.mark.parametrize("finer", [2, 4])
 @pytest.mark.parametrize("kind", ["mirror", "keep"])
-def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer):
+@pytest.mark.parametrize("saturation", [None, -0.7])
+def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer, saturation):
     """Of a map whose lower half is the mirror of its sky, the sun moved; against the working map."""
     height, width = WORKING[0] * finer, WORKING[1] * finer
     up = sky(height, width, sun=(20.0, 200.0), seed=1)[: height // 2]
@@ -470,6 +471,8 @@ def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer):
     turn = np.zeros((made.lights.count, 3))
     turn[0] = rotation_vector(made.lights.centres[0], toward(25.0, 90.0))
     params = params | {"turn": mi.TensorXf(np.float32(turn / made.scales["turn"]))}
+    if saturation is not None:
+        params["saturation"] = mi.TensorXf(np.full((1, 1), saturation, np.float32))
     edited = made.decode(params).numpy()
     full = full_resolution.carry(made, params, working, edited, source, Rows.of(WORKING[0]))
     assert full.shape == source.shape and np.isfinite(full).all()

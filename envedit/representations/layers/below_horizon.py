@@ -168,11 +168,13 @@ class Below:
         gone: mi.Float | None = None,
         core: mi.TensorXf | None = None,
         ground: mi.TensorXf | None = None,
+        before: mi.TensorXf | None = None,
     ) -> mi.TensorXf:
         """Return the log factor (rows, W, 3) of the rows under a sky (sky_rows, W, 3) without cores.
 
         ``core`` is the cores' radiance in the whole map, for what falls on ground: without, it is as before.
         ``ground`` (1, 3) is the logarithm of a factor beyond that, for light that does not come from above.
+        ``before`` is the sky that it is compared with, the original by default.
         With what is to be revealed, ``gone`` (sky_rows * W) is the share of a texel's light above the horizon
         that was a glow's and is gone.
         """
@@ -181,10 +183,13 @@ class Below:
             change = self.light.log_change(sky, core)
             change = change if ground is None else change + ground
             lit = dr.matmul(self._lit, dr.matmul(change, self._around))
-        sky = _veiled(sky)
-        soft = dr.log((self._blur(sky) + self._faint) / (self._before_soft + self._faint))
+        sky, was, was_soft = _veiled(sky), self._before, self._before_soft
+        if before is not None:
+            was = _veiled(before)
+            was_soft = self._blur(was)
+        soft = dr.log((self._blur(sky) + self._faint) / (was_soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
-        sharp = dr.log((sky.array + self._faint) / (self._before.array + self._faint))
+        sharp = dr.log((sky.array + self._faint) / (was.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
         factor = dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3))
         if self._behind is None or gone is None:

@@ -29,12 +29,13 @@ from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
 from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.lights import DARK, SPARE, Lights
+from envedit.representations.layers.saturation import saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
 UNSEEN = 1 / 512
 """Relative change of radiance below a display's resolution: a step of 8 bits is twice as large."""
-SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5}
+SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5, "saturation": 1.0}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
 
 GROUND = 0.3
@@ -56,6 +57,8 @@ def gone_of(ratio: mi.Color3f) -> mi.Float:
 
 class Layers:
     """Lights that move, a background under a smooth gain.
+
+    Parameters may hold ``saturation`` (1, 1), the logarithm of k of ``saturation.py``; without it, k is 1.
 
     Parameters
     ----------
@@ -195,10 +198,11 @@ class Layers:
         if self.below is None:
             return sky, self._core(real, shape, rows)
         core = self._core(real, self.whole, rows)
-        factor = dr.unravel(
-            mi.Color3f, dr.exp(self.below.log_factor(sky, gone, core, real.get("ground"))).array
-        )
-        low = dr.ravel(brightened(self.below.radiance, factor))
+        factor = dr.unravel(mi.Color3f, dr.exp(self._log_below(real, sky, gone, core)).array)
+        low = self.below.radiance
+        if self.mirrored and "saturation" in real:
+            low = saturated(low, _exponent(real))
+        low = dr.ravel(brightened(low, factor))
         return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
 
     def _units(self):
@@ -216,6 +220,7 @@ class Layers:
     def _sky(self, real, shape):
         """Background and glow (rows, W, 3); share of a texel's radiance that was a glow's and is gone."""
         _, d, base, before, gain, free, behind = self._at(shape)
+        base = saturated(base, _exponent(real)) if "saturation" in real else base
         factor = dr.exp(self.gain.evaluate(real, gain))
         factor = dr.select(free, factor, 1) if free is not None else factor
         sky, gone = brightened(base, factor), None
@@ -232,7 +237,15 @@ class Layers:
         real = {name: value * self.scales[name] for name, value in params.items()}
         sky, gone = self._sky(real, self.shape)
         core = self._core(real, self.whole, self.rows)
-        return self.below.log_factor(sky, gone, core, real.get("ground")).numpy()
+        return self._log_below(real, sky, gone, core).numpy()
+
+    def _log_below(self, real, sky, gone, core):
+        """Log factor of the rows that follow; of a mirror, beside what the saturation of its own does."""
+        before = None
+        if self.mirrored and "saturation" in real:
+            before = saturated(self._at(self.shape)[2], _exponent(real))
+            before = mi.TensorXf(dr.ravel(before), (*self.shape, 3))
+        return self.below.log_factor(sky, gone, core, real.get("ground"), before)
 
     @property
     def active(self) -> slice:
@@ -295,6 +308,14 @@ class Layers:
             node, share = node.reshape(self.shape)[rows], share.reshape(self.shape)[rows]
             taps.append((node.ravel(), (share * self.follows[:, None]).ravel()))
         return taps
+
+    def sky_base(self, params: dict) -> np.ndarray:
+        """Return what the gain multiplies, (rows, W, 3): the original without cores, with its saturation."""
+        if "saturation" not in params:
+            return self.base
+        real = {"saturation": params["saturation"] * self.scales["saturation"]}
+        base = saturated(self._at(self.shape)[2], _exponent(real))
+        return mi.TensorXf(dr.ravel(base), (*self.shape, 3)).numpy()
 
     def log_gain(self, params: dict) -> np.ndarray:
         """Return the logarithm of the gain (rows, W, 3) float32, at the resolution of the image.
@@ -359,3 +380,7 @@ class Layers:
         whole[first : first + len(image)] = image
         whole[:first] = image[:1]
         return latlong.lookup(whole, d).astype(np.float32)
+
+
+def _exponent(real):
+    return dr.exp(real["saturation"].array)

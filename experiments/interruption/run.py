@@ -6,9 +6,8 @@ r"""Kill runs at random moments and see whether ``--resume`` ends them as if not
 A trial starts ``python -m envedit.run`` with empty caches, sends SIGKILL at a moment drawn evenly from the
 time that an undisturbed run takes, looks at what is left, and resumes. Every second trial is killed again
 while it resumes. Every file of the results must have the bytes of the undisturbed run's, but for times and
-the folder's name, and no file that can be seen after a kill may be half written. Runs take all cores; path
-tracing takes one, for on several Mitsuba adds gradients in any order. What is done is skipped; exits with 1
-if a trial fails.
+the folder's name, and no file that can be seen after a kill may be half written. Runs take all cores. What is
+done is skipped; exits with 1 if a trial fails.
 """
 
 import argparse
@@ -70,20 +69,16 @@ def command_of(base: Path, kind: str, renderer: str, out: Path, overrides, *more
     return [sys.executable, "-m", "envedit.run", str(path), "--out", str(out), *sets, *more]
 
 
-def started(command, cache: Path, renderer: str, log) -> subprocess.Popen:
-    """Start a run; path tracing on one core."""
-    one = renderer == "path" and hasattr(os, "sched_setaffinity")
-    if one:
-        pin = "import os, sys; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
-        command = [sys.executable, "-c", f"{pin}os.execv(sys.argv[1], sys.argv[1:])", *command]
+def started(command, cache: Path, log) -> subprocess.Popen:
+    """Start a run with a folder of caches."""
     environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
     return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
 
 
-def killed_after(seconds: float, command, cache: Path, renderer: str, log: Path) -> bool:
+def killed_after(seconds: float, command, cache: Path, log: Path) -> bool:
     """Start a run and kill it; False if it was done before. The last line it said is in ``log``."""
     with open(log, "w") as file:
-        process = started(command, cache, renderer, file)
+        process = started(command, cache, file)
         try:
             process.wait(seconds)
             return False
@@ -190,7 +185,7 @@ def undisturbed(base: Path, kind: str, renderer: str, overrides) -> float:
             shutil.rmtree(out, ignore_errors=True)
             begun, cache = time.monotonic(), base / f"cache-{out.name}-{attempt}"
             with open(out.with_suffix(".log"), "w") as log:
-                code = started(command_of(base, kind, renderer, out, overrides), cache, renderer, log).wait()
+                code = started(command_of(base, kind, renderer, out, overrides), cache, log).wait()
             if code:
                 raise SystemExit(f"{out}: the undisturbed run ended with {code}: see {out}.log")
         seconds.write_text(f"{time.monotonic() - begun:.3f}")
@@ -213,9 +208,7 @@ def trial(base: Path, number: int, kind: str, renderer: str, seed: int, override
         moment = float(rng.uniform(0, seconds))
         more = ("--resume",) if attempt else ()
         log = folder / f"killed-{attempt}.log"
-        if not killed_after(
-            moment, command_of(base, kind, renderer, out, overrides, *more), cache, renderer, log
-        ):
+        if not killed_after(moment, command_of(base, kind, renderer, out, overrides, *more), cache, log):
             row["kills"].append({"after_s": round(moment, 2), "stage": "done before", "half": []})
             break
         said = log.read_text().splitlines()
@@ -224,7 +217,7 @@ def trial(base: Path, number: int, kind: str, renderer: str, seed: int, override
         row["kills"].append({"after_s": round(moment, 2), "stage": stage} | look(out, reference))
     with open(folder / "resumed.log", "w") as log:
         command = command_of(base, kind, renderer, out, overrides, "--resume")
-        row["code"] = started(command, cache, renderer, log).wait()
+        row["code"] = started(command, cache, log).wait()
     row["differs"] = differing(out, reference) if row["code"] == 0 else ["exit code"]
     row["good"] = not row["differs"] and not any(kill["half"] for kill in row["kills"])
     result.write_text(json.dumps(row, indent=1))

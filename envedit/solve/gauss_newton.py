@@ -72,7 +72,8 @@ class Run:
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
-        return both | {"numbers": np.array([self.damping, self.scale, self.finished, self.asked, self.most])}
+        scale = self.scale if np.isfinite(self.scale) else 0.0  # before the first step
+        return both | {"numbers": np.array([self.damping, scale, self.finished, self.asked, self.most])}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -82,7 +83,8 @@ class Run:
             for part in ("state", "start")
         )
         damping, scale, finished, asked, most = arrays["numbers"].tolist()
-        return cls(state, start, damping, scale, bool(finished), list(history), int(asked), int(most))
+        done = bool(finished), list(history), int(asked), int(most)
+        return cls(state, start, damping, scale or np.inf, *done)
 
 
 @dataclass

@@ -310,9 +310,6 @@ class Job:
                 more = {"most_added": SPARE, "judge": self._display_error}
             asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
             made = gauss_newton.solve(*asked, **more)
-        if self.folder and not made.run.history:  # a run that is killed while it writes can be resumed
-            kept = adam_loop.State(step=0, history=[]), made.run.arrays(), self.renderer.state()
-            checkpoint.save(self.folder, what, *kept, self.wanted.aim)
         self.posterior, self.note = made.posterior, made.note
         if "saturation" in made.params:
             kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))

@@ -143,7 +143,7 @@ def solve(
     iterations : int
         Most steps.
     after_step : callable, optional
-        Called after every step, and when no further one lowers F, with where the solution is; with None in
+        Called after every step, and when no further one is made, with where the solution is; with None in
         place of the run while lights are tried, when there is nothing to go on from yet. What it raises ends
         the solution.
     run : Run, optional
@@ -247,6 +247,8 @@ class _Search:
         if point.residual is None:
             raise NumericalError("the initial map is not finite: check the input map for extreme values")
         if not self.iterations:
+            if self.after_step:
+                self.after_step(run, point)
             return run, point
         if self.most_added:
             run, point = self._placed(run, point)

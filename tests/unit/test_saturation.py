@@ -20,7 +20,8 @@ def of(radiance, exponent):
 def plain(radiance, exponent):
     radiance = np.float64(radiance)
     light = radiance @ LUMINANCE
-    chroma = np.maximum(radiance / light[:, None], LEAST) ** exponent
+    chroma = radiance / light[:, None]
+    chroma = np.maximum(chroma + (1 - exponent) * 0.2 * (1 - chroma), LEAST) ** exponent
     return chroma * (light / (chroma @ LUMINANCE))[:, None]
 
 

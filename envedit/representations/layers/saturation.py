@@ -2,9 +2,9 @@ r"""How saturated the colours of a sky are: one number for all of it, with its l
 
 With L the luminance of a texel's radiance E, and c = E / L,
 
-    E_k = L c^k / lum(c^k)
+    E_k = L b^k / lum(b^k),    b = c + (1 - k) VEIL (1 - c)
 
-k = 0 is a grey sky, 1 the sky as it is. A smooth gain cannot do that: what takes the blue from a sky makes
+k = 0 is a grey sky, 1 the sky as it is; b, as a channel that is black has no logarithm. A smooth gain cannot do that: what takes the blue from a sky makes
 the white clouds in it orange.
 """
 
@@ -13,12 +13,16 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from envedit.representations.layers.gain import VEIL
+
 LEAST = 1e-4
-"""Least c: a channel that is black has no logarithm."""
+"""Least b, where k is near 1."""
 
 
 def saturated(radiance: mi.Color3f, exponent: mi.Float) -> mi.Color3f:
     """Return E_k of radiance, k = ``exponent``."""
     light = mi.luminance(radiance)
-    chroma = dr.exp(exponent * dr.log(dr.maximum(radiance / dr.maximum(light, 1e-36), LEAST)))
+    chroma = radiance / dr.maximum(light, 1e-36)
+    chroma += (1 - exponent) * VEIL * (1 - chroma)
+    chroma = dr.exp(exponent * dr.log(dr.maximum(chroma, LEAST)))
     return chroma * (light / mi.luminance(chroma))

@@ -4,8 +4,8 @@ With L the luminance of a texel's radiance E, and c = E / L,
 
     E_k = L b^k / lum(b^k),    b = c + (1 - k) VEIL (1 - c)
 
-k = 0 is a grey sky, 1 the sky as it is; b, as a channel that is black has no logarithm. A smooth gain cannot do that: what takes the blue from a sky makes
-the white clouds in it orange.
+k = 0 is a grey sky, 1 the sky as it is; b, as a channel that is black has no logarithm. A smooth gain cannot
+do that: what takes the blue from a sky makes the white clouds in it orange.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
 """Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
 larger lobe would be seen."""
 SATURATIONS = (-3.0, 0.0)
-"""Logarithms of the sky's saturation that are looked for: from grey to twice as saturated."""
+"""Logarithms of the sky's saturation that are looked for, from 5 % to the original's own: more would amplify
+what its colours have of noise."""
 FURTHER = 0.05
 """Step of the finite difference by it."""
 ROWS = 64

@@ -16,6 +16,13 @@ _SPACE_NAMES = "colorInteropID", "oiio:ColorSpace"  # attributes that name a col
 _MOST_VALUES = 4 * MAX_TEXELS  # over all channels: colour and alpha of the largest
 _MOST_TILE = 2**20  # texels: OpenEXR takes memory for a whole tile, however small the image
 
+_LINES = {
+    "NO_COMPRESSION": 1, "RLE_COMPRESSION": 1, "ZIPS_COMPRESSION": 1, "ZIP_COMPRESSION": 16,
+    "PIZ_COMPRESSION": 32, "PXR24_COMPRESSION": 16, "B44_COMPRESSION": 32, "B44A_COMPRESSION": 32,
+    "DWAA_COMPRESSION": 32, "DWAB_COMPRESSION": 256,
+}  # fmt: skip
+"""Rows of a chunk of scanlines."""
+
 
 def declared(name: str) -> list:
     """Return the parts of a file, without pixels, once the sizes that they declare have been checked."""
@@ -47,10 +54,40 @@ def declared(name: str) -> list:
     return parts
 
 
+def require_whole(name: str) -> None:
+    """Refuse a file that cannot be decoded, before a decoder sees it that does not survive that.
+
+    OpenEXR finds the chunks of a file anew where their table is damaged, and Mitsuba's use of it does not.
+    """
+    parts = declared(name)
+    _decoded(name, len(parts))
+    if len(parts) == 1:
+        _require_chunks(name, parts[0])
+
+
+def _require_chunks(name, part):
+    """Refuse a file of one part whose table of chunks points out of it."""
+    _, _, width, height = _window(part.header["dataWindow"])
+    tile, lines = part.header.get("tiles"), _LINES.get(part.header["compression"].name)
+    if tile is not None and tile.mode.name == "ONE_LEVEL":
+        count = -(-width // tile.xSize) * -(-height // tile.ySize)
+    elif tile is None and lines:
+        count = -(-height // lines)
+    else:
+        return
+    with open(name, "rb") as file:
+        data = file.read()
+    begin = 8
+    while data[begin : begin + 1] not in (b"", b"\0"):  # an attribute: name, type, size, value
+        end = data.index(b"\0", data.index(b"\0", begin) + 1) + 1
+        begin = end + 4 + int.from_bytes(data[end : end + 4], "little")
+    table = np.frombuffer(data[begin + 1 : begin + 1 + 8 * count], "<u8")
+    if len(table) < count or not ((table > begin) & (table < len(data))).all():
+        raise damaged(name, "its table of chunks points out of the file")
+
+
 def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`."""
-    import OpenEXR
-
     parts = declared(name)
     windows = [_window(p.header["dataWindow"]) for p in parts]
     index, names = _choose_channels(name, [p.header for p in parts], info)
@@ -61,28 +98,41 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
         alpha = [c for c in beside if c.name.rpartition(".")[2].upper() == "A"]
         names += [c.name for c in alpha if c.xSampling == c.ySampling == 1]
 
-    # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
+    decoded = _decoded(name, len(parts))[index]
+    left, top, width, height = windows[index]
     try:
-        with quiet_libraries() as said:
-            decoded = OpenEXR.File(name, separate_channels=True)
-            channels = decoded.parts[index].channels if len(decoded.parts) == len(parts) else None
-            planes = None if channels is None else [np.array(channels[c].pixels, np.float32) for c in names]
+        planes = [np.array(decoded.channels[c].pixels, np.float32) for c in names]
     except MemoryError:
         raise
     except Exception as e:
         raise damaged(name, e) from None
-    left, top, width, height = windows[index]
-    # A part that cannot be decoded is dropped with a printed warning, and the others move up.
-    # The decoder of JPEG 2000 says that a stream ended early, and fills up with what it likes.
-    early = "terminated early" in (said[0] if said else "")
-    if planes is None or early or any(p.shape != (height, width) for p in planes):
-        raise damaged(name, said and said[0] or "not all of its parts could be decoded")
+    if any(p.shape != (height, width) for p in planes):
+        raise damaged(name, "not all of its channels could be decoded")
     display = _window(header["displayWindow"])
     if stored and len(planes) in (1, 3) and windows[index] != display:
         planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
     image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
     _describe(name, header, info)
     return _to_display(image, (left, top), display, name, info)
+
+
+def _decoded(name, count):
+    """Decode the parts of a file that declares so many."""
+    import OpenEXR
+
+    try:
+        with quiet_libraries() as said:
+            # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
+            parts = OpenEXR.File(name, separate_channels=True).parts
+    except MemoryError:
+        raise
+    except Exception as e:
+        raise damaged(name, e) from None
+    # A part that cannot be decoded is dropped with a printed warning, and the others move up.
+    # The decoder of JPEG 2000 says that a stream ended early, and fills up with what it likes.
+    if len(parts) != count or "terminated early" in (said[0] if said else ""):
+        raise damaged(name, said and said[0] or "not all of its parts could be decoded")
+    return parts
 
 
 def _window(box):

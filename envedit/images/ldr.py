@@ -138,6 +138,7 @@ def _bitmap(name):
             pixels = np.array(mi.Bitmap(name))
     except Exception as e:
         raise damaged(name, re.sub(r'^(\[\w+\] )?("[^"]*": )?', "", str(e))) from None
-    if re.search("corrupt|premature", said[0] if said else "", re.I):  # libjpeg only prints
-        raise damaged(name, said[0])
+    printed = said[0] if said else ""  # all that libjpeg does
+    if re.search("corrupt|premature|invalid|inconsistent", printed, re.I):
+        raise damaged(name, printed)
     return pixels if pixels.ndim == 3 else pixels[..., None]

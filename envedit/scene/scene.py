@@ -39,6 +39,7 @@ import numpy as np
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
+from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_text, supported
 
@@ -381,7 +382,7 @@ def load(
         for key in node.props.keys():  # noqa: SIM118 (no dict)
             node.props.mark_queried(key, False)
 
-    with _two_threads():
+    with _two_threads(), quiet_libraries():  # libjpeg prints about odd textures
         built = parser.told(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
     if scene.environment() is None or scene.environment().id() != name:

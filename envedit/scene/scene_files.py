@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from envedit.core.errors import InputError
-from envedit.images import exr, images, ldr
+from envedit.images import exr, images
 from envedit.images.headers import damaged, head_of
 
 MOST_BYTES = 2**31
@@ -241,10 +241,9 @@ def _volume(path):
 
 
 def _texture(path):
+    """Decode a texture: Mitsuba's decoders print, stop the process or corrupt memory on damaged ones."""
     head = head_of(str(path))
-    if head.startswith(b"#?"):  # Mitsuba's decoder corrupts memory on damaged ones
+    if head.startswith(b"v/1\x01"):
+        exr.require_whole(str(path))
+    elif head.startswith((b"#?", b"\x89PNG", b"\xff\xd8")):
         images.read_stored(path)
-    elif head.startswith(b"v/1\x01"):
-        exr.declared(str(path))
-    elif head.startswith((b"\x89PNG", b"\xff\xd8")):
-        ldr.declared(str(path), head)

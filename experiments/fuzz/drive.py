@@ -73,6 +73,7 @@ def seeds(what: str) -> list[tuple[str, bytes]]:
             "checkpoint": lambda: pictures.checkpoint_files(Path(folder)),
             "scene": scenes.scene_files,
             "mesh": scenes.mesh_files,
+            "texture": lambda: pictures.painted_files(Path(folder)),
             "entry": scenes.entry_files,
             "state": scenes.state_files,
         }[what]()

@@ -99,6 +99,6 @@ def state(path: Path, index: int) -> None:
 
 READERS = {
     "exr": environment, "hdr": environment, "toml": configuration, "painted": picture, "weights": tensors,
-    "checkpoint": state, "scene": scenes.read_scene, "mesh": scenes.read_mesh, "entry": scenes.read_entry,
-    "state": scenes.read_state,
+    "checkpoint": state, "scene": scenes.read_scene, "mesh": scenes.read_mesh,
+    "texture": scenes.read_texture, "entry": scenes.read_entry, "state": scenes.read_state,
 }  # fmt: skip

@@ -1,7 +1,7 @@
 r"""Damage files of every kind that the package reads, and see that reading them ends well.
 
     python -m experiments.fuzz.run [--cases 10000] [--seed 0] [--first 0] \
-        [--what exr hdr toml painted weights checkpoint scene mesh entry state] [--keep DIR] \
+        [--what exr hdr toml painted weights checkpoint scene mesh texture entry state] [--keep DIR] \
         [--record FILE] [--heap-check LIBRARY]
 
 Case i of a kind and seed is always the same file: ``--first`` and ``--cases`` take a run to pieces, and

@@ -241,6 +241,18 @@ def read_mesh(path: Path, index: int) -> None:
     _named(path, lambda: scene.load(outer))
 
 
+def read_texture(path: Path, index: int) -> None:
+    """Load a scene with a texture."""
+    from envedit.scene import scene
+
+    file = f'<string name="filename" value="{path}"/>'
+    texture = f'<texture type="bitmap" name="reflectance">{file}</texture>'
+    shape = f'<shape type="sphere"><bsdf type="diffuse">{texture}</bsdf></shape>'
+    outer = path.with_name("outer.xml")
+    outer.write_text(f'<scene version="3.0.0">{SENSOR}<emitter type="constant"/>{shape}</scene>')
+    _named(path, lambda: scene.load(outer))
+
+
 def _named(path, call):
     """Let an error name the scene by the file's name alone, as those of parameters do."""
     from envedit.core.errors import EnveditError

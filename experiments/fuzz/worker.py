@@ -121,7 +121,7 @@ def _prepare(reader):
 
     from envedit.losses.perceptual import weights  # noqa: F401
 
-    if reader in ("painted", "checkpoint", "scene", "mesh", "entry", "state"):
+    if reader in ("painted", "checkpoint", "scene", "mesh", "texture", "entry", "state"):
         import mitsuba as mi
 
         mi.set_variant("llvm_ad_rgb")

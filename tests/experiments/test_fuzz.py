@@ -28,6 +28,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
             ("checkpoint", 40),
             ("scene", 60),
             ("mesh", 60),
+            ("texture", 60),
             ("entry", 40),
             ("state", 60),
         ],

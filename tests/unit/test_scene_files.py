@@ -160,6 +160,34 @@ def test_textures_state_sizes_that_can_be_read(tmp_path):
     scene_files.check("bitmap", str(tmp_path / "a.exr"))
 
 
+def test_textures_that_mitsubas_decoder_does_not_survive_are_refused(tmp_path):
+    """A chunk that is cut, and a table of chunks that points out of the file, stop the process."""
+    path = tmp_path / "a.exr"
+    mi.Bitmap(np.linspace(0, 1, 3600, dtype=np.float32).reshape(40, 30, 3).round(2)).write(str(path))
+    scene_files.check("bitmap", str(path))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-200])
+    with pytest.raises(InputError, match="damaged or truncated"):
+        scene_files.check("bitmap", str(path))
+    # Two chunks of 32 rows: the table holds where the first and the second begin.
+    first = min(n for n in range(8, len(whole)) if whole[n - 16 : n - 8] == struct.pack("<Q", n))
+    path.write_bytes(whole[: first - 8] + struct.pack("<Q", 1 << 61) + whole[first:])
+    with pytest.raises(InputError, match="table of chunks points out of the file"):
+        scene_files.check("bitmap", str(path))
+
+
+def test_a_damaged_jpeg_is_refused_and_nothing_is_printed(tmp_path, capfd):
+    path = tmp_path / "a.jpg"
+    mi.Bitmap(np.full((16, 16, 3), 90, np.uint8)).write(str(path))
+    scene_files.check("bitmap", str(path))
+    whole = path.read_bytes()
+    scan = whole.index(b"\xff\xda")
+    path.write_bytes(whole[: scan + 11] + b"\7" + whole[scan + 12 :])  # where its coefficients begin
+    with pytest.raises(InputError, match="damaged or truncated"):
+        scene_files.check("bitmap", str(path))
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_line_of_an_obj_that_cannot_be_read_is_not_repeated(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 secret\1 0\n")
     shape = '<shape type="obj"><string name="filename" value="a.obj"/></shape>'

@@ -34,6 +34,10 @@ it could have had, some 20,000, of which the best has been chosen; and the steps
 by which a solution with one more light may be longer."""
 PLACINGS = 3
 """Most times that the map's light is placed, each time with the noise that the last has left."""
+FADED, NEEDED = -2.0, 1.1
+"""Log flux below which a light of the map is put out if the rest of the sky can stand in for it, and how many
+times as large the noise must be without it for it to stay: under clouds there is no sun, and its disc would
+be seen."""
 SAME_PLACE = np.cos(np.radians(1.0))
 """Cosine of the angle below which an added light is where it would be added again."""
 
@@ -272,8 +276,10 @@ class _Search:
         """Descend, put added lights where they lower F more, and add others while they lower it."""
         while True:
             point = self._descended(run, point, min(self.iterations, run.most), self.after_step)
-            if not self.most_added or run.asked > self.most_added or not run.history:
+            if not self.most_added or not run.history:
                 return run, point
+            if run.asked > self.most_added:
+                return self._without_faded(run, point)
             before, run.asked = run, run.asked + 1
             run, point = self._placed_again(run, point)
             if len(self.problem.added(run.state)) < self.most_added:
@@ -283,7 +289,22 @@ class _Search:
                 if found is not None and found[1] >= WORTH:
                     run, point = self._better(run, point, *self._additions(run, found[0]))
             if run is before:
-                return run, point
+                return self._without_faded(run, point)
+
+    def _without_faded(self, run, point):
+        """Put out lights of the map that have faded (:data:`FADED`), where steps make up for them."""
+        problem = self.problem
+        for k in problem.lit(run.state):
+            if k in problem.added(run.state) or run.state["flux"][k].mean() > FADED:
+                continue
+            without = _without(run.state, k)
+            rival = replace(run, state=without, damping=1e-3, finished=False, history=list(run.history))
+            most = min(self.iterations, len(run.history) + ADDED_STEPS)
+            end = self._descended(rival, problem.evaluate(without), most, self._tried)
+            noise = problem.noise(point.residual, self.sigma)
+            if problem.loss(end, run.start, noise) < NEEDED**2 * problem.loss(point, run.start, noise):
+                run, point = rival, end
+        return run, point
 
     def _placed_again(self, run, point):
         """Place every added light where it would be added now, or remove it, if that lowers F.

@@ -793,6 +793,20 @@ def test_a_light_that_explains_nothing_goes_out(rng):
     assert not problem.lit(problem.state(found.params))
 
 
+@pytest.mark.parametrize(("left", "stays"), [(0.001, False), (0.1, True)])
+def test_a_faded_light_goes_out_where_the_sky_can_stand_in_for_it(rng, left, stays):
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    target = shown(transport, image + left * lamp())
+    problem, params = problem_of(image + lamp(), transport, target)
+    state = problem.state(params)
+    state["flux"][0] = np.log(left)
+    assert np.log(left) < gauss_newton.FADED
+    ends = [solve(problem, params, 0.01, run=Run(copy(state), copy(state)), most_added=k) for k in (0, 1)]
+    kept, found = (problem.state(end.params) for end in ends)
+    assert problem.lit(kept) == [0] and problem.lit(found) == [0] * stays
+    assert ends[1].history[-1]["residual"] < 1.2 * ends[0].history[-1]["residual"] + 1e-3
+
+
 def test_flux_that_no_sky_of_its_own_has_is_given_to_a_light_beside(case):
     problem, _, start, _ = case
     state, spare = copy(start), problem.layers.lights.count - SPARE

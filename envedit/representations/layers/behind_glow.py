@@ -8,10 +8,10 @@ seen there instead is
     c = k min(1, sqrt(m(v) / K v)),    v = (b - l)^2
 
 the texture stays, at no more than the contrast that it has at this elevation, but for that within K of a
-light, where k is 0: it is bloom and no cloud. Level and colour are those of the elevation. Means are weighted
-by 1 / glow^2: they describe the sky away from the lights. A texel goes from B to R by w, the share of its
-radiance that was the glow's and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a light
-that has not moved changes nothing, and there is no edge.
+light's core, where k is 0: it is bloom and no cloud. Level and colour are those of the elevation. Means are
+weighted by 1 / glow^2: they describe the sky away from the lights. A texel goes from B to R by w, the share
+of its radiance that was the glow's and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a
+light that has not moved changes nothing, and there is no edge.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def behind_glow(
     background, glow : ndarray (rows, W, 3)
         Linear radiance without lights; the factor by which they brightened it, at least 1.
     away : ndarray (rows, W)
-        Degrees to the nearest light that has a glow.
+        Degrees to the core of the nearest light that has a glow.
     rows : (int, int)
         First row in the map, and the rows of the map.
     """

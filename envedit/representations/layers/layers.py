@@ -142,11 +142,17 @@ class Layers:
         return params | {name: tensor(value) for name, value in self.gain.init().items()}
 
     def _away(self):
-        """Degrees from each texel to the nearest light that has a glow, (rows, W)."""
+        """Degrees from each texel to the nearest light that has a glow, (rows, W); 0 within its core.
+
+        A core is taken to be a disc of the solid angle of its texels.
+        """
         first, total = self.rows
         toward = latlong.directions(total, self.shape[1])[first : first + self.shape[0]]
-        glowing = [light.direction for light in self.separation.lights if light.glow is not None]
-        return np.degrees(np.arccos(np.clip((toward @ np.transpose(glowing)).max(axis=2), -1, 1)))
+        omega = latlong.lookup_solid_angles(total, self.shape[1])
+        glowing = [light for light in self.separation.lights if light.glow is not None]
+        radii = [np.sqrt(omega[first + one.texels // self.shape[1]].sum() / np.pi) for one in glowing]
+        angles = np.arccos(np.clip(toward @ np.transpose([one.direction for one in glowing]), -1, 1))
+        return np.degrees(np.maximum(angles - radii, 0).min(axis=2))
 
     def _below(self, low, params):
         """Rows that follow, and what they show where the reflection of a glow has gone."""

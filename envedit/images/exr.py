@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import re
 
 import numpy as np
@@ -75,14 +76,16 @@ def _require_chunks(name, part):
         count = -(-height // lines)
     else:
         return
-    with open(name, "rb") as file:
-        data = file.read()
-    begin = 8
-    while data[begin : begin + 1] not in (b"", b"\0"):  # an attribute: name, type, size, value
-        end = data.index(b"\0", data.index(b"\0", begin) + 1) + 1
-        begin = end + 4 + int.from_bytes(data[end : end + 4], "little")
-    table = np.frombuffer(data[begin + 1 : begin + 1 + 8 * count], "<u8")
-    if len(table) < count or not ((table > begin) & (table < len(data))).all():
+    # Only the header and the table are read into memory.
+    with open(name, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        begin, size = 8, len(data)
+        while data[begin : begin + 1] not in (b"", b"\0"):  # an attribute: name, type, size, value
+            end = data.find(b"\0", data.find(b"\0", begin) + 1) + 1
+            if end <= begin:
+                raise damaged(name, "its header does not end")
+            begin = end + 4 + int.from_bytes(data[end : end + 4], "little")
+        table = np.frombuffer(data[begin + 1 : begin + 1 + 8 * count], "<u8")
+    if len(table) < count or not ((table > begin) & (table < size)).all():
         raise damaged(name, "its table of chunks points out of the file")
 
 

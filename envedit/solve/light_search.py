@@ -207,7 +207,9 @@ class Question:
         """Find the direction of a light, and its flux as a factor; ``others``' pictures may be mixed in."""
         if self._gains is None:
             gains = products(self.directions.reshape(-1, 3), GAIN_ORDER)
-            self._gains = [self.render(self.background * g[:, None]).reshape(-1, 3) for g in gains.T]
+            maps = self.background * gains.T[..., None]
+            seen = self.transport.linear(tensor(maps.reshape(-1, *self.shape)))
+            self._gains = list(seen.numpy().reshape(len(maps), -1, 3))
         mixed = [*self._gains, *(other.reshape(-1, 3) for other in others)]
         if glow is not None:
             shine = glow_at(glow, self.directions @ direction).reshape(-1, 3)

@@ -136,7 +136,7 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
         overview.to_blocks(display_curve.to_display(tensor(one)).numpy()) for one in (picture, rendering)
     )
     share = overview.to_blocks(count)
-    lamps = overview.to_blocks(transport.apply(tensor(np.zeros_like(envmap))).numpy())
+    lamps = overview.to_blocks(transport.other_light())
     omega = np.repeat(latlong.lookup_solid_angles(height, width), width).reshape(height, width)
     total = np.bincount(overview.cell_of, omega.ravel())
     cells = len(total)

@@ -18,7 +18,7 @@ import numpy as np
 from envedit.core import seeds
 from envedit.scene.scene import Scene
 from envedit.transport import path_vertices
-from envedit.transport.sparse_matrix import SLICE, merge
+from envedit.transport.sparse_matrix import SLICE, add_products, merge
 from envedit.transport.texel_sampling import Grid
 
 MOST_VALUES = 1 << 22
@@ -223,15 +223,18 @@ class ExactColumns:
 
     # ------------------------------------------------------------------ using
 
-    def product(self, packets: mi.Float) -> mi.Color3f:
-        """Multiply with a map: sum over columns of column * E[texel], one colour a pixel.
+    def product(self, packets: mi.Float, count: int = 1) -> list[mi.Color3f]:
+        """Multiply with maps: sum over columns of column * E[texel], of each map one colour a pixel.
 
         Parameters
         ----------
         packets : Float
-            The map, 4 floats a texel, (r, g, b, unused), flat.
+            The maps, as :func:`.sparse_matrix.to_packets` interleaves them.
+        count : int
+            How many there are.
         """
-        return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity)
+        args = self._store, packets, self._texel_of, self._count, self.pixels, self.capacity
+        return _product(*args, count)
 
     def read(self, texels: np.ndarray) -> np.ndarray:
         """Return the columns of texels that have one, (n, pixels, 3); in memory channel by channel."""
@@ -299,14 +302,13 @@ def _first_place(pixel, capacity):
 
 
 @dr.syntax
-def _product(store, packets, texel_of, count, pixels, capacity):
+def _product(store, packets, texel_of, columns, pixels, capacity, count):
     place = _first_place(dr.arange(mi.UInt32, pixels), capacity)
     slot = dr.zeros(mi.UInt32, pixels)
-    total = mi.Color3f(0)
-    while slot < count:
+    total = [mi.Color3f(0) for _ in range(count)]
+    while slot < columns:
         weight = dr.gather(mi.Vector4f, store, place)
-        value = dr.gather(mi.Vector4f, packets, dr.gather(mi.UInt32, texel_of, slot))
-        total += mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z)
+        total = add_products(total, weight, packets, dr.gather(mi.UInt32, texel_of, slot))
         place += SLICE
         slot += 1
     return total

@@ -330,10 +330,26 @@ class LightTransport:
         _check(envmap, (self.grid.height, self.grid.width, 3), "map")
         return dr.custom(_Apply, self, envmap)
 
-    def linear(self, envmap: mi.TensorXf) -> mi.TensorXf:
-        """Render a map without the light of other lamps: T E, not differentiable."""
-        _check(envmap, (self.grid.height, self.grid.width, 3), "map")
-        return self._apply(envmap, offset=False)
+    def linear(self, maps: mi.TensorXf) -> mi.TensorXf:
+        """Render maps without the light of other lamps: T E, not differentiable.
+
+        Parameters
+        ----------
+        maps : TensorXf (H, W, 3) or (k, H, W, 3)
+            Linear radiance, of any sign. Several are little more work than one.
+
+        Returns
+        -------
+        TensorXf (h, w, 3) or (k, h, w, 3)
+        """
+        many = maps.shape[0] if maps.ndim == 4 else 1
+        _check(maps, (*maps.shape[:-3], self.grid.height, self.grid.width, 3), "map")
+        return mi.TensorXf(self._products(maps, many), (*maps.shape[:-3], *self.shape, 3))
+
+    def other_light(self) -> np.ndarray:
+        """Return the picture of other lamps, I_0, (h, w, 3); zeros where there are none."""
+        light = self._offset.numpy()
+        return np.zeros((*self.shape, 3), np.float32) if light.size == 1 else light.reshape(*self.shape, 3)
 
     def pictures(self, maps: np.ndarray, rows: slice, most: int = COLUMNS_A_LOOK) -> np.ndarray:
         """Render maps that are black but for few texels, without the light of other lamps.
@@ -451,15 +467,21 @@ class LightTransport:
         self._exact.restore(state, self.seed)
 
     def _apply(self, envmap, offset=True):
-        packets = to_packets(envmap.array, self.grid.texels)
-        coarse = self.forward.apply(scale_packets(packets, self._exact.mask, self.grid.texels))
-        exact = self._exact.product(packets)
-        flat = dr.ravel(coarse + exact)
+        flat = self._products(envmap)
         return mi.TensorXf(flat + self._offset if offset else flat, (*self.shape, 3))
+
+    def _products(self, maps, count=1):
+        """T times maps, flat."""
+        packets = to_packets(maps.array, self.grid.texels, count)
+        masked = scale_packets(packets, self._exact.mask, self.grid.texels, count)
+        both = zip(self.forward.apply(masked, count), self._exact.product(packets, count), strict=True)
+        found = [dr.ravel(coarse + exact) for coarse, exact in both]
+        return found[0] if count == 1 else dr.concat(found)
 
     def _adjoint(self, image):
         packets = to_packets(image.array, self.shape[0] * self.shape[1])
-        coarse = self.reverse.apply(packets) * self._exact.mask
+        (coarse,) = self.reverse.apply(packets)
+        coarse *= self._exact.mask
         flat = dr.ravel(coarse)
         self._exact.add_adjoint(flat, packets)
         return mi.TensorXf(flat, (self.grid.height, self.grid.width, 3))

@@ -159,22 +159,24 @@ class ColourMatrix:
                 one[:, c] = np.bincount(column, entries[:, c] * colours[row, c], self.shape[1])
         return total
 
-    def apply(self, x: mi.Float) -> mi.Color3f:
-        """Multiply with a vector of colours.
+    def apply(self, x: mi.Float, count: int = 1) -> list[mi.Color3f]:
+        """Multiply with vectors of colours; reading the matrix once is most of what one product costs.
 
         Parameters
         ----------
         x : Float
-            4 floats per column, (r, g, b, unused), flat: packets are loaded four at a time.
+            For each column a packet of each vector, of 4 floats (r, g, b, unused), flat: :func:`to_packets`.
+        count : int
+            How many vectors.
 
         Returns
         -------
-        Color3f
-            One colour per row.
+        list of Color3f
+            Of each vector one colour per row.
         """
-        y = _product(self._packed, x, self._start, self._stop)
+        y = _product(self._packed, x, self._start, self._stop, count)
         dr.eval(y)
-        return dr.gather(mi.Color3f, y, self._lane)
+        return [dr.gather(mi.Color3f, one, self._lane) for one in y]
 
 
 def _largest(values):
@@ -186,27 +188,43 @@ def _largest(values):
 
 
 @dr.syntax
-def _product(packed, x, start, stop):
+def _product(packed, x, start, stop, count):
     i = mi.UInt32(start)
-    total = mi.Color3f(0)
+    total = [mi.Color3f(0) for _ in range(count)]
     while i < stop:
         entry = dr.gather(mi.Vector4f, packed, i)
-        value = dr.gather(mi.Vector4f, x, dr.reinterpret_array(mi.UInt32, entry.w))
-        total += mi.Color3f(entry.x * value.x, entry.y * value.y, entry.z * value.z)
+        total = add_products(total, entry, x, dr.reinterpret_array(mi.UInt32, entry.w))
         i += SLICE
     return total
 
 
-def to_packets(flat: mi.Float, count: int) -> mi.Float:
-    """Pad ``count`` colours, 3 floats each, to the 4 that :meth:`ColourMatrix.apply` loads at once."""
-    i = dr.arange(mi.UInt32, count * 4)
-    return dr.gather(mi.Float, flat, (i >> 2) * 3 + (i & 3), (i & 3) < 3)
+def add_products(
+    total: list[mi.Color3f], weight: mi.Vector4f, packets: mi.Float, column: mi.UInt32
+) -> list[mi.Color3f]:
+    """Add to the total of each vector a weight times its colour in a column."""
+    found = []
+    for k, one in enumerate(total):
+        value = dr.gather(mi.Vector4f, packets, column * len(total) + k if len(total) > 1 else column)
+        found.append(one + mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z))
+    return found
 
 
-def scale_packets(packets: mi.Float, scale: mi.Float, count: int) -> mi.Float:
-    """Multiply each of ``count`` packets by its own number."""
-    i = dr.arange(mi.UInt32, count * 4)
-    return packets * dr.gather(mi.Float, scale, i >> 2)
+def to_packets(flat: mi.Float, size: int, count: int = 1) -> mi.Float:
+    """Interleave ``count`` vectors of ``size`` colours, 3 floats each, for :meth:`ColourMatrix.apply`.
+
+    A colour is padded to the 4 floats that are loaded at once.
+    """
+    i = dr.arange(mi.UInt32, size * count * 4)
+    packet = i >> 2
+    if count > 1:
+        packet = packet // count + packet % count * size
+    return dr.gather(mi.Float, flat, packet * 3 + (i & 3), (i & 3) < 3)
+
+
+def scale_packets(packets: mi.Float, scale: mi.Float, size: int, count: int = 1) -> mi.Float:
+    """Multiply the packets of each of ``size`` columns by its own number."""
+    i = dr.arange(mi.UInt32, size * count * 4)
+    return packets * dr.gather(mi.Float, scale, (i >> 2) // count)
 
 
 def merge(

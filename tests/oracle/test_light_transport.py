@@ -343,6 +343,19 @@ def test_linear_is_the_rendering_without_other_lamps(transport, rng):
     assert (transport.linear(mi.TensorXf(black())).numpy() == 0).all()
 
 
+def test_several_maps_are_rendered_as_each_is_alone(transport, rng):
+    maps = rng.standard_normal((3, HEIGHT, WIDTH, 3)).astype(np.float32)
+    together = transport.linear(mi.TensorXf(maps)).numpy()
+    apart = np.stack([transport.linear(mi.TensorXf(one)).numpy() for one in maps])
+    np.testing.assert_array_equal(together, apart)
+
+
+def test_the_light_of_other_lamps_is_the_picture_of_a_black_map(transport):
+    lamps = transport.other_light()
+    assert lamps.max() > 0
+    np.testing.assert_array_equal(lamps, picture(transport, black()))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-30, 65504.0, 1e6, 1e30])
 def test_scale_of_the_map_is_the_scale_of_the_picture(scale):

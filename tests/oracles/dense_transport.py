@@ -47,7 +47,14 @@ class DenseTransport:
         rgb = [dr.matmul(w, flat[:, c : c + 1]).array for c, w in enumerate(self._tensors)]
         return mi.TensorXf(dr.ravel(mi.Color3f(*rgb)), (*self.shape, 3))
 
-    linear = apply  # no other lamps
+    def linear(self, maps):
+        """Render one map or several."""
+        if maps.ndim == 3:
+            return self.apply(maps)
+        return mi.TensorXf(np.stack([self.apply(mi.TensorXf(one)).numpy() for one in maps.numpy()]))
+
+    def other_light(self):
+        return np.zeros((*self.shape, 3), np.float32)
 
     def adjoint(self, image):
         flat = np.asarray(image, np.float32).reshape(-1, 3)

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.transport.sparse_matrix import ColourMatrix, merge
+from envedit.transport.sparse_matrix import ColourMatrix, merge, scale_packets, to_packets
 
 
 def dense(rows, columns, weights, shape):
@@ -26,7 +26,7 @@ def product(matrix, x):
     packets = np.zeros((len(x), 4), np.float32)
     packets[:, :3] = x
     packets[:, 3] = np.nan  # "unused": must not reach a result
-    return np.array(matrix.apply(mi.Float(packets.ravel()))).T
+    return np.array(matrix.apply(mi.Float(packets.ravel()))[0]).T
 
 
 @pytest.mark.parametrize("shape", [(1, 5), (7, 3), (8, 8), (9, 20), (64, 1), (37, 101)])
@@ -42,6 +42,19 @@ def test_product_is_the_dense_one(rng, shape):
     assert result.shape == expected.shape
     bound = (np.bincount(rows, minlength=shape[0])[:, None] + 1) * 2.0**-24 * magnitude
     assert (np.abs(result - expected) <= bound).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_several_vectors_give_the_bits_of_each_alone(count, rng):
+    shape = (37, 101)
+    matrix = ColourMatrix(*entries(rng, shape, 400), shape)
+    vectors, scale = np.float32(rng.standard_normal((count, shape[1], 3))), np.float32(rng.random(shape[1]))
+    packets = to_packets(mi.Float(vectors.ravel()), shape[1], count)
+    packets = scale_packets(packets, mi.Float(scale), shape[1], count)
+    found = [np.array(one).T for one in matrix.apply(packets, count)]
+    assert len(found) == count
+    for one, vector in zip(found, vectors, strict=True):
+        np.testing.assert_array_equal(one, product(matrix, vector * scale[:, None]))
 
 
 def test_rows_without_entries_give_zero():

@@ -223,6 +223,9 @@ class _Blur:
         self._down = tensor(weight.T)
         self._across = tensor(np.kron(self.across, np.eye(3)))
         self._share = tensor(1 / np.maximum(np.repeat(share, 3, axis=1), 1e-30))
+        at = (np.arange(columns)[:, None] + np.arange(columns)) % columns  # distance, column
+        place = np.arange(rows)[:, None, None, None] * columns + at[..., None]
+        self._shifted = dr.opaque(mi.UInt32((3 * place + np.arange(3)).ravel().astype(np.uint32)))
 
     def widen(self, widest: float) -> None:
         """Make K for a greatest standard deviation, degrees; each of its rows sums to 1."""
@@ -234,17 +237,37 @@ class _Blur:
         width = np.minimum(NARROWEST + WIDENING * (90 - np.degrees(theta)), widest)
         kernel = np.exp(-0.5 * (angle / width[:, None, None]) ** 2) * np.sin(theta)[:, None]
         kernel = (kernel / kernel.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
-        apart = (np.arange(columns) - np.arange(columns)[:, None]) % columns
-        whole = kernel[:, :, apart].transpose(0, 2, 1, 3)
-        self._kernel = tensor(whole.reshape(rows * columns, rows * columns))
+        self._kernel, self._adjoint = (
+            tensor(one.reshape(rows, rows * columns)) for one in (kernel, kernel.transpose(1, 0, 2))
+        )
 
     def __call__(self, sky: mi.TensorXf) -> mi.TensorXf:
         """Average a sky over K, at the nodes of the grid: (rows, 3 columns)."""
-        rows, columns = self.grid
         flat = dr.reshape(sky, (sky.shape[0], 3 * sky.shape[1]))
         coarse = dr.matmul(dr.matmul(self._down, flat), self._across) * self._share
-        soft = dr.matmul(self._kernel, dr.reshape(coarse, (rows * columns, 3)))
-        return dr.reshape(soft, (rows, 3 * columns))
+        return dr.custom(_Around, coarse, self._kernel, self._adjoint, self._shifted)
+
+
+class _Around(dr.CustomOp):
+    """K on its grid, a matrix of rows and of distances along them; it is even in these.
+
+    Every row is laid out once for each distance, and one product sums over rows and distances in a fixed
+    order.
+    """
+
+    def eval(self, coarse, kernel, adjoint, shifted):
+        self._adjoint, self._shifted = adjoint, shifted
+        return self._product(coarse, kernel)
+
+    def _product(self, coarse, kernel):
+        laid_out = dr.gather(mi.Float, coarse.array, self._shifted)
+        return dr.matmul(kernel, mi.TensorXf(laid_out, (kernel.shape[1], coarse.shape[1])))
+
+    def backward(self):
+        self.set_grad_in("coarse", self._product(self.grad_out(), self._adjoint))
+
+    def name(self):
+        return "average over K"
 
 
 def _veiled(sky):

@@ -179,7 +179,7 @@ def solve(
         point = search._descended(run, point, min(iterations, run.most), after_step)
     else:
         run, point = search.solved(run, point)
-    normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
+    normal = problem.normal(point, run.start, problem.noise(point.residual, sigma), descent=False)
     loss, note = _unlikeliness(problem, run, point, sigma), ""
     loss += 2 * normal.determined if run.history else 0
     whole = run
@@ -196,7 +196,7 @@ def solve(
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
             run, point, loss = before, first, least
-            normal = problem.normal(point, run.start, problem.noise(point.residual, sigma))
+            normal = problem.normal(point, run.start, problem.noise(point.residual, sigma), descent=False)
     posterior = None if trial else problem.posterior(normal)
     return Solution(problem.found(run.state), run.history, loss, whole, posterior, note)
 

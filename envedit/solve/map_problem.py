@@ -51,8 +51,6 @@ larger lobe would be seen."""
 SATURATIONS = (-3.0, 0.0)
 """Logarithms of the sky's saturation that are looked for, from 5 % to the original's own: more would amplify
 what its colours have of noise."""
-FURTHER = 0.05
-"""Step of the finite difference by it."""
 ROWS = 64
 """Rows of a triangular matrix that are solved for together."""
 _AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
@@ -409,11 +407,12 @@ class Problem:
 
     # ---- normal equations ----------------------------------------------------------------------------------
 
-    def normal(self, point: Point, start: dict, sigma: float) -> Normal:
+    def normal(self, point: Point, start: dict, sigma: float, descent: bool = True) -> Normal:
         """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2.
 
-        The gain's part of the gradient is exact, through T; its part of the Hessian, and what it has in
-        common with lights, is that of the block transport.
+        The gradient by gain and saturation is exact, through T; their part of the Hessian, and what it has in
+        common with lights, is that of the block transport. Without ``descent`` only the Hessian is asked for,
+        and the gradient is 0.
         """
         state, n = point.state, self.nodes
         size = _sizes(point.residual)
@@ -424,13 +423,15 @@ class Problem:
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         squared = blocks.summed((slope * profile) ** 2 * robust)
         pulled = blocks.summed(slope * profile * robust * point.residual)
-        pulled_back = self._pulled_back(point, slope * robust * point.residual)
+        pulled_back = np.zeros((n, 3)), 0.0
+        if descent:
+            pulled_back = self._pulled_back(point, slope * robust * point.residual)
         seen, lit = np.zeros((len(lights.pictures), n * 3)), []
         for c, j in enumerate(jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
-            gradient[part] = pulled_back[:, c]
+            gradient[part] = pulled_back[0][:, c]
             if len(lights.pictures):
                 weighted = lights.pictures[..., c] * (slope**2 * profile * robust)[..., c]
                 in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
@@ -441,33 +442,38 @@ class Problem:
             flat = (lights.pictures * (slope * np.sqrt(robust))).reshape(len(lights.pictures), -1)
             hessian[rest, rest] = flat @ flat.T
             gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
+            if self.saturates:
+                gradient[-1] = pulled_back[1]
             hessian[rest, : 3 * n], hessian[: 3 * n, rest] = seen, seen.T
         precision, back = self._precision(lights.unknowns), self._from_prior(state, start, lights.unknowns)
         hessian += precision
-        gradient += precision @ back
+        gradient = gradient + precision @ back if descent else np.zeros(unknowns)
         pixels = robust, slope, point.residual, profile, lights.pictures
         parts = Blocks(jacobian, squared, pulled, lit)
         return Normal(hessian, gradient, precision, lights.unknowns, parts, *pixels)
 
     def _pulled_back(self, point, picture):
-        """Return the derivative by every node's log gain (n, 3) of the sum of a picture times T E."""
+        """Return the derivatives of the sum of a picture times T E.
+
+        By every node's log gain, (n, 3), and by the log saturation; 0 where that is no unknown.
+        """
         light = self.transport.adjoint(np.float32(picture)).numpy()[self.rows]
         params = self.params(point.state)
-        grids = [params[name] for name in self._grids]
+        names = self._grids + ["saturation"] * self.saturates
         with dr.isolate_grad():
-            dr.enable_grad(grids)
+            dr.enable_grad([params[name] for name in names])
             sky, _ = self.layers.parts(params)
             dr.backward(dr.sum(sky.array * tensor(light).array))
-            found = [dr.grad(grid).numpy().reshape(-1, 3) for grid in grids]
-        units = [_numpy(self.layers.scales[name]) for name in self._grids]
-        return np.concatenate([np.float64(g) / u for g, u in zip(found, units, strict=True)])
+            units = [_numpy(self.layers.scales[name]) for name in names]
+            found = [dr.grad(params[name]).numpy() / unit for name, unit in zip(names, units, strict=True)]
+        colour = float(found.pop()[0, 0]) if self.saturates else 0.0
+        return np.concatenate([np.float64(one).reshape(-1, 3) for one in found]), colour
 
     def _linearised(self, point):
         """Pictures of lights and Jacobian of the gain, which no weight changes: kept of the last point."""
         if self._linear is None or self._linear[0] is not point:
-            profile = self._profile(point)
-            jacobian = self.blocks.jacobian(self._slopes(point))
-            self._linear = point, self._lights(point, profile), profile, jacobian
+            lights, profile = self._lights(point)
+            self._linear = point, lights, profile, self.blocks.jacobian(self._slopes(point))
         return self._linear[1:]
 
     def _precision(self, unknowns):
@@ -579,22 +585,24 @@ class Problem:
             slopes[:own] = np.where(self.free[:own, :, None], slopes[:own], 0)
         return slopes.reshape(-1, 3)
 
-    def _profile(self, point):
+    def _profile(self, point, cores):
         """Return the sky's light on every pixel over the mean of its block, (h, w, 3).
 
-        What a node changes is taken to spread so over a block: by texture, shading and outlines.
+        What a node changes is taken to spread so over a block: by texture, shading and outlines. ``cores``
+        are pictures, (pixels, 3) each, of what in the point's rendering is light of cores.
         """
-        sky = self.envmap.copy()
-        sky[self.rows] = point.sky
-        return self.blocks.profile(self.transport.linear(tensor(sky)).numpy())
+        sky = point.rendering - self.transport.other_light()
+        for one in cores:
+            sky -= one.reshape(sky.shape)
+        return self.blocks.profile(np.maximum(sky, 0))
 
-    def _lights(self, point: Point, profile: np.ndarray) -> _Lights:
+    def _lights(self, point: Point) -> tuple[_Lights, np.ndarray]:
         """Pictures by which a light's unknowns change the rendering, (k, h, w, 3), and what they are.
 
-        A light's core is seen through T, its glow through the block transport.
+        And the :meth:`_profile` of blocks. A light's core is seen through T, its glow through the block
+        transport.
         """
-        state, unknowns, pictures = point.state, [], []
-        layers, sky = self.layers, point.sky
+        state, layers, sky, found, unknowns = point.state, self.layers, point.sky, [], []
         # Columns of one light must not take the place of another's.
         lit = self.lit(state)
         most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
@@ -607,33 +615,39 @@ class Problem:
                     turns.append(rotation_vector(layers.lights.centres[i], there))
             ways = [(one, flux, size) for one in turns] + [(turn, flux, size + 0.1)]
             now, *ends, larger = layers.lights.cores_of(i, ways, layers.whole)
-            cores = [now, *_differences(ends), (larger - now) / 0.1]
-            seen = self.transport.pictures(np.stack(cores), self.rows, most).reshape(4, -1, 3)
+            cores = np.stack([now, *_differences(ends), (larger - now) / 0.1])
+            seen = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
+            found.append((i, turns, cores, seen))
+            unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
+            unknowns += [("flux", i, c) for c in range(3)]
+        profile = self._profile(point, [seen[0] for *_, seen in found])
+        for i, turns, cores, seen in found:
             glow, *ends = (self._log_glow(state, i, one) for one in turns)
             shone = None
             if glow is not None:
                 shone = np.stack([sky * -np.expm1(-glow), *(sky * d for d in _differences(ends))])
-            shone = self._with_lit_ground(point, np.stack(cores[:3]), shone)
+            shone = self._with_lit_ground(point, cores[:3], shone)
             if shone is not None:
                 seen[:3] += self.blocks.pictures(shone) * profile.reshape(-1, 3)
-            pictures.append(seen)
-            unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
-            unknowns += [("flux", i, c) for c in range(3)]
         whole = []
         if self.saturates:
             unknowns.append(("saturation", 0, 0))
-            whole.append(self._by_saturation(point))
-        return _Lights(self._apart(pictures, whole), unknowns)
+            whole.append(self._by_saturation(point, profile))
+        return _Lights(self._apart([seen for *_, seen in found], whole), unknowns), profile
 
-    def _by_saturation(self, point):
-        """Return the derivative of the rendering by the log saturation, (h, w, 3)."""
-        back = point.state["saturation"] + FURTHER > SATURATIONS[1]
-        step = -FURTHER if back else FURTHER
-        further = self.params(point.state | {"saturation": point.state["saturation"] + step})
-        sky = self.layers.parts(further)[0].numpy()
-        change = np.zeros_like(self.envmap)
-        change[self.rows] = (sky - point.sky) / np.float32(step)
-        return self.transport.linear(tensor(change)).numpy()
+    def _by_saturation(self, point, profile):
+        """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
+        params, own = self.params(point.state), self.layers.shape[0]
+        base, change = self.layers.base_by_saturation(params)
+        # Of what a gain brightens a part is luminance, which stays.
+        more = np.maximum(np.exp(self.layers.log_gain(params)) - 1, 0)
+        luminance = base[:own] @ np.array(LUMINANCE, np.float32)
+        grey = (1 - VEIL) * base[:own] + VEIL * luminance[..., None]
+        base[:own] += more * grey
+        change[:own] *= 1 + (1 - VEIL) * more
+        change *= np.divide(point.sky, base, out=np.zeros_like(base), where=base > 0)
+        change = self._with_lit_ground(point, np.zeros_like(change[None]), change[None])
+        return (self.blocks.pictures(change) * profile.reshape(-1, 3))[0]
 
     def _with_lit_ground(
         self, point: Point, cores: np.ndarray, shone: np.ndarray | None

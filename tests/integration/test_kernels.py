@@ -62,7 +62,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
     settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100", "representation.turn=false"])
     fresh, launched, columns, normal = [], [], [], map_problem.Problem.normal
 
-    def counted(problem, *arguments):
+    def counted(problem, *arguments, **options):
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
         launched.append(len(kernels))
         fresh.append(sum(not k["cache_hit"] or k["cache_disk"] for k in kernels))
@@ -71,7 +71,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
             bright = problem.envmap.copy()
             bright[4, len(fresh)] = 1e5
             problem.transport.resolve(bright)
-        return normal(problem, *arguments)
+        return normal(problem, *arguments, **options)
 
     monkeypatch.setattr(map_problem.Problem, "normal", counted)
     monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # some steps more

@@ -19,6 +19,8 @@ def of(radiance, exponent):
 
 def plain(radiance, exponent):
     radiance = np.float64(radiance)
+    if exponent == 1:
+        return radiance
     light = radiance @ LUMINANCE
     chroma = radiance / light[:, None]
     chroma = np.maximum(chroma + (1 - exponent) * 0.2 * (1 - chroma), LEAST) ** exponent
@@ -37,7 +39,7 @@ def test_it_is_the_formula_and_keeps_luminance(exponent, value, rng):
 
 def test_one_changes_nothing_and_nought_is_grey(rng):
     radiance = 0.01 + rng.random((50, 3))
-    np.testing.assert_allclose(of(radiance, 1.0), radiance, rtol=1e-5)
+    np.testing.assert_array_equal(of(radiance, 1.0), np.float32(radiance))
     grey = of(radiance, 0.0)
     np.testing.assert_allclose(grey, grey[:, :1] * np.ones(3), rtol=1e-6)
 
@@ -75,3 +77,12 @@ def test_its_derivative_is_the_finite_difference(rng):
         return (found[:, 0] - 2 * found[:, 2]).sum()
 
     assert dr.grad(exponent)[0] == pytest.approx((f(0.601) - f(0.599)) / 0.002, rel=1e-3)
+
+
+def test_a_black_channel_has_the_derivative_by_less_saturation_where_it_has_all():
+    radiance, exponent, step = np.float32([[0.0, 0.5, 1.0]]), mi.Float(1.0), 0.01
+    dr.enable_grad(exponent)
+    made = saturated(mi.Color3f(np.ascontiguousarray(radiance.T)), exponent)
+    dr.backward(dr.sum(made.x))
+    slope = (plain(radiance, 1.0) - plain(radiance, 1 - step))[0, 0] / step
+    assert slope < -0.05 and dr.grad(exponent)[0] == pytest.approx(slope, rel=0.2)

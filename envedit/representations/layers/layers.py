@@ -29,7 +29,7 @@ from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
 from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.lights import DARK, SPARE, Lights
-from envedit.representations.layers.saturation import saturated
+from envedit.representations.layers.saturation import by_saturation, saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
@@ -322,6 +322,14 @@ class Layers:
         real = {"saturation": params["saturation"] * self.scales["saturation"]}
         base = saturated(self._at(self.shape)[2], _exponent(real))
         return mi.TensorXf(dr.ravel(base), (*self.shape, 3)).numpy()
+
+    def base_by_saturation(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Return the image without cores, (rows, W, 3), and its derivative by the log saturation."""
+        image = self.base if self.below is None else np.concatenate([self.base, self.below.image])
+        parts = [(slice(self.shape[0]), self._at(self.shape)[2])]
+        if self.mirrored:
+            parts.append((slice(self.shape[0], None), self.below.radiance))
+        return by_saturation(image, parts, (params["saturation"] * self.scales["saturation"]).array)
 
     def log_gain(self, params: dict) -> np.ndarray:
         """Return the logarithm of the gain (rows, W, 3) float32, at the resolution of the image.

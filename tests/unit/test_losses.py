@@ -107,7 +107,7 @@ def test_a_bad_texel_is_not_hidden(name, bad, rng):
     assert not np.isfinite(LOSSES[name](single(x), single(y), single(w))[0])
 
 
-@pytest.mark.parametrize("name", set(LOSSES) - {"l1", "tv"})
+@pytest.mark.parametrize("name", sorted(set(LOSSES) - {"l1", "tv"}))
 def test_shapes_must_agree(name):
     x = dr.zeros(mi.TensorXf, (12, 15, 3))
     with pytest.raises(InputError, match=r"image \(12, 15, 3\) and reference \(15, 12, 3\) differ in shape"):

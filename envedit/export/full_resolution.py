@@ -20,9 +20,11 @@ from envedit.export.source_cores import SourceCores
 from envedit.export.texel_maps import Places, as_colours, as_image
 from envedit.representations.base import Representation
 from envedit.representations.layers import lights
+from envedit.representations.layers.behind_glow import gone_of
 from envedit.representations.layers.gain import brightened
-from envedit.representations.layers.layers import Layers, gone_of, unseen_kept
+from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.saturation import saturated
+from envedit.representations.layers.unseen import unseen_kept
 
 
 def carry(
@@ -130,7 +132,8 @@ class _LayersAt:
     edge : int or None
         Working row from which rows follow.
     relit : bool
-        The glow has changed; then ``behind`` and ``faint`` are what it had hidden.
+        The glow has changed; then ``behind`` and ``faint`` are what it had hidden, and ``by_lights`` is the
+        log factor of rows that follow.
     exponent : Float or None
         k of ``saturation.py``, where the sky's colours change by it.
     strength : Float
@@ -144,7 +147,8 @@ class _LayersAt:
         self.exponent = None
         if "saturation" in params:
             self.exponent = dr.opaque(mi.Float, float(np.exp(params["saturation"].numpy()[0, 0])))
-        self.gain = np.concatenate([layers.log_gain(params), layers.log_below(params)])
+        by_lights, further = layers.log_below(params)
+        self.gain = np.concatenate([layers.log_gain(params), further])
         self.edge = None if layers.below is None else layers.shape[0]
         self.free = layers.free
         if self.edge is not None and self.free is not None:
@@ -152,9 +156,9 @@ class _LayersAt:
         own = layers.lights.count - lights.SPARE
         self.relit = layers.lights.glowing and bool(turn.any() or flux[:own].any())
         if self.relit:
-            # Rows that follow have it in their factor.
-            none = np.zeros_like(self.gain[layers.shape[0] :])
+            none = np.zeros_like(further)
             self.behind = [np.concatenate([f, none]) for f in (layers.behind.offset, layers.behind.slope)]
+            self.by_lights = np.concatenate([np.zeros_like(layers.behind.offset), by_lights])
             self.faint = dr.opaque(mi.Float, layers.behind.faint)
         moved = (turn != 0).any(axis=1) | (size != 0).any(axis=1)
         strength = np.where(moved[:own, None], 0, lights.flux_factor(flux[:own]))
@@ -204,21 +208,23 @@ class _LayersAt:
             light, _, core = self.cores.of(image, row, column, d, start, size)
             base = image - core
         colours = base
+        if self.relit:
+            offset, slope, by_lights = (
+                self.grid.across(mi.Color3f, flat(mi.Float, field), row, column)
+                for field in (
+                    self.grid.along_rows(f, start, size, self.edge) for f in (*self.behind, self.by_lights)
+                )
+            )
+            before, follow = self.cores.glow(d), self.cores.follow(start, row)
+            ratio = self.layers.lights.glow(self.placed["turn"], self.placed["flux"], d) / before
+            revealed = dr.exp(gone_of(ratio) * (offset + slope * dr.log(base / before + self.faint)))
+            ratio = dr.select(follow, dr.exp(by_lights), ratio * revealed)
+            colours = base * ratio
+            same &= ratio == 1
         if self.exponent is not None:
             kept = self.cores.follow(start, row) & (not self.layers.mirrored)
-            colours, same = dr.select(kept, base, saturated(base, self.exponent)), same & kept
+            colours, same = dr.select(kept, colours, saturated(colours, self.exponent)), same & kept
         sky = brightened(colours, factor)
-        if self.relit:
-            before = self.cores.glow(d)
-            ratio = self.layers.lights.glow(self.placed["turn"], self.placed["flux"], d) / before
-            ratio = dr.select(self.cores.follow(start, row), 1, ratio)
-            offset, slope = (
-                self.grid.across(mi.Color3f, flat(mi.Float, field), row, column)
-                for field in (self.grid.along_rows(f, start, size, self.edge) for f in self.behind)
-            )
-            change = offset + slope * dr.log(base / before + self.faint)
-            sky *= ratio * dr.exp(gone_of(ratio) * change)
-            same &= ratio == 1
         if core is not None:
             # The last is 1, for texels of no light.
             which = dr.select(light < 0, dr.opaque(mi.Int32, self.layers.lights.count - lights.SPARE), light)

@@ -22,8 +22,8 @@ from envedit.losses import display_curve, optimizer
 from envedit.losses.perceptual import distances
 from envedit.renderers import Renderer
 from envedit.representations.layers.gain import LEVELS
-from envedit.representations.layers.layers import unseen_kept
 from envedit.representations.layers.lights import SPARE
+from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
 from envedit.targets import target

@@ -34,7 +34,7 @@ it could have had, some 20,000, of which the best has been chosen; and the steps
 by which a solution with one more light may be longer."""
 PLACINGS = 3
 """Most times that the map's light is placed, each time with the noise that the last has left."""
-FADED, NEEDED = -2.0, 1.1
+FADED, NEEDED = -1.0, 1.1
 """Log flux below which a light of the map is put out if the rest of the sky can stand in for it, and how many
 times as large the noise must be without it for it to stay: under clouds there is no sun, and its disc would
 be seen."""

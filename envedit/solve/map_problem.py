@@ -576,7 +576,7 @@ class Problem:
         slopes = point.sky.astype(np.float64)
         own = self.layers.shape[0]
         params = self.params(point.state)
-        sky, base = slopes[:own], self.layers.sky_base(params).astype(np.float64)
+        sky, base = slopes[:own], self.layers.before_gain(params).astype(np.float64)
         gain = np.exp(np.float64(self.layers.log_gain(params)))
         grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
         more = base + (gain - 1) * grey
@@ -638,7 +638,7 @@ class Problem:
     def _by_saturation(self, point, profile):
         """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
         params, own = self.params(point.state), self.layers.shape[0]
-        base, change = self.layers.base_by_saturation(params)
+        base, change = self.layers.by_saturation(params)
         # Of what a gain brightens a part is luminance, which stays.
         more = np.maximum(np.exp(self.layers.log_gain(params)) - 1, 0)
         luminance = base[:own] @ np.array(LUMINANCE, np.float32)

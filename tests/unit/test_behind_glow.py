@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE, tonemap
 from envedit.images.analytic_sky import sunsky
 from envedit.losses import metrics
 from envedit.representations.layers.behind_glow import behind_glow
-from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.layers import SCALES, Layers
+from envedit.representations.layers.lights import DARK
 from tests.unit.test_layers import SHAPE, SUN, sent, sky
 
 D = latlong.directions(*SHAPE)
@@ -66,6 +68,27 @@ def test_the_old_place_of_a_sun_looks_like_the_elevation_and_an_unmoved_one_keep
     edited = made.decode(sent(made, params, made.lights.centres[0] * [-1, 1, -1])).numpy()
     for near in (AWAY < 8, mirror < 8):
         assert np.abs(np.log(edited / plain)[near]).max() < 0.5
+
+
+def test_a_low_orange_sun_that_leaves_a_grey_sky_leaves_no_fleck_below_the_horizon():
+    """Its reflection goes with its glow, and its colour before the sky's saturation is lowered."""
+    low, orange = (29, 20), np.float32([1.0, 0.4, 0.1])
+    plain, at = sky(sun=None), D[low]
+    away = np.degrees(np.arccos(np.clip(D @ at, -1, 1)))
+    image = plain * (1 + 8 * np.float32(np.exp(-away / 8))[..., None] * orange)
+    image[low] = 5e3 * orange
+    mirror = np.degrees(np.arccos(np.clip(D @ (at * [1, -1, 1]), -1, 1)))
+    shine = 1 + 20 * np.float32(np.exp(-0.5 * (mirror / 3) ** 2))[..., None] * orange
+    image[32:] = (plain * (1 + 8 * np.float32(np.exp(-mirror / 8))[..., None] * orange) * shine)[32:]
+    made = Layers(horizon="mirror")
+    params = made.encode(image)
+    flux = params["flux"].numpy()
+    flux[0] = DARK / SCALES["flux"]
+    grey = tensor(np.full((1, 1), np.log(0.05), np.float32))
+    edited = made.decode(params | {"flux": tensor(flux), "saturation": grey}).numpy()
+    for near in (away < 6, mirror < 6):
+        assert np.abs(np.log(edited @ LUMINANCE / (plain @ LUMINANCE)))[near].max() < 0.5
+        assert (edited.max(axis=2) / edited.min(axis=2))[near].max() < 1.15
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.images import images
 from envedit.losses import naturalness
-from envedit.representations.layers import below_horizon, layers
+from envedit.representations.layers import below_horizon, unseen
 from envedit.representations.layers.below_horizon import Below, kind_of, sky_rows
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.layers import Layers
@@ -224,9 +224,9 @@ def test_only_a_whole_map_has_rows_that_follow():
 def test_texels_whose_change_nobody_sees_keep_their_bits():
     original = np.full((2, 2, 3), 0.7, np.float32)
     edited = original.copy()
-    edited[0, 0, 1] *= 1 + 0.9 * layers.UNSEEN
-    edited[1, 1, 2] *= 1 + 1.1 * layers.UNSEEN
-    kept = layers.unseen_kept(original, edited)
+    edited[0, 0, 1] *= 1 + 0.9 * unseen.UNSEEN
+    edited[1, 1, 2] *= 1 + 1.1 * unseen.UNSEEN
+    kept = unseen.unseen_kept(original, edited)
     assert kept[0].tobytes() == original[0].tobytes() and kept[1, 1, 2] == edited[1, 1, 2]
     black = np.zeros((1, 1, 3), np.float32)
-    assert layers.unseen_kept(black, np.full_like(black, 1e-30))[0, 0, 0] == np.float32(1e-30)
+    assert unseen.unseen_kept(black, np.full_like(black, 1e-30))[0, 0, 0] == np.float32(1e-30)

@@ -32,8 +32,9 @@ from envedit.export import adjustments
 from envedit.losses import display_curve
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
-from envedit.representations.layers.layers import Layers, unseen_kept
+from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
+from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL

@@ -18,9 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from envedit.core import latlong
 from envedit.core.color import LUMINANCE
+from envedit.representations.layers.separation import Light
 
 BLUR = 4.0
 """Standard deviation of K, degrees: what is finer is texture, what is coarser the sky's brightness."""
@@ -46,6 +50,30 @@ class BehindGlow:
     def log_change(self, background: np.ndarray) -> np.ndarray:
         """Return log R - b of a background (rows, W, 3)."""
         return self.offset + self.slope * np.log(background + self.faint)
+
+
+def degrees_to_cores(lights: list[Light], shape: tuple[int, int], rows: tuple[int, int]) -> np.ndarray:
+    """Return degrees from each texel to the nearest light that has a glow, ``shape``; 0 within its core.
+
+    A core is taken to be a disc of the solid angle of its texels. ``rows`` is as of :func:`behind_glow`.
+    """
+    (first, total), width = rows, shape[1]
+    toward = latlong.directions(total, width)[first : first + shape[0]]
+    omega = latlong.lookup_solid_angles(total, width)
+    glowing = [light for light in lights if light.glow is not None]
+    radii = [np.sqrt(omega[first + one.texels // width].sum() / np.pi) for one in glowing]
+    angles = np.arccos(np.clip(toward @ np.transpose([one.direction for one in glowing]), -1, 1))
+    return np.degrees(np.maximum(angles - radii, 0).min(axis=2))
+
+
+def gone_of(ratio: mi.Color3f) -> mi.Float:
+    """Return the share of radiance that was a glow's and is gone, where the glow changes by a ratio."""
+    return dr.maximum(mi.luminance(1 - ratio), 0)
+
+
+def near_core(away: np.ndarray) -> np.ndarray:
+    """Return 1 within a core, falling to 0 over :data:`BLUR`, of degrees to it: bloom, and no cloud."""
+    return np.exp(-0.5 * np.square(away / BLUR))
 
 
 def behind_glow(
@@ -75,7 +103,7 @@ def behind_glow(
         return (_along_rows(shape[0], BLUR, rows[1]) @ mean)[:, None]
 
     contrast = np.sqrt(np.minimum((at_elevation(texture) + _LEAST) / (around + _LEAST), 1))
-    contrast *= 1 - np.exp(-0.5 * np.square(away / BLUR))[..., None]
+    contrast *= 1 - near_core(away)[..., None]
     slope = np.broadcast_to(contrast - 1, background.shape)
     offset = at_elevation(low) - contrast * low
     return BehindGlow(offset.astype(np.float32), slope.astype(np.float32), faint)

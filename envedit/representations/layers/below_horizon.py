@@ -9,10 +9,11 @@ are the original's, times a smooth factor, the change of the sky above:
 S and S_0 are the sky, without cores of lights, after the edit and before, in every channel with some of its
 luminance (:data:`.VEIL`; a ratio to a channel that is black says nothing), m is the mirrored direction, K a
 Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
-:data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio. f is 1 for
-a mirror; for ground it falls off with the angle (:data:`FADE`). Farther down ground follows H, the light that
-falls on it (``ground_light.py``), or keeps its brightness where its albedo would be none that there is. a is
-an unknown of the edit, 1 where the picture does not determine it: light from the side, or another ground.
+:data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio; what a
+mirror shows of one goes with its glow (:meth:`Below.reveal`). f is 1 for a mirror; for ground it falls off
+with the angle (:data:`FADE`). Farther down ground follows H, the light that falls on it
+(``ground_light.py``), or keeps its brightness where its albedo would be none that there is. a is an unknown
+of the edit, 1 where the picture does not determine it: light from the side, or another ground.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ BLENDED = 5.0
 """Degrees below the horizon over which the blur sets in."""
 FADE = 10.0
 """Degrees below the horizon at which ground follows what it would mirror by 1/e."""
+UNLIT = 1e-3
+"""Share of light below which a glow has none."""
 COLUMNS, COARSE = 96, 48
 """Columns of the grid on which K is applied, and on which its width is chosen."""
 
@@ -155,12 +158,22 @@ class Below:
             errors.append(omega @ np.square(varying(soft) - shown).mean(axis=1))
         return WIDEST[int(np.argmin(errors))]
 
-    def reveal(self, log_change: np.ndarray) -> None:
+    def reveal(self, log_change: np.ndarray, gone: np.ndarray, near: np.ndarray) -> None:
         """Say what changes, (rows, W, 3), where all of a texel's light was a glow's and is gone.
 
-        From nothing at the horizon, which follows the sky's own change, to all of it at :data:`BLENDED`.
+        From nothing at the horizon, which follows the sky's own change, to all of it at :data:`BLENDED`. The
+        mirror image of a core goes with its glow, all of it and at any elevation.
+
+        Parameters
+        ----------
+        log_change : ndarray (rows, W, 3)
+            Of :meth:`.BehindGlow.log_change`, beside what follows from the sky.
+        gone, near : ndarray (rows, W, 1)
+            Share of the light that is gone where every glow is, and :func:`.near_core`.
         """
-        self._behind = tensor(log_change * self._blend[:, None, None])
+        share = 1 - near + near / np.maximum(gone, UNLIT)
+        seen = 1 - (1 - self._blend[:, None, None]) * (1 - near)
+        self._behind = tensor(log_change * share * seen)
 
     def log_factor(
         self,

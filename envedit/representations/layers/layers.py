@@ -1,15 +1,14 @@
 """Layers: a representation of the edit instead of the map.
 
-    E = E_0' * prod((1 + G_l) / (1 + G_l^0)) * exp(w r) * exp(g) + sum(C_l)
+    E = sat_k(E_0' * prod((1 + G_l) / (1 + G_l^0)) * exp(w r)) * exp(g) + sum(C_l)
 
 E_0' is the original without the cores of its lights, G_l and C_l are glow and core of light l
 (``separation.py``, ``lights.py``), with index 0 before they moved; w and r are what is seen where a glow has
-gone (``behind_glow.py``), g is the smooth gain of the sky (``gain.py``), and s_l, the factor of a light's
-flux, is in G_l. Rows below the horizon follow those above (``below_horizon.py``), or are edited like them.
-Where f = exp(g) is above 1, E f is read as
-E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`.brightened`. Unmoved lights and no gain give the original
-back, bit for bit outside the cores: there is nothing to fit, the sky's own detail is kept, and the map has
-any resolution.
+gone (``behind_glow.py``), k is the saturation of the sky's colours (``saturation.py``), g is its smooth gain
+(``gain.py``), and s_l, the factor of a light's flux, is in G_l. Rows below the horizon follow those above
+(``below_horizon.py``), or are edited like them. Where f = exp(g) is above 1, E f is read as
+E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`.brightened`. Unmoved lights, no gain and k = 1 give the
+original back, bit for bit outside the cores: the sky's own detail is kept, and the map has any resolution.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
-from envedit.representations.layers.behind_glow import BehindGlow, behind_glow
+from envedit.representations.layers import behind_glow
 from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
 from envedit.representations.layers.ground_light import GroundLight
@@ -33,8 +32,6 @@ from envedit.representations.layers.saturation import by_saturation, saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
 Horizon = Literal["mirror", "keep", "free"]
-UNSEEN = 1 / 512
-"""Relative change of radiance below a display's resolution: a step of 8 bits is twice as large."""
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5, "saturation": 1.0}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
 
@@ -42,17 +39,6 @@ GROUND = 0.3
 """What a unit of the log factor of lit ground is: by so much the colour of daylight changes. With 1, Adam,
 which has no prior, made ground pink under a mirror (three edits of the analytic sky: maps 34.3, 27.1 and
 22.1 dB; with 0.3 36.5, 33.4 and 28.9)."""
-
-
-def unseen_kept(original: np.ndarray, edited: np.ndarray) -> np.ndarray:
-    """Give texels of an edited image the original's bits where no channel changes by over :data:`UNSEEN`."""
-    seen = np.abs(edited - original) > UNSEEN * original
-    return np.where(seen.any(axis=2, keepdims=True), edited, original)
-
-
-def gone_of(ratio: mi.Color3f) -> mi.Float:
-    """Return the share of radiance that was a glow's and is gone, where the glow changes by a ratio."""
-    return dr.maximum(mi.luminance(1 - ratio), 0)
 
 
 class Layers:
@@ -126,8 +112,10 @@ class Layers:
         self.base = np.maximum(base, 0).astype(np.float32)
         self.behind = None
         if self.lights.glowing:
-            told = self.separation.background, self.separation.glow, self._away()
-            self.behind = behind_glow(*told, self.rows)
+            self._away = behind_glow.degrees_to_cores(self.separation.lights, self.shape, self.rows)
+            self.behind = behind_glow.behind_glow(
+                self.separation.background, self.separation.glow, self._away, self.rows
+            )
         self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1], self.rows[0] == 0)
         self._prepared: dict = {}
         n = self.lights.count
@@ -141,19 +129,6 @@ class Layers:
         self.scales = self._units()
         return params | {name: tensor(value) for name, value in self.gain.init().items()}
 
-    def _away(self):
-        """Degrees from each texel to the nearest light that has a glow, (rows, W); 0 within its core.
-
-        A core is taken to be a disc of the solid angle of its texels.
-        """
-        first, total = self.rows
-        toward = latlong.directions(total, self.shape[1])[first : first + self.shape[0]]
-        omega = latlong.lookup_solid_angles(total, self.shape[1])
-        glowing = [light for light in self.separation.lights if light.glow is not None]
-        radii = [np.sqrt(omega[first + one.texels // self.shape[1]].sum() / np.pi) for one in glowing]
-        angles = np.arccos(np.clip(toward @ np.transpose([one.direction for one in glowing]), -1, 1))
-        return np.degrees(np.maximum(angles - radii, 0).min(axis=2))
-
     def _below(self, low, params):
         """Rows that follow, and what they show where the reflection of a glow has gone."""
         above = self._unmoved(params) if self._horizon == "keep" else None
@@ -164,9 +139,9 @@ class Layers:
         gone = 1 - 1 / (glow @ LUMINANCE)[..., None]
         dark = background * np.exp(gone * self.behind.log_change(background))
         unlit = low * np.exp(np.float64(below.log_factor(tensor(dark)).numpy()))
-        mirrored = glow[below.mirrored], self._away()[below.mirrored]
-        behind = behind_glow(unlit, *mirrored, (self.shape[0], self.rows[1]))
-        below.reveal(behind.log_change(unlit))
+        glow, gone, away = (one[below.mirrored] for one in (glow, gone, self._away))
+        behind = behind_glow.behind_glow(unlit, glow, away, (self.shape[0], self.rows[1]))
+        below.reveal(behind.log_change(unlit), gone, behind_glow.near_core(away)[..., None])
         return below
 
     def refine(self, params: dict, octaves: list[Octave]) -> dict:
@@ -194,22 +169,24 @@ class Layers:
 
     def parts(self, params: dict, shape: tuple[int, int] | None = None) -> tuple[mi.TensorXf, mi.TensorXf]:
         """Compose the map as :meth:`decode` does, its lights' cores apart: the sky, and cores."""
-        height, width = shape or self.shape
-        shape = height, width
+        shape = shape or self.shape
         if self.below is not None and shape != self.shape:
             raise ValueError(f"rows below the horizon follow at {self.whole} texels only, asked for {shape}")
         rows = self._at(shape)[0]
-        real = {name: value * self.scales[name] for name, value in params.items()}
-        sky, gone = self._sky(real, shape)
+        real = self._real(params)
+        lit, gone = self._lit(real, shape)
+        sky = self._under_gain(real, lit, shape)
         if self.below is None:
             return sky, self._core(real, shape, rows)
         core = self._core(real, self.whole, rows)
-        factor = dr.unravel(mi.Color3f, dr.exp(self._log_below(real, sky, gone, core)).array)
-        low = self.below.radiance
-        if self.mirrored and "saturation" in real:
-            low = saturated(low, _exponent(real))
-        low = dr.ravel(brightened(low, factor))
+        by_lights, further = self._log_below(real, lit, gone, sky, core)
+        low = self._low(real, by_lights)
+        low = dr.ravel(brightened(low, dr.unravel(mi.Color3f, dr.exp(further).array)))
         return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
+
+    def _real(self, params):
+        """Return parameters as logarithms and radians."""
+        return {name: value * self.scales[name] for name, value in params.items()}
 
     def _units(self):
         """Return what a unit of each parameter is; the factor of lit ground is a logarithm, as the gain."""
@@ -223,35 +200,51 @@ class Layers:
     def _core(self, real, shape, rows):
         return self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
 
-    def _sky(self, real, shape):
-        """Background and glow (rows, W, 3); share of a texel's radiance that was a glow's and is gone."""
-        _, d, base, before, gain, free, behind = self._at(shape)
-        base = saturated(base, _exponent(real)) if "saturation" in real else base
+    def _lit(self, real, shape):
+        """Return the sky under its lights, and which share of a texel's light was a glow's and is gone."""
+        _, d, base, before, _, _, behind = self._at(shape)
+        if not self.lights.glowing:
+            return base, None
+        ratio = self.lights.glow(real["turn"], real["flux"], d) / before
+        gone = behind_glow.gone_of(ratio)
+        return base * ratio * dr.exp(gone * behind), gone
+
+    def _under_gain(self, real, lit, shape):
+        """Return the sky with its saturation and its gain."""
+        *_, gain, free, _ = self._at(shape)
         factor = dr.exp(self.gain.evaluate(real, gain))
         factor = dr.select(free, factor, 1) if free is not None else factor
-        sky, gone = brightened(base, factor), None
-        if self.lights.glowing:
-            ratio = self.lights.glow(real["turn"], real["flux"], d) / before
-            gone = gone_of(ratio)
-            sky *= ratio * dr.exp(gone * behind)
-        return mi.TensorXf(dr.ravel(sky), (*shape, 3)), gone
+        return mi.TensorXf(dr.ravel(brightened(_coloured(real, lit), factor)), (*shape, 3))
 
-    def log_below(self, params: dict) -> np.ndarray:
-        """Return the log factor of the rows that follow, (rows, W, 3); without such rows, none."""
+    def log_below(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Return log factors of the rows that follow, (rows, W, 3); without such rows, none.
+
+        By what lights do, which comes before the saturation of a mirror, and further ones.
+        """
         if self.below is None:
-            return np.zeros((0, self.shape[1], 3), np.float32)
-        real = {name: value * self.scales[name] for name, value in params.items()}
-        sky, gone = self._sky(real, self.shape)
-        core = self._core(real, self.whole, self.rows)
-        return self._log_below(real, sky, gone, core).numpy()
+            return (np.zeros((0, self.shape[1], 3), np.float32),) * 2
+        real = self._real(params)
+        lit, gone = self._lit(real, self.shape)
+        sky, core = self._under_gain(real, lit, self.shape), self._core(real, self.whole, self.rows)
+        by_lights, further = self._log_below(real, lit, gone, sky, core)
+        return np.broadcast_to(by_lights.numpy(), further.shape), further.numpy()
 
-    def _log_below(self, real, sky, gone, core):
-        """Log factor of the rows that follow; of a mirror, beside what the saturation of its own does."""
+    def _log_below(self, real, lit, gone, sky, core):
+        """Log factors of the rows that follow: by what lights do, and by what else the sky does."""
         before = None
-        if self.mirrored and "saturation" in real:
-            before = saturated(self._at(self.shape)[2], _exponent(real))
-            before = mi.TensorXf(dr.ravel(before), (*self.shape, 3))
-        return self.below.log_factor(sky, gone, core, real.get("ground"), before)
+        by_lights = mi.TensorXf(np.zeros((1, 1, 1), np.float32))
+        if self.lights.glowing:
+            by_lights = self.below.log_factor(self._image(lit), gone)
+        if self.lights.glowing or (self.mirrored and "saturation" in real):
+            before = self._image(_coloured(real, lit) if self.mirrored else lit)
+        return by_lights, self.below.log_factor(sky, None, core, real.get("ground"), before)
+
+    def _low(self, real, by_lights):
+        """Rows that follow, before the gain."""
+        low = self.below.radiance
+        if self.lights.glowing:
+            low = low * dr.unravel(mi.Color3f, dr.exp(by_lights).array)
+        return _coloured(real, low) if self.mirrored else low
 
     @property
     def active(self) -> slice:
@@ -315,30 +308,32 @@ class Layers:
             taps.append((node.ravel(), (share * self.follows[:, None]).ravel()))
         return taps
 
-    def sky_base(self, params: dict) -> np.ndarray:
-        """Return what the gain multiplies, (rows, W, 3): the original without cores, with its saturation."""
-        if "saturation" not in params:
-            return self.base
-        real = {"saturation": params["saturation"] * self.scales["saturation"]}
-        base = saturated(self._at(self.shape)[2], _exponent(real))
-        return mi.TensorXf(dr.ravel(base), (*self.shape, 3)).numpy()
+    def before_gain(self, params: dict) -> np.ndarray:
+        """Return what the gain multiplies, (rows, W, 3): the sky under its lights, with its saturation."""
+        real = self._real(params)
+        return self._image(_coloured(real, self._lit(real, self.shape)[0])).numpy()
 
-    def base_by_saturation(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Return the image without cores, (rows, W, 3), and its derivative by the log saturation."""
-        image = self.base if self.below is None else np.concatenate([self.base, self.below.image])
-        parts = [(slice(self.shape[0]), self._at(self.shape)[2])]
-        if self.mirrored:
-            parts.append((slice(self.shape[0], None), self.below.radiance))
-        return by_saturation(image, parts, (params["saturation"] * self.scales["saturation"]).array)
+    def by_saturation(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Return the image before the gain, without cores, and its derivative by the log saturation."""
+        real = self._real(params)
+        lit, gone = self._lit(real, self.shape)
+        parts, image = [(slice(self.shape[0]), lit)], np.empty((*self.whole, 3), np.float32)
+        if self.below is not None:
+            unsaturated = {name: value for name, value in real.items() if name != "saturation"}
+            by_lights = self.below.log_factor(self._image(lit), gone)
+            low = self._low(unsaturated, by_lights)
+            image[self.shape[0] :] = dr.ravel(low).numpy().reshape(*self.below.shape, 3)
+            parts += [(slice(self.shape[0], None), low)] * self.mirrored
+        return by_saturation(image, parts, real["saturation"].array)
 
     def log_gain(self, params: dict) -> np.ndarray:
         """Return the logarithm of the gain (rows, W, 3) float32, at the resolution of the image.
 
         Of all texels that the gain acts on itself, also of those that :meth:`keep` excepts from it.
         """
-        real = {name: value * self.scales[name] for name, value in params.items()}
+        real = self._real(params)
         field = self.gain.evaluate(real, self.gain.prepare(self.shape, self.rows))
-        return mi.TensorXf(dr.ravel(field), (*self.shape, 3)).numpy()
+        return self._image(field).numpy()
 
     def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
         """Return log(1 + s_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
@@ -348,10 +343,13 @@ class Layers:
         if i >= len(self.separation.lights) or self.separation.lights[i].glow is None:
             return None
         factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._at(self.shape)[1])
-        found = mi.TensorXf(dr.ravel(dr.log(factor)), (*self.shape, 3)).numpy()
+        found = self._image(dr.log(factor)).numpy()
         if self.below is None:
             return found
         return np.concatenate([found, found[self.below.mirrored] * self.below.fade[:, None, None]])
+
+    def _image(self, colours):
+        return mi.TensorXf(dr.ravel(colours), (*self.shape, 3))
 
     def _at(self, shape):
         if shape not in self._prepared:
@@ -370,7 +368,7 @@ class Layers:
         if self.behind is not None:
             glow = self._finer(self.separation.glow, shape, d)
             smooth = [self._finer(field, shape, d) for field in (self.behind.offset, self.behind.slope)]
-            change = BehindGlow(smooth[0], smooth[1], self.behind.faint).log_change(base / glow)
+            change = behind_glow.BehindGlow(smooth[0], smooth[1], self.behind.faint).log_change(base / glow)
             behind = dr.opaque(mi.Color3f(np.ascontiguousarray(change.reshape(-1, 3).T, np.float32)))
         d = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)))
         n, before = self.lights.count, mi.Color3f(1)
@@ -396,5 +394,6 @@ class Layers:
         return latlong.lookup(whole, d).astype(np.float32)
 
 
-def _exponent(real):
-    return dr.exp(real["saturation"].array)
+def _coloured(real, radiance):
+    """Return radiance with the saturation of its colours, where that is a parameter."""
+    return saturated(radiance, dr.exp(real["saturation"].array)) if "saturation" in real else radiance

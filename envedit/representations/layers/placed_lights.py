@@ -15,8 +15,9 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.representations.layers import below_horizon
-from envedit.representations.layers.layers import Layers, unseen_kept
+from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, rotation_vector
+from envedit.representations.layers.unseen import unseen_kept
 
 NARROWEST = 0.6
 """Least standard deviation of an added light in texels: one that is narrower would vanish between them."""

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+GL = ["--no-sandbox", "--enable-unsafe-swiftshader"]  # WebGL by software; the page as Chromium likes
 SETTLED = "document.querySelector('[data-testid=status]').dataset.state"
 
 

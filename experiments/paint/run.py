@@ -115,14 +115,55 @@ def rate(arguments, folder, pixels):
             found["solved_frames_s"], soon, last = paint(page)
             found["db_to_converged"] = float(20 * np.log10(soon / last))
             page.screenshot(path=folder / f"rates_{pixels}.png")
+    found |= alone(folder, pixels, arguments.width)
     print(json.dumps(found, indent=1), flush=True)
     return found
+
+
+def alone(folder, pixels, width):
+    """Return milliseconds of a dragged and of a solved frame in a session, without server and browser."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from envedit.cli.paint import project, protocol, session
+
+    class Silent(session.Tell):
+        pass
+
+    (folder / "edit.toml").write_text(CONFIG.format(pixels=pixels, width=width))
+    work = session.Session(project.opened(str(folder / "edit.toml")), Silent())
+    while work.advance():
+        pass
+
+    def timed(document, phase, count=40):
+        times = []
+        for i in range(count):
+            began = time.perf_counter()
+            work.update(protocol.Edit(protocol.document(document(i / count)), phase))
+            if phase == "drawing":
+                work.advance()
+            times.append(1000 * (time.perf_counter() - began))
+        return float(np.median(times[count // 4 :]))
+
+    def light(t):
+        place = {"azimuth": 90 + 60 * t, "elevation": 35 + 10 * t}
+        return {"lights": [{"light": 1, "flux": [1.0] * 3, "size": 1.0} | place]}
+
+    def shadow(t):
+        points = [[0.2 + 0.5 * t * k / 20, 0.8] for k in range(21)]
+        return {"strokes": [{"type": "shadow", "amount": 0.6, "points": points, "width": 0.1}]}
+
+    found = {"drag_ms": timed(light, "dragging")}
+    work.update(protocol.Edit(protocol.Document()))
+    return found | {"solved_ms": timed(shadow, "drawing")}
 
 
 def rates_table(found):
     """Return the figures as a table, beside what is asked at 128 x 128 pixels; at 256 x 256 half of it."""
     rows = (
         ("page ready after the command, s", "ready_s", "at most 5"),
+        ("session without a browser: a dragged frame, ms", "drag_ms", "-"),
+        ("the same: a solved frame, ms", "solved_ms", "-"),
         ("light dragged: new frames a second", "drag_frames_s", "at least 15"),
         ("from pointer to picture, median, ms", "pointer_to_picture_ms", "at most 100"),
         ("the same, 95 %, ms", "pointer_to_picture_95_ms", "-"),

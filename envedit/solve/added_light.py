@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 
 from envedit.core import latlong
-from envedit.representations.layers.lights import SPARE, rotation_vector
-from envedit.solve.map_problem import Normal, Point, Problem, forward
+from envedit.core.rotations import rotation_vector
+from envedit.representations.layers.lights import SPARE
+from envedit.solve.map_problem import Point, Problem
+from envedit.solve.normal_equations import Normal, forward
 
 SPACINGS, REACH = (2, 1), (2, 1)
 """Distances in texels of the exact columns around the best cell, and how many of them to each side."""

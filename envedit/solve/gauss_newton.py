@@ -16,7 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from envedit.core.errors import NumericalError
-from envedit.representations.layers.lights import DARK, rotation_vector
+from envedit.core.rotations import rotation_vector
+from envedit.representations.layers.lights import DARK
 from envedit.solve import added_light
 from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 

@@ -22,10 +22,11 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.core.rotations import rotation_vector
 from envedit.core.types import Params
 from envedit.representations.layers.gain import LEVELS, VEIL
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, Lights, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE, Lights
 from envedit.representations.layers.separation import glow_at
 from envedit.solve.matching_pursuit import GAIN_ORDER, Given, Place, place, products, relative
 from envedit.transport.block_transport import Overview

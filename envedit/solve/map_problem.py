@@ -22,7 +22,6 @@ Longer than 400 lines: objective, normal equations and posterior share the layou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -30,11 +29,14 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
+from envedit.core.rotations import rotated, rotation_between, rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE
 from envedit.solve.block_jacobian import BlockJacobian
+from envedit.solve.normal_equations import Blocks, Normal, solved
+from envedit.solve.prior import AXES, Prior
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
@@ -51,57 +53,6 @@ larger lobe would be seen."""
 SATURATIONS = (-3.0, 0.0)
 """Logarithms of the sky's saturation that are looked for, from 5 % to the original's own: more would amplify
 what its colours have of noise."""
-ROWS = 64
-"""Rows of a triangular matrix that are solved for together."""
-_AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-
-
-@dataclass(frozen=True)
-class Prior:
-    """How far a sky changes: standard deviations, the same for every scene and map.
-
-    Attributes
-    ----------
-    luminance : float
-        Of the mean log gain on the coarsest grid: 1 is a factor of e.
-    chroma : float
-        Of its blue-amber difference, along which daylight varies: 0.3 is 30 %.
-    tint : float
-        Of its green-magenta difference, which skies hardly have.
-    flux : float
-        Of a light's mean log flux; for the map's own lights around their original flux. Its colour changes as
-        the sky's does.
-    turn : float
-        Of a light's direction, radians from where the search has put it.
-    size, added_size : float
-        Of a light's log size: of the map's own, and of a light that is added, which may be haze or a sun.
-    saturation : float
-        Of the log saturation of the sky's colours.
-    """
-
-    luminance: float = 1.0
-    chroma: float = 0.3
-    tint: float = 0.1
-    flux: float = 1.5
-    turn: float = np.radians(10.0)
-    size: float = 0.3
-    added_size: float = 1.0
-    saturation: float = 1.0
-
-    def gain_precisions(self, sizes: Sequence[tuple[int, int]], ground: bool = False) -> np.ndarray:
-        """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n).
-
-        ``ground``: the last is the factor of ground, which changes as a coarse node of the sky.
-        """
-        fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
-        fall = np.append(fall, 1.0) if ground else fall
-        return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
-
-    @property
-    def flux_precision(self) -> np.ndarray:
-        """Inverse covariance of a light's log flux per channel, (3, 3)."""
-        sd = np.array([np.sqrt(3) * self.flux, self.chroma, self.tint])
-        return _AXES.T @ (sd[:, None] ** -2.0 * _AXES)
 
 
 @dataclass(frozen=True)
@@ -136,56 +87,6 @@ class Point:
     sky: np.ndarray
     rendering: np.ndarray | None
     residual: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Hessian (m, m) and gradient (m,) of F / 2.
-
-    ``precision`` is K in the Hessian, ``unknowns`` names those after the gain's, ``blocks`` is what the
-    Hessian was made of; so are weights ``robust`` (h, w, 1), ``slope`` of the display curve, ``residual`` and
-    ``profile`` of the blocks (h, w, 3), and ``pictures`` (k, h, w, 3) of the unknowns that are named.
-    """
-
-    hessian: np.ndarray
-    gradient: np.ndarray
-    precision: np.ndarray
-    unknowns: list
-    blocks: Blocks
-    robust: np.ndarray
-    slope: np.ndarray
-    residual: np.ndarray
-    profile: np.ndarray
-    pictures: np.ndarray
-
-    @property
-    def determined(self) -> float:
-        """How many unknowns the picture determines: the trace of H^-1 (H - K)."""
-        try:
-            shares = np.linalg.solve(self.hessian, self.precision)
-        except np.linalg.LinAlgError:
-            return float(len(self.hessian))
-        return float(len(self.hessian) - np.trace(shares))
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """What normal equations are made of, by blocks of pixels.
-
-    Attributes
-    ----------
-    jacobian : list of ndarray (blocks, n)
-        Of the gain, per channel.
-    squared, pulled : ndarray (blocks, 3)
-        Sums of weight times slope squared, and of weight, slope and residual.
-    lights : list of ndarray (blocks, k)
-        Sums of weight times slope squared times pictures of lights, per channel; empty without lights.
-    """
-
-    jacobian: list[np.ndarray]
-    squared: np.ndarray
-    pulled: np.ndarray
-    lights: list[np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -376,7 +277,7 @@ class Problem:
 
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
-        total = (self._precisions * (_AXES @ state["gain"].T) ** 2).sum()
+        total = (self._precisions * (AXES @ state["gain"].T) ** 2).sum()
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
         for i in self.lit(state):
             change = self._flux_change(state, start, i)
@@ -391,11 +292,11 @@ class Problem:
         return state["flux"][i] - (0.0 if i < own else start["flux"][i])
 
     def _angle(self, state, start, i):
-        return float(np.linalg.norm(_between(self.direction(start, i), self.direction(state, i))))
+        return float(np.linalg.norm(rotation_between(self.direction(start, i), self.direction(state, i))))
 
     def direction(self, state: dict, i: int) -> np.ndarray:
         """Return where light ``i`` is, (3,)."""
-        return _rotated(self.layers.lights.centres[i], state["turn"][i])
+        return rotated(self.layers.lights.centres[i], state["turn"][i])
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
         """Return the first part of F."""
@@ -481,7 +382,7 @@ class Problem:
         n = self.nodes
         precision = np.zeros((3 * n + len(unknowns),) * 2)
         node = np.arange(n)
-        for a, axis in enumerate(_AXES):
+        for a, axis in enumerate(AXES):
             for c, d in np.ndindex(3, 3):
                 precision[c * n + node, d * n + node] += axis[c] * axis[d] * self._precisions[a]
         for k, (name, i, axis) in enumerate(unknowns, 3 * n):
@@ -506,7 +407,7 @@ class Problem:
             elif name == "saturation":
                 found.append(state[name][i])
             elif name == "turn":
-                found.append([_between(self.direction(start, i), self.direction(state, i)) @ axis])
+                found.append([rotation_between(self.direction(start, i), self.direction(state, i)) @ axis])
             else:
                 found.append([(state[name] - start[name])[i, axis]])
         return np.concatenate(found)
@@ -516,7 +417,7 @@ class Problem:
         damped = normal.hessian.copy()
         damped[np.diag_indices_from(damped)] *= 1 + damping
         try:
-            step = -_solved(np.linalg.cholesky(damped), normal.gradient)
+            step = -solved(np.linalg.cholesky(damped), normal.gradient)
             if self.saturates:
                 step = self._within(step, state["saturation"][0, 0], damped, normal)
         except np.linalg.LinAlgError:  # radiance beyond what squares of single precision hold
@@ -537,7 +438,7 @@ class Problem:
         found["size"][own:] = np.clip(found["size"][own:], *LOBE_SIZES)
         for i, turn in turns.items():
             turn = turn * min(1.0, LARGEST["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
-            there = _rotated(self.direction(state, i), turn)
+            there = rotated(self.direction(state, i), turn)
             found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
         return found
 
@@ -549,7 +450,7 @@ class Problem:
             return step
         rest = np.arange(len(step)) != k
         gradient = normal.gradient[rest] + damped[rest, k] * to
-        step[rest] = -_solved(np.linalg.cholesky(damped[np.ix_(rest, rest)]), gradient)
+        step[rest] = -solved(np.linalg.cholesky(damped[np.ix_(rest, rest)]), gradient)
         step[k] = to
         return step
 
@@ -611,7 +512,7 @@ class Problem:
             axes, turns = self._tangents(state, i), [turn]
             for axis in axes:
                 for sign in (1, -1):
-                    there = _rotated(self.direction(state, i), sign * ANGLE * axis)
+                    there = rotated(self.direction(state, i), sign * ANGLE * axis)
                     turns.append(rotation_vector(layers.lights.centres[i], there))
             ways = [(one, flux, size) for one in turns] + [(turn, flux, size + 0.1)]
             now, *ends, larger = layers.lights.cores_of(i, ways, layers.whole)
@@ -703,40 +604,5 @@ def _sizes(residual):
     return np.sqrt((residual**2).mean(axis=2, keepdims=True))
 
 
-def forward(lower: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Solve L x = values, (n,) or (n, k), by substitution, :data:`ROWS` at a time; L is lower triangular."""
-    x = np.array(values, np.float64)
-    for k in range(0, len(x), ROWS):
-        part = slice(k, k + ROWS)
-        x[part] = np.linalg.solve(lower[part, part], x[part] - lower[part, :k] @ x[:k])
-    return x
-
-
-def _solved(lower, values):
-    """Solve L L' x = values."""
-    x = forward(lower, values)
-    for k in reversed(range(0, len(x), ROWS)):
-        part, rest = slice(k, k + ROWS), slice(k + ROWS, None)
-        x[part] = np.linalg.solve(lower[part, part].T, x[part] - lower[rest, part].T @ x[rest])
-    return x
-
-
 def _numpy(unit):
     return unit.numpy() if hasattr(unit, "numpy") else np.float64(unit)
-
-
-def _rotated(vector, turn):
-    """Rotate a vector by a rotation vector (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    if angle < 1e-12:
-        return np.array(vector, np.float64)
-    axis = np.asarray(turn) / angle
-    along = axis * (axis @ vector) * (1 - np.cos(angle))
-    return vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + along
-
-
-def _between(one, other):
-    """Return the rotation vector that brings a direction to another."""
-    axis = np.cross(one, other)
-    sine = float(np.linalg.norm(axis))
-    return axis * (np.arctan2(sine, one @ other) / max(sine, 1e-30))

@@ -17,11 +17,11 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import luminance
+from envedit.core.rotations import rotation_vector
 from envedit.images import images
 from envedit.losses import metrics, naturalness
 from envedit.representations.layers import behind_glow as product
 from envedit.representations.layers import below_horizon, layers, separation
-from envedit.representations.layers.lights import rotation_vector
 from experiments import puresky
 from experiments.harness import markdown
 

@@ -13,13 +13,15 @@ import pytest
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import NumericalError
+from envedit.core.rotations import rotated, rotation_between, rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE
 from envedit.solve import added_light, checkpoint, gauss_newton, map_problem
 from envedit.solve.adam_loop import State
 from envedit.solve.gauss_newton import Run, solve
 from envedit.solve.map_problem import ANGLE, Problem
+from envedit.solve.prior import Prior
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.matrix_renderer import same, without_times
 from tests.oracles.plain import plain_display
@@ -27,7 +29,7 @@ from tests.oracles.tiers import slow_but
 
 GRID, FILM = (24, 48), (10, 12)
 SUN = (7, 20)
-PRIOR = map_problem.Prior()
+PRIOR = Prior()
 
 
 def lamp(place=SUN, radiance=200.0):
@@ -65,7 +67,7 @@ def moved(problem, state, unknowns, k, h):
         return state
     name, i, axis = unknowns[k - 3 * n]
     if name == "turn":
-        there = map_problem._rotated(problem.direction(state, i), h * axis)
+        there = rotated(problem.direction(state, i), h * axis)
         state["turn"][i] = rotation_vector(problem.layers.lights.centres[i], there)
     else:
         state[name][i, axis] += h
@@ -88,7 +90,7 @@ def case():
     state["flux"][0] += [0.1, -0.2, 0.3]
     state["size"][0] = 0.05
     # Off the texels' centres, where the derivative jumps.
-    state["turn"][0] = rotation_vector(centre, map_problem._rotated(centre, np.array([0.03, 0.05, -0.04])))
+    state["turn"][0] = rotation_vector(centre, rotated(centre, np.array([0.03, 0.05, -0.04])))
     return problem, params, start, state
 
 
@@ -314,7 +316,7 @@ def test_penalty_of_a_light(case):
         "turn": (
             rotation_vector(
                 centre,
-                map_problem._rotated(
+                rotated(
                     centre, 0.1 * np.cross(centre, [0, 1, 0]) / np.linalg.norm(np.cross(centre, [0, 1, 0]))
                 ),
             ),
@@ -482,7 +484,7 @@ def test_a_change_that_layers_can_make_is_found(rng):
     nodes = params["gain.0"].numpy() + 0.5 * rng.normal(0, 1, params["gain.0"].shape[:2])[..., None]
     turned = np.zeros((3, 3), np.float32)
     centre = layers.lights.centres[0]
-    end = map_problem._rotated(centre, np.array([0.0, np.radians(5), 0.0]))
+    end = rotated(centre, np.array([0.0, np.radians(5), 0.0]))
     turned[0] = rotation_vector(centre, end) / layers.scales["turn"]
     true = layers.decode(
         params | {"gain.0": mi.TensorXf(nodes.astype(np.float32)), "turn": mi.TensorXf(turned)}
@@ -542,7 +544,7 @@ def test_no_step_is_longer_than_its_limit(case):
     for name in ("gain", "flux", "size"):
         change = np.abs(found[name] - state[name])
         assert 0.99 * largest[name] < change.max() <= largest[name] * (1 + 1e-9), name
-    turned = map_problem._between(problem.direction(state, 0), problem.direction(found, 0))
+    turned = rotation_between(problem.direction(state, 0), problem.direction(found, 0))
     assert np.linalg.norm(turned) == pytest.approx(largest["turn"], rel=1e-6)
     np.testing.assert_array_equal(found["flux"][1:], state["flux"][1:])
 
@@ -907,7 +909,7 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
     state = copy(start)
     state["gain"] = rng.normal(0, 0.3, state["gain"].shape)
     state["saturation"][:] = -0.4
-    off_centre = map_problem._rotated(layers.lights.centres[0], np.array([0.03, 0.05, -0.04]))
+    off_centre = rotated(layers.lights.centres[0], np.array([0.03, 0.05, -0.04]))
     state["turn"][0] = rotation_vector(layers.lights.centres[0], off_centre)
     point = problem.evaluate(state)
     normal = problem.normal(point, start, 1.0)

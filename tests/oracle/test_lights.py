@@ -11,8 +11,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from envedit.core import latlong
+from envedit.core.rotations import rotation_vector
 from envedit.representations.layers import lights
-from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights, rotation_vector
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 from tests.oracles.plain import single
 

@@ -10,13 +10,13 @@ import pytest
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.rotations import rotation_vector
 from envedit.images import images
 from envedit.losses import naturalness
 from envedit.representations.layers import below_horizon, unseen
 from envedit.representations.layers.below_horizon import Below, kind_of, sky_rows
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import rotation_vector
 
 SHAPE = (32, 64)
 

@@ -6,13 +6,14 @@ import pytest
 
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
+from envedit.core.rotations import rotation_vector
 from envedit.core.rows import Rows
 from envedit.export import full_resolution, moved_lights, texel_maps
 from envedit.images import images
 from envedit.representations import Pixels
 from envedit.representations.layers import layers
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE
 from envedit.scene import scene
 from tests.oracles.builders import grey
 

@@ -7,10 +7,11 @@ import pytest
 
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
+from envedit.core.rotations import rotation_vector
 from envedit.representations.layers import gain, layers
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE, rotation_vector
+from envedit.representations.layers.lights import DARK, SPARE
 from tests.oracles.builders import grey
 from tests.oracles.plain import double, single
 

@@ -292,35 +292,6 @@ def rotate(v: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
     return d * dr.cos(angle) + dr.cross(v, d) * sinc + v * (dr.dot(v, d) * (0.5 * half * half))
 
 
-def rotation_vector(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the rotation vector that takes one direction to another and keeps what was upright upright.
-
-    About the vertical by the difference in azimuth, then tilted by the difference in elevation.
-    """
-    frames = []
-    for d in (start, end):
-        d = np.asarray(d, np.float64) / np.linalg.norm(d)
-        level = np.hypot(d[0], d[2])
-        east = np.array([-d[2], 0.0, d[0]]) / level if level > 1e-6 else np.array([1.0, 0.0, 0.0])
-        frames.append(np.stack([east, np.cross(d, east), d], axis=1))
-    r = frames[1] @ frames[0].T
-    # Through the quaternion: well defined for half turns too.
-    q = np.linalg.eigh(
-        np.array(
-            [
-                [np.trace(r), r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-                [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-                [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
-                [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
-            ]
-        ),
-        UPLO="U",
-    )[1][:, -1]
-    q = q if q[0] >= 0 else -q
-    sine = np.linalg.norm(q[1:])
-    return 2 * math.atan2(sine, q[0]) * q[1:] / sine if sine > 1e-12 else np.zeros(3)
-
-
 def lobe() -> tuple[np.ndarray, np.ndarray, float]:
     """Return the points of a cut Gaussian lobe: directions around the zenith, weights, spacing in radians."""
     k = np.arange(LOBE_POINTS) + 0.5

@@ -14,9 +14,10 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.rotations import rotation_vector
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, rotation_vector
+from envedit.representations.layers.lights import DARK
 from envedit.representations.layers.unseen import unseen_kept
 
 NARROWEST = 0.6

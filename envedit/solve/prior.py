@@ -1,0 +1,59 @@
+"""How far a sky changes in an edit: the standard deviations behind K of ``map_problem.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+"""Luminance, blue-amber and green-magenta, as unit vectors of log RGB."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How far a sky changes: standard deviations, the same for every scene and map.
+
+    Attributes
+    ----------
+    luminance : float
+        Of the mean log gain on the coarsest grid: 1 is a factor of e.
+    chroma : float
+        Of its blue-amber difference, along which daylight varies: 0.3 is 30 %.
+    tint : float
+        Of its green-magenta difference, which skies hardly have.
+    flux : float
+        Of a light's mean log flux; for the map's own lights around their original flux. Its colour changes as
+        the sky's does.
+    turn : float
+        Of a light's direction, radians from where the search has put it.
+    size, added_size : float
+        Of a light's log size: of the map's own, and of a light that is added, which may be haze or a sun.
+    saturation : float
+        Of the log saturation of the sky's colours.
+    """
+
+    luminance: float = 1.0
+    chroma: float = 0.3
+    tint: float = 0.1
+    flux: float = 1.5
+    turn: float = np.radians(10.0)
+    size: float = 0.3
+    added_size: float = 1.0
+    saturation: float = 1.0
+
+    def gain_precisions(self, sizes: Sequence[tuple[int, int]], ground: bool = False) -> np.ndarray:
+        """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n).
+
+        ``ground``: the last is the factor of ground, which changes as a coarse node of the sky.
+        """
+        fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
+        fall = np.append(fall, 1.0) if ground else fall
+        return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
+
+    @property
+    def flux_precision(self) -> np.ndarray:
+        """Inverse covariance of a light's log flux per channel, (3, 3)."""
+        sd = np.array([np.sqrt(3) * self.flux, self.chroma, self.tint])
+        return AXES.T @ (sd[:, None] ** -2.0 * AXES)

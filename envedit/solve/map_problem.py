@@ -14,10 +14,8 @@ r_p is the root mean square over the channels of d(T E(x))_p - d(t)_p.
 * K is the inverse covariance of a sky's change (:class:`Prior`): luminance, blue-amber and green-magenta each
   with their standard deviation, smaller by half for every finer grid; of lights flux, size and direction.
 
-The residual is exact, through T. The Jacobian is that of the block transport (``block_jacobian.py``), but
-pictures of lights are exact.
-
-Longer than 400 lines: objective, normal equations and posterior share the layout of the unknowns.
+The residual is exact, through T; so is the gradient by gain and saturation. Other derivatives are those of
+``derivatives.py``.
 """
 
 from __future__ import annotations
@@ -28,23 +26,21 @@ import drjit as dr
 import numpy as np
 
 from envedit.core.arrays import tensor
-from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotated, rotation_between, rotation_vector
 from envedit.losses import display_curve
-from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE
+from envedit.representations.layers.lights import SPARE
 from envedit.solve.block_jacobian import BlockJacobian
+from envedit.solve.derivatives import Derivatives
 from envedit.solve.normal_equations import Blocks, Normal, solved
 from envedit.solve.prior import AXES, Prior
-from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
+from envedit.solve.unknowns import Point, Unknowns, in_numpy
+from envedit.transport.light_transport import LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
 INDEPENDENT = 256
 """Residuals of a picture that count as independent, per channel: neighbouring pixels err together."""
-ANGLE = np.radians(0.7)
-"""Rotation of the finite difference by a light's direction."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
 """Largest step of an unknown: beyond it the linear model does not hold."""
 SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
@@ -75,27 +71,7 @@ class Posterior:
         return np.where(self.prior > 0, np.clip(1 - share, 0, 1), 0).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Point:
-    """A state with its map, rendering and residual of display values; the last two None if not finite.
-
-    ``sky`` is the map's active rows without the cores of its lights, (rows, W, 3).
-    """
-
-    state: dict
-    edited: np.ndarray
-    sky: np.ndarray
-    rendering: np.ndarray | None
-    residual: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class _Lights:
-    pictures: np.ndarray
-    unknowns: list
-
-
-class Problem:
+class Problem(Unknowns):
     """F and its derivatives for one picture.
 
     Parameters
@@ -129,109 +105,23 @@ class Problem:
         prior: Prior = None,
         saturates: bool = False,
     ):
-        self.layers, self.transport, self.envmap, self.free = layers, transport, envmap, free
-        self.prior, self.saturates = prior or Prior(), saturates
-        self.rows = layers.active
+        super().__init__(layers, saturates)
+        self.transport, self.envmap, self.rows = transport, envmap, layers.active
+        self.prior = prior or Prior()
         self.target = display_curve.to_display(tensor(picture)).numpy()
         shape = picture.shape[:2]
         self.weight = np.ones((*shape, 1), np.float32) if weight is None else np.float32(weight)
         self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
-        self.sizes = layers.gain.sizes
-        self._ground = layers.ground_light is not None
-        self.nodes = sum(rows * columns for rows, columns in self.sizes) + self._ground
         self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
-        self._precisions = self.prior.gain_precisions(self.sizes, self._ground)
-        self._linear: tuple | None = None
+        self.derivatives = Derivatives(self, transport, self.blocks, free)
+        self._precisions = self.prior.gain_precisions(self.sizes, self.ground)
 
     def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:
-        """Take another target, with its weights; returns a point with its residual from that target.
-
-        What was linearised at the point stays: it does not depend on the target.
-        """
+        """Take another target, with its weights; returns a point with its residual from that target."""
         self.target = display_curve.to_display(tensor(picture)).numpy()
         self.weight = np.ones((*picture.shape[:2], 1), np.float32) if weight is None else np.float32(weight)
         shown = display_curve.to_display(tensor(point.rendering)).numpy()
-        found = replace(point, residual=np.float64(shown) - self.target)
-        if self._linear is not None and self._linear[0] is point:
-            self._linear = found, *self._linear[1:]
-        return found
-
-    @property
-    def _grids(self):
-        """Names of the parameters that are nodes of the gain."""
-        return [f"gain.{i}" for i in range(len(self.sizes))] + ["ground"] * self._ground
-
-    # ---- unknowns ------------------------------------------------------------------------------------------
-
-    def state(self, params: dict) -> dict[str, np.ndarray]:
-        """Return the parameters in their own units: logarithms and radians, float64.
-
-        The factor of ground, where there is one, is the last of the gain's nodes.
-        """
-        real = {k: np.float64(v.numpy()) * _numpy(self.layers.scales[k]) for k, v in params.items()}
-        grids = [real.pop(name).reshape(-1, 3) for name in self._grids]
-        return {"saturation": np.zeros((1, 1))} | real | {"gain": np.concatenate(grids)}
-
-    def params(self, state: dict) -> dict:
-        """Return the layers' parameters of a state; where it is an unknown, with the saturation."""
-        found, start = {}, 0
-        shapes = [(*size, 3) for size in self.sizes] + [(1, 3)] * self._ground
-        for name, shape in zip(self._grids, shapes, strict=True):
-            stop = start + int(np.prod(shape[:-1]))
-            grid = state["gain"][start:stop].reshape(shape)
-            unit = _numpy(self.layers.scales[name])
-            found[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
-            start = stop
-        names = ["turn", "flux", "size"]
-        if self.saturates or state["saturation"].any():
-            names.append("saturation")
-        for name in names:
-            found[name] = tensor(state[name] / self.layers.scales[name])
-        return found
-
-    def found(self, state: dict) -> dict:
-        """Return the layers' parameters of a state that is a solution: colours that stay keep their bits."""
-        params = self.params(state)
-        if not state["saturation"].any():
-            params.pop("saturation", None)
-        return params
-
-    def clear(self, state: dict) -> None:
-        """Reset what the search found without a prior.
-
-        The gain becomes zero, own lights get their colour back and at most a factor of e of their flux.
-        """
-        state["gain"][:], state["saturation"][:] = 0, 0
-        own = [i for i in self.lit(state) if i < self.layers.lights.count - SPARE]
-        state["flux"][own] = np.clip(state["flux"][own].mean(axis=1, keepdims=True), -1, 1)
-
-    def beyond(self, state: dict) -> dict | None:
-        """Return a state with a spare light where the map's own would need a flux that :meth:`clear` cuts.
-
-        A hazy light that is to be a sun stays what it is, with the sun beside it. None where no light does.
-        """
-        own = self.layers.lights.count - SPARE
-        mean = {i: state["flux"][i].mean() for i in self.lit(state) if i < own}
-        i = max(mean, key=mean.get, default=None)
-        if i is None or mean[i] <= 1:
-            return None
-        found = {name: value.copy() for name, value in state.items()}
-        self.clear(found)
-        fluxes = self.layers.lights.flux @ LUMINANCE
-        more = (np.exp(mean[i]) - np.exp(1.0)) * fluxes[i] / fluxes[own]
-        if not more > 0:
-            return None
-        found["turn"][own] = rotation_vector(self.layers.lights.centres[own], self.direction(state, i))
-        found["flux"][own], found["size"][own] = np.log(more), 0.0
-        return found
-
-    def added(self, state: dict) -> list[int]:
-        """List the spare lights that are lit."""
-        return [i for i in self.lit(state) if i >= self.layers.lights.count - SPARE]
-
-    def lit(self, state: dict) -> list[int]:
-        """List the lights that there are."""
-        return [i for i, flux in enumerate(state["flux"]) if flux.max() > DARK + 1]
+        return replace(point, residual=np.float64(shown) - self.target)
 
     # ---- F -------------------------------------------------------------------------------------------------
 
@@ -294,10 +184,6 @@ class Problem:
     def _angle(self, state, start, i):
         return float(np.linalg.norm(rotation_between(self.direction(start, i), self.direction(state, i))))
 
-    def direction(self, state: dict, i: int) -> np.ndarray:
-        """Return where light ``i`` is, (3,)."""
-        return rotated(self.layers.lights.centres[i], state["turn"][i])
-
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
         """Return the first part of F."""
         return self._huber(_sizes(residual), sigma)
@@ -319,39 +205,40 @@ class Problem:
         size = _sizes(point.residual)
         robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
         slope = display_curve.slope(point.rendering)
-        blocks, (lights, profile, jacobian) = self.blocks, self._linearised(point)
-        unknowns = 3 * n + len(lights.pictures)
+        blocks, linear = self.blocks, self.derivatives.at(point)
+        pictures, profile = linear.pictures, linear.profile
+        unknowns = 3 * n + len(pictures)
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         squared = blocks.summed((slope * profile) ** 2 * robust)
         pulled = blocks.summed(slope * profile * robust * point.residual)
         pulled_back = np.zeros((n, 3)), 0.0
         if descent:
             pulled_back = self._pulled_back(point, slope * robust * point.residual)
-        seen, lit = np.zeros((len(lights.pictures), n * 3)), []
-        for c, j in enumerate(jacobian):
+        seen, lit = np.zeros((len(pictures), n * 3)), []
+        for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
             gradient[part] = pulled_back[0][:, c]
-            if len(lights.pictures):
-                weighted = lights.pictures[..., c] * (slope**2 * profile * robust)[..., c]
+            if len(pictures):
+                weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
                 in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
                 seen[:, part] = in_blocks.T @ j
                 lit.append(in_blocks)
-        if len(lights.pictures):
+        if len(pictures):
             rest = slice(3 * n, unknowns)
-            flat = (lights.pictures * (slope * np.sqrt(robust))).reshape(len(lights.pictures), -1)
+            flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), -1)
             hessian[rest, rest] = flat @ flat.T
             gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
             if self.saturates:
                 gradient[-1] = pulled_back[1]
             hessian[rest, : 3 * n], hessian[: 3 * n, rest] = seen, seen.T
-        precision, back = self._precision(lights.unknowns), self._from_prior(state, start, lights.unknowns)
+        precision, back = self._precision(linear.named), self._from_prior(state, start, linear.named)
         hessian += precision
         gradient = gradient + precision @ back if descent else np.zeros(unknowns)
-        pixels = robust, slope, point.residual, profile, lights.pictures
-        parts = Blocks(jacobian, squared, pulled, lit)
-        return Normal(hessian, gradient, precision, lights.unknowns, parts, *pixels)
+        pixels = robust, slope, point.residual, profile, pictures
+        parts = Blocks(linear.jacobian, squared, pulled, lit)
+        return Normal(hessian, gradient, precision, linear.named, parts, *pixels)
 
     def _pulled_back(self, point, picture):
         """Return the derivatives of the sum of a picture times T E.
@@ -360,22 +247,15 @@ class Problem:
         """
         light = self.transport.adjoint(np.float32(picture)).numpy()[self.rows]
         params = self.params(point.state)
-        names = self._grids + ["saturation"] * self.saturates
+        names = self.grids + ["saturation"] * self.saturates
         with dr.isolate_grad():
             dr.enable_grad([params[name] for name in names])
             sky, _ = self.layers.parts(params)
             dr.backward(dr.sum(sky.array * tensor(light).array))
-            units = [_numpy(self.layers.scales[name]) for name in names]
+            units = [in_numpy(self.layers.scales[name]) for name in names]
             found = [dr.grad(params[name]).numpy() / unit for name, unit in zip(names, units, strict=True)]
         colour = float(found.pop()[0, 0]) if self.saturates else 0.0
         return np.concatenate([np.float64(one).reshape(-1, 3) for one in found]), colour
-
-    def _linearised(self, point):
-        """Pictures of lights and Jacobian of the gain, which no weight changes: kept of the last point."""
-        if self._linear is None or self._linear[0] is not point:
-            lights, profile = self._lights(point)
-            self._linear = point, lights, profile, self.blocks.jacobian(self._slopes(point))
-        return self._linear[1:]
 
     def _precision(self, unknowns):
         """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
@@ -471,138 +351,7 @@ class Problem:
         whole[:, self.rows] = spread
         return Posterior(*whole)
 
-    def _slopes(self, point):
-        """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        # In double precision: products of three radiances leave the range of the other.
-        slopes = point.sky.astype(np.float64)
-        own = self.layers.shape[0]
-        params = self.params(point.state)
-        sky, base = slopes[:own], self.layers.before_gain(params).astype(np.float64)
-        gain = np.exp(np.float64(self.layers.log_gain(params)))
-        grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
-        more = base + (gain - 1) * grey
-        slopes[:own] = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
-        if self.free is not None:
-            slopes[:own] = np.where(self.free[:own, :, None], slopes[:own], 0)
-        return slopes.reshape(-1, 3)
-
-    def _profile(self, point, cores):
-        """Return the sky's light on every pixel over the mean of its block, (h, w, 3).
-
-        What a node changes is taken to spread so over a block: by texture, shading and outlines. ``cores``
-        are pictures, (pixels, 3) each, of what in the point's rendering is light of cores.
-        """
-        sky = point.rendering - self.transport.other_light()
-        for one in cores:
-            sky -= one.reshape(sky.shape)
-        return self.blocks.profile(np.maximum(sky, 0))
-
-    def _lights(self, point: Point) -> tuple[_Lights, np.ndarray]:
-        """Pictures by which a light's unknowns change the rendering, (k, h, w, 3), and what they are.
-
-        And the :meth:`_profile` of blocks. A light's core is seen through T, its glow through the block
-        transport.
-        """
-        state, layers, sky, found, unknowns = point.state, self.layers, point.sky, [], []
-        # Columns of one light must not take the place of another's.
-        lit = self.lit(state)
-        most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
-        for i in lit:
-            turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])
-            axes, turns = self._tangents(state, i), [turn]
-            for axis in axes:
-                for sign in (1, -1):
-                    there = rotated(self.direction(state, i), sign * ANGLE * axis)
-                    turns.append(rotation_vector(layers.lights.centres[i], there))
-            ways = [(one, flux, size) for one in turns] + [(turn, flux, size + 0.1)]
-            now, *ends, larger = layers.lights.cores_of(i, ways, layers.whole)
-            cores = np.stack([now, *_differences(ends), (larger - now) / 0.1])
-            seen = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
-            found.append((i, turns, cores, seen))
-            unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
-            unknowns += [("flux", i, c) for c in range(3)]
-        profile = self._profile(point, [seen[0] for *_, seen in found])
-        for i, turns, cores, seen in found:
-            glow, *ends = (self._log_glow(state, i, one) for one in turns)
-            shone = None
-            if glow is not None:
-                shone = np.stack([sky * -np.expm1(-glow), *(sky * d for d in _differences(ends))])
-            shone = self._with_lit_ground(point, cores[:3], shone)
-            if shone is not None:
-                seen[:3] += self.blocks.pictures(shone) * profile.reshape(-1, 3)
-        whole = []
-        if self.saturates:
-            unknowns.append(("saturation", 0, 0))
-            whole.append(self._by_saturation(point, profile))
-        return _Lights(self._apart([seen for *_, seen in found], whole), unknowns), profile
-
-    def _by_saturation(self, point, profile):
-        """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
-        params, own = self.params(point.state), self.layers.shape[0]
-        base, change = self.layers.by_saturation(params)
-        # Of what a gain brightens a part is luminance, which stays.
-        more = np.maximum(np.exp(self.layers.log_gain(params)) - 1, 0)
-        luminance = base[:own] @ np.array(LUMINANCE, np.float32)
-        grey = (1 - VEIL) * base[:own] + VEIL * luminance[..., None]
-        base[:own] += more * grey
-        change[:own] *= 1 + (1 - VEIL) * more
-        change *= np.divide(point.sky, base, out=np.zeros_like(base), where=base > 0)
-        change = self._with_lit_ground(point, np.zeros_like(change[None]), change[None])
-        return (self.blocks.pictures(change) * profile.reshape(-1, 3))[0]
-
-    def _with_lit_ground(
-        self, point: Point, cores: np.ndarray, shone: np.ndarray | None
-    ) -> np.ndarray | None:
-        """Add to changes of the sky (k, rows, W, 3), None for none, those of the ground that it lights."""
-        falls, lit, up = self.layers.ground_light, self.layers.lit, self.layers.shape[0]
-        if falls is None:
-            return shone
-        whole = np.zeros_like(cores) if shone is None else shone
-        light = np.maximum(falls.irradiance(point.edited[self.rows][:up]), 1e-30)
-        for k, core in enumerate(cores):
-            more = falls.irradiance(whole[k, :up] + core[:up]) / light
-            whole[k, up:] += point.sky[up:] * np.float32(lit[up:, None, None] * more)
-        return whole
-
-    def _log_glow(self, state, i, turn):
-        turns = state["turn"].copy()
-        turns[i] = turn
-        return self.layers.log_glow_of(i, turns, state["flux"])
-
-    def _apart(self, pictures, whole):
-        """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
-
-        By direction, size, and flux per channel; in memory channel by channel. Pictures (h, w, 3) of
-        unknowns that are no light's come last.
-        """
-        lights = 6 * len(pictures)
-        found = np.zeros((3, lights + len(whole), self.target[..., 0].size), np.float32)
-        for k, seen in enumerate(pictures):
-            for c in range(3):
-                found[c, 6 * k : 6 * k + 3] = seen[1:, :, c]
-                found[c, 6 * k + 3 + c] = seen[0, :, c]
-        for k, one in enumerate(whole, lights):
-            found[:, k] = one.reshape(-1, 3).T
-        return found.reshape(3, -1, *self.target.shape[:2]).transpose(1, 2, 3, 0)
-
-    def _tangents(self, state, i):
-        """Two directions in which a light can move, (3,) each: axes of rotation."""
-        centre = self.direction(state, i)
-        across = np.cross(centre, [0.0, 1.0, 0.0])
-        length = np.linalg.norm(across)
-        across = across / length if length > 1e-6 else np.array([1.0, 0, 0])
-        return across, np.cross(across, centre)
-
-
-def _differences(ends):
-    """Return derivatives by two angles of what is given ahead and back along each."""
-    return [(ends[k] - ends[k + 1]) / (2 * ANGLE) for k in (0, 2)]
-
 
 def _sizes(residual):
     """Root mean square over the channels of every pixel, (h, w, 1)."""
     return np.sqrt((residual**2).mean(axis=2, keepdims=True))
-
-
-def _numpy(unit):
-    return unit.numpy() if hasattr(unit, "numpy") else np.float64(unit)

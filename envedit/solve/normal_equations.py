@@ -69,8 +69,8 @@ def forward(lower: np.ndarray, values: np.ndarray) -> np.ndarray:
     return x
 
 
-def solved(lower, values):
-    """Solve L L' x = values."""
+def solved(lower: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Solve L L' x = values, (n,) or (n, k), as :func:`forward` does."""
     x = forward(lower, values)
     for k in reversed(range(0, len(x), ROWS)):
         part, rest = slice(k, k + ROWS), slice(k + ROWS, None)

@@ -19,8 +19,9 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE
 from envedit.solve import added_light, checkpoint, gauss_newton, map_problem
 from envedit.solve.adam_loop import State
+from envedit.solve.derivatives import ANGLE
 from envedit.solve.gauss_newton import Run, solve
-from envedit.solve.map_problem import ANGLE, Problem
+from envedit.solve.map_problem import Problem
 from envedit.solve.prior import Prior
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.matrix_renderer import same, without_times
@@ -225,8 +226,11 @@ def plain_precision(problem, names, prior=PRIOR):
 
 def test_frozen_texels_have_no_slope_and_lights_may_cross_them(case):
     problem, params, start, state = case
-    frozen = ~problem.free
-    assert frozen.any() and not problem._slopes(problem.evaluate(state)).reshape(*GRID, 3)[frozen].any()
+    frozen = ~problem.derivatives.free
+    assert (
+        frozen.any()
+        and not problem.derivatives._slopes(problem.evaluate(state)).reshape(*GRID, 3)[frozen].any()
+    )
     edited = problem.evaluate(state).edited
     np.testing.assert_array_equal(edited[frozen], problem.envmap[frozen])
     away = copy(start)
@@ -768,7 +772,9 @@ def test_the_maps_light_is_placed_with_the_prior_before_the_first_step(rng):
 def test_no_light_is_added_where_none_is_missing(case):
     problem, params, _, _ = case
     whole = problem.evaluate(problem.state(params)).rendering
-    there = Problem(problem.layers, problem.transport, problem.envmap, whole * 0.9, free=problem.free)
+    there = Problem(
+        problem.layers, problem.transport, problem.envmap, whole * 0.9, free=problem.derivatives.free
+    )
     ends = [there.state(solve(there, params, 0.1, most_added=most).params) for most in (0, 2)]
     assert same(*ends)
 
@@ -885,15 +891,15 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(rng):
     state["flux"][0] = -0.2
     point = problem.evaluate(state)
     normal, n = problem.normal(point, start, 1.0), problem.nodes
-    lights, _ = problem._lights(point)
-    for k, (name, _, _) in enumerate(lights.unknowns):
+    pictures, named, _ = problem.derivatives._lights(point)
+    for k, (name, _, _) in enumerate(named):
         if name == "size":
             continue
         h = STEPS[name]
         ends = [problem.evaluate(moved(problem, state, normal.unknowns, 3 * n + k, s * h)) for s in (1, -1)]
         slope = (ends[0].rendering - ends[1].rendering) / (2 * h)
         # Cells are some texels, and the glow's own peak is narrower.
-        assert np.abs(lights.pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
+        assert np.abs(pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
 
 
 @pytest.mark.parametrize("horizon", ["mirror", "keep"])

@@ -1,0 +1,141 @@
+"""The unknowns of an edit with layers, as they are solved for: logarithms and radians.
+
+A state is a dict of float64 arrays: ``gain`` (nodes, 3), ``turn`` and ``flux`` (lights, 3), ``size``
+(lights, 1) and ``saturation`` (1, 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
+from envedit.core.rotations import rotated, rotation_vector
+from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import DARK, SPARE
+
+
+@dataclass(frozen=True)
+class Point:
+    """A state with its map, rendering and residual of display values; the last two None if not finite.
+
+    ``sky`` is the map's active rows without the cores of its lights, (rows, W, 3).
+    """
+
+    state: dict
+    edited: np.ndarray
+    sky: np.ndarray
+    rendering: np.ndarray | None
+    residual: np.ndarray | None
+
+
+class Unknowns:
+    """The unknowns of some layers.
+
+    Parameters
+    ----------
+    layers : Layers
+        After ``encode``.
+    saturates : bool
+        The saturation of the sky's colours is an unknown.
+
+    Attributes
+    ----------
+    sizes : list of (int, int)
+        Rows and columns of the gain's grids.
+    nodes : int
+        Of all grids, and one more where ground goes by the light that falls on it.
+    """
+
+    def __init__(self, layers: Layers, saturates: bool = False):
+        self.layers, self.saturates = layers, saturates
+        self.sizes = layers.gain.sizes
+        self.ground = layers.ground_light is not None
+        self.nodes = sum(rows * columns for rows, columns in self.sizes) + self.ground
+
+    @property
+    def grids(self) -> list[str]:
+        """Names of the parameters that are nodes of the gain."""
+        return [f"gain.{i}" for i in range(len(self.sizes))] + ["ground"] * self.ground
+
+    def state(self, params: dict) -> dict[str, np.ndarray]:
+        """Return the parameters in their own units: logarithms and radians, float64.
+
+        The factor of ground, where there is one, is the last of the gain's nodes.
+        """
+        real = {k: np.float64(v.numpy()) * in_numpy(self.layers.scales[k]) for k, v in params.items()}
+        grids = [real.pop(name).reshape(-1, 3) for name in self.grids]
+        return {"saturation": np.zeros((1, 1))} | real | {"gain": np.concatenate(grids)}
+
+    def params(self, state: dict) -> dict:
+        """Return the layers' parameters of a state; where it is an unknown, with the saturation."""
+        found, start = {}, 0
+        shapes = [(*size, 3) for size in self.sizes] + [(1, 3)] * self.ground
+        for name, shape in zip(self.grids, shapes, strict=True):
+            stop = start + int(np.prod(shape[:-1]))
+            grid = state["gain"][start:stop].reshape(shape)
+            unit = in_numpy(self.layers.scales[name])
+            found[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
+            start = stop
+        names = ["turn", "flux", "size"]
+        if self.saturates or state["saturation"].any():
+            names.append("saturation")
+        for name in names:
+            found[name] = tensor(state[name] / self.layers.scales[name])
+        return found
+
+    def found(self, state: dict) -> dict:
+        """Return the layers' parameters of a state that is a solution: colours that stay keep their bits."""
+        params = self.params(state)
+        if not state["saturation"].any():
+            params.pop("saturation", None)
+        return params
+
+    def clear(self, state: dict) -> None:
+        """Reset what the search found without a prior.
+
+        The gain becomes zero, own lights get their colour back and at most a factor of e of their flux.
+        """
+        state["gain"][:], state["saturation"][:] = 0, 0
+        own = [i for i in self.lit(state) if i < self.layers.lights.count - SPARE]
+        state["flux"][own] = np.clip(state["flux"][own].mean(axis=1, keepdims=True), -1, 1)
+
+    def beyond(self, state: dict) -> dict | None:
+        """Return a state with a spare light where the map's own would need a flux that :meth:`clear` cuts.
+
+        A hazy light that is to be a sun stays what it is, with the sun beside it. None where no light does.
+        """
+        own = self.layers.lights.count - SPARE
+        mean = {i: state["flux"][i].mean() for i in self.lit(state) if i < own}
+        i = max(mean, key=mean.get, default=None)
+        if i is None or mean[i] <= 1:
+            return None
+        found = {name: value.copy() for name, value in state.items()}
+        self.clear(found)
+        fluxes = self.layers.lights.flux @ LUMINANCE
+        more = (np.exp(mean[i]) - np.exp(1.0)) * fluxes[i] / fluxes[own]
+        if not more > 0:
+            return None
+        found["turn"][own] = rotation_vector(self.layers.lights.centres[own], self.direction(state, i))
+        found["flux"][own], found["size"][own] = np.log(more), 0.0
+        return found
+
+    def added(self, state: dict) -> list[int]:
+        """List the spare lights that are lit."""
+        return [i for i in self.lit(state) if i >= self.layers.lights.count - SPARE]
+
+    def lit(self, state: dict) -> list[int]:
+        """List the lights that there are."""
+        return [i for i, flux in enumerate(state["flux"]) if flux.max() > DARK + 1]
+
+    def direction(self, state: dict, i: int) -> np.ndarray:
+        """Return where light ``i`` is, (3,)."""
+        return rotated(self.layers.lights.centres[i], state["turn"][i])
+
+
+def in_numpy(unit: Any) -> Any:
+    """Return a unit of :attr:`.Layers.scales`, a number or a tensor, as numpy has it."""
+    return unit.numpy() if hasattr(unit, "numpy") else np.float64(unit)

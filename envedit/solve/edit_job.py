@@ -261,7 +261,7 @@ class Job:
         wanted = self.wanted.aim, self.wanted.weight, self.representation.free
         asked = self.representation, self.renderer.transport, self.original, *wanted
         whole = self._rendered and self.representation.free is None
-        return map_problem.Problem(*asked, saturates=whole)
+        return map_problem.Problem(*asked, saturates=whole, robust=self._rendered)
 
     @property
     def _sigma(self):

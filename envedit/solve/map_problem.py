@@ -92,6 +92,9 @@ class Problem(Unknowns):
         How far a sky changes.
     saturates : bool
         The saturation of its colours is an unknown.
+    robust : bool
+        Pixels that no light can explain have limited weight (Huber); else every residual counts by its
+        square, as where the picture was painted: what is far from the paint is what was asked about.
     """
 
     def __init__(
@@ -104,8 +107,10 @@ class Problem(Unknowns):
         free: np.ndarray = None,
         prior: Prior = None,
         saturates: bool = False,
+        robust: bool = True,
     ):
         super().__init__(layers, saturates)
+        self.robust = robust
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
         self.prior = prior or Prior()
         self.target = display_curve.to_display(tensor(picture)).numpy()
@@ -150,6 +155,8 @@ class Problem(Unknowns):
         size = _sizes(residual)
         if self._huber(size, least) <= 3 * INDEPENDENT:
             return least
+        if not self.robust:
+            return float(np.sqrt((self.weight * size**2).sum() / (self.area * INDEPENDENT)))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         order = np.argsort(size, axis=None)
@@ -189,7 +196,9 @@ class Problem(Unknowns):
         return self._huber(_sizes(residual), sigma)
 
     def _huber(self, size, sigma):
-        loss = np.where(size <= sigma, size**2, sigma * (2 * size - sigma))
+        loss = size**2
+        if self.robust:
+            loss = np.where(size <= sigma, loss, sigma * (2 * size - sigma))
         return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
 
     # ---- normal equations ----------------------------------------------------------------------------------
@@ -203,7 +212,9 @@ class Problem(Unknowns):
         """
         state, n = point.state, self.nodes
         size = _sizes(point.residual)
-        robust = self.weight * np.minimum(1, sigma / np.maximum(size, 1e-12)) / (self.area * sigma**2)
+        robust = self.weight / (self.area * sigma**2)
+        if self.robust:
+            robust = robust * np.minimum(1, sigma / np.maximum(size, 1e-12))
         slope = display_curve.slope(point.rendering)
         blocks, linear = self.blocks, self.derivatives.at(point)
         pictures, profile = linear.pictures, linear.profile

@@ -134,24 +134,17 @@ def run(
                 lit, original, few, Seeds.of(settings.seed).painted_initial, settings.renderer.cache
             )
 
-    # ---- Transport, and what any light can do
+    # ---- Transport
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
     start.trace()
-    traced, within, notes = start.renderer.transport, None, []
+    traced = start.renderer.transport
     if traced and wanted.coverage is not None:
-        with clock("reach_s"):
-            watch.stage("estimating how much of the target is feasible")
-            within = reaches.reachable(
-                traced, original, wanted.picture, wanted.weight, rows, None, wanted.coverage[..., 0], initial
-            )
-            notes.append(within.note)
-            warnings += [within.warning] if within.warning else []
-            wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
+        wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
 
     # ---- The edit: where it starts, and its optimisation
     edit = start.edit(wanted)
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
-    renderer, notes = job.renderer, notes + edit.notes
+    renderer, within, notes = job.renderer, None, list(edit.notes)
     traced = renderer.transport
     warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
     with clock("edit_s"), _in_file_units(given):
@@ -160,6 +153,19 @@ def run(
         found_map = job.decode(params)
         edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
         wanted = job.wanted  # a resumed run has the picture that it began with
+    predicted = None
+    if traced:
+        with _in_file_units(given), keeping(edited):
+            predicted = traced.coarse_error(edited)
+
+    # ---- What any light can do, under the weights of paint and rest that the edit has come to
+    if traced and wanted.coverage is not None:
+        with clock("reach_s"):
+            watch.stage("estimating how much of the target is feasible")
+            asked = traced, original, wanted.picture, wanted.weight, rows, None, wanted.coverage[..., 0]
+            within = reaches.reachable(*asked, initial)
+            notes.append(within.note)
+            warnings += [within.warning] if within.warning else []
 
     # ---- The result, rendered with fresh samples
     with clock("judge_s"), _in_file_units(given), keeping(edited):
@@ -185,7 +191,6 @@ def run(
     with _in_file_units(given), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
         measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit)
-        predicted = traced.coarse_error(edited) if traced else None
     rate = "; lower optimizer.lr" if job.raised_rate else ""
     pair = [measured[name] for name in ("render", "initial")]
     measured["worse"] = wanted.coverage is None and metrics.worse(*pair)

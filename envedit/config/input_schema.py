@@ -123,7 +123,13 @@ class Target(Table):
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
     paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
-    hold: float = key(1.0, Number(0), "weight of all pixels that were not painted", when=_PAINTED)
+    hold: float | str = key(
+        "auto",
+        OrAuto(Number(0)),
+        "weight of all pixels that were not painted; auto: 1, and with Gauss-Newton steps as much more as "
+        "keeps the mean change of their display values below 0.02",
+        when=_PAINTED,
+    )
     spp: int | str = key(
         "auto",
         OrAuto(Integer(1, 1 << 20)),
@@ -183,7 +189,7 @@ class Target(Table):
             )
         if self.kind == "strokes" and self.mask:
             raise ConfigError(f"target.mask: got {show(self.mask)}, expected none: strokes have a place")
-        if self.kind in ("image", "strokes") and not self.paint + self.hold:
+        if self.kind in ("image", "strokes") and not self.paint and self.hold == 0:
             raise ConfigError("target.paint, target.hold: got 0 for both, expected one above 0")
         if self.kind != "strokes" and self.strokes:
             raise ConfigError(

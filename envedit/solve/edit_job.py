@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -16,6 +14,7 @@ import numpy as np
 from envedit import config
 from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError, place_of
+from envedit.core.interrupts import ctrl_c
 from envedit.core.seeds import Seeds
 from envedit.core.types import Params
 from envedit.losses import display_curve, optimizer
@@ -25,7 +24,7 @@ from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.lights import SPARE
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, gauss_newton, map_problem
+from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, map_problem
 from envedit.targets import target
 
 CHECKED_SPP = 64
@@ -308,13 +307,39 @@ class Job:
             more: dict[str, Any] = {"sparing": False}
             if self._rendered:
                 more = {"most_added": SPARE, "judge": self._display_error}
-            asked = self._problem(), params, self._sigma, chosen.iterations, after_step, run
-            made = gauss_newton.solve(*asked, **more)
+            self._hold(run)
+            asked = params, self._sigma, chosen.iterations, after_step
+            made = gauss_newton.solve(self._problem(), *asked, run, **more)
+            while (run := self._held_more(made.run)) is not None:
+                made = gauss_newton.solve(self._problem(), *asked, run, **more)
         self.posterior, self.note = made.posterior, made.note
+        if made.run.hold > 1:
+            self.note = f"what was not painted weighs {made.run.hold:.3g}: with less it would change visibly"
         if "saturation" in made.params:
             kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))
             self.note = f"saturation of the sky's colours: {kept:.0f} % of the original's"
         return made.params, adam_loop.State(step=len(made.history), history=made.history)
+
+    def _hold(self, run):
+        """Take the weight of what was not painted that a run has come to."""
+        if run is not None and run.hold > 1:
+            self.wanted = self.wanted.held(self.settings.target.paint, run.hold)
+
+    def _held_more(self, run):
+        """Return a run that goes on with more weight on what was not painted; None where it need not."""
+        chosen, wanted = self.settings.target, self.wanted
+        left = self.settings.optimizer.iterations - len(run.history)
+        if self._rendered or chosen.hold != "auto" or not chosen.paint or left <= 0:
+            return None
+        rendering = self._problem().evaluate(run.state, resolve=False).rendering
+        changed = hold.change(rendering, wanted.aim, wanted.coverage, wanted.weight)
+        more = hold.raised(run.hold, changed)
+        if more is None:
+            return None
+        run = gauss_newton.Run(run.state, run.start, history=run.history, hold=more)
+        run.most = len(run.history) + gauss_newton.ITERATIONS
+        self._hold(run)
+        return run
 
     def _display_error(self, envmap):
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
@@ -376,23 +401,3 @@ def keeping(envmap: np.ndarray) -> Iterator[None]:
         yield
     except NumericalError as error:
         raise Stopped(str(error), envmap) from error
-
-
-@contextlib.contextmanager
-def ctrl_c() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into an event, so that a step is never cut in half; a second Ctrl-C is not waited for."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-
-    def handle(number, frame):
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, before)

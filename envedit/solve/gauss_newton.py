@@ -63,6 +63,8 @@ class Run:
         Rounds of adding and moving lights that were made after convergence.
     most : int
         Steps after which it ends; more once a light was added or moved.
+    hold : float
+        Weight of what was not painted, where it is raised (:mod:`.hold`).
     """
 
     state: dict
@@ -73,12 +75,14 @@ class Run:
     history: list[dict] = field(default_factory=list)
     asked: int = 0
     most: int = ITERATIONS
+    hold: float = 1.0
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
         scale = self.scale if np.isfinite(self.scale) else 0.0  # before the first step
-        return both | {"numbers": np.array([self.damping, scale, self.finished, self.asked, self.most])}
+        numbers = self.damping, scale, self.finished, self.asked, self.most, self.hold
+        return both | {"numbers": np.array(numbers)}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -87,8 +91,8 @@ class Run:
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
         )
-        damping, scale, finished, asked, most = arrays["numbers"].tolist()
-        done = bool(finished), list(history), int(asked), int(most)
+        damping, scale, finished, asked, most, hold = arrays["numbers"].tolist()
+        done = bool(finished), list(history), int(asked), int(most), hold
         return cls(state, start, damping, scale or np.inf, *done)
 
 

@@ -76,6 +76,12 @@ class Target:
         """Return the target with another :attr:`aim`."""
         return replace(self, picture=picture) if self.compared is None else replace(self, compared=picture)
 
+    def held(self, paint: float, hold: float) -> Target:
+        """Return the target with other weights of paint and rest, among the pixels that count."""
+        assert self.coverage is not None and self.weight is not None, "nothing was painted"
+        uncounted = self.weight[..., 0] == 0
+        return replace(self, weight=pixel_weight(self.coverage, uncounted, paint, hold))
+
 
 def make(
     settings: config.Config,
@@ -131,11 +137,10 @@ def make(
         picture = np.minimum(picture, np.float32(BRIGHTEST))
         warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
     untold = found.excluded & (found.coverage[..., 0] > 0)  # what was not painted has the initial value
-    weight = pixel_weight(found.coverage, untold, chosen.paint, chosen.hold)
+    hold = first_hold(chosen)
+    weight = pixel_weight(found.coverage, untold, chosen.paint, hold)
     share = 100 * float((found.coverage > 0).mean())
-    source += (
-        f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {chosen.hold:g} (the rest)"
-    )
+    source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
     return _seen(Target(picture, weight, None, source, warnings, initial, found.coverage, asked), hidden)
 
 
@@ -209,6 +214,11 @@ def _seen(target, hidden):
         raise InputError("target: no pixel counts: none that is asked for sees a surface (hide_emitters)")
     share = f"{100 * hidden.mean():.3g} % of the pixels see no surface (hide_emitters) and do not count"
     return replace(target, weight=weight, source=f"{target.source}; {share}")
+
+
+def first_hold(chosen: config.Target) -> float:
+    """Return the weight of what was not painted that an edit begins with."""
+    return 1.0 if chosen.hold == "auto" else chosen.hold
 
 
 def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:

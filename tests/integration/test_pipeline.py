@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from envedit import api, config, inputs, pipeline, preparation, representations
-from envedit.core import latlong
+from envedit.core import interrupts, latlong
 from envedit.core.errors import InputError
-from envedit.images import images
+from envedit.images import analytic_sky, images
 from envedit.representations.layers import gain
 from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint, edit_job, gauss_newton
@@ -315,6 +315,23 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
         assert abs(peak[0] - 4) <= 2 and abs(peak[1] - 4) <= 2
     else:  # without it the black bar counts
         assert error("edited") > 0.02 * error("initial")
+
+
+@pytest.mark.slow
+def test_a_highlight_that_matte_ground_cannot_show_leaves_the_rest(tmp_path):
+    """As bright as painted, the ground takes a sky that makes all of it bright."""
+    spot = {"type": "light", "ellipse": [0.5, 0.4, 0.06, 0.06, 0.0], "amount": 3.0, "units": "fraction"}
+    tables = {
+        "input": {"width": 64, "rows": "all"}, "scene": {"width": 48}, "output": {"spp": 64},
+        "renderer": {"spp": 64, "max_depth": 3}, "optimizer": {"iterations": 60},
+    }  # fmt: skip
+    picture, held = analytic_sky.sunsky(64, 240.0, 45.0), {}
+    for weight in ("auto", 1.0):
+        target = {"kind": "strokes", "strokes": [spot], "hold": weight}
+        found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
+        held[weight] = found.metrics["painted"]["elsewhere"]
+        assert any("weighs" in line for line in found.notes) == (weight == "auto")
+    assert held[1.0] > 0.05 and held["auto"] < 0.025
 
 
 @pytest.mark.slow
@@ -646,7 +663,7 @@ def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):
 
 
 def test_a_second_ctrl_c_is_not_waited_for():
-    with pytest.raises(KeyboardInterrupt), edit_job.ctrl_c() as event:
+    with pytest.raises(KeyboardInterrupt), interrupts.ctrl_c() as event:
         signal.raise_signal(signal.SIGINT)
         assert event.is_set()
         signal.raise_signal(signal.SIGINT)
@@ -657,7 +674,7 @@ def test_outside_the_main_thread_signals_are_left_alone():
 
     def enter():
         try:
-            with edit_job.ctrl_c() as event:
+            with interrupts.ctrl_c() as event:
                 assert not event.is_set()
         except Exception as error:
             failures.append(error)

@@ -36,11 +36,11 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
-from envedit.solve import feasibility, gauss_newton, map_problem, painted_change
+from envedit.solve import feasibility, gauss_newton, hold, map_problem, painted_change
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.solve.light_search import SearchProblem
 from envedit.targets import strokes
-from envedit.targets.target import pixel_weight
+from envedit.targets.target import first_hold, pixel_weight
 
 DRAGGED_COLUMNS, COLUMNS = 16, 32
 """Most exact columns of T in one frame while a light is dragged, with the fewest paths, and otherwise."""
@@ -182,6 +182,7 @@ class Session:
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
         chosen, self.reach, self.searched = self.project.settings.target, None, False
+        self.hold = first_hold(chosen)
         painted = self._after(list(self.document.strokes), chosen.tonemap)
         self.solving = bool(painted is not None and painted.coverage.any())
         if not self.solving:
@@ -191,10 +192,25 @@ class Session:
             self.target, self.weight, self.coverage = self.base, None, None
             return
         self.target, self.coverage = painted.picture, painted.coverage
-        untold = np.zeros(self.coverage.shape[:2], bool)
-        self.weight = self._seen(pixel_weight(self.coverage, untold, chosen.paint, chosen.hold))
+        self._weigh()
+
+    def _weigh(self):
+        """Aim the solution at the paint, with the present weight of what was not painted."""
+        untold, paint = np.zeros(self.coverage.shape[:2], bool), self.project.settings.target.paint
+        self.weight = self._seen(pixel_weight(self.coverage, untold, paint, self.hold))
         self.point = self.problem.aimed_at(self.target, self.weight, self.point)
         self.run = gauss_newton.Run(self.run.state, self.start)
+
+    def _held_more(self):
+        """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
+        chosen = self.project.settings.target
+        changed = hold.change(self.point.rendering, self.target, self.coverage, self.weight)
+        more = hold.raised(self.hold, changed)
+        if chosen.hold != "auto" or not chosen.paint or more is None:
+            return False
+        self.hold = more
+        self._weigh()
+        return True
 
     def _seen(self, weight):
         """Leave out pixels that see no surface, where the scene hides what lights it."""
@@ -241,6 +257,8 @@ class Session:
                 return True
             if self.solving and not self.searched:
                 self._search()
+                return True
+            if self.solving and self._held_more():
                 return True
             if self.solving and self.reach is None:
                 self._reach()

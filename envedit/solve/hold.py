@@ -1,0 +1,42 @@
+"""How strongly pixels without paint are held, where ``target.hold`` is "auto".
+
+Paint and the rest have the same weight at first, and the rest gains weight until it is not visibly changed:
+a rough surface shows a small highlight only under a sky so bright that the whole picture pales.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envedit.core.color import tonemap
+
+VISIBLE = 0.02
+"""Mean change of display values from which on a change of what was not painted counts as visible."""
+LEAST, MOST_AT_ONCE, MOST = 1.5, 16.0, 256.0
+"""Least and largest factor by which the weight is raised at once; largest weight."""
+
+
+def change(rendering: np.ndarray, aim: np.ndarray, coverage: np.ndarray, counts: np.ndarray) -> float:
+    """Return the mean |change| of display values where nothing was painted; 0 if all was.
+
+    Parameters
+    ----------
+    rendering, aim : ndarray (h, w, 3)
+        Under the edited map, and what was asked for, linear radiance.
+    coverage, counts : ndarray (h, w, 1)
+        How much each pixel was painted; which count.
+    """
+    rest = ((coverage <= 0) & (counts > 0))[..., 0]
+    if not rest.any():
+        return 0.0
+    return float(np.abs(tonemap(rendering[rest]) - tonemap(aim[rest])).mean())
+
+
+def raised(hold: float, changed: float) -> float | None:
+    """Return a larger weight of what was not painted; None if it has changed too little for that.
+
+    Residuals count by their squares: the weight grows with the square of the change.
+    """
+    if changed <= VISIBLE or hold >= MOST:
+        return None
+    return min(MOST, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST, MOST_AT_ONCE)))

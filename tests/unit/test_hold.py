@@ -1,0 +1,41 @@
+"""The weight of what was not painted, where the program chooses it."""
+
+import numpy as np
+import pytest
+
+from envedit.solve import hold
+
+
+def test_only_pixels_without_paint_that_count_have_changed():
+    aim = np.zeros((1, 4, 3))
+    rendering = np.array([0.0, 0.5, 0.5, 1.0]).reshape(1, 4, 1) ** 2.2 * np.ones(3)
+    coverage, counts = np.array([0, 0, 0.01, 0]), np.array([1, 1, 1, 0])
+    shaped = (part.reshape(1, 4, 1) for part in (coverage, counts))
+    assert hold.change(rendering, aim, *shaped) == pytest.approx(0.25)
+    assert hold.change(rendering, aim, np.ones((1, 4, 1)), np.ones((1, 4, 1))) == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "changed", "after"),
+    [
+        (1, 0.019, None),
+        (1, 0.02, None),
+        (1, 0.0201, 1.5),
+        (1, 0.04, 4),
+        (4, 0.04, 16),
+        (1, 1.0, 16),
+        (200, 1.0, 256),
+    ],
+)
+def test_the_weight_grows_with_the_square_of_a_visible_change(before, changed, after):
+    found = hold.raised(before, changed)
+    assert found is None if after is None else found == pytest.approx(after)
+
+
+def test_the_weight_has_an_end_whatever_the_picture():
+    weight, rounds = 1.0, 0
+    while (more := hold.raised(weight, 1e6)) is not None:
+        assert more > weight
+        weight, rounds = more, rounds + 1
+    assert weight == hold.MOST and rounds <= 3
+    assert hold.raised(1.0, 0.0) is None

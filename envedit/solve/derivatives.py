@@ -18,8 +18,9 @@ from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.unknowns import Point, Unknowns
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
-ANGLE = np.radians(0.7)
-"""Rotation of the finite difference by a light's direction."""
+ANGLE, WIDE = np.radians(0.7), np.radians(2.1)
+"""Rotations of the finite difference by a light's direction: half a texel of a map of 256, and, where that
+leads no further, as much as the noise of single columns of T does not hide."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,11 @@ class Derivatives:
         T of blocks of pixels.
     free : ndarray of bool (rows, W), optional
         Texels whose gain is free; None: all.
+
+    Attributes
+    ----------
+    angle : float
+        Rotation of the finite difference by a light's direction.
     """
 
     def __init__(
@@ -65,15 +71,17 @@ class Derivatives:
         self.unknowns, self.transport, self.blocks, self.free = unknowns, transport, blocks, free
         self.layers = unknowns.layers
         self.rows, self.shape = self.layers.active, transport.shape
-        self._last: tuple[np.ndarray, Linearisation] | None = None
+        self.angle = ANGLE
+        self._last: tuple[np.ndarray, float, Linearisation] | None = None
 
     def at(self, point: Point) -> Linearisation:
         """Return the derivatives at a point, which must be finite; they depend on no target and no weight."""
-        if self._last is None or self._last[0] is not point.rendering:
+        if self._last is None or self._last[0] is not point.rendering or self._last[1] != self.angle:
             pictures, named, profile = self._lights(point)
             jacobian = self.blocks.jacobian(self._slopes(point))
-            self._last = point.rendering, Linearisation(pictures, named, profile, jacobian)
-        return self._last[1]
+            made = Linearisation(pictures, named, profile, jacobian)
+            self._last = point.rendering, self.angle, made
+        return self._last[2]
 
     def _slopes(self, point):
         """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
@@ -112,11 +120,11 @@ class Derivatives:
             axes, turns = self._tangents(state, i), [turn]
             for axis in axes:
                 for sign in (1, -1):
-                    there = rotated(self.unknowns.direction(state, i), sign * ANGLE * axis)
+                    there = rotated(self.unknowns.direction(state, i), sign * self.angle * axis)
                     turns.append(rotation_vector(layers.lights.centres[i], there))
             ways = [(one, flux, size) for one in turns] + [(turn, flux, size + 0.1)]
             now, *ends, larger = layers.lights.cores_of(i, ways, layers.whole)
-            cores = np.stack([now, *_differences(ends), (larger - now) / 0.1])
+            cores = np.stack([now, *self._differences(ends), (larger - now) / 0.1])
             seen = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
             found.append((i, turns, cores, seen))
             unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
@@ -126,7 +134,7 @@ class Derivatives:
             glow, *ends = (self._log_glow(state, i, one) for one in turns)
             shone = None
             if glow is not None:
-                shone = np.stack([sky * -np.expm1(-glow), *(sky * d for d in _differences(ends))])
+                shone = np.stack([sky * -np.expm1(-glow), *(sky * d for d in self._differences(ends))])
             shone = self._with_lit_ground(point, cores[:3], shone)
             if shone is not None:
                 seen[:3] += self.blocks.pictures(shone) * profile.reshape(-1, 3)
@@ -193,7 +201,6 @@ class Derivatives:
         across = across / length if length > 1e-6 else np.array([1.0, 0, 0])
         return across, np.cross(across, centre)
 
-
-def _differences(ends):
-    """Return derivatives by two angles of what is given ahead and back along each."""
-    return [(ends[k] - ends[k + 1]) / (2 * ANGLE) for k in (0, 2)]
+    def _differences(self, ends):
+        """Return derivatives by two angles of what is given ahead and back along each."""
+        return [(ends[k] - ends[k + 1]) / (2 * self.angle) for k in (0, 2)]

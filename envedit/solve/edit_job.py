@@ -324,22 +324,19 @@ class Job:
         """Take the weight of what was not painted that a run has come to."""
         if run is not None and run.hold > 1:
             self.wanted = self.wanted.held(self.settings.target.paint, run.hold)
+        return run
 
     def _held_more(self, run):
         """Return a run that goes on with more weight on what was not painted; None where it need not."""
-        chosen, wanted = self.settings.target, self.wanted
-        left = self.settings.optimizer.iterations - len(run.history)
-        if self._rendered or chosen.hold != "auto" or not chosen.paint or left <= 0:
+        chosen, wanted, most = self.settings.target, self.wanted, self.settings.optimizer.iterations
+        if self._rendered or chosen.hold != "auto" or not chosen.paint or len(run.history) >= most:
             return None
-        rendering = self._problem().evaluate(run.state, resolve=False).rendering
-        changed = hold.change(rendering, wanted.aim, wanted.coverage, wanted.weight)
-        more = hold.raised(run.hold, changed)
+        seen = self._problem().evaluate(run.state, resolve=False).rendering
+        more = hold.raised(run.hold, hold.change(seen, wanted.aim, wanted.coverage, wanted.weight))
         if more is None:
             return None
-        run = gauss_newton.Run(run.state, run.start, history=run.history, hold=more)
-        run.most = len(run.history) + gauss_newton.ITERATIONS
-        self._hold(run)
-        return run
+        most = len(run.history) + gauss_newton.ITERATIONS
+        return self._hold(gauss_newton.Run(run.state, run.start, history=run.history, most=most, hold=more))
 
     def _display_error(self, envmap):
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""

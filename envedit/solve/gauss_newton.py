@@ -19,6 +19,7 @@ from envedit.core.errors import NumericalError
 from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK
 from envedit.solve import added_light
+from envedit.solve.derivatives import ANGLE, WIDE
 from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
@@ -65,6 +66,8 @@ class Run:
         Steps after which it ends; more once a light was added or moved.
     hold : float
         Weight of what was not painted, where it is raised (:mod:`.hold`).
+    wide : bool
+        Derivatives by a light's direction are wide differences: with narrow ones no step leads further.
     """
 
     state: dict
@@ -76,12 +79,13 @@ class Run:
     asked: int = 0
     most: int = ITERATIONS
     hold: float = 1.0
+    wide: bool = False
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
         scale = self.scale if np.isfinite(self.scale) else 0.0  # before the first step
-        numbers = self.damping, scale, self.finished, self.asked, self.most, self.hold
+        numbers = self.damping, scale, self.finished, self.asked, self.most, self.hold, self.wide
         return both | {"numbers": np.array(numbers)}
 
     @classmethod
@@ -91,8 +95,8 @@ class Run:
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
         )
-        damping, scale, finished, asked, most, hold = arrays["numbers"].tolist()
-        done = bool(finished), list(history), int(asked), int(most), hold
+        damping, scale, finished, asked, most, hold, wide = arrays["numbers"].tolist()
+        done = bool(finished), list(history), int(asked), int(most), hold, bool(wide)
         return cls(state, start, damping, scale or np.inf, *done)
 
 
@@ -303,7 +307,8 @@ class _Search:
             if k in problem.added(run.state) or run.state["flux"][k].mean() > FADED:
                 continue
             without = _without(run.state, k)
-            rival = replace(run, state=without, damping=1e-3, finished=False, history=list(run.history))
+            rival = replace(run, state=without, damping=1e-3, finished=False, wide=False)
+            rival.history = list(run.history)
             most = min(self.iterations, len(run.history) + ADDED_STEPS)
             end = self._descended(rival, problem.evaluate(without), most, self._tried)
             noise = problem.noise(point.residual, self.sigma)
@@ -432,7 +437,9 @@ class _Search:
             start = _copy(run.start)
             for name in ("turn", "flux", "size"):
                 start[name][new] = state[name][new]
-            rival = replace(run, state=state, start=start, history=list(run.history), finished=False)
+            rival = replace(
+                run, state=state, start=start, history=list(run.history), finished=False, wide=False
+            )
             first = problem.evaluate(state)
             if first.residual is not None:
                 ends.append((rival, self._descended(rival, first, most, self._tried)))
@@ -461,7 +468,9 @@ class _Search:
             halved = run.scale / 2 if np.isfinite(run.scale) else 0
             run.scale = min(run.scale, max(problem.noise(point.residual, sigma), halved))
             before = problem.loss(point, run.start, run.scale)
+            problem.derivatives.angle = WIDE if run.wide else ANGLE
             normal = problem.normal(point, run.start, run.scale)
+            problem.derivatives.angle = ANGLE
             better = None
             for _ in range(TRIES):
                 moved = problem.step(run.state, normal, run.damping)
@@ -479,7 +488,9 @@ class _Search:
                         break
                 run.damping = max(10 * run.damping, 1e-2)
             little = better is None or before - data - penalty < LITTLE * before
-            run.finished = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
+            ended = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
+            run.finished = ended and (run.wide or not problem.lit(run.state))
+            run.wide |= ended
             if better is not None:
                 point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
                 row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}

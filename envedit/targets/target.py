@@ -218,7 +218,7 @@ def _seen(target, hidden):
 
 def first_hold(chosen: config.Target) -> float:
     """Return the weight of what was not painted that an edit begins with."""
-    return 1.0 if chosen.hold == "auto" else chosen.hold
+    return 1.0 if chosen.hold == "auto" else float(chosen.hold)
 
 
 def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:

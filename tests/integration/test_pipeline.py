@@ -694,7 +694,7 @@ def test_a_transport_that_does_not_fit_is_refused_before_anything_is_rendered(tm
 
 @pytest.mark.slow
 def test_paint_on_a_black_map_is_followed(tmp_path):
-    painted = {"kind": "strokes", "strokes": STROKES}
+    painted = {"kind": "strokes", "strokes": STROKES, "hold": 1.0}
     black = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     settings = settings_of(
         tmp_path, black, target=painted, input={"rows": "all"}, optimizer={"iterations": 30}

@@ -81,6 +81,11 @@ class Run:
     hold: float = 1.0
     wide: bool = False
 
+    def elsewhere(self, state: dict, start: dict) -> Run:
+        """Return a run that goes on from another state, with steps of its own."""
+        history = list(self.history)
+        return replace(self, state=state, start=start, history=history, finished=False, wide=False)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
@@ -307,8 +312,7 @@ class _Search:
             if k in problem.added(run.state) or run.state["flux"][k].mean() > FADED:
                 continue
             without = _without(run.state, k)
-            rival = replace(run, state=without, damping=1e-3, finished=False, wide=False)
-            rival.history = list(run.history)
+            rival = replace(run.elsewhere(without, run.start), damping=1e-3)
             most = min(self.iterations, len(run.history) + ADDED_STEPS)
             end = self._descended(rival, problem.evaluate(without), most, self._tried)
             noise = problem.noise(point.residual, self.sigma)
@@ -437,9 +441,7 @@ class _Search:
             start = _copy(run.start)
             for name in ("turn", "flux", "size"):
                 start[name][new] = state[name][new]
-            rival = replace(
-                run, state=state, start=start, history=list(run.history), finished=False, wide=False
-            )
+            rival = run.elsewhere(state, start)
             first = problem.evaluate(state)
             if first.residual is not None:
                 ends.append((rival, self._descended(rival, first, most, self._tried)))

@@ -8,7 +8,7 @@ use, so that ``import envedit`` is quick and works without LLVM.
 
 from __future__ import annotations
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 _PUBLIC = {
     "Config": "envedit.config",
     "ConfigError": "envedit.core.errors",

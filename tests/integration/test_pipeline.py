@@ -535,6 +535,7 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
     assert all(np.abs(whole.found.params[name].numpy()).max() > 0 for name in levels)
 
     monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted, match="iteration 7"):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -549,6 +550,7 @@ def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path
     settings = settings_of(tmp_path, smooth(rng), renderer={"kind": "path", "spp": 4, "max_depth": 3})
     whole = pipeline.run(settings)
     monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -636,6 +638,7 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
     settings = settings_of(tmp_path, sunny(rng), **PIXELS)
     whole = pipeline.run(settings)
     monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
     folder = tmp_path / "run"
     folder.mkdir()
     with pytest.raises(pipeline.Interrupted):

@@ -163,7 +163,7 @@ def run(
         with clock("reach_s"):
             watch.stage("estimating how much of the target is feasible")
             asked = traced, original, wanted.picture, wanted.weight, rows, None, wanted.coverage[..., 0]
-            within = reaches.reachable(*asked, initial)
+            within = reaches.reachable(*asked, initial, known=found_map)
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
 

@@ -139,6 +139,7 @@ def reachable(
     free: np.ndarray | None = None,
     painted: np.ndarray | None = None,
     rendered: np.ndarray | None = None,
+    known: np.ndarray | None = None,
 ) -> Reach:
     """Find the closest picture that any non-negative map makes.
 
@@ -160,6 +161,8 @@ def reachable(
         Coverage of the region that the request is about, 0 to 1; where None, all pixels that count.
     rendered : ndarray (h, w, 3), optional
         The rendering that was painted on. Its difference from T E is noise, and is no part of the request.
+    known : ndarray (H, W, 3), optional
+        A map that answers the request already, such as an edit's: the closest picture is no farther than its.
 
     Returns
     -------
@@ -196,6 +199,10 @@ def reachable(
             if not last:
                 model, x = _around_light(question, model, x, found)
                 picture = question.apply(model.map(x))
+    if known is not None and asked > 0:
+        transport.resolve(known)
+        picture = question.apply(known)
+        best = min(best, (question.distance(picture), known, picture), key=lambda one: one[0])
     # ---- What is left
     distance, envmap, picture = best
     residual = tonemap(question.target) - tonemap(picture)

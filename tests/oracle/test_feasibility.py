@@ -124,6 +124,16 @@ def test_what_a_map_makes_is_within_reach(dense, envmap, rng):
     np.testing.assert_allclose(found.residual, tonemap(target) - tonemap(found.picture), atol=1e-6)
 
 
+def test_a_map_that_is_known_is_within_reach_whatever_the_solution_finds(dense, envmap, rng, monkeypatch):
+    monkeypatch.setattr(feasibility, "_solve", lambda model, x, picture: (x, 0, 1.0))  # stays at the original
+    other = (envmap * rng.uniform(0.3, 3, envmap.shape)).astype(np.float32)
+    target = render(dense, other)
+    assert feasibility.reachable(dense, envmap, target).share == 0
+    found = feasibility.reachable(dense, envmap, target, known=other)
+    assert found.share > 0.999 and np.array_equal(found.envmap, other)
+    assert feasibility.reachable(dense, envmap, target, known=envmap).share == 0
+
+
 def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):
     initial, painted = render(dense, envmap), rng.random(PIXELS)
     target = initial * np.where(rng.random((*PIXELS, 1)) < 0.5, 0.5, 1.4)

@@ -356,7 +356,8 @@ class Session:
         """Ask how much of what is painted any light could do; a newer edit ends it."""
         self._tell_doing("estimating how much of the target is feasible")
         asked = self.problem.envmap, self.target, self.weight, self.rows, None
-        self.reach = feasibility.reachable(self._watched, *asked, self.coverage[..., 0], self.base)
+        painted, known = self.coverage[..., 0], self.point.edited
+        self.reach = feasibility.reachable(self._watched, *asked, painted, self.base, known)
         self.status["reachable"] = self.reach.share
         self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
         self.tell_state()

@@ -329,10 +329,10 @@ class Job:
     def _held_more(self, run):
         """Return a run that goes on with more weight on what was not painted; None where it need not."""
         chosen, wanted, most = self.settings.target, self.wanted, self.settings.optimizer.iterations
-        if self._rendered or chosen.hold != "auto" or not chosen.paint or len(run.history) >= most:
+        if self._rendered or len(run.history) >= most:
             return None
         seen = self._problem().evaluate(run.state, resolve=False).rendering
-        more = hold.raised(run.hold, hold.change(seen, wanted.aim, wanted.coverage, wanted.weight))
+        more = hold.further(chosen, run.hold, seen, wanted.aim, wanted.coverage, wanted.weight)
         if more is None:
             return None
         most = len(run.history) + gauss_newton.ITERATIONS

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from envedit import config
 from envedit.core.color import tonemap
 
 VISIBLE = 0.02
@@ -40,3 +41,22 @@ def raised(hold: float, changed: float) -> float | None:
     if changed <= VISIBLE or hold >= MOST:
         return None
     return min(MOST, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST, MOST_AT_ONCE)))
+
+
+def further(
+    chosen: config.Target, weight: float, rendering: np.ndarray, aim: np.ndarray, *pixels: np.ndarray
+) -> float | None:
+    """Return the weight with which an edit goes on; None where it need not, or where the user gave the weight.
+
+    Parameters
+    ----------
+    chosen : Target
+        Table ``[target]``: ``hold`` and ``paint``.
+    weight : float
+        Of what was not painted, in the steps that led to ``rendering``.
+    rendering, aim, *pixels
+        As for ``change``.
+    """
+    if chosen.hold != "auto" or not chosen.paint:
+        return None
+    return raised(weight, change(rendering, aim, *pixels))

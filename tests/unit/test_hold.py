@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from envedit import config
 from envedit.solve import hold
 
 
@@ -39,3 +40,15 @@ def test_the_weight_has_an_end_whatever_the_picture():
         weight, rounds = more, rounds + 1
     assert weight == hold.MOST and rounds <= 3
     assert hold.raised(1.0, 0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("target", "after"),
+    [({"paint": 1.0}, 4.0), ({"paint": 1.0, "hold": 3.0}, None), ({"paint": 0.0}, None)],
+)
+def test_only_a_weight_that_the_user_left_open_is_raised(target, after):
+    aim, pixels = np.zeros((1, 2, 3)), np.ones((1, 2, 1))
+    rendering = np.full((1, 2, 3), 0.04**2.2)
+    coverage = np.array([0.0, 1.0]).reshape(1, 2, 1)
+    found = hold.further(config.Target(**target), 1.0, rendering, aim, coverage, pixels)
+    assert found is None if after is None else found == pytest.approx(after)

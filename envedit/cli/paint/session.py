@@ -204,9 +204,9 @@ class Session:
     def _held_more(self):
         """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
         chosen = self.project.settings.target
-        changed = hold.change(self.point.rendering, self.target, self.coverage, self.weight)
-        more = hold.raised(self.hold, changed)
-        if chosen.hold != "auto" or not chosen.paint or more is None:
+        seen = self.point.rendering, self.target, self.coverage, self.weight
+        more = hold.further(chosen, self.hold, *seen)
+        if more is None:
             return False
         self.hold = more
         self._weigh()

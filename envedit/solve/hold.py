@@ -46,7 +46,7 @@ def raised(hold: float, changed: float) -> float | None:
 def further(
     chosen: config.Target, weight: float, rendering: np.ndarray, aim: np.ndarray, *pixels: np.ndarray
 ) -> float | None:
-    """Return the weight with which an edit goes on; None where it need not, or where the user gave the weight.
+    """Return the weight with which an edit goes on; None where it need not, or where the weight was given.
 
     Parameters
     ----------

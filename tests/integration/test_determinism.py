@@ -13,7 +13,6 @@ import pytest
 
 from tests.oracles import ROOT
 from tests.oracles.runs import call, changed, differing, pixels, world
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
@@ -48,8 +47,13 @@ def configured(folder, rng, kind, renderer="transport"):
     return world(folder, rng, **tables)
 
 
-@pytest.mark.parametrize("renderer", slow_but(["transport", "path"], "transport"))
-@pytest.mark.parametrize("kind", slow_but(KINDS, "pixels"))
+CASES = [("transport", kind) for kind in KINDS] + [("path", "siren"), ("path", "layers")]
+
+
+@pytest.mark.parametrize(
+    ("renderer", "kind"),
+    [pytest.param(*one, marks=[] if one == ("transport", "pixels") else pytest.mark.slow) for one in CASES],
+)
 def test_the_same_files_on_any_number_of_threads(kind, renderer, tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, kind, renderer)
     one, again, two = (carried_out(path, count) for count in (1, 1, 2))

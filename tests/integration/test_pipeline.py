@@ -418,7 +418,6 @@ CASES = {
             "fit": {"epochs": 60},
         },
     ),
-    "transport recorded afresh": (sunny, PIXELS | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}}),
     "layers, columns": (sunny, ADAM),
     "layers, transport recorded afresh": (
         sunny,

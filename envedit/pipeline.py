@@ -32,9 +32,6 @@ from envedit.targets import target
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
-INITIAL_SPP = 256
-"""Samples a pixel of the initial rendering, which is far from the target."""
-
 
 @dataclass
 class _Clock:
@@ -127,12 +124,7 @@ def run(
         watch.stage("rendering the target")
         wanted = target.make(settings, lit, original, memory.picture, memory.mask, memory.target_map)
         warnings += wanted.warnings
-        few = INITIAL_SPP if settings.output.spp == "auto" else min(INITIAL_SPP, settings.output.spp)
         initial = wanted.initial
-        if initial is None and wanted.coverage is not None:
-            initial, _, _ = rendered(
-                lit, original, few, Seeds.of(settings.seed).painted_initial, settings.renderer.cache
-            )
 
     # ---- Transport
     start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
@@ -340,7 +332,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
     if len(lit.views) > 1:
         measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap)
     if coverage is not None:
-        measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap)
+        measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap, seen)
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
         original, true, edited = (maps[name][rows.slice] for name in ("initial", "target", "edited"))
@@ -360,7 +352,8 @@ def _of_views(views, renders, coverage, lpips, seen, tonemap):
         of_view |= {"render": metrics.compare(after, wanted, *some)}
         of_view |= {"initial": metrics.compare(before, wanted, *some), "painted": None}
         if coverage is not None:
-            of_view["painted"] = metrics.painted(after, wanted, before, coverage[view.rows], tonemap)
+            painted = after, wanted, before, coverage[view.rows], tonemap, some[2]
+            of_view["painted"] = metrics.painted(*painted)
         found.append(of_view)
     return found
 

@@ -138,7 +138,7 @@ class Preparation:
             return self._prepared(wanted, 0.0, [])
         said = f"sky turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
-        if self._explained(turn, noise):
+        if self._explained(turn, noise, wanted.weight):
             said += "; the rest is noise, nothing else changed"
             return idle._prepared(wanted, turn.degrees, [said], search=False, ask=False)
         turned = self._prepared(wanted, turn.degrees, [said], search=False)
@@ -189,14 +189,15 @@ class Preparation:
         with self.clock("start_s"):
             return turning.residual(self.renderer.transport, self.original, wanted.picture, wanted.weight)
 
-    def _explained(self, turn, noise):
+    def _explained(self, turn, noise, weight):
         """Whether the turn alone gives the target, to the noise."""
         if not DOUBTFUL * noise > turn.error > TO_NOISE * noise:
             return turn.error <= TO_NOISE * noise
         with self.clock("start_s"):
             turned = latlong.rotate(self.original, turn.degrees)
             shown = self.lit.render(turned, CHECKED_SPP, Seeds.of(self.settings.seed).turn_check)
-            return turn.error <= TO_NOISE * turning.residual(self.renderer.transport, turned, shown)
+            asked = self.renderer.transport, turned, shown, weight
+            return turn.error <= TO_NOISE * turning.residual(*asked)
 
     def _prepared(self, wanted, degrees, notes, search=True, ask=True):
         """Prepare the edit of the turned map; ``ask``: how fine its gain may be."""
@@ -276,10 +277,10 @@ class Preparation:
 
     def _horizon(self):
         """Return what the rows below the horizon do."""
-        chosen = self.settings.input.horizon
-        if self.settings.representation.kind != "layers" or self.settings.input.rows != "all":
+        given = self.settings.input
+        if self.settings.representation.kind != "layers":
             return "free"
-        return below_horizon.kind_of(self.original) if chosen == "auto" else chosen
+        return below_horizon.treatment(given.horizon, given.rows, self.original)
 
     def _count(self, done, total):
         self.watch.progress(done, total, "")

@@ -61,7 +61,7 @@ class Result:
         The scene's file.
     reach : feasibility.Reach, optional
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
-    posterior : gauss_newton.Posterior, optional
+    posterior : map_problem.Posterior, optional
         How well the target determines the sky; None where that is not known.
     given : inputs.InputMap, optional
         The map that was edited.
@@ -194,7 +194,7 @@ class Result:
         settings = replace(self._settings, output=replace(self._settings.output, dir=str(folder)))
         own = replace(self, metrics=copy.deepcopy(self.metrics), warnings=[*self.warnings])
         with output_folder.alone(folder):
-            named = settings.input.envmap, settings.scene.file, *settings.target.files, *settings.target.masks
-            output_folder.prepare_folder(folder, output_folder.names(folder), filter(None, named))
+            named = output_folder.names(folder), output_folder.inputs_of(settings)
+            output_folder.prepare_folder(folder, *named)
             settings = run_folder.write_given(settings, folder, self.memory, own.warnings)
             return run_folder.write(settings, folder, own, 0.0, self.base)

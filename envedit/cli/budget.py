@@ -14,7 +14,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from envedit import config, inputs, pipeline
+from envedit import config, inputs
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError
@@ -222,7 +222,7 @@ def expect(level: Level, found: Calibration, work: Work) -> float:
     """Expect the seconds of a run after the calibration."""
     pixels = level.film**2 * work.aspect
     each = found.quiet_spp if isinstance(level.spp, str) else level.spp
-    samples = 2 * each + min(pipeline.INITIAL_SPP, each)
+    samples = 3 * each  # of target, initial rendering and result
     traced = level.traced_s * work.aspect * found.render / REFERENCE_RENDER * (PAINTED if work.painted else 1)
     numbers = (level.numbers_s + FULL * work.texels) * found.machine
     return found.render * pixels * samples + traced + numbers + found.compile_s

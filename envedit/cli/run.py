@@ -146,11 +146,9 @@ def _edit(settings, arguments, folder, allowed, start):
     from envedit.cli import doctor
     from envedit.report import output_folder
 
-    target = settings.target
-    named = (settings.input.envmap, settings.scene.file, *target.files, *target.masks)
-    inputs = [path for path in named if path]
     spare = [] if arguments.config is None else [arguments.config]
-    output_folder.prepare_folder(folder, output_folder.names(folder), inputs, arguments.resume, spare)
+    asked = output_folder.names(folder), output_folder.inputs_of(settings), arguments.resume, spare
+    output_folder.prepare_folder(folder, *asked)
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
         _check_same(settings, folder)
         _say(arguments, f"{folder}: this run is complete, there is nothing to resume")
@@ -186,6 +184,8 @@ def _edit(settings, arguments, folder, allowed, start):
                 watch=pipeline.Watch(progress.stage, progress.update),
             )
         except pipeline.Interrupted as stop:
+            if not (folder / "checkpoint.npz").exists():  # nothing was found yet
+                return _interrupted(arguments, folder, again)
             images.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
             _tell(arguments, "error", f"{stop}; checkpoint and edited.exr so far are in {folder}{again}")
             return 130

@@ -153,7 +153,7 @@ class _LayersAt:
         self.free = layers.free
         if self.edge is not None and self.free is not None:
             self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
-        own = layers.lights.count - lights.SPARE
+        own = layers.lights.own
         self.relit = layers.lights.glowing and bool(turn.any() or flux[:own].any())
         if self.relit:
             none = np.zeros_like(further)
@@ -185,7 +185,7 @@ class _LayersAt:
         for i, parts in found.items():
             if any(part[2].any() for part in parts):
                 self.moved.place_texels(i, *(np.concatenate(p) for p in zip(*parts, strict=True)))
-        own = self.layers.lights.count - lights.SPARE
+        own = self.layers.lights.own
         for spare in range(own, self.layers.lights.count):
             if self._lit[spare]:
                 self.moved.place_lobe(spare)
@@ -196,8 +196,8 @@ class _LayersAt:
         size = len(source)
         image = as_colours(source)
         row, column = self.grid.texels(size)
-        gain = flat(mi.Float, self.grid.along_rows(self.gain, start, size, self.edge))
-        log = self.grid.across(mi.Color3f, gain, row, column)
+        gain = flat(mi.Float, self.grid.smooth_rows(self.gain, start, size, self.edge))
+        log = self.grid.smooth_across(mi.Color3f, gain, row, column)
         if self.free is not None:
             inner = flat(mi.Float, self.grid.inner(self.free, start, size))
             log *= self.grid.across(mi.Float, inner, row, column, corners=True)
@@ -210,9 +210,9 @@ class _LayersAt:
         colours = base
         if self.relit:
             offset, slope, by_lights = (
-                self.grid.across(mi.Color3f, flat(mi.Float, field), row, column)
+                self.grid.smooth_across(mi.Color3f, flat(mi.Float, field), row, column)
                 for field in (
-                    self.grid.along_rows(f, start, size, self.edge) for f in (*self.behind, self.by_lights)
+                    self.grid.smooth_rows(f, start, size, self.edge) for f in (*self.behind, self.by_lights)
                 )
             )
             before, follow = self.cores.glow(d), self.cores.follow(start, row)
@@ -227,7 +227,7 @@ class _LayersAt:
         sky = brightened(colours, factor)
         if core is not None:
             # The last is 1, for texels of no light.
-            which = dr.select(light < 0, dr.opaque(mi.Int32, self.layers.lights.count - lights.SPARE), light)
+            which = dr.select(light < 0, dr.opaque(mi.Int32, self.layers.lights.own), light)
             strength = dr.gather(mi.Color3f, self.strength, mi.UInt32(which))
             sky += core * strength
             same &= (strength == 1) | (core == 0)

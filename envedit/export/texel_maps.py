@@ -1,7 +1,9 @@
 """Where the texels of a large map lie among those of a coarser one, and the bands in which it is worked on.
 
 A band is some rows of the large map. What is known at the coarser map's texels is interpolated along the rows
-on the host, where it is small, and across the columns on the device.
+on the host, where it is small, and across the columns on the device. What is smooth is interpolated by cubic
+convolution (Keys 1981, a = -1/2): linearly, the log factor of a reflection that is taken away, 25 at its
+centre and five texels wide, errs by 5 %, and texels of the coarser map show as bars.
 """
 
 from __future__ import annotations
@@ -54,8 +56,8 @@ class Places:
         self.column = np.minimum(across.astype(np.int64), self.columns - 1)
         self.place = place
         left = np.floor(across - 0.5)
-        tables = left % self.columns, (left + 1) % self.columns, self.column, self.column + 1, self.column
-        index = np.stack(tables, axis=1).astype(np.uint32)
+        around = [(left + step) % self.columns for step in (0, 1, -1, 2)]
+        index = np.stack([*around, self.column, self.column + 1], axis=1).astype(np.uint32)
         part = np.stack([across - 0.5 - left, across - self.column], axis=1).astype(np.float32)
         self._index = [dr.opaque(mi.UInt32(np.ascontiguousarray(i))) for i in index.T]
         self._part = [dr.opaque(mi.Float(np.ascontiguousarray(p))) for p in part.T]
@@ -67,16 +69,25 @@ class Places:
         for fresh in range(self.start, self.stop, max(size, 1)):
             yield min(fresh, self.stop - size), fresh, size
 
-    def along_rows(self, values: np.ndarray, start: int, size: int, edge: int | None = None) -> np.ndarray:
-        """Interpolate values (rows, w, C) at rows of the source; float32 (size, w, C).
+    def along_rows(self, values: np.ndarray, start: int, size: int) -> np.ndarray:
+        """Interpolate values (rows, w, C) linearly at rows of the source; float32 (size, w, C)."""
+        return _between(values, np.clip(self.place[start : start + size], 0, self.count - 1))
+
+    def smooth_rows(self, values: np.ndarray, start: int, size: int, edge: int | None = None) -> np.ndarray:
+        """Interpolate values (rows, w, C) by cubic convolution at rows of the source; float32 (size, w, C).
 
         Nothing is interpolated across the edge before row ``edge`` of the values.
         """
-        place = np.clip(self.place[start : start + size], 0, self.count - 1)
+        place = self.place[start : start + size]
+        first, last = np.zeros(size, np.int64), np.full(size, self.count - 1)
         if edge is not None:
             above = place < edge - 0.5
-            place = np.where(above, np.minimum(place, edge - 1), np.clip(place, edge, self.count - 1))
-        return _between(values, place)
+            first, last = np.where(above, 0, edge), np.where(above, edge - 1, last)
+        place = np.clip(place, first, last)
+        top = np.floor(place).astype(np.int64)
+        a, b, before, after = (values[np.clip(top + step, first, last)] for step in (0, 1, -1, 2))
+        part = (place - top)[:, None, None]
+        return _keys(a, b, before, after, part).astype(np.float32)
 
     def inner(self, mask: np.ndarray, start: int, size: int) -> np.ndarray:
         """Interpolate a mask (rows, w) by its corners, 0 wherever a texel is not in it; (size, w + 1)."""
@@ -91,12 +102,21 @@ class Places:
         self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32, corners: bool = False
     ) -> DrArray:
         """Interpolate a table of :meth:`along_rows`, or of :meth:`inner`, at texels of a band."""
-        left, right = self._index[2:4] if corners else self._index[:2]
+        left, right = self._index[4:6] if corners else self._index[:2]
         part = dr.gather(mi.Float, self._part[1 if corners else 0], column)
         first = row * dr.opaque(mi.UInt32, self.columns + (1 if corners else 0))
         a = dr.gather(kind, table, first + dr.gather(mi.UInt32, left, column))
         b = dr.gather(kind, table, first + dr.gather(mi.UInt32, right, column))
         return a + (b - a) * part
+
+    def smooth_across(
+        self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32
+    ) -> DrArray:
+        """Interpolate a table of :meth:`smooth_rows` by cubic convolution at texels of a band."""
+        first = row * dr.opaque(mi.UInt32, self.columns)
+        around = [dr.gather(mi.UInt32, index, column) for index in self._index[:4]]
+        a, b, before, after = (dr.gather(kind, table, first + one) for one in around)
+        return _keys(a, b, before, after, dr.gather(mi.Float, self._part[0], column))
 
     def nearest(self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32) -> DrArray:
         """Look up a table (size, w) at texels of a band."""
@@ -112,6 +132,16 @@ class Places:
         index = dr.arange(mi.UInt32, size * self.shape[1])
         row = index // dr.opaque(mi.UInt32, self.shape[1])
         return row, index - row * dr.opaque(mi.UInt32, self.shape[1])
+
+
+def _keys(a, b, before, after, part):
+    """Cubic convolution (Keys 1981, a = -1/2) between a and b, from the four values around.
+
+    By differences from a, so that what is constant keeps its bits.
+    """
+    square, cube = part * part, part * part * part
+    near, far = (4 * square - 3 * cube + part) / 2, (cube - square) / 2
+    return a + (b - a) * near + (before - a) * (square - (cube + part) / 2) + (after - a) * far
 
 
 def _between(values, place):

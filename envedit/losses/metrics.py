@@ -212,7 +212,12 @@ def log_rmse(a: np.ndarray, b: np.ndarray) -> float | None:
 
 
 def painted(
-    edited: np.ndarray, wanted: np.ndarray, initial: np.ndarray, coverage: np.ndarray, tonemap: str = "gamma"
+    edited: np.ndarray,
+    wanted: np.ndarray,
+    initial: np.ndarray,
+    coverage: np.ndarray,
+    tonemap: str = "gamma",
+    seen: np.ndarray | None = None,
 ) -> dict:
     """Measure how far a painted picture was followed, and how still the rest was held.
 
@@ -226,6 +231,8 @@ def painted(
         How much each pixel was painted.
     tonemap : str
         Of the display values.
+    seen : ndarray of bool (h, w), optional
+        Pixels that count; all by default.
 
     Returns
     -------
@@ -241,11 +248,13 @@ def painted(
     edited, wanted = _pair(edited, wanted)
     _, initial = _pair(edited, initial)
     d, t, before = (apply_tonemap(image, tonemap) for image in (edited, wanted, initial))
-    cover = np.broadcast_to(coverage, d.shape).astype(np.float64)
-    asked, rest = float((cover * np.abs(before - t)).sum()), float((1 - cover).sum())
+    counts = 1.0 if seen is None else np.asarray(seen, np.float64)[..., None]
+    cover = counts * np.broadcast_to(coverage, d.shape).astype(np.float64)
+    left = np.broadcast_to(counts - cover, d.shape)
+    asked, rest = float((cover * np.abs(before - t)).sum()), float(left.sum())
     return {
         "towards": 1 - float((cover * np.abs(d - t)).sum()) / asked if asked > 0 else None,
-        "elsewhere": float(((1 - cover) * np.abs(d - before)).sum()) / rest if rest > 0 else None,
+        "elsewhere": float((left * np.abs(d - before)).sum()) / rest if rest > 0 else None,
     }
 
 

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from envedit import config
 from envedit.core.types import FilePath, Views
 
 try:
@@ -26,7 +27,8 @@ RESULTS = (
     "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "given_envmap.exr",
     "given_target_map.exr", "given_target.exr", "given_mask.exr", "checkpoint.npz",
 )  # fmt: skip
-"""Every file that a run may leave in its folder, the last only while it runs.
+"""The files that a run may leave in its folder, beside those of single views (:func:`names`); the last only
+while it runs.
 
 The first says that a run is complete: whoever moves them away moves it first of all.
 """
@@ -50,6 +52,13 @@ def names(folder: Path) -> tuple[str, ...]:
     """Return :data:`RESULTS`, with the numbered renderings that are in a folder before the last."""
     found = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
     return (*RESULTS[:-1], *found, RESULTS[-1])
+
+
+def inputs_of(settings: config.Config) -> list[str]:
+    """List the files that a configuration reads, which no result may replace."""
+    target = settings.target
+    named = (settings.input.envmap, settings.scene.file, *target.files, *target.masks)
+    return [file for file in named if file]
 
 
 def tidy(folder: Path) -> None:

@@ -16,7 +16,6 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.rotations import rotation_vector
-from envedit.representations.layers.lights import SPARE
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
 
@@ -42,7 +41,7 @@ def best(
         None in place of both where no light lowers F, or none is spare.
     """
     layers, transport = problem.layers, problem.transport
-    spare = range(layers.lights.count - SPARE, layers.lights.count)
+    spare = range(layers.lights.own, layers.lights.count)
     dark = [i for i in spare if i not in problem.added(point.state)] if light is None else [light]
     if not dark:
         return None

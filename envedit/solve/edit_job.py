@@ -44,7 +44,7 @@ quickstart, four representations at rates of 0.1 to 1e38: it ends at 0.02 to 1.7
 
 
 class Interrupted(Exception):
-    """Ctrl-C during the edit, after the checkpoint was written; ``envmap`` is the map so far."""
+    """Ctrl-C during the edit; ``envmap`` is the map so far, that of the checkpoint where there is one."""
 
     def __init__(self, envmap: np.ndarray, step: int):
         super().__init__(f"interrupted at iteration {step}")
@@ -280,25 +280,25 @@ class Job:
         elif run is not None:
             self._problem().evaluate(run.state)  # another trial may have taken the columns of its lights
         saved, most = time.perf_counter(), min(chosen.iterations, gauss_newton.ITERATIONS)
+        done, reached = 0, self.original
 
         with ctrl_c() as interrupt:
 
             def after_step(run, point):
-                nonlocal saved
-                if run is None:
-                    self.watch.progress(0, most, "trying lights")
+                nonlocal saved, done, reached
+                if run is None:  # of a state that may be rejected
+                    self.watch.progress(done, max(most, done), "trying lights")
                     if interrupt.is_set():
-                        raise Interrupted(point.edited, 0)
+                        raise Interrupted(reached.copy(), done)
                     return
-                done = len(run.history)
+                done, reached = len(run.history), point.edited
                 if done:
                     self.watch.progress(done, max(most, done), f"loss {run.history[-1]['loss']:.4g}")
                 due = time.perf_counter() - saved >= chosen.checkpoint_s
                 due |= run.finished or done >= most  # what follows may be interrupted too
                 if self.folder and (due or interrupt.is_set()):
-                    state = adam_loop.State(step=done, history=run.history)
-                    asked = self.folder, what, state, run.arrays(), self.renderer.state(), self.wanted.aim
-                    checkpoint.save(*asked)
+                    kept = what, adam_loop.State(step=done, history=run.history), run.arrays()
+                    checkpoint.save(self.folder, *kept, self.renderer.state(), self.wanted.aim)
                     saved = time.perf_counter()
                 if interrupt.is_set():
                     raise Interrupted(point.edited, done)

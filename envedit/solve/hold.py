@@ -1,7 +1,8 @@
 """How strongly pixels without paint are held, where ``target.hold`` is "auto".
 
-Paint and the rest have the same weight at first, and the rest gains weight until it is not visibly changed:
-a rough surface shows a small highlight only under a sky so bright that the whole picture pales.
+Paint and the rest, of the pixels that count, have the same weight at first. The rest gains weight until it is
+not visibly changed: a rough surface shows a small highlight only under a sky so bright that the whole picture
+pales.
 """
 
 from __future__ import annotations

@@ -212,11 +212,25 @@ def _searched(layers, params, transport, wanted, original, only_own=False):
         # Of several lights one may have changed, and the search have moved others to make up for it.
         still = (params, ["all lights initialised at their places in the map"])
         return [still, searched] if several else [searched]
-    problem = replace(problem, initial=wanted.initial)
-    daring = (False, True) if (wanted.coverage < 1).any() else (False,)
+    return painted_starts(replace(problem, initial=wanted.initial), params, wanted.coverage)
+
+
+def painted_starts(
+    problem: light_search.SearchProblem, params: dict, coverage: np.ndarray
+) -> list[tuple[dict, list[str]]]:
+    """List where the edit of a painted picture may start, (parameters, notes), no two alike.
+
+    Parameters
+    ----------
+    problem, params
+        As for :func:`.painted_change.start`.
+    coverage : ndarray (h, w, 1)
+        How much each pixel was painted.
+    """
+    daring = (False, True) if (coverage < 1).any() else (False,)
     found = [painted_change.start(problem, params, bold) for bold in daring]
-    if layers.separation.lights:
-        found.append(painted_change.softened(layers, params))
+    if problem.layers.separation.lights:
+        found.append(painted_change.softened(problem.layers, params))
     return [one for i, one in enumerate(found) if not any(_same(one, other) for other in found[:i])]
 
 

@@ -29,7 +29,6 @@ from envedit.core.arrays import tensor
 from envedit.core.rotations import rotated, rotation_between, rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import SPARE
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.derivatives import Derivatives
 from envedit.solve.normal_equations import Blocks, Normal, solved
@@ -85,7 +84,7 @@ class Problem(Unknowns):
     picture : ndarray (h, w, 3)
         The target, linear radiance.
     weight : ndarray (h, w, 1), optional
-        How much each pixel counts, 1 on average.
+        How much each pixel counts beside the others.
     free : ndarray of bool (rows, W), optional
         Active texels whose gain is free, as given to :meth:`.Layers.keep`; None: all.
     prior : Prior
@@ -115,7 +114,7 @@ class Problem(Unknowns):
         self.prior = prior or Prior()
         self.target = display_curve.to_display(tensor(picture)).numpy()
         shape = picture.shape[:2]
-        self.weight = np.ones((*shape, 1), np.float32) if weight is None else np.float32(weight)
+        self.weight = _on_average_one(weight, shape)
         self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
         self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks, free)
@@ -124,7 +123,7 @@ class Problem(Unknowns):
     def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:
         """Take another target, with its weights; returns a point with its residual from that target."""
         self.target = display_curve.to_display(tensor(picture)).numpy()
-        self.weight = np.ones((*picture.shape[:2], 1), np.float32) if weight is None else np.float32(weight)
+        self.weight = _on_average_one(weight, picture.shape[:2])
         shown = display_curve.to_display(tensor(point.rendering)).numpy()
         return replace(point, residual=np.float64(shown) - self.target)
 
@@ -185,7 +184,7 @@ class Problem(Unknowns):
 
     def _flux_change(self, state, start, i):
         """Log flux of a light over that of the map; of a light that was added, over that of the start."""
-        own = self.layers.lights.count - SPARE
+        own = self.layers.lights.own
         return state["flux"][i] - (0.0 if i < own else start["flux"][i])
 
     def _angle(self, state, start, i):
@@ -287,7 +286,7 @@ class Problem(Unknowns):
         """Return the standard deviation of a light's direction or size, or of the saturation."""
         if name in ("turn", "saturation"):
             return getattr(self.prior, name)
-        return self.prior.size if i < self.layers.lights.count - SPARE else self.prior.added_size
+        return self.prior.size if i < self.layers.lights.own else self.prior.added_size
 
     def _from_prior(self, state, start, unknowns):
         """How far the unknowns are from where the prior draws them."""
@@ -323,7 +322,7 @@ class Problem(Unknowns):
                 turns[i] = turns.get(i, 0.0) + value * axis
             else:
                 found[name][i, axis] += np.clip(value, -LARGEST[name], LARGEST[name])
-        own = self.layers.lights.count - SPARE
+        own = self.layers.lights.own
         found["saturation"] = np.clip(found["saturation"], *SATURATIONS)
         found["size"][:own] = np.clip(found["size"][:own], *SIZES)
         found["size"][own:] = np.clip(found["size"][own:], *LOBE_SIZES)
@@ -361,6 +360,14 @@ class Problem(Unknowns):
         whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
         whole[:, self.rows] = spread
         return Posterior(*whole)
+
+
+def _on_average_one(weight, shape):
+    """Return weights (h, w, 1) whose mean is 1: where few pixels count, they are the whole picture."""
+    if weight is None:
+        return np.ones((*shape, 1), np.float32)
+    mean = float(np.mean(weight, dtype=np.float64))
+    return np.float32(weight) if abs(mean - 1) < 1e-6 else np.float32(weight / max(mean, 1e-30))
 
 
 def _sizes(residual):

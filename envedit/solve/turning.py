@@ -120,7 +120,7 @@ def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None 
     off = np.float64(display_curve.to_display(tensor(rendering)).numpy())
     off -= display_curve.to_display(tensor(picture)).numpy()
     size = np.sqrt(np.square(off).mean(axis=2, keepdims=True))
-    mean = (size * (1 if weight is None else weight)).mean()
+    mean = size.mean() if weight is None else (size * weight).mean() / max(float(weight.mean()), 1e-30)
     return float(mean) if np.isfinite(mean) else np.inf
 
 

@@ -15,7 +15,7 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotated, rotation_vector
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK, SPARE
+from envedit.representations.layers.lights import DARK
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Unknowns:
         The gain becomes zero, own lights get their colour back and at most a factor of e of their flux.
         """
         state["gain"][:], state["saturation"][:] = 0, 0
-        own = [i for i in self.lit(state) if i < self.layers.lights.count - SPARE]
+        own = [i for i in self.lit(state) if i < self.layers.lights.own]
         state["flux"][own] = np.clip(state["flux"][own].mean(axis=1, keepdims=True), -1, 1)
 
     def beyond(self, state: dict) -> dict | None:
@@ -108,7 +108,7 @@ class Unknowns:
 
         A hazy light that is to be a sun stays what it is, with the sun beside it. None where no light does.
         """
-        own = self.layers.lights.count - SPARE
+        own = self.layers.lights.own
         mean = {i: state["flux"][i].mean() for i in self.lit(state) if i < own}
         i = max(mean, key=mean.get, default=None)
         if i is None or mean[i] <= 1:
@@ -125,7 +125,7 @@ class Unknowns:
 
     def added(self, state: dict) -> list[int]:
         """List the spare lights that are lit."""
-        return [i for i in self.lit(state) if i >= self.layers.lights.count - SPARE]
+        return [i for i in self.lit(state) if i >= self.layers.lights.own]
 
     def lit(self, state: dict) -> list[int]:
         """List the lights that there are."""

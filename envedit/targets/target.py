@@ -136,12 +136,17 @@ def make(
         # Squares and sums of what is more would leave single precision; on a display it is as white.
         picture = np.minimum(picture, np.float32(BRIGHTEST))
         warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
-    untold = found.excluded & (found.coverage[..., 0] > 0)  # what was not painted has the initial value
+    coverage = found.coverage if hidden is None else np.where(hidden[..., None], 0, found.coverage)
+    if found.coverage.any() and not coverage.any():
+        raise InputError(
+            "target: all paint lies where no surface is seen (hide_emitters): paint on a surface"
+        )
+    untold = found.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
     hold = first_hold(chosen)
-    weight = pixel_weight(found.coverage, untold, chosen.paint, hold)
-    share = 100 * float((found.coverage > 0).mean())
+    weight = pixel_weight(coverage, untold if hidden is None else untold | hidden, chosen.paint, hold)
+    share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
-    return _seen(Target(picture, weight, None, source, warnings, initial, found.coverage, asked), hidden)
+    return _seen(Target(picture, weight, None, source, warnings, initial, coverage, asked), hidden)
 
 
 def _painted_files(scene, initial, chosen):

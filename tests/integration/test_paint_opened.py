@@ -73,10 +73,17 @@ def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, m
         assert asked(f"{server.url}map/a.hdr", **{**put, "headers": {}})[0] == 403
         code, path = asked(f"{server.url}map/a.hdr", **put)
         assert code == 200 and path == "maps/a.hdr" and Path(path).read_bytes() == b"#?RADIANCE"
+        again = (
+            asked(f"{server.url}map/a.hdr", **put),
+            asked(f"{server.url}map/a.hdr", **put | {"data": b"other"}),
+        )
+        assert again == ((200, "maps/a.hdr"), (200, "maps/a-2.hdr"))  # another map replaces none
         assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.*")) == [
             "edit.toml",
+            "maps/a-2.hdr",
             "maps/a.hdr",
         ]
+        assert Path(path).read_bytes() == b"#?RADIANCE"
         page.send(json.dumps({"type": "save"}))
         assert "no scene is open" in heard(page, "error")["text"]
         page.send(json.dumps({"type": "open", "name": "nowhere.toml"}))

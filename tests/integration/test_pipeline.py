@@ -575,6 +575,17 @@ def as_tables(settings):
     return {name: dataclasses.asdict(getattr(settings, name)) for name in tables}
 
 
+def test_what_is_only_tried_is_not_the_map_so_far(tmp_path, rng):
+    """Ctrl-C while lights are tried, before the first step: the map is as it was, and nothing is stored."""
+    settings = settings_of(tmp_path, sunny(rng))
+    (tmp_path / "run").mkdir()
+    with pytest.raises(pipeline.Interrupted, match="iteration 0") as stop:
+        pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
+    assert stop.value.step == 0 and not list((tmp_path / "run").iterdir())
+    original = images.load_envmap(settings.input.envmap, stop.value.envmap.shape[1])[0]
+    assert stop.value.envmap.tobytes() == original.tobytes()
+
+
 def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng, monkeypatch):
     monkeypatch.setattr(edit_job, "SPARE", 0)  # nothing is saved while lights are tried
     folder = tmp_path / "run"

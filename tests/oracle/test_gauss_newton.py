@@ -1022,3 +1022,22 @@ def test_saturation_comes_back_from_a_checkpoint_of_its_state(rng):
     np.testing.assert_allclose(again["saturation"], -0.7, rtol=1e-6)
     run = Run.of_arrays(Run(state, state).arrays(), [])
     assert run.state["saturation"].tolist() == state["saturation"].tolist()
+
+
+# ---- pixels that do not count -----------------------------------------------------------------------------
+
+
+def test_pixels_that_count_are_the_whole_picture(rng):
+    """Where a mask takes nine tenths of the picture away, the noise is that of the rest."""
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    mask = np.zeros((*FILM, 1), np.float32)
+    mask[: max(1, FILM[0] // 10)] = 0.5
+    residual = 0.03 * rng.normal(size=(*FILM, 3))
+    problem, params = problem_of(image, transport, shown(transport, image), weight=mask)
+    of_all, _ = problem_of(image, transport, shown(transport, image))
+    inside = np.where(mask > 0, residual, 0)
+    assert problem.weight.mean() == pytest.approx(1)
+    assert of_all.noise(residual, 0.001) == pytest.approx(problem.noise(inside, 0.001), rel=0.3)
+    point = problem.evaluate(problem.state(params))
+    aimed = problem.aimed_at(shown(transport, image), 7 * mask, point)
+    assert problem.weight.mean() == pytest.approx(1) and aimed.residual.shape == residual.shape

@@ -191,3 +191,16 @@ def test_painted_without_a_question_is_unknown():
         "towards": None,
         "elsewhere": None,
     }
+
+
+def test_of_paint_only_pixels_that_count_are_measured(rng):
+    edited, wanted, initial = (rng.random((4, 6, 3)) for _ in range(3))
+    coverage, seen = rng.random((4, 6, 1)), np.ones((4, 6), bool)
+    whole = metrics.painted(edited, wanted, initial, coverage)
+    assert metrics.painted(edited, wanted, initial, coverage, seen=seen) == whole
+    seen[:, 3:] = False
+    left = metrics.painted(*(a[:, :3] for a in (edited, wanted, initial, coverage)))
+    assert metrics.painted(edited, wanted, initial, coverage, seen=seen) == pytest.approx(left)
+    assert metrics.painted(edited, wanted, initial, coverage, seen=~np.ones((4, 6), bool)) == {
+        "towards": None, "elsewhere": None,
+    }  # fmt: skip

@@ -119,3 +119,20 @@ def test_a_stroke_is_solved_for_while_it_is_drawn_however_fast_the_pointer_moves
     painting.join(30)
     painting.stop()
     assert not painting.is_alive() and done[:20] == ["edit", "step"] * 10, done[:20]
+
+
+def test_what_was_painted_before_is_not_written_into_what_is_opened_next(monkeypatch):
+    """A stroke on the first that waits while the second is opened; what comes while the first opens is kept."""
+    stroke, kept = protocol.Edit(protocol.Document(), "done"), []
+    painting = worker.Worker(Tell())
+
+    def opened(_):
+        painting.post(stroke)  # drawn on what is still shown
+        painting.session = object()
+
+    monkeypatch.setattr(painting, "_open", opened)
+    monkeypatch.setattr(worker.project, "opened", lambda *_: None)
+    for name in ("first", "second"):
+        painting._carry_out(protocol.Open(name))
+        kept.append(painting._waiting.pop(protocol.Edit, None))
+    assert kept == [stroke, None]

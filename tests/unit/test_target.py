@@ -12,6 +12,7 @@ from envedit.images import images
 from envedit.scene import scene
 from envedit.targets import initial_rendering, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
+from tests.oracles.users_scenes import HIDDEN
 
 SIZE = (12, 16)
 
@@ -194,3 +195,23 @@ def test_a_target_without_weight_is_refused():
         target.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
     with pytest.raises(ConfigError, match=r"target\.paint"):
         asking(kind="strokes", strokes=(a_stroke(),), paint=0.0, hold=0.0)
+
+
+# ---- pixels that see no surface ---------------------------------------------------------------------------
+
+
+def test_paint_beside_the_object_does_not_count(tmp_path, rng):
+    """Of a scene that hides what lights it: weights are shared out among pixels that see a surface."""
+    ball = scene.load(write_scene(tmp_path, HIDDEN, SENSOR, BALL, LIGHT))
+    hidden = ball.alpha == 0
+    assert 0.1 < hidden.mean() < 0.9
+    stroke, envmap = {"type": "light", "amount": 2}, sky(rng)
+    upper, corner = ({**stroke, "rectangle": [0, 0, *size]} for size in ((1, 0.5), (0.1, 0.1)))
+    made = target.make(asking(kind="strokes", strokes=(upper,)), ball, envmap)
+    assert not made.coverage[hidden].any() and made.coverage.any() and not made.weight[hidden].any()
+    painted = made.coverage[..., 0] > 0
+    assert made.weight[painted].sum() == pytest.approx(made.weight[~painted].sum(), rel=1e-5)
+    held = made.held(1, 3)
+    assert held.weight[~painted].sum() == pytest.approx(3 * held.weight[painted].sum(), rel=1e-5)
+    with pytest.raises(InputError, match="no surface is seen"):
+        target.make(asking(kind="strokes", strokes=(corner,)), ball, envmap)

@@ -11,7 +11,7 @@ from envedit import config
 from envedit.cli import run
 from envedit.cli.paint.protocol import Document
 from envedit.core import array_cache, atomic_files
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, InputError
 
 NAME = "painted.toml"
 _RECENT = 12
@@ -95,7 +95,10 @@ class Project:
         InputError
             It cannot be written.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
         atomic_files.write_atomically(self.folder / NAME, self.text(document).encode())
 
 
@@ -194,10 +197,10 @@ def note(project: Project) -> None:
     path = str(project.folder / NAME)
     title = f"{Path(project.settings.scene.file).stem}, {Path(project.settings.input.envmap).stem}"
     listed = [{"path": path, "title": title}, *(one for one in recent() if one["path"] != path)]
-    with contextlib.suppress(OSError, AttributeError):
+    with contextlib.suppress(OSError, AttributeError, InputError):
         file = _recent_file()
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(listed[:_RECENT]), encoding="utf-8")
+        atomic_files.write_atomically(file, json.dumps(listed[:_RECENT]).encode())
 
 
 def _recent_file():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import filecmp
 import hmac
 import re
 import secrets
@@ -216,6 +217,7 @@ class Server:
                     if size > LARGEST_MAP:
                         return PlainTextResponse(f"more than {LARGEST_MAP} bytes", 413, _SAFE)
                     file.write(piece)
+            name = _free(part, folder, name)
             part.replace(folder / name)
         except (OSError, ClientDisconnect) as error:
             return PlainTextResponse(f"not written: {error}", 500, _SAFE)
@@ -232,7 +234,7 @@ class Server:
             return
         await socket.accept()
         client, name = Client(), secrets.token_hex(4)
-        for kind, message in self.hub.last.items():
+        for kind, message in list(self.hub.last.items()):  # the worker may say something meanwhile
             client.put(kind, message)
         self.hub.clients.add(client)
         await socket.send_json({"type": "hello", "client": name})
@@ -267,6 +269,15 @@ class Server:
             for other in self.hub.clients - {client}:
                 other.put("document", told)
         self.worker.post(request)
+
+
+def _free(part, folder, name):
+    """Return a name under which a file replaces none of other content: this one, or it with a number."""
+    stem, ending, number = Path(name).stem, Path(name).suffix, 1
+    while (there := folder / name).exists() and not filecmp.cmp(part, there, shallow=False):
+        number += 1
+        name = f"{stem}-{number}{ending}"
+    return name
 
 
 async def _send(client, socket):

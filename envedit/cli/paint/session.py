@@ -36,7 +36,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
-from envedit.solve import feasibility, gauss_newton, hold, map_problem, painted_change
+from envedit.solve import feasibility, gauss_newton, hold, initialization, map_problem
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.solve.light_search import SearchProblem
 from envedit.targets import strokes
@@ -145,7 +145,9 @@ class Session:
         """Take lights and turn of a document for the map that is painted on."""
         self.document, self._dragged = document, False
         self.origin = self._by_hand(document)
-        layers = Layers(self.rows.place, horizon=self._horizon())
+        given = self.project.settings.input
+        horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
+        layers = Layers(self.rows.place, horizon=horizon)
         params = layers.encode(self.origin[self.rows.slice])
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
@@ -158,12 +160,6 @@ class Session:
         self._paint()
         self._tell_lights()
 
-    def _horizon(self):
-        chosen, rows = self.project.settings.input.horizon, self.project.settings.input.rows
-        if rows != "all":
-            return "free"
-        return below_horizon.kind_of(self.origin) if chosen == "auto" else chosen
-
     def _by_hand(self, document):
         return latlong.rotate(self.placed.place(document.lights), document.rotate_degrees)
 
@@ -175,7 +171,7 @@ class Session:
         self._dragged, self.solving = True, False
         origin = self._by_hand(self.document)
         found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
-        self._quick.probe(self._quick.bright_texels(found)[:DRAGGED_COLUMNS])
+        self._quick.probe(self._quick.bright_texels(found)[: min(DRAGGED_COLUMNS, self._quick.capacity)])
         changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
         self._preview = found, np.maximum(self.point.rendering + changed, 0)
 
@@ -184,22 +180,23 @@ class Session:
         chosen, self.reach, self.searched = self.project.settings.target, None, False
         self.hold = first_hold(chosen)
         painted = self._after(list(self.document.strokes), chosen.tonemap)
-        self.solving = bool(painted is not None and painted.coverage.any())
+        coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
+        self.solving = bool(coverage is not None and coverage.any())
         if not self.solving:
             self.start = self.still
             self.run = gauss_newton.Run(self.start, self.start)
             self.point = self.problem.evaluate(self.start, resolve=False)
             self.target, self.weight, self.coverage = self.base, None, None
             return
-        self.target, self.coverage = painted.picture, painted.coverage
+        self.target, self.coverage = painted.picture, coverage
         self._weigh()
 
     def _weigh(self):
         """Aim the solution at the paint, with the present weight of what was not painted."""
-        untold, paint = np.zeros(self.coverage.shape[:2], bool), self.project.settings.target.paint
-        self.weight = self._seen(pixel_weight(self.coverage, untold, paint, self.hold))
+        paint = self.project.settings.target.paint
+        self.weight = pixel_weight(self.coverage, self._hidden, paint, self.hold)
         self.point = self.problem.aimed_at(self.target, self.weight, self.point)
-        self.run = gauss_newton.Run(self.run.state, self.start)
+        self.run, self._rendered = gauss_newton.Run(self.run.state, self.start), None
 
     def _held_more(self):
         """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
@@ -212,9 +209,11 @@ class Session:
         self._weigh()
         return True
 
-    def _seen(self, weight):
-        """Leave out pixels that see no surface, where the scene hides what lights it."""
-        return weight if self.lit.alpha is None else weight * (self.lit.alpha > 0)[..., None]
+    @property
+    def _hidden(self):
+        """Pixels that see no surface, where the scene hides what lights it: they do not count."""
+        shape = self.lit.height, self.lit.width
+        return np.zeros(shape, bool) if self.lit.alpha is None else self.lit.alpha == 0
 
     def _after(self, painted, tonemap):
         """Paint strokes; all but the last as they were painted before, where they are the same."""
@@ -293,9 +292,7 @@ class Session:
         self._tell_doing("looking for other lights")
         layers, params = self.problem.layers, self.problem.params(self.still)
         asked = SearchProblem(layers, self._watched, self.target, self.weight, self.origin, self.base)
-        starts = [painted_change.start(asked, params, bold)[0] for bold in (False, True)]
-        if layers.separation.lights:
-            starts.append(painted_change.softened(layers, params)[0])
+        starts = [start for start, _ in initialization.painted_starts(asked, params, self.coverage)]
         best = gauss_newton.solve(self.problem, params, iterations=0, run=self.run, trial=True, sparing=False)
         least, found = best.loss - LIKELIER, None
         for start in [params, *starts]:
@@ -485,8 +482,8 @@ class Session:
         project.keep(self.document)
         settings, folder = project.configured(self.document), project.folder
         with output_folder.alone(folder):
-            named = (settings.input.envmap, settings.scene.file)
-            output_folder.prepare_folder(folder, output_folder.RESULTS, [path for path in named if path])
+            named = output_folder.names(folder), output_folder.inputs_of(settings)
+            output_folder.prepare_folder(folder, *named)
             watch = pipeline.Watch(
                 lambda text: self.tell.say({"type": "saving", "text": text}),
                 lambda done, total, text: self._progress(done, total, text),
@@ -498,7 +495,7 @@ class Session:
         self.tell.frame("map", "saved", result.maps["edited"])
         self._shown = None
         self.resting = True  # what is shown is what was saved
-        files = [name for name in output_folder.RESULTS if (folder / name).exists()]
+        files = [name for name in output_folder.names(folder) if (folder / name).exists()]
         self.tell.say({"type": "saved", "folder": folder.name, "files": files, "warnings": warnings})
         return warnings
 

@@ -81,7 +81,12 @@ class Worker(threading.Thread):
 
     def _carry_out(self, request):
         if isinstance(request, Open):
+            before = self.session
             self._open(project.opened(request.name, request.envmap))
+            if before is not None:
+                with self._lock:  # what came meanwhile is about what was open before
+                    for kind in (Edit, Pick, Save):
+                        self._waiting.pop(kind, None)
         elif self.session is None:
             if not isinstance(request, Again):
                 self.tell.say({"type": "error", "text": "no scene is open: open one first"})

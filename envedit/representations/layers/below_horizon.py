@@ -18,7 +18,7 @@ of the edit, 1 where the picture does not determine it: light from the side, or 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +29,8 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.ground_light import GroundLight
+
+Horizon = Literal["mirror", "keep", "free"]
 
 KINDS = "mirror", "keep"
 SMOOTH, BOX = 0.0125, 7.0
@@ -54,6 +56,13 @@ COLUMNS, COARSE = 96, 48
 def sky_rows(total: int) -> int:
     """Return how many rows of a map look up, the horizon's own included."""
     return (total + 1) // 2
+
+
+def treatment(horizon: str, rows: str | tuple[int, int], envmap: np.ndarray) -> Any:
+    """Return what the rows below the horizon of a map do (:data:`Horizon`), from keys of ``[input]``."""
+    if rows != "all":
+        return "free"
+    return kind_of(envmap) if horizon == "auto" else horizon
 
 
 def kind_of(envmap: np.ndarray) -> str:

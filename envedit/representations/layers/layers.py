@@ -13,8 +13,6 @@ original back, bit for bit outside the cores: the sky's own detail is kept, and 
 
 from __future__ import annotations
 
-from typing import Literal
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -24,14 +22,13 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.representations.layers import behind_glow
-from envedit.representations.layers.below_horizon import Below, sky_rows
+from envedit.representations.layers.below_horizon import Below, Horizon, sky_rows
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
 from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.lights import DARK, SPARE, Lights
 from envedit.representations.layers.saturation import by_saturation, saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
-Horizon = Literal["mirror", "keep", "free"]
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5, "saturation": 1.0}
 """What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
 

@@ -63,8 +63,8 @@ class Lights:
 
     Attributes
     ----------
-    count : int
-        Lights, spare ones included.
+    count, own : int
+        Lights, spare ones included; those of the map.
     centres : ndarray (count, 3)
         Directions of unmoved lights; spare ones are at the zenith.
     flux : ndarray (count, 3)
@@ -74,7 +74,7 @@ class Lights:
 
     def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
         first, total = rows
-        self.count, self.width, self.total = len(lights) + SPARE, width, total
+        self.own, self.count, self.width, self.total = len(lights), len(lights) + SPARE, width, total
         self._rows = rows
         omega = latlong.lookup_solid_angles(total, width)
         directions, fluxes, which, sines = [], [], [], []

@@ -64,8 +64,10 @@ def crop(envmap: np.ndarray, row: int, column: int, around: int) -> np.ndarray:
     return envmap[rows][:, np.arange(column - around, column + around) % WIDTH]
 
 
-def _shown(linear, white):
-    return np.uint8(255 * np.clip(linear / white, 0, 1) ** (1 / 2.2))
+def _shown(*both):
+    """Show crops beside each other, with one exposure and a curve that nothing is too bright for."""
+    middle = np.median(both)
+    return np.concatenate([np.uint8(255 * (one / (one + middle)) ** (1 / 2.2)) for one in both], axis=1)
 
 
 def main(argv=None):
@@ -104,9 +106,8 @@ def main(argv=None):
     change = np.log2((edited[rows] + 1e-4) / (source[rows] + 1e-4)).mean(axis=2)
     middle, most = np.percentile(np.abs(change[1] - change[0]), [50, 99.9])
     print(f"step of the change across the horizon: median {middle:.4f}, 99.9 % {most:.4f} stops")
-    white, both = 3 * np.median(source), (source, edited)
     crops = [
-        np.concatenate([_shown(crop(one, *place, AROUND)[::2, ::2], white) for one in both], axis=1)
+        _shown(*(crop(one, *place, AROUND)[::2, ::2] for one in (source, edited)))
         for place in (old, new, (HEIGHT // 2, old[1]), (HEIGHT // 2, new[1]))
     ]
     picture = np.concatenate([np.concatenate(crops[k : k + 2], axis=1) for k in (0, 2)])

@@ -64,6 +64,8 @@ summary { cursor: pointer; }
 @media (max-width: 640px) { .grid { grid-template-columns: 1fr !important; } }
 """.replace("RISING", ", ".join(f"rgb({r},{g},{b})" for r, g, b in RISING))
 
+WIDEST = 1024
+"""Pixels along a picture of the report, at most."""
 MOST_DRAWN = 20
 """Lights that :func:`lights_figure` draws."""
 NUMBERS = {
@@ -167,18 +169,20 @@ def grid(figures: Sequence[str], columns: int | None = None) -> str:
     return f'<div class="grid" style="grid-template-columns:repeat({columns},1fr)">{"".join(figures)}</div>'
 
 
-def shrunk(image: np.ndarray, tonemap: str, exposure: float = 0.0, widest: int = 1024) -> np.ndarray:
-    """Tonemap a picture at its own size, or at 1024 pixels where it is wider."""
-    height, width = image.shape[:2]
-    factor = min(1.0, widest / width)
-    return display(image, max(round(height * factor), 1), max(round(width * factor), 1), tonemap, exposure)
+def shrunk(image: np.ndarray, tonemap: str) -> np.ndarray:
+    """Tonemap a picture at its own size, or at :data:`WIDEST` pixels where it is wider."""
+    height, width = _size(image)
+    return display(image, height, width, tonemap)
+
+
+def _size(image):
+    factor = min(1.0, WIDEST / image.shape[1])
+    return max(round(image.shape[0] * factor), 1), max(round(image.shape[1] * factor), 1)
 
 
 def difference_figure(a: np.ndarray, b: np.ndarray, caption: str, kind: str, tonemap: str) -> str:
     """Show the difference a - b of two pictures; ``kind`` as of :func:`.preview.difference_image`."""
-    factor = min(1.0, 1024 / a.shape[1])
-    size = max(round(a.shape[0] * factor), 1), max(round(a.shape[1] * factor), 1)
-    (a, bad_a), (b, bad_b) = fit_finite(a, *size), fit_finite(b, *size)
+    (a, bad_a), (b, bad_b) = (fit_finite(image, *_size(a)) for image in (a, b))
     a[bad_a | bad_b] = np.nan
     pixels, scale = difference_image(a, b, kind, tonemap)
     unit = " stops" if kind == "stops" else ""

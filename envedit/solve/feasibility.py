@@ -36,10 +36,9 @@ from envedit.core.errors import InputError, place_of
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.solve import light_search, matching_pursuit
+from envedit.transport.block_transport import CELLS, tiles
 from envedit.transport.light_transport import LightTransport
 
-CELLS = 64
-"""Cells around the horizon."""
 SHARP = 4.0
 """Samples behind an entry of T from which on the texels of a cell are distinguished."""
 PROBES = 8
@@ -275,10 +274,8 @@ def _cells(transport, shape):
     sum w^2 / sum w, and sum w^2 is the mean of (T's)^2 over pictures s of random signs (Hutchinson 1990).
     """
     height, width = shape
-    size = _size(width)
-    across = -(-width // size)
-    cell = (np.arange(height) // size)[:, None] * across + np.arange(width) // size
-    flat, rng = cell.ravel(), np.random.default_rng(SIGNS)
+    flat, _ = tiles(height, width, _size(width))
+    cell, rng = flat.reshape(shape), np.random.default_rng(SIGNS)
     square = np.zeros((height, width))
     for _ in range(PROBES):
         signs = rng.choice(np.array([-1, 1], np.float32), size=(*transport.shape, 3))

@@ -69,7 +69,7 @@ def make(matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], vi
         Rows of each view, where the picture is of several: no block is of two.
     """
     block_of, blocks = _blocks(shape, views)
-    cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
+    cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))
     rows, columns, weights = matrix.coordinates()
     key = block_of[rows] * cells + cell_of[columns]
     count = np.bincount(block_of, minlength=blocks)
@@ -88,7 +88,7 @@ def whole(
 ) -> bool:
     """Return whether arrays from disk are an overview of such a picture and map: no index leaves it."""
     block_of, blocks = _blocks(shape, views)
-    cell_of, cells = _tiles(*grid, max(1, -(-grid[1] // CELLS)))
+    cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))
     wanted = {
         "matrix": ("f4", (3, blocks, cells)),
         "block_of": ("i8", block_of.shape),
@@ -105,14 +105,14 @@ def _blocks(shape, views):
     heights = [rows.stop - rows.start for rows in views] or [shape[0]]
     size, parts, count = max(1, -(-max(*heights, shape[1]) // BLOCKS)), [], 0
     for height in heights:
-        block_of, blocks = _tiles(height, shape[1], size)
+        block_of, blocks = tiles(height, shape[1], size)
         parts.append(block_of + count)
         count += blocks
     return np.concatenate(parts), count
 
 
-def _tiles(height, width, size):
-    """Return the number of every pixel's square tile, and the count of tiles."""
+def tiles(height: int, width: int, size: int) -> tuple[np.ndarray, int]:
+    """Return the number of every pixel's square tile, flat, and the count of tiles."""
     across = -(-width // size)
     tile = (np.arange(height) // size)[:, None] * across + np.arange(width) // size
     return tile.ravel(), -(-height // size) * across

@@ -13,6 +13,7 @@ import urllib.request
 import numpy as np
 import pytest
 
+from envedit.cli.paint.protocol import Document
 from tests.oracles.painting import SMALL, asked, connected, heard, served, until
 
 pytestmark = pytest.mark.slow
@@ -111,7 +112,7 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
         assert 0 < reach <= 1
         again.send(json.dumps({"type": "document", "number": 6, "document": {}}))
         heard(again, "status", lambda m: m.get("number") == 6)
-    until(lambda: server.worker.session.document.empty)
+    until(lambda: server.worker.session.document == Document())
 
 
 def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):

@@ -72,7 +72,9 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
         'seed = 4\n[input]\nenvmap = "sunsky"\nwidth = 64\n[scene]\nfile = "pair"\n[target]\nhold = 2\n'
     )
     opened = project.opened(str(file))
-    assert opened.document.empty and opened.folder == tmp_path / "edit_out" and not opened.again
+    assert (
+        opened.document == protocol.Document() and opened.folder == tmp_path / "edit_out" and not opened.again
+    )
     light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3]}
     done = protocol.document(
         {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "white_balance": 5000}

@@ -56,11 +56,6 @@ class Document:
     exposure: float = 0.0
     white_balance: float = 0.0
 
-    @property
-    def empty(self) -> bool:
-        """Whether nothing has been done."""
-        return self == Document()
-
     def plain(self) -> dict:
         """Return it as JSON has it."""
         return {name: getattr(self, name) for name in _CHECKS}

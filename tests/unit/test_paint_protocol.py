@@ -124,7 +124,7 @@ def test_a_stroke_is_solved_for_while_it_is_drawn_however_fast_the_pointer_moves
 
 
 def test_what_was_painted_before_is_not_written_into_what_is_opened_next(monkeypatch):
-    """A stroke on the first that waits while the second is opened; what comes while the first opens is kept."""
+    """A stroke on the first waits while the second is opened; what comes while the first opens is kept."""
     stroke, kept = protocol.Edit(protocol.Document(), "done"), []
     painting = worker.Worker(Tell())
 

@@ -45,7 +45,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--scene", default="statue")
     parser.add_argument("--width", type=int, default=128, help="pixels across")
     parser.add_argument("--angle", type=float, default=60.0, help="turn of the true map to the left, degrees")
-    parser.add_argument("--roughness", type=float, nargs="+", default=ROUGHNESS)
+    parser.add_argument(
+        "--roughness",
+        type=float,
+        nargs="*",
+        default=ROUGHNESS,
+        help="none: that of the scene's own materials",
+    )
     given = parser.parse_args(argv)
     try:
         with unwrapped():
@@ -65,8 +71,9 @@ def table(given: argparse.Namespace) -> Iterator[str]:
     doctor.ensure(variant)
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
-    lit = [scene.load(given.scene, given.width, 0, {"roughness": r}, None) for r in given.roughness]
-    yield "| map | " + " | ".join(f"roughness {r:g}" for r in given.roughness) + " |"
+    kinds = {f"roughness {r:g}": {"roughness": r} for r in given.roughness} or {"own materials": {}}
+    lit = [scene.load(given.scene, given.width, 0, parameters, None) for parameters in kinds.values()]
+    yield f"| map | {' | '.join(kinds)} |"
     yield "|---" * (1 + len(lit)) + "|"
     scores = []
     for name, file in files.items():

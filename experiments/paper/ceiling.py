@@ -79,7 +79,7 @@ def table(given: argparse.Namespace) -> Iterator[str]:
     for name, file in files.items():
         original, _ = inputs.load_map(config.Input(envmap=str(file)))
         true = np.ascontiguousarray(latlong.rotate(original, given.angle), np.float32)
-        row = [twice(one, true) for one in lit]
+        row = [twice(one, inputs.scaled(true, one.own.scale, str(file))) for one in lit]
         scores.append([(score["psnr"], score["ssim"]) for score in row])
         yield _line(name, scores[-1])
     yield _line(f"**mean of {len(scores)}**", np.mean(scores, axis=0))

@@ -212,7 +212,7 @@ TARGETS = {
         _unchecked(np.nan),
         refused(NumericalError, "not finite", "No step is taken: the map stays as it was."),
     ),
-    "equal to the initial rendering": (
+    "painted, and equal to the initial rendering": (
         _equal,
         refused(InputError, "target: nothing of the picture is painted"),
     ),

@@ -347,13 +347,14 @@ def _of_views(views, renders, coverage, lpips, seen, tonemap):
     found = []
     for view in views:
         before, wanted, after = (renders[name][view.rows] for name in ("initial", "target", "edited"))
-        some = tonemap, lpips, None if seen is None else seen[view.rows]
+        counts = None if seen is None else seen[view.rows]
+        some = tonemap, lpips, counts
         of_view = {"name": view.name}
         of_view |= {"render": metrics.compare(after, wanted, *some)}
         of_view |= {"initial": metrics.compare(before, wanted, *some), "painted": None}
         if coverage is not None:
-            painted = after, wanted, before, coverage[view.rows], tonemap, some[2]
-            of_view["painted"] = metrics.painted(*painted)
+            painted = coverage[view.rows], tonemap, counts
+            of_view["painted"] = metrics.painted(after, wanted, before, *painted)
         found.append(of_view)
     return found
 

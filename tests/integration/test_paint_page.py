@@ -131,7 +131,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
     assert np.abs(found.envmap - saved).max() <= 1e-3 * saved.mean(), "envedit run makes another map"
 
     with served(folder / "painted.toml") as server:
-        page = Page(browser, server.url + "?canvas=2d")
+        page = Page(browser, server.url + "?canvas=webgl2")
         page.settled(False)
         sync_api.expect(page.page.get_by_test_id("undo")).to_be_enabled()
         assert "elevation" in page.page.get_by_test_id("handle-1").get_attribute("aria-label")

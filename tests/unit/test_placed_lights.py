@@ -49,6 +49,17 @@ def test_a_light_goes_where_it_is_put_with_its_flux(sky):
     assert out.max() < 0.2 * sky.max() and np.isfinite(out).all()
 
 
+@pytest.mark.parametrize("horizon", ["mirror", "keep", "free"])
+def test_lights_are_placed_as_without_any_gain(horizon, sky):
+    placed = PlacedLights(sky, horizon)
+    place = {"azimuth": 200.0, "elevation": 50.0}
+    params = placed.params([{"light": 1, "flux": [2.0] * 3, "size": 2.0} | place])
+    lights = {name: value for name, value in params.items() if not name.startswith("gain.")}
+    assert len(lights) < len(params)
+    found, with_gain = (placed.layers.decode(one).numpy() for one in (lights, params))
+    assert np.array_equal(found, with_gain) and not np.array_equal(found, sky)
+
+
 @pytest.mark.parametrize("size", [0.01, 3.0, 40.0])
 @pytest.mark.parametrize("elevation", [-90.0, 0.0, 33.0, 90.0])
 def test_an_added_light_has_its_flux_at_any_size_resolution_and_place(size, elevation):

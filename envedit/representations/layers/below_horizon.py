@@ -18,7 +18,7 @@ of the edit, 1 where the picture does not determine it: light from the side, or 
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -51,6 +51,13 @@ UNLIT = 1e-3
 """Share of light below which a glow has none."""
 COLUMNS, COARSE = 96, 48
 """Columns of the grid on which K is applied, and on which its width is chosen."""
+
+
+class Averaged(NamedTuple):
+    """A sky (rows, W, 3) with some of its luminance in every channel, and its average over K."""
+
+    sky: mi.TensorXf
+    soft: mi.TensorXf
 
 
 def sky_rows(total: int) -> int:
@@ -128,8 +135,7 @@ class Below:
         self._back = tensor(np.kron(self._blur.across.T, np.eye(3)))
         self.widest = WIDEST[2] if kind == "keep" else self._best_width(radiance, sky, total)
         self._blur.widen(self.widest)
-        before = _veiled(tensor(sky))
-        self._before, self._before_soft = before, self._blur(before)
+        self._before = self.averaged(tensor(sky))
         self.light: GroundLight | None = None
         if kind == "keep" and above is not None:
             light = GroundLight(above, radiance)
@@ -184,34 +190,43 @@ class Below:
         seen = 1 - (1 - self._blend[:, None, None]) * (1 - near)
         self._behind = tensor(log_change * share * seen)
 
+    def averaged(self, sky: mi.TensorXf) -> Averaged:
+        """Return what :meth:`log_factor` compares of a sky (sky_rows, W, 3) without cores."""
+        sky = _veiled(sky)
+        return Averaged(sky, self._blur(sky))
+
+    def log_lit(
+        self, sky: mi.TensorXf, core: mi.TensorXf, ground: mi.TensorXf | None = None
+    ) -> mi.TensorXf | float:
+        """Return the log factor (rows, 3 W) of ground that the light from above falls on; 0 of other rows.
+
+        ``sky`` is as for :meth:`log_factor`, ``core`` the cores' radiance in the whole map. ``ground`` (1, 3)
+        is the logarithm of a factor beyond that, for light that does not come from above.
+        """
+        if self.light is None:
+            return 0.0
+        change = self.light.log_change(sky, core)
+        change = change if ground is None else change + ground
+        return dr.matmul(self._lit, dr.matmul(change, self._around))
+
     def log_factor(
         self,
-        sky: mi.TensorXf,
+        sky: mi.TensorXf | Averaged,
         gone: mi.Float | None = None,
-        core: mi.TensorXf | None = None,
-        ground: mi.TensorXf | None = None,
-        before: mi.TensorXf | None = None,
+        lit: mi.TensorXf | float = 0.0,
+        before: mi.TensorXf | Averaged | None = None,
     ) -> mi.TensorXf:
         """Return the log factor (rows, W, 3) of the rows under a sky (sky_rows, W, 3) without cores.
 
-        ``core`` is the cores' radiance in the whole map, for what falls on ground: without, it is as before.
-        ``ground`` (1, 3) is the logarithm of a factor beyond that, for light that does not come from above.
-        ``before`` is the sky that it is compared with, the original by default.
-        With what is to be revealed, ``gone`` (sky_rows * W) is the share of a texel's light above the horizon
-        that was a glow's and is gone.
+        ``before`` is the sky that it is compared with, the original by default, ``lit`` what else is to be
+        added (:meth:`log_lit`). With what is to be revealed, ``gone`` (sky_rows * W) is the share of a
+        texel's light above the horizon that was a glow's and is gone.
         """
-        lit: Any = 0.0
-        if core is not None and self.light is not None:
-            change = self.light.log_change(sky, core)
-            change = change if ground is None else change + ground
-            lit = dr.matmul(self._lit, dr.matmul(change, self._around))
-        sky, was, was_soft = _veiled(sky), self._before, self._before_soft
-        if before is not None:
-            was = _veiled(before)
-            was_soft = self._blur(was)
-        soft = dr.log((self._blur(sky) + self._faint) / (was_soft + self._faint))
+        was = self._before if before is None else before
+        now, was = (one if isinstance(one, Averaged) else self.averaged(one) for one in (sky, was))
+        soft = dr.log((now.soft + self._faint) / (was.soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
-        sharp = dr.log((sky.array + self._faint) / (was.array + self._faint))
+        sharp = dr.log((now.sky.array + self._faint) / (was.sky.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
         factor = dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3))
         if self._behind is None or gone is None:

@@ -13,6 +13,8 @@ original back, bit for bit outside the cores: the sky's own detail is kept, and 
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -159,7 +161,7 @@ class Layers:
     def decode(self, params: dict, shape: tuple[int, int] | None = None) -> mi.TensorXf:
         """Compose the map at the resolution of the image, or at any other ``shape`` (rows, W).
 
-        Rows that follow have the resolution of the image.
+        Rows that follow have the resolution of the image. Without parameters of the gain it is 1.
         """
         sky, core = self.parts(params, shape)
         return sky + core
@@ -178,7 +180,9 @@ class Layers:
         core = self._core(real, self.whole, rows)
         by_lights, further = self._log_below(real, lit, gone, sky, core)
         low = self._low(real, by_lights)
-        low = dr.ravel(brightened(low, dr.unravel(mi.Color3f, dr.exp(further).array)))
+        if further is not None:
+            low = brightened(low, dr.unravel(mi.Color3f, dr.exp(further).array))
+        low = dr.ravel(low)
         return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
 
     def _real(self, params):
@@ -209,6 +213,8 @@ class Layers:
     def _under_gain(self, real, lit, shape):
         """Return the sky with its saturation and its gain."""
         *_, gain, free, _ = self._at(shape)
+        if "gain.0" not in real:
+            return mi.TensorXf(dr.ravel(_coloured(real, lit)), (*shape, 3))
         factor = dr.exp(self.gain.evaluate(real, gain))
         factor = dr.select(free, factor, 1) if free is not None else factor
         return mi.TensorXf(dr.ravel(brightened(_coloured(real, lit), factor)), (*shape, 3))
@@ -224,17 +230,22 @@ class Layers:
         lit, gone = self._lit(real, self.shape)
         sky, core = self._under_gain(real, lit, self.shape), self._core(real, self.whole, self.rows)
         by_lights, further = self._log_below(real, lit, gone, sky, core)
-        return np.broadcast_to(by_lights.numpy(), further.shape), further.numpy()
+        found = np.zeros((*self.below.shape, 3), np.float32) if further is None else further.numpy()
+        return np.broadcast_to(by_lights.numpy(), found.shape), found
 
     def _log_below(self, real, lit, gone, sky, core):
-        """Log factors of the rows that follow: by what lights do, and by what else the sky does."""
-        before = None
+        """Log factors of the rows that follow: by lights, and by what else the sky does, if it does."""
+        before: Any = None
         by_lights = mi.TensorXf(np.zeros((1, 1, 1), np.float32))
         if self.lights.glowing:
-            by_lights = self.below.log_factor(self._image(lit), gone)
-        if self.lights.glowing or (self.mirrored and "saturation" in real):
-            before = self._image(_coloured(real, lit) if self.mirrored else lit)
-        return by_lights, self.below.log_factor(sky, None, core, real.get("ground"), before)
+            before = self.below.averaged(self._image(lit))
+            by_lights = self.below.log_factor(before, gone)
+        ground = self.below.log_lit(sky, core, real.get("ground"))
+        if "gain.0" not in real and "saturation" not in real:  # the sky is as lights have made it
+            return by_lights, dr.reshape(ground, (*self.below.shape, 3)) if self.ground_light else None
+        if self.mirrored and "saturation" in real:
+            before = self._image(_coloured(real, lit))
+        return by_lights, self.below.log_factor(sky, None, ground, before)
 
     def _low(self, real, by_lights):
         """Rows that follow, before the gain."""

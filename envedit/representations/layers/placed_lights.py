@@ -78,7 +78,9 @@ class PlacedLights:
         """
         found = self.envmap
         if any("light" in light for light in placed):
-            found = unseen_kept(found, self.layers.decode(self.params(placed)).numpy())
+            params = self.params(placed)
+            lights = {name: value for name, value in params.items() if not name.startswith("gain.")}
+            found = unseen_kept(found, self.layers.decode(lights).numpy())
         found = add(found, [light for light in placed if "light" not in light])
         require_radiance(found, "input.lights", brightest=BRIGHTEST)
         return found

@@ -1,4 +1,5 @@
-// Half floats on a canvas: WebGL2, or a 2D canvas where there is none. Exposure and tone mapping happen here.
+// Half floats on a canvas: WebGL2, or a 2D canvas where there is none or it would be drawn by software, which is
+// slower. Exposure and tone mapping happen here.
 
 const VERTEX = `#version 300 es
 out vec2 at;
@@ -28,6 +29,18 @@ void main() {
   color = vec4(shown(e), 1);
   if (split > 0.0 && split < 1.0 && abs(at.x - split) < 0.002) color = vec4(1);
 }`;
+
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+
+// Whether WebGL2 draws on a graphics card.
+export function accelerated() {
+  const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
+  if (!gl) return false;
+  const name = gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER;
+  const software = SOFTWARE.test(gl.getParameter(name));
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return !software;
+}
 
 export class Display {
   // mode: "radiance", "signed" differences of display values, or "values" of a display.
@@ -122,17 +135,31 @@ export class Display {
   }
 
   drawFlat() {
-    const { width, height, pixels } = this.now, scale = 2 ** this.settings.stops;
-    Object.assign(this.canvas, { width, height });
-    const image = this.flat.createImageData(width, height);
-    const earlier = this.before && this.before.width === width ? this.before.pixels : null;
-    const edge = earlier ? this.settings.split * width : 0;
-    for (let i = 0; i < width * height; i++) {
-      const from = i % width < edge ? earlier : pixels;
-      for (let c = 0; c < 3; c++) image.data[4 * i + c] = 255 * this.value(HALF[from[3 * i + c]], scale);
-      image.data[4 * i + 3] = 255;
+    const { width, height, pixels } = this.now, { canvas } = this;
+    if (canvas.width !== width || canvas.height !== height || !this.image) {
+      Object.assign(canvas, { width, height });
+      this.image = this.flat.createImageData(width, height);
+      this.image.data.fill(255); // opaque
     }
-    this.flat.putImageData(image, 0, 0);
+    const earlier = this.before && this.before.width === width ? this.before.pixels : null;
+    const edge = earlier ? this.settings.split * width : 0, bytes = this.bytes(), data = this.image.data;
+    for (let i = 0, to = 0, of = 0; i < width * height; i++, to += 4, of += 3) {
+      const from = i % width < edge ? earlier : pixels;
+      data[to] = bytes[from[of]];
+      data[to + 1] = bytes[from[of + 1]];
+      data[to + 2] = bytes[from[of + 2]];
+    }
+    this.flat.putImageData(this.image, 0, 0);
+  }
+
+  // What each half float is shown as, under the present exposure and tone mapping.
+  bytes() {
+    const { stops, curve } = this.settings, key = `${stops} ${curve}`;
+    if (this.shownAs?.key !== key) {
+      const values = Uint8ClampedArray.from(HALF, (e) => 255 * this.value(e, 2 ** stops));
+      this.shownAs = { key, values };
+    }
+    return this.shownAs.values;
   }
 
   value(e, scale) {

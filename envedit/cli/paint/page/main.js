@@ -1,13 +1,14 @@
 // The page: what is sent when, and what is shown where.
 
 import { Connection } from "./connection.js";
-import { Display } from "./display.js";
+import { accelerated, Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
 import { Lights, linear } from "./lights.js";
 import { Strokes } from "./strokes.js";
 
 const $ = (id) => document.getElementById(id);
-const plain = new URLSearchParams(location.search).get("canvas") === "2d"; // without WebGL2
+const canvas = new URLSearchParams(location.search).get("canvas"); // "2d" or "webgl2": as it is asked for
+const plain = canvas === "2d" || (canvas !== "webgl2" && !accelerated());
 const displays = {
   render: new Display($("render"), "radiance", plain),
   map: new Display($("map"), "radiance", plain),

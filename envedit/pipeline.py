@@ -28,7 +28,8 @@ from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
 from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
-from envedit.targets import target
+from envedit.targets import target, working_size
+from envedit.targets.working_size import at_size
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
@@ -120,21 +121,29 @@ def run(
             warnings += config.unused(settings)
             found = _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
             return replace(found, memory=memory, base=base)
-        renderers.check(settings, lit, (height, width))
+        small = working_size.smaller(settings, lit)
+        renderers.check(settings, small, (height, width))
         watch.stage("rendering the target")
         wanted = target.make(settings, lit, original, memory.picture, memory.mask, memory.target_map)
         warnings += wanted.warnings
-        initial = wanted.initial
+        solved = wanted if small is lit else working_size.worked_on(settings, lit, small, original, wanted)
 
-    # ---- Transport
-    start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
+    # ---- Transport, at the size that the edit is solved at
+    start = Preparation(settings, small, original, rows, folder, watch, dists, clock)
     start.trace()
+    if small is not lit:
+        if start.detailed(solved):
+            small, solved = lit, wanted
+            start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
+            start.trace()
+        else:
+            said.append(f"solved on a picture of {small.width}x{small.height} pixels")
     traced = start.renderer.transport
-    if traced and wanted.coverage is not None:
-        wanted = replace(wanted, compared=_as_seen(traced, original, wanted))
+    if traced and solved.coverage is not None:
+        solved = replace(solved, compared=_as_seen(traced, original, solved))
 
     # ---- The edit: where it starts, and its optimisation
-    edit = start.edit(wanted)
+    edit = start.edit(solved)
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, within, notes = job.renderer, None, list(edit.notes)
     traced = renderer.transport
@@ -144,18 +153,22 @@ def run(
         params, state = job.optimise(edit.params, edit.crop, resume)
         found_map = job.decode(params)
         edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
-        wanted = job.wanted  # a resumed run has the picture that it began with
+        solved = job.wanted  # a resumed run has the picture that it began with
+        if small is lit:
+            wanted = solved
     predicted = None
     if traced:
         with _in_file_units(given), keeping(edited):
             predicted = traced.coarse_error(edited)
 
     # ---- What any light can do, under the weights of paint and rest that the edit has come to
-    if traced and wanted.coverage is not None:
+    if traced and solved.coverage is not None:
         with clock("reach_s"):
             watch.stage("estimating how much of the target is feasible")
-            asked = traced, original, wanted.picture, wanted.weight, rows, None, wanted.coverage[..., 0]
-            within = reaches.reachable(*asked, initial, known=found_map)
+            asked = traced, original, solved.picture, solved.weight, rows, None, solved.coverage[..., 0]
+            within = reaches.reachable(*asked, solved.initial, known=found_map)
+            picture, residual = (at_size(one, small, lit) for one in (within.picture, within.residual))
+            within = replace(within, picture=picture, residual=residual)
             notes.append(within.note)
             warnings += [within.warning] if within.warning else []
 
@@ -164,6 +177,7 @@ def run(
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, _ = lit.sampled(edited, spp, seed)
+        initial = wanted.initial
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         lights, core = _lights(original, edited, lit.to_world, edit.degrees)

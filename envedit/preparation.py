@@ -116,6 +116,19 @@ class Preparation:
             shape = self.original.shape[:2]
             self.renderer = renderers.make(self.settings, self.lit, shape, self._count)
 
+    def detailed(self, wanted: Target) -> bool:
+        """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""
+        if self.settings.representation.kind != "layers":
+            return False
+        with self.clock("fit_s"):
+            representation: Any = representations.make(
+                self.settings, fit.default_folder(), None, self.rows.place, self._horizon()
+            )
+            representation.encode(self.original[self.rows.slice], self.settings.seed)
+        with self.clock("transport_s"):
+            found = self._recorded(representation, wanted)
+        return bool(found and found.octaves)
+
     def edit(self, wanted: Target) -> Edit:
         """Prepare the edit; the sky is turned where that explains the target better."""
         turn, settings = self._turn(wanted), self.settings

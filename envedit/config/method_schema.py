@@ -175,6 +175,13 @@ class Renderer(Table):
         "per pixel",
         EDITED,
     )
+    pixels: int | str = key(
+        "auto",
+        OrAuto(Integer(64, 1 << 30)),
+        'most pixels that the edit is solved on; "auto": 16384 for layers by Gauss-Newton, else all',
+        "pixels",
+        EDITED,
+    )
     max_depth: int | str = key("auto", OrAuto(Integer(1, 1024)), "longest path", "segments", EDITED)
     refresh: int | str = key(
         0,

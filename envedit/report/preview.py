@@ -13,6 +13,7 @@ from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import InputError
+from envedit.core.resampling import fit
 from envedit.core.types import ArrayLike, FilePath, Views
 from envedit.images.images import png
 from envedit.report.curves import round_up
@@ -53,36 +54,12 @@ def checked(image: ArrayLike, name: str) -> np.ndarray:
     return image
 
 
-def _resampling(old, new):
-    """Make the (new, old) matrix of one axis: area average to shrink, nearest to enlarge; rows sum to 1."""
-    if new >= old:
-        nearest = ((np.arange(new) + 0.5) * old / new).astype(int)
-        return np.eye(old, dtype=np.float32)[nearest]
-    edges = np.arange(new + 1) * (old / new)
-    texel = np.arange(old)
-    overlap = np.minimum(edges[1:, None], texel + 1) - np.maximum(edges[:-1, None], texel)
-    return (np.clip(overlap, 0, None) * (new / old)).astype(np.float32)
-
-
-def _fit(image, height, width):
-    """Scale (H, W, C) to (height, width, C) in linear radiance; always a copy."""
-    old_height, old_width, channels = image.shape
-    image = np.array(image, np.float32)
-    with np.errstate(invalid="ignore"):  # BLAS has been seen to raise the flag for finite operands
-        if old_height != height:
-            image = _resampling(old_height, height) @ image.reshape(old_height, -1)
-            image = image.reshape(height, old_width, channels)
-        if old_width != width:
-            image = np.matmul(_resampling(old_width, width), image)
-    return image
-
-
 def fit_finite(image: ArrayLike, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Scale what is finite, and return the (height, width) mask of pixels that hold a NaN or Inf as well."""
     finite = np.isfinite(image).all(axis=2, keepdims=True)
     if finite.all():
-        return _fit(image, height, width), np.zeros((height, width), bool)
-    return _fit(np.where(finite, image, 0), height, width), _fit(~finite, height, width)[..., 0] > 0
+        return fit(image, height, width), np.zeros((height, width), bool)
+    return fit(np.where(finite, image, 0), height, width), fit(np.asarray(~finite), height, width)[..., 0] > 0
 
 
 def display(

@@ -27,7 +27,7 @@ import difflib
 import functools
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,6 +101,9 @@ class Scene:
         What of the file is not used, or used otherwise.
     parameters : dict
         Values that were filled in for the ``$names`` of the XML.
+    again : callable or None
+        Loads it with a film of another (width, height), in pixels, height 0 by the aspect; errors as of
+        :func:`load`. None of a scene that was not loaded from a file or dict.
     """
 
     mi: mi.Scene
@@ -117,6 +120,7 @@ class Scene:
     hide_emitters: bool = False
     notes: tuple[str, ...] = ()
     parameters: dict[str, str | float | bool] = field(default_factory=dict)
+    again: Callable[[int, int], Scene] | None = None
 
     @functools.cached_property
     def alpha(self) -> np.ndarray | None:
@@ -393,7 +397,11 @@ def load(
     rows = views[-1].rows.stop
     told = views, own, asked.max_depth, asked.hide_emitters, notes
     given: dict[str, Any] = dict(parameters or {})
-    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told, given)
+
+    def again(width: int, height: int) -> Scene:
+        return load(file, width, height, parameters, base, sampler, sensors)
+
+    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told, given, again)
 
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:

@@ -138,3 +138,19 @@ def test_what_was_painted_before_is_not_written_into_what_is_opened_next(monkeyp
         painting._carry_out(protocol.Open(name))
         kept.append(painting._waiting.pop(protocol.Edit, None))
     assert kept == [stroke, None]
+
+
+def test_an_edit_of_another_painting_is_left_out():
+    """It was under way while a page opened the next one."""
+    taken = []
+
+    class Open:
+        def update(self, edit):
+            taken.append(edit.painting)
+
+    painting = worker.Worker(Tell())
+    painting.session, painting._painting = Open(), 2
+    text = '{"type": "document", "document": {}, "painting": %d}'
+    for number in (1, 2, 0, 3):
+        painting._carry_out(protocol.read(text % number))
+    assert taken == [2, 0]

@@ -6,6 +6,7 @@ import pytest
 from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.core.errors import InputError
+from envedit.core.resampling import fit
 from envedit.report import preview
 from tests.oracles.builders import grey, read_png
 
@@ -15,11 +16,11 @@ BAD = [np.nan, np.inf, -np.inf]
 def test_shrinking_averages_areas_and_enlarging_repeats_texels(rng):
     image = rng.random((12, 18, 3), np.float32)
     blocks = image.reshape(4, 3, 6, 3, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(preview._fit(image, 4, 6), blocks, rtol=1e-6)
-    np.testing.assert_array_equal(preview._fit(image, 24, 54), image.repeat(2, axis=0).repeat(3, axis=1))
+    np.testing.assert_allclose(fit(image, 4, 6), blocks, rtol=1e-6)
+    np.testing.assert_array_equal(fit(image, 24, 54), image.repeat(2, axis=0).repeat(3, axis=1))
     # 5 to 3: the first output covers texel 0 and two thirds of texel 1.
     ramp = np.arange(5, dtype=np.float32).reshape(1, 5, 1)
-    np.testing.assert_allclose(preview._fit(ramp, 1, 3)[0, :, 0], [0.4, 2.0, 3.6], rtol=1e-6)
+    np.testing.assert_allclose(fit(ramp, 1, 3)[0, :, 0], [0.4, 2.0, 3.6], rtol=1e-6)
 
 
 def test_preview_places_tonemapped_renderings_above_their_maps(tmp_path):

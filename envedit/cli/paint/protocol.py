@@ -94,12 +94,16 @@ def document(value: Any) -> Document:
 
 @dataclass(frozen=True)
 class Edit:
-    """The document as it is now, which edit of whose it is, and whether it is still being made."""
+    """The document as it is now, which edit of whose it is, and whether it is still being made.
+
+    ``painting`` is the number of the ``opened`` message that it belongs to; 0: of the one that is open.
+    """
 
     document: Document
     phase: str = "done"
     client: str = ""
     number: int = 0
+    painting: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,7 +155,8 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
             phase = found.get("phase", "done")
             if phase not in PHASES:
                 raise BadMessageError(f"phase: got {show(phase)[:80]}, expected one of {', '.join(PHASES)}")
-            return Edit(document(found.get("document")), phase, client, _count(found.get("number", 0)))
+            counts = (_count(found.get(name, 0)) for name in ("number", "painting"))
+            return Edit(document(found.get("document")), phase, client, *counts)
         if kind == "pick":
             x, y = (Number(0, 1)(found.get(name)) for name in "xy")
             light = int(Number(-1, 100)(found.get("light", -1)))

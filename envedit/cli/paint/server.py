@@ -263,7 +263,7 @@ class Server:
     def _take(self, request, client):
         if isinstance(request, protocol.Edit):
             opened = self.hub.last.get("opened")
-            if opened is not None:
+            if opened is not None and request.painting in (0, opened["painting"]):
                 opened["document"] = request.document.plain()
             told = {"type": "document", "client": request.client, "document": request.document.plain()}
             for other in self.hub.clients - {client}:

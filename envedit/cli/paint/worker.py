@@ -38,6 +38,7 @@ class Worker(threading.Thread):
         self._waiting: dict[type, object] = {}
         self._lock = threading.Condition()
         self._over = self._owed = False
+        self._painting = 0
         self.faults: list[Exception] = []  # of ours, no user's mistakes
 
     def post(self, request: object) -> None:
@@ -91,7 +92,8 @@ class Worker(threading.Thread):
             if not isinstance(request, Again):
                 self.tell.say({"type": "error", "text": "no scene is open: open one first"})
         elif isinstance(request, Edit):
-            self.session.update(request)
+            if request.painting in (0, self._painting):
+                self.session.update(request)
         elif isinstance(request, Pick):
             self.session.pick(request)
         elif isinstance(request, Save):
@@ -113,10 +115,12 @@ class Worker(threading.Thread):
         mi.set_variant(opened.settings.variant)
         mi.set_log_level(mi.LogLevel.Error)
         self.session = Session(opened, self.tell, lambda: self.newer)
+        self._painting += 1
         project.note(opened)
         self.tell.say(
             {
                 "type": "opened",
+                "painting": self._painting,
                 "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
                 "folder": opened.folder.name,
                 "views": [view.name for view in self.session.lit.views],

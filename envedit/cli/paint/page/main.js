@@ -23,7 +23,7 @@ const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // la
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [] }; // the last of each view
 
 let view = 0, views = [], outlined = false;
-let client = "", sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
+let client = "", painting = 0, sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
 
@@ -44,7 +44,7 @@ function send(document, phase) {
 
 function flush() {
   if (!waiting || !opened) return;
-  const message = { type: "document", number: ++sent, ...waiting };
+  const message = { type: "document", number: ++sent, painting, ...waiting };
   if (!connection.send(message)) return; // sent again when the server is back
   note({ edit: sent, phase: waiting.phase, since });
   since = null;
@@ -141,6 +141,7 @@ const RECEIVED = {
       if (!mine) history.begin({ ...EMPTY, ...message.document });
     }
     opened = true;
+    painting = message.painting;
     if (mine) flush();
     say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();

@@ -1,0 +1,101 @@
+"""The size at which an edit is solved: that of the target, or fewer pixels where these say as much.
+
+Neighbouring pixels err together, and a smooth change of the sky shows in all of them: of a large picture the
+solver sees the same scene on a smaller film. What is judged in the end is rendered at full size. A mirror
+tells detail of the sky by every single pixel, and is worked on as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from envedit import config
+from envedit.core.errors import ConfigError
+from envedit.core.radiance import BRIGHTEST
+from envedit.core.resampling import fit
+from envedit.core.seeds import Seeds
+from envedit.scene.renderings import rendered
+from envedit.scene.scene import Scene
+from envedit.targets import initial_rendering
+from envedit.targets.target import Target, first_hold, pixel_weight
+
+PIXELS = 128 * 128
+"""Pixels that an edit is solved on with "auto": of pictures of 256x256 pixels, three edits on two scenes, it
+then takes a quarter to two fifths of the time, with the rendering 0.1 to 1.1 dB better and the map 0.8 to
+3.3 dB (``experiments/solver``)."""
+MUCH = 1.8
+"""How many times as many pixels a picture must have to be worked on at a smaller size."""
+
+
+def most_pixels(settings: config.Config) -> int | None:
+    """Return the most pixels that an edit is solved on; None: as many as there are."""
+    asked = settings.renderer.pixels
+    if isinstance(asked, int):
+        return asked
+    solved = settings.representation.kind == "layers" and settings.optimizer.kind != "adam"
+    return PIXELS if solved and settings.renderer.kind == "transport" else None
+
+
+def smaller(settings: config.Config, lit: Scene) -> Scene:
+    """Return the scene on a film of at most so many pixels as are asked for, all views together.
+
+    It is the scene itself where its film is hardly larger, or takes no other size.
+    """
+    most, pixels = most_pixels(settings), lit.width * lit.height
+    if most is None or pixels <= MUCH * most or lit.again is None:
+        return lit
+    share = (most / pixels) ** 0.5
+    heights = {rows.stop - rows.start for rows in lit.rows}
+    height = max(1, round(share * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
+    try:
+        found = lit.again(max(4, round(share * lit.width)), height)
+    except ConfigError:  # a cropped film
+        return lit
+    return found if found.width * found.height < pixels else lit
+
+
+def worked_on(
+    settings: config.Config, lit: Scene, small: Scene, envmap: np.ndarray, wanted: Target
+) -> Target:
+    """Return the target (of ``lit``) as the picture of a smaller scene.
+
+    It is rendered anew, so that the film's filter is the same as in what it is compared with. What was
+    painted is the change of each pixel, averaged over its area and added to the smaller initial rendering.
+
+    Parameters
+    ----------
+    settings : config.Config
+        Of the run.
+    lit, small : Scene
+        The scene, and it on a smaller film.
+    envmap : ndarray (H, W, 3)
+        The map that is edited.
+    wanted : Target
+        What was asked for.
+    """
+    chosen = settings.target
+    hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0
+    if wanted.coverage is None or wanted.initial is None or wanted.weight is None:
+        assert wanted.envmap is not None, "what was not painted was rendered"
+        asked = chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
+        picture, _, noise = rendered(small, wanted.envmap, *asked)
+        weight = None
+        if wanted.weight is not None:
+            weight = np.where(hidden[..., None], 0, at_size(wanted.weight, lit, small)).astype("f4")
+            weight = weight if weight.any() else None
+        return replace(wanted, picture=picture, noise=noise, weight=weight)
+    initial = initial_rendering.initial(small, envmap, settings)
+    change = at_size(wanted.picture - wanted.initial, lit, small)
+    picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))
+    coverage = np.where(hidden[..., None], 0, at_size(wanted.coverage, lit, small))
+    untold = at_size((wanted.weight == 0).astype(np.float32), lit, small)[..., 0] > 0.5
+    weight = pixel_weight(coverage, untold | hidden, chosen.paint, first_hold(chosen))
+    return replace(wanted, picture=picture, initial=initial, coverage=coverage, weight=weight)
+
+
+def at_size(image: np.ndarray, of: Scene, to: Scene) -> np.ndarray:
+    """Scale a picture (h, w, k) of a scene to the film of the same scene at another size, view by view."""
+    parts = zip(of.rows, to.rows, strict=True)
+    return np.concatenate([fit(image[part], rows.stop - rows.start, to.width) for part, rows in parts])

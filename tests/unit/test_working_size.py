@@ -1,0 +1,111 @@
+"""The size at which an edit is solved, and the target at that size."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import envedit
+from envedit import config
+from envedit.scene import scene
+from envedit.targets import target, working_size
+from tests.oracles.builders import LIGHT, write_scene
+
+SKY = envedit.sunsky(32)
+SQUARE = {"type": "shadow", "amount": 0.6, "rectangle": [0.25, 0.5, 0.75, 1.0], "softness": 0.0}
+
+
+def settings(**tables):
+    return config.from_dict({"scene": {"file": "sphere", "width": 24}, "renderer": {"pixels": 150}} | tables)
+
+
+@pytest.mark.parametrize(
+    ("tables", "most"),
+    [
+        ({}, working_size.PIXELS),
+        ({"renderer": {"pixels": 100}, "representation": {"kind": "pixels"}}, 100),
+        ({"representation": {"kind": "siren"}}, None),
+        ({"optimizer": {"kind": "adam"}}, None),
+        ({"renderer": {"kind": "path"}}, None),
+    ],
+)
+def test_only_gauss_newton_is_solved_on_fewer_pixels_unless_they_are_asked_for(tables, most):
+    assert working_size.most_pixels(config.from_dict(tables)) == most
+
+
+def test_a_large_film_is_made_smaller_and_keeps_its_aspect():
+    lit = scene.load("sphere", 48, 24)
+    for pixels, size in ((1 << 20, (48, 24)), (700, (48, 24)), (288, (24, 12)), (70, (12, 6))):
+        small = working_size.smaller(settings(renderer={"pixels": pixels}), lit)
+        assert (small.width, small.height) == size
+        assert (small is lit) == (size == (48, 24))
+
+
+def test_what_takes_no_other_size_stays_as_it_is(tmp_path):
+    crop = '<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="48"/>'
+    crop += '<integer name="crop_width" value="40"/><integer name="crop_height" value="40"/></film>'
+    sensor = f'<sensor type="perspective"><float name="fov" value="40"/>{crop}</sensor>'
+    cropped = scene.load(write_scene(tmp_path, sensor, '<shape type="sphere"/>', LIGHT, name="crop.xml"))
+    loaded = scene.load("sphere", 48)
+    built = envedit.load_scene(loaded.mi)
+    for lit in (cropped, built):
+        assert working_size.smaller(settings(), lit) is lit
+
+
+def test_views_are_scaled_each_by_itself(rng):
+    lit = scene.load("sphere", 8)
+    of = replace(lit, views=(scene.View("a", slice(0, 4)), scene.View("b", slice(4, 12))))
+    to = replace(of, width=4, views=(scene.View("a", slice(0, 2)), scene.View("b", slice(2, 6))))
+    image = rng.random((12, 8, 3)).astype(np.float32)
+    blocks = image.reshape(6, 2, 4, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(working_size.at_size(image, of, to), blocks, rtol=1e-6)
+    assert np.array_equal(working_size.at_size(blocks, to, of), blocks.repeat(2, axis=0).repeat(2, axis=1))
+
+
+def test_a_rendered_target_is_rendered_on_the_smaller_film():
+    asked = settings(target={"rotate_degrees": 90.0, "spp": 64})
+    lit = scene.load("sphere", 24)
+    small = working_size.smaller(asked, lit)
+    wanted = target.make(asked, lit, SKY)
+    found = working_size.worked_on(asked, lit, small, SKY, wanted)
+    assert found.picture.shape == (12, 12, 3) and found.envmap is wanted.envmap and found.weight is None
+    blocks = wanted.picture.reshape(12, 2, 12, 2, 3).mean(axis=(1, 3))
+    assert np.abs(found.picture - blocks).mean() < 0.1 * blocks.mean()
+
+
+def test_paint_keeps_its_change_and_its_weight():
+    asked = settings(target={"kind": "strokes", "strokes": [SQUARE], "spp": 64})
+    lit = scene.load("sphere", 24)
+    small = working_size.smaller(asked, lit)
+    wanted = target.make(asked, lit, SKY)
+    found = working_size.worked_on(asked, lit, small, SKY, wanted)
+    change = (wanted.picture - wanted.initial).reshape(12, 2, 12, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(found.picture - found.initial, change, atol=1e-5)
+    assert found.coverage.mean() == pytest.approx(wanted.coverage.mean(), rel=1e-5)
+    for one in (wanted, found):
+        paint = float((one.weight * (one.coverage > 0.5)).sum() / one.weight.sum())
+        assert paint == pytest.approx(asked.target.paint / (asked.target.paint + 1), abs=0.02)
+
+
+@pytest.mark.slow
+def test_an_edit_on_fewer_pixels_is_judged_at_full_size():
+    """Nearly as good as one on all of them; what is shown has the size of the film."""
+    found = {}
+    for pixels in (32 * 32, 64 * 64):
+        tables = {
+            "input": {"width": 64},
+            "scene": {"file": "sphere", "width": 64},
+            "target": {"rotate_degrees": 60.0, "spp": 256},
+            "output": {"spp": 256},
+            "renderer": {"pixels": pixels},
+            "representation": {"turn": False},
+        }
+        found[pixels] = envedit.edit(tables, envmap=envedit.sunsky(64))
+    fewer, all_of_them = found.values()
+    assert "solved on a picture of 32x32 pixels" in fewer.notes
+    assert not any("solved on" in note for note in all_of_them.notes)
+    assert {picture.shape for picture in fewer.renders.values()} == {(64, 64, 3)}
+    for part in ("render", "envmap"):
+        psnr = [one.metrics[part]["psnr"] for one in (fewer, all_of_them)]
+        assert psnr[0] > psnr[1] - 3, (part, psnr)
+    assert fewer.metrics["render"]["psnr"] > fewer.metrics["initial"]["psnr"] + 10

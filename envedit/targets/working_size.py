@@ -16,6 +16,7 @@ from envedit.core.errors import ConfigError
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.resampling import fit
 from envedit.core.seeds import Seeds
+from envedit.representations.layers.gain import CYCLES
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering
@@ -34,8 +35,10 @@ def most_pixels(settings: config.Config) -> int | None:
     asked = settings.renderer.pixels
     if isinstance(asked, int):
         return asked
-    solved = settings.representation.kind == "layers" and settings.optimizer.kind != "adam"
-    return PIXELS if solved and settings.renderer.kind == "transport" else None
+    chosen = settings.representation
+    smooth = isinstance(chosen.cycles, str) or chosen.cycles <= CYCLES
+    solved = chosen.kind == "layers" and settings.optimizer.kind != "adam"
+    return PIXELS if smooth and solved and settings.renderer.kind == "transport" else None
 
 
 def smaller(settings: config.Config, lit: Scene) -> Scene:

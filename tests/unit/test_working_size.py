@@ -27,6 +27,8 @@ def settings(**tables):
         ({"representation": {"kind": "siren"}}, None),
         ({"optimizer": {"kind": "adam"}}, None),
         ({"renderer": {"kind": "path"}}, None),
+        ({"representation": {"cycles": 12}}, working_size.PIXELS),
+        ({"representation": {"cycles": 48}}, None),
     ],
 )
 def test_only_gauss_newton_is_solved_on_fewer_pixels_unless_they_are_asked_for(tables, most):

@@ -2,7 +2,7 @@
 
 Neighbouring pixels err together, and a smooth change of the sky shows in all of them: of a large picture the
 solver sees the same scene on a smaller film. What is judged in the end is rendered at full size. A mirror
-tells detail of the sky by every single pixel, and is worked on as it is.
+shows detail of the sky in every single pixel, and is worked on as it is.
 """
 
 from __future__ import annotations

@@ -209,6 +209,11 @@ class Below:
         change = change if ground is None else change + ground
         return dr.matmul(self._lit, dr.matmul(change, self._around))
 
+    def reshaped(self, log_factor: mi.TensorXf | float) -> mi.TensorXf:
+        """Return a log factor (rows, 3 W), or one number for all, as (rows, W, 3)."""
+        rows, width = self.shape
+        return dr.reshape(dr.zeros(mi.TensorXf, (rows, 3 * width)) + log_factor, (rows, width, 3))
+
     def log_factor(
         self,
         sky: mi.TensorXf | Averaged,

@@ -13,8 +13,6 @@ original back, bit for bit outside the cores: the sky's own detail is kept, and 
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -180,9 +178,7 @@ class Layers:
         core = self._core(real, self.whole, rows)
         by_lights, further = self._log_below(real, lit, gone, sky, core)
         low = self._low(real, by_lights)
-        if further is not None:
-            low = brightened(low, dr.unravel(mi.Color3f, dr.exp(further).array))
-        low = dr.ravel(low)
+        low = dr.ravel(brightened(low, dr.unravel(mi.Color3f, dr.exp(further).array)))
         return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
 
     def _real(self, params):
@@ -213,36 +209,32 @@ class Layers:
     def _under_gain(self, real, lit, shape):
         """Return the sky with its saturation and its gain."""
         *_, gain, free, _ = self._at(shape)
-        if "gain.0" not in real:
-            return mi.TensorXf(dr.ravel(_coloured(real, lit)), (*shape, 3))
-        factor = dr.exp(self.gain.evaluate(real, gain))
-        factor = dr.select(free, factor, 1) if free is not None else factor
-        return mi.TensorXf(dr.ravel(brightened(_coloured(real, lit), factor)), (*shape, 3))
+        sky = _coloured(real, lit)
+        if "gain.0" in real:
+            factor = dr.exp(self.gain.evaluate(real, gain))
+            sky = brightened(sky, factor if free is None else dr.select(free, factor, 1))
+        return mi.TensorXf(dr.ravel(sky), (*shape, 3))
 
     def log_below(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Return log factors of the rows that follow, (rows, W, 3); without such rows, none.
-
-        By what lights do, which comes before the saturation of a mirror, and further ones.
-        """
+        """Return log factors (rows, W, 3) of rows that follow: by lights, before saturation; and further."""
         if self.below is None:
             return (np.zeros((0, self.shape[1], 3), np.float32),) * 2
         real = self._real(params)
         lit, gone = self._lit(real, self.shape)
         sky, core = self._under_gain(real, lit, self.shape), self._core(real, self.whole, self.rows)
         by_lights, further = self._log_below(real, lit, gone, sky, core)
-        found = np.zeros((*self.below.shape, 3), np.float32) if further is None else further.numpy()
-        return np.broadcast_to(by_lights.numpy(), found.shape), found
+        return np.broadcast_to(by_lights.numpy(), further.shape), further.numpy()
 
     def _log_below(self, real, lit, gone, sky, core):
-        """Log factors of the rows that follow: by lights, and by what else the sky does, if it does."""
-        before: Any = None
+        """Log factors of the rows that follow: by what lights do, and by what else the sky does."""
+        before = None
         by_lights = mi.TensorXf(np.zeros((1, 1, 1), np.float32))
         if self.lights.glowing:
             before = self.below.averaged(self._image(lit))
             by_lights = self.below.log_factor(before, gone)
         ground = self.below.log_lit(sky, core, real.get("ground"))
         if "gain.0" not in real and "saturation" not in real:  # the sky is as lights have made it
-            return by_lights, dr.reshape(ground, (*self.below.shape, 3)) if self.ground_light else None
+            return by_lights, self.below.reshaped(ground)
         if self.mirrored and "saturation" in real:
             before = self._image(_coloured(real, lit))
         return by_lights, self.below.log_factor(sky, None, ground, before)

@@ -248,8 +248,10 @@ class Preparation:
             watch=self.watch,
             dists=self.dists,
         )
-        frozen = None
+        frozen, smooth = None, None
         if recordings:
+            if recordings.octaves and search and traced and job.newton:
+                smooth = self._smooth(job, params, recordings, crop)
             params = representation.refine(params, recordings.octaves)
         if traced:
             frozen = np.zeros(original.shape[:2], bool)
@@ -258,7 +260,7 @@ class Preparation:
                 frozen[rows] = ~known[rows]
             job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
-            params, found = self._started(job, params, recordings, crop, search)
+            params, found = self._started(job, params, recordings, crop, search, smooth)
             notes += found
         return Edit(job, params, crop, degrees, frozen, notes)
 
@@ -274,8 +276,18 @@ class Preparation:
                 self.renderer = self._recordings.transport
         return self._recordings
 
-    def _started(self, job, params, recordings, crop, search):
-        """Find where layers start; without a search, from what is there."""
+    def _smooth(self, job, params, recordings, crop):
+        """Solve by Gauss-Newton for lights and coarse grids: a start from which finer grids go on."""
+        with self.clock("start_s"):
+            self.watch.stage("solving for lights and coarse gain")
+            alone = replace(recordings, octaves=[])
+            found = initialization.find(
+                job.representation, params, alone, job.wanted, job.original, only_own=True
+            )
+            return job.solved(job.best(found.starts, crop)[0])
+
+    def _started(self, job, params, recordings, crop, search, smooth=None):
+        """Find where layers start, or from the ``smooth`` solution; without a search, from what is there."""
         with self.clock("start_s"):
             job.representation.keep(job.free)
             job.free = None  # the gain keeps to them, while a light may move across the others
@@ -285,6 +297,9 @@ class Preparation:
             asked = job.representation, params, recordings, job.wanted, job.original
             ready = initialization.find(*asked, only_own=job.newton)
             job.wanted = ready.wanted
+            if smooth is not None:
+                solved = params | smooth, ["lights and coarse gain solved for by Gauss-Newton"]
+                ready.starts.append(solved)
             params, placed = job.best(ready.starts, crop)
             return params, ready.notes + placed
 

@@ -214,6 +214,13 @@ class Job:
         objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists, self.lit.rows)
         return self._loop(params, objective, few)[1].history[-1]["loss"]
 
+    def solved(self, params: Params) -> Params:
+        """Return where Gauss-Newton steps towards a rendered target end, lights added and moved."""
+        more: dict[str, Any] = {"most_added": SPARE, "judge": self._display_error, "run": self.begun}
+        found = gauss_newton.solve(self._problem(), params, self._sigma, **more)
+        self.begun = None
+        return found.params
+
     def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
         """Optimise from the start, or from the checkpoint; returns parameters and state."""
         if self.newton:

@@ -154,12 +154,12 @@ def find(
     original: np.ndarray,
     only_own: bool = False,
 ) -> Starts:
-    """Find where to start; ``layers`` may get finer grids.
+    """Find where to start.
 
     Parameters
     ----------
     layers, params : Layers, dict
-        The representation and its parameters, of :meth:`.Layers.encode`.
+        The representation, with its finer grids, and its parameters.
     recordings : Recordings
         Of :func:`recordings`; their bright columns may change.
     wanted : Target
@@ -170,7 +170,6 @@ def find(
         As of :func:`.light_search.start`.
     """
     transport, notes = recordings.transport, list(recordings.notes)
-    params = layers.refine(params, recordings.octaves)
     starts = _searched(layers, params, transport, wanted, original, only_own)
     if recordings.octaves:  # a mirror: images of lights, and caustics, are where the lights are now found
         began = original.copy()

@@ -299,7 +299,7 @@ class Preparation:
             job.wanted = ready.wanted
             if smooth is not None:
                 solved = params | smooth, ["lights and coarse gain solved for by Gauss-Newton"]
-                ready.starts.append(solved)
+                ready.starts.insert(0, solved)
             params, placed = job.best(ready.starts, crop)
             return params, ready.notes + placed
 

@@ -298,8 +298,10 @@ class Preparation:
             ready = initialization.find(*asked, only_own=job.newton)
             job.wanted = ready.wanted
             if smooth is not None:
-                solved = params | smooth, ["lights and coarse gain solved for by Gauss-Newton"]
-                ready.starts.insert(0, solved)
+                # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
+                kept = {name: value for name, value in smooth.items() if name != "ground"}
+                said = ["lights and coarse gain solved for by Gauss-Newton"]
+                ready.starts.insert(0, (params | kept, said))
             params, placed = job.best(ready.starts, crop)
             return params, ready.notes + placed
 

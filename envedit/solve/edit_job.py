@@ -385,17 +385,8 @@ class Job:
         return float(objective(rendering, tensor(edited[self.first : self.first + rows]), step)[0][0])
 
     def _loop(self, params, objective, chosen, **more):
-        return adam_loop.optimise(
-            self.representation,
-            params,
-            self.renderer,
-            objective,
-            self.original,
-            self.first,
-            chosen,
-            free=self.free,
-            **more,
-        )
+        parts = self.representation, params, self.renderer, objective, self.original, self.first, chosen
+        return adam_loop.optimise(*parts, free=self.free, **more)
 
 
 @contextlib.contextmanager

@@ -277,14 +277,17 @@ class Preparation:
         return self._recordings
 
     def _smooth(self, job, params, recordings, crop):
-        """Solve by Gauss-Newton for lights and coarse grids: a start from which finer grids go on."""
+        """Solve by Gauss-Newton for lights and coarse grids, where finer grids go on; None if it fails."""
         with self.clock("start_s"):
             self.watch.stage("solving for lights and coarse gain")
             alone = replace(recordings, octaves=[])
             found = initialization.find(
                 job.representation, params, alone, job.wanted, job.original, only_own=True
             )
-            return job.solved(job.best(found.starts, crop)[0])
+            try:
+                return job.solved(job.best(found.starts, crop)[0])
+            except NumericalError:  # a start that goes nowhere is no reason to stop
+                return None
 
     def _started(self, job, params, recordings, crop, search, smooth=None):
         """Find where layers start, or from the ``smooth`` solution; without a search, from what is there."""

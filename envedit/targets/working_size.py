@@ -87,7 +87,6 @@ def worked_on(
         weight = None
         if wanted.weight is not None:
             weight = np.where(hidden[..., None], 0, at_size(wanted.weight, lit, small)).astype("f4")
-            weight = weight if weight.any() else None
         return replace(wanted, picture=picture, noise=noise, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
     change = at_size(wanted.picture - wanted.initial, lit, small)

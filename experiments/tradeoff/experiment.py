@@ -27,7 +27,7 @@ from .plan import Cell, Setting
 
 QUICK_SPP = 512
 """Samples a pixel of the judge in a quick run."""
-JOINT, JOINT_QUICK = 12, 2
+JOINT, JOINT_QUICK = 5, 2
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -63,12 +63,12 @@ class Setting:
     name: str
     group: str
     table: dict
-    seconds: float = 17.0
+    seconds: float = 10.0
 
 
 def _levels(knob: str, group: str, levels: dict[str, dict], seconds: dict[str, float] | None = None):
     return [
-        Setting(f"{knob}: {level}", group, table, (seconds or {}).get(level, 17.0))
+        Setting(f"{knob}: {level}", group, table, (seconds or {}).get(level, 10.0))
         for level, table in levels.items()
     ]
 
@@ -81,31 +81,33 @@ def _key(knob: str, table: str, key: str, values, **seconds) -> list[Setting]:
 
 def knobs() -> list[Setting]:
     """List one change at a time from the standard preset, whose own level is not repeated."""
+    adam = {"optimizer": {"kind": "adam"}}
     return [
-        *_key("samples of T", "renderer", "spp", (16, 64, 512), v16=13, v64=14, v512=24),
-        *_key("refresh of T", "renderer", "refresh", (25,), v25=30),
-        *_levels(
-            "path tracer, spp",
-            "knob",
-            {str(n): {"renderer": {"kind": "path", "spp": n}} for n in (4, 16)},
-            {"4": 20.0, "16": 28.0},
-        ),
-        *_key("path depth", "renderer", "max_depth", (2, 8), v2=14, v8=20),
+        *_key("samples of T", "renderer", "spp", (16, 64, 512), v512=24),
+        *_key("path depth", "renderer", "max_depth", (2,)),
         *_key("map width", "input", "width", (64, 128, 512), v512=28),
         *_levels(
             "film width",
             "knob",
             {
                 "64": {"scene": {"width": 64}},
-                # "auto" gives a larger film fewer samples of T a pixel.
-                "192, T 64": {"scene": {"width": 192}},
-                "192, T 256": {"scene": {"width": 192}, "renderer": {"spp": 256}},
+                # "auto" solves larger pictures on a film of 128 pixels.
+                "192, every pixel": {"scene": {"width": 192}, "renderer": {"pixels": 2**20}},
             },
-            {"64": 12.0, "192, T 64": 27.0, "192, T 256": 40.0},
+            {"64": 8.0, "192, every pixel": 30.0},
         ),
-        *_key("steps", "optimizer", "iterations", (10, 30, 200), v200=21),
+        *_key("steps at most", "optimizer", "iterations", (2, 4, 8)),
         # A number means those cycles and no finer grids, wherever the picture may tell them.
-        *_key("gain without detail, cycles", "representation", "cycles", (4, 12, 24)),
+        *_key("gain without detail, cycles", "representation", "cycles", (4, 12)),
+        *_levels(
+            "instead of Gauss-Newton",
+            "knob",
+            {
+                "Adam": adam,
+                "Adam, path tracer with 16 samples": adam | {"renderer": {"kind": "path", "spp": 16}},
+            },
+            {"Adam": 20.0, "Adam, path tracer with 16 samples": 30.0},
+        ),
         *_levels(
             "samples of target and result",
             "knob",
@@ -114,37 +116,16 @@ def knobs() -> list[Setting]:
     ]
 
 
-_SMALL_SIREN = {"representation": {"kind": "siren"}, "input": {"width": 128}}
-
-
 def siren() -> list[Setting]:
-    """List one change at a time from the standard robust SIREN, on a map of 128 texels across.
-
-    At 256 a run with its fit takes ten times as long as one with layers, whatever the knob.
-    """
-
-    def changed(name, table, seconds=36.0):
-        return Setting(name, "siren", overlaid(_SMALL_SIREN, table), seconds)
-
-    return [
-        changed("siren: as it is", {}),
-        changed("siren, hidden: 64", {"representation": {"hidden": 64}}, 28),
-        changed("siren, hidden: 256", {"representation": {"hidden": 256}}, 70),
-        changed("siren, depth: 2", {"representation": {"depth": 2}}, 32),
-        changed("siren, depth: 5", {"representation": {"depth": 5}}, 45),
-        changed("siren, fit epochs: 300", {"fit": {"epochs": 300}}, 30),
-        changed("siren, fit epochs: 2400", {"fit": {"epochs": 2400}}, 45),
-        changed("siren, AWP every: 1", {"fit": {"awp_every": 1}}, 40),
-        changed("siren, AWP every: 8", {"fit": {"awp_every": 8}}, 34),
-        changed("siren, steps: 150", {"optimizer": {"iterations": 150}}, 24),
-    ]
+    """List the standard robust SIREN, on a map of 128 texels across: at 256 it takes ten times as long."""
+    table = {"representation": {"kind": "siren"}, "input": {"width": 128}}
+    return [Setting("siren, map 128", "siren", table, 50.0)]
 
 
 FACTORS = {
-    "T": (8, 16, 32, 64, 128, 256),
+    "T": (16, 32, 64, 128, 256),
     "map": (64, 96, 128, 192, 256, 384),
-    "film": (48, 64, 96, 128, 160, 192),
-    "steps": (10, 16, 25, 40, 64, 100, 160),
+    "film": (32, 48, 64, 96, 128),
     "samples": (16, 64, 256, 1024),
 }
 """Knobs that are changed together, and their levels: about evenly spaced in their logarithm."""
@@ -163,35 +144,28 @@ def joint(count: int, seed: int = 0) -> list[Setting]:
         drawn[factor] = [levels[int(x * len(levels))] for x in u]
     settings = []
     for i in range(count):
-        t, width, film, steps, samples = (drawn[factor][i] for factor in FACTORS)
+        t, width, film, samples = (drawn[factor][i] for factor in FACTORS)
         table = {
             "renderer": {"spp": t},
             "input": {"width": width},
             "scene": {"width": film},
-            "optimizer": {"iterations": steps},
             "target": {"spp": samples},
             "output": {"spp": samples},
         }
-        name = f"joint {i + 1}: T {t}, map {width}, film {film}, {steps} steps, samples {samples}"
-        settings.append(Setting(name, "joint", table, 15.0))
+        name = f"joint {i + 1}: T {t}, map {width}, film {film}, samples {samples}"
+        settings.append(Setting(name, "joint", table))
     return settings
 
 
-def film_and_steps() -> list[Setting]:
-    """List smaller pictures with more steps: the two knobs that are the cheapest alone, where presets lie."""
+def small() -> list[Setting]:
+    """List smaller maps with smaller pictures: the two knobs that are the cheapest alone, for presets."""
 
-    def both(film, steps, seconds):
-        table = {"scene": {"width": film}, "optimizer": {"iterations": steps}}
-        return Setting(f"film {film}, {steps} steps", "joint", table, seconds)
+    def both(width, film, **more):
+        table = {"input": {"width": width}, "scene": {"width": film}} | more
+        return Setting(f"map {width}, film {film}" + ", samples 64" * bool(more), "joint", table, 8.0)
 
-    return [
-        both(48, 200, 10.0),
-        both(64, 200, 12.0),
-        both(64, 400, 14.0),
-        both(96, 100, 14.0),
-        both(96, 200, 16.0),
-        both(128, 400, 26.0),
-    ]
+    few = {"target": {"spp": 64}, "output": {"spp": 64}}
+    return [both(96, 32, **few), both(96, 48, **few), both(128, 96)]
 
 
 DRAFT = Setting("draft", "preset", {"preset": "draft"}, 10.0)
@@ -201,14 +175,16 @@ PAPER = Setting("paper", LONG, {"preset": "paper"}, 1300.0)
 def settings(count: int, quick: bool = False) -> list[Setting]:
     """List all settings but the standard preset itself and the paper's, the presets first."""
     if quick:
-        some = {"samples of T: 16", "path tracer, spp: 4", "map width: 128", "film width: 64", "steps: 30"}
-        small = Setting("siren: draft", "siren", {"preset": "draft", **_kind("siren")}, 16.0)
-        return [DRAFT, *(s for s in knobs() if s.name in some), small, *joint(count)]
-    return [DRAFT, *knobs(), *siren(), *joint(count), *film_and_steps()]
-
-
-def _kind(name):
-    return {"representation": {"kind": name}}
+        adam = "instead of Gauss-Newton: Adam"
+        some = {"samples of T: 16", "map width: 128", "film width: 64", "steps at most: 4", adam}
+        network = {"preset": "draft", "representation": {"kind": "siren"}}
+        return [
+            DRAFT,
+            *(s for s in knobs() if s.name in some),
+            Setting("siren: draft", "siren", network, 16.0),
+            *joint(count),
+        ]
+    return [DRAFT, *knobs(), *siren(), *joint(count), *small()]
 
 
 def cells(folder: Path, names=MAPS, scenes=tuple(SCENES)) -> list[Cell]:
@@ -240,7 +216,7 @@ def case_of(cell: Cell, setting: Setting, session: str = "", own: bool = False) 
     """
     base = {
         # Where the sky turned, every setting would find the same map.
-        "input": {"envmap": str(cell.file), "rows": "upper"},
+        "input": {"envmap": str(cell.file)},
         "scene": SCENES[cell.scene],
         "target": {"rotate_degrees": ANGLE},
         "representation": {"turn": False},
@@ -264,4 +240,4 @@ def job_of(cell: Cell, setting: Setting, session: str = "") -> Job:
 
 def references(n: int) -> Setting:
     """Return the standard preset's n-th repetition; its seed tells how far results differ by chance."""
-    return Setting(f"standard, seed {n}", "standard", {"seed": n}, 17.0)
+    return Setting(f"standard, seed {n}", "standard", {"seed": n})

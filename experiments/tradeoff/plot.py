@@ -102,17 +102,15 @@ def by_cell(compared: list[dict], bounds: list[dict], file: Path, kind: str = "t
 def by_knob(rows: list[dict], file: Path, kind: str = "time") -> None:
     """Draw a panel for each knob: rendering and map against time, a label for each level, no lines.
 
-    Neither time nor worth need follow a knob: larger widths come with fewer samples of T.
+    Neither time nor worth need follow a knob.
     """
     import matplotlib.pyplot as plt
 
     knobs: dict[str, list[dict]] = {}
     for r in rows:
-        if r["group"] in ("knob", "siren") and ": " in r["setting"]:
+        if r["group"] == "knob":
             knobs.setdefault(r["setting"].split(": ")[0], []).append(r)
     standard = next(r for r in rows if r["group"] == "standard")
-    siren = [r for r in rows if r["setting"] == "siren: as it is"]
-    knobs = {name: some for name, some in knobs.items() if name != "siren"}
     if not knobs:
         return
     across = 4
@@ -123,15 +121,13 @@ def by_knob(rows: list[dict], file: Path, kind: str = "time") -> None:
     for panel in panels.ravel()[len(knobs) :]:
         panel.set_axis_off()
     for panel, (name, some) in zip(panels.ravel(), knobs.items(), strict=False):
-        base = siren if some[0]["group"] == "siren" else [standard]
         for key, colour in (("psnr", "tab:blue"), ("map_psnr", "tab:orange")):
-            at = [(r["ratio"][kind], r["change"][key]) for r in [*some, *base]]
+            at = [(r["ratio"][kind], r["change"][key]) for r in [*some, standard]]
             panel.plot(*zip(*at, strict=True), "o", color=colour, ms=4, label=WORTH[key])
         for r in some:
             level = r["setting"].split(": ")[1]
             panel.annotate(f" {level}", (r["ratio"][kind], r["change"]["psnr"]), fontsize="x-small")
-        for r in base:
-            panel.plot(r["ratio"][kind], r["change"]["psnr"], "*", color="tab:red", ms=9)
+        panel.plot(standard["ratio"][kind], standard["change"]["psnr"], "*", color="tab:red", ms=9)
         panel.set_title(name, fontsize="small")
         panel.grid(alpha=0.3)
     panels[0, 0].legend(fontsize="x-small")

@@ -84,19 +84,16 @@ def test_a_knob_changes_what_it_says_and_nothing_else(folder):
         changed.setdefault(setting.name.split(": ")[0], set()).update(found)
     assert changed == {
         "samples of T": {"renderer.spp"},
-        "refresh of T": {"renderer.refresh"},
-        "path tracer, spp": {"renderer.kind", "renderer.spp"},
         "path depth": {"renderer.max_depth"},
         "map width": {"input.width"},
-        "film width": {"scene.width", "renderer.spp"},
-        "steps": {"optimizer.iterations"},
+        "film width": {"scene.width", "renderer.pixels"},
+        "steps at most": {"optimizer.iterations"},
+        "instead of Gauss-Newton": {"optimizer.kind", "renderer.kind", "renderer.spp"},
         "gain without detail, cycles": {"representation.cycles"},
         "samples of target and result": {"target.spp", "output.spp"},
     }
     widths = {flat(s)["input.width"] for s in plan.knobs()}
     assert min(widths) == 64 and max(widths) == 512
-    keys = {k for s in plan.siren() for k, v in flat(s).items() if v != standard[k]}
-    assert {"representation.hidden", "representation.depth", "fit.epochs", "fit.awp_every"} <= keys
     # Nothing is kept from one run to the next, but kernels.
     assert standard["renderer.cache"] is False and standard["fit.cache"] is False
     assert flat(plan.PAPER)["renderer.kind"] == "path" and flat(plan.DRAFT)["input.width"] == 128
@@ -113,9 +110,8 @@ def test_joint_settings_fill_every_range_evenly():
     for factor, (table, key) in factors.items():
         levels = plan.FACTORS[factor]
         drawn = [s.table[table][key] for s in settings]
-        assert sorted(drawn) == sorted(levels * (12 // len(levels))), factor
-    steps = [s.table["optimizer"]["iterations"] for s in settings]
-    assert {steps.count(level) for level in plan.FACTORS["steps"]} <= {1, 2, 3}
+        low, high = 12 // len(levels), -(-12 // len(levels))
+        assert {drawn.count(level) for level in levels} <= {low, high}, factor
     assert all(s.table["output"] == s.table["target"] for s in settings)
     assert settings == plan.joint(12, seed=3) != plan.joint(12, seed=4)
     assert plan.joint(0) == []

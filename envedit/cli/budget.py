@@ -36,8 +36,6 @@ class Level:
         What to report to the user.
     map, film : int
         Widths: texels, pixels.
-    iterations : int
-        Steps of the edit.
     spp : int or "auto"
         Samples a pixel of target and result.
     traced_s : float
@@ -53,7 +51,6 @@ class Level:
     name: str
     map: int
     film: int
-    iterations: int
     spp: int | str
     traced_s: float
     numbers_s: float
@@ -62,10 +59,10 @@ class Level:
 
 
 LEVELS = (
-    Level("least", 96, 32, 60, 64, 1.5, 0.6, 5.1, 1.4),
-    Level("coarse", 96, 48, 120, 64, 1.5, 1.0, 4.0, 1.2),
-    Level("draft", 128, 64, 200, "auto", 3.6, 2.2, 0.3, 0.3),
-    Level("standard", 256, 128, 100, "auto", 12.9, 3.3, 0.0, 0.0),
+    Level("least", 96, 32, 64, 1.5, 0.6, 5.1, 1.4),
+    Level("coarse", 96, 48, 64, 1.5, 1.0, 4.0, 1.2),
+    Level("draft", 128, 64, "auto", 3.6, 2.2, 0.3, 0.3),
+    Level("standard", 256, 128, "auto", 12.9, 3.3, 0.0, 0.0),
 )
 """The standard preset is the finest: a picture of 192 pixels with 200 steps cost 1.4 to 1.7 times as much and
 was no better (4.1 dB less of the rendering, 0.4 dB less of the map). A map of 64 texels is no quicker."""
@@ -132,8 +129,8 @@ def apply(
     Parameters
     ----------
     settings : config.Config
-        What is to be done; [input] width, [scene] width and height, [optimizer] iterations, and samples of
-        target and result are replaced.
+        What is to be done; [input] width, [scene] width and height, and samples of target and result
+        are replaced.
     budget : float
         Seconds from the start of the program to its end.
     elapsed : float
@@ -171,13 +168,12 @@ def apply(
         settings,
         input=_at_width(settings.input, level.map),
         scene=_film_at(settings.scene, level.film),
-        optimizer=replace(settings.optimizer, iterations=level.iterations),
         target=replace(settings.target, spp=level.spp),
         output=replace(settings.output, spp=level.spp),
     )
     return chosen, (
         f"budget of {budget:g} s: level '{level.name}', map {level.map} and picture {level.film} across, "
-        f"{level.iterations} steps, {level.spp} samples a pixel; {expected:.0f} s expected; {loss(level)}"
+        f"{level.spp} samples a pixel; {expected:.0f} s expected; {loss(level)}"
     )
 
 

@@ -86,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
     instead.add_argument(
         "--budget",
         metavar="TIME",
-        help="choose widths, steps and samples so that the run ends within 30, 30s or 2m",
+        help="choose widths and samples so that the run ends within 30, 30s or 2m",
     )
     made.add_argument("--quiet", action="store_true", help="print nothing but errors")
     made.add_argument(

@@ -47,16 +47,22 @@ def smaller(settings: config.Config, lit: Scene) -> Scene:
     It is the scene itself where its film is hardly larger, or takes no other size.
     """
     most, pixels = most_pixels(settings), lit.width * lit.height
-    if most is None or pixels <= MUCH * most or lit.again is None:
+    if most is None or pixels <= MUCH * most:
         return lit
-    share = (most / pixels) ** 0.5
+    found = scaled(lit, (most / pixels) ** 0.5)
+    return found if found is not None and found.width * found.height < pixels else lit
+
+
+def scaled(lit: Scene, factor: float) -> Scene | None:
+    """Return the scene on a film that is ``factor`` times as wide and high; None where it takes no other."""
+    if lit.again is None:
+        return None
     heights = {rows.stop - rows.start for rows in lit.rows}
-    height = max(1, round(share * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
+    height = max(1, round(factor * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
     try:
-        found = lit.again(max(4, round(share * lit.width)), height)
+        return lit.again(max(4, round(factor * lit.width)), height)
     except ConfigError:  # a cropped film
-        return lit
-    return found if found.width * found.height < pixels else lit
+        return None
 
 
 def worked_on(

@@ -27,7 +27,7 @@ def tables_of(cell, level) -> dict:
         "input": {"envmap": str(cell.file), "width": level.map},
         "scene": {**plan.SCENES[cell.scene], "width": level.film},
         "target": {"rotate_degrees": plan.ANGLE, "spp": level.spp},
-        "optimizer": {"iterations": level.iterations},
+        "representation": {"turn": False},  # what the target is made by; other targets take as long
         "output": {"spp": level.spp, "report": True},
         "renderer": {"cache": False},
     }

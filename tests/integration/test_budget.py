@@ -28,7 +28,7 @@ def test_the_standard_level_is_the_standard_preset_and_draft_s_the_draft():
     for name in ("standard", "draft"):
         level, preset = next(one for one in LEVELS if one.name == name), config.loads("", preset=name)
         assert (level.map, level.film) == (preset.input.width, preset.scene.width)
-        assert (level.iterations, level.spp) == (preset.optimizer.iterations, preset.target.spp)
+        assert level.spp == preset.target.spp
         assert preset.target.spp == preset.output.spp
     assert (level.render_db, level.map_db) != (0, 0), "what draft loses is measured"
 
@@ -144,12 +144,12 @@ def test_paint_takes_longer_to_search():
 
 @pytest.mark.slow
 def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, capsys):
-    tiny = dataclasses.replace(LEVELS[0], name="tiny", map=32, film=24, iterations=2, spp=16)
+    tiny = dataclasses.replace(LEVELS[0], name="tiny", map=32, film=24, spp=16)
     monkeypatch.setattr(budget, "LEVELS", (tiny,))
     out = small.parent / "out"
     assert run.main([str(small), "--budget", "10m", "--out", str(out)]) == 0
     done = config.load(out / "config.toml")
-    assert (done.input.width, done.scene.width, done.optimizer.iterations) == (32, 24, 2)
+    assert (done.input.width, done.scene.width) == (32, 24)
     assert done.target.spp == done.output.spp == 16 and done.optimizer.lr == 0.01
     assert "budget of 600 s: level 'tiny'" in capsys.readouterr().out
     assert "level 'tiny'" in (out / "metrics.json").read_text()

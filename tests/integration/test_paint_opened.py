@@ -19,6 +19,28 @@ pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed
 pytest.importorskip("websockets", reason="the extra envedit[paint] is not installed")
 
 
+def sizes_shown(server, views=1):
+    """Return width and height of the renderings by T (0) and by Mitsuba (1) of each view."""
+    sizes = {}
+    with connected(server) as page:
+        while {(source, v) for source in (0, 1) for v in range(views)} - set(sizes):
+            received = page.recv(timeout=60)
+            if isinstance(received, bytes) and received[4] == 0:
+                width, height, _, view = struct.unpack("<HHIH", received[6:16])
+                sizes[received[5], view] = width, height
+    return sizes
+
+
+@pytest.mark.parametrize(("units", "shown"), [("fraction", (32, 64)), ("pixels", (48, 96))])
+def test_a_large_picture_is_painted_at_the_size_at_which_it_is_solved(units, shown, tmp_path):
+    stroke = f'kind = "strokes"\n[[target.strokes]]\ntype = "shadow"\nunits = "{units}"\npolygon = [[0, 0], [1, 0], [1, 1]]\n'
+    settings = SMALL.replace("[renderer]\n", f"{stroke}[renderer]\npixels = 1024\n")
+    assert settings != SMALL
+    (tmp_path / "edit.toml").write_text(settings)
+    with served(tmp_path / "edit.toml") as server:
+        assert sizes_shown(server) == {(source, 0): (width, width) for source, width in enumerate(shown)}
+
+
 def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path):
     write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
     (tmp_path / "edit.toml").write_text(OF_TWO)
@@ -45,14 +67,7 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
         assert front[6:14, 11:21].mean() > 0.05 and behind[10:18, 11:21].mean() < -0.02
         for asked, rest in zip((front, behind), left, strict=True):
             assert np.square(rest).sum() < 0.5 * np.square(asked).sum(), "not solved for together"
-        with connected(server) as other:
-            sizes = {}
-            while {(source, v) for source in (0, 1) for v in (0, 1)} - set(sizes):
-                received = other.recv(timeout=60)
-                if isinstance(received, bytes) and received[4] == 0:
-                    width, height, _, view = struct.unpack("<HHIH", received[6:16])
-                    sizes[received[5], view] = width, height
-        assert sizes == {(0, 0): (32, 20), (0, 1): (32, 28), (1, 0): (64, 40), (1, 1): (64, 56)}
+        assert sizes_shown(server, 2) == {(0, 0): (32, 20), (0, 1): (32, 28), (1, 0): (64, 40), (1, 1): (64, 56)}
         page.send(json.dumps({"type": "document", "document": {"strokes": [{**light, "view": 2}]}}))
         assert "got view 2, expected one of 0 (front), 1 (behind)" in heard(page, "error")["text"]
         toward = []

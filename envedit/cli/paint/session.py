@@ -5,7 +5,7 @@ Everything here runs on the thread that owns Dr.Jit. What an edit asks for at on
 new edit comes.
 
 While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
-target. The target is painted on T E_0. The edit that is saved is the pipeline's, which paints on Mitsuba's
+target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit that is saved is the pipeline's, which paints on Mitsuba's
 rendering, tries several starts, and judges its result.
 
 Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
@@ -25,7 +25,7 @@ from envedit.cli.paint.project import Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.errors import ConfigError, NumericalError
+from envedit.core.errors import NumericalError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
@@ -39,7 +39,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import feasibility, gauss_newton, hold, initialization, map_problem
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.solve.light_search import SearchProblem
-from envedit.targets import strokes
+from envedit.targets import strokes, working_size
 from envedit.targets.target import first_hold, pixel_weight
 
 DRAGGED_COLUMNS, COLUMNS = 16, 32
@@ -96,7 +96,7 @@ class Session:
         }
         settings = project.settings
         self._stage("loading the scene")
-        self.lit = inputs.load_scene(settings.scene, project.base)
+        self.lit = self._worked_on(inputs.load_scene(settings.scene, project.base))
         self._stage("reading the map")
         self.given = inputs.read_map(settings.input, self.lit, settings.input.width)
         self.notes = self.given.warnings
@@ -328,7 +328,7 @@ class Session:
         if done >= passes:
             return False
         if self._sharp is None:
-            self._sharp = self._sharper()
+            self._sharp = working_size.scaled(self.lit, SHARPER) or self.lit
         seed = Seeds.of(self.project.settings.seed).pass_of_page(done)
         total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
         done += 1
@@ -339,15 +339,10 @@ class Session:
             self.tell_state()
         return True
 
-    def _sharper(self):
-        """Return the scene with more pixels; of a cropped film, which takes no other size, as it is."""
-        chosen = self.project.settings.scene
-        height = self.lit.height if len(self.lit.views) == 1 else chosen.height
-        sharper = replace(chosen, width=SHARPER * self.lit.width, height=SHARPER * height)
-        try:
-            return inputs.load_scene(sharper, self.project.base)
-        except ConfigError:
-            return self.lit
+    def _worked_on(self, lit):
+        """Return the scene at the size that an edit is solved at; as it is, if strokes are in its pixels."""
+        in_pixels = any(one.get("units") == "pixels" for one in self.project.document.strokes)
+        return lit if in_pixels else working_size.smaller(self.project.settings, lit)
 
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
@@ -491,7 +486,8 @@ class Session:
             result = pipeline.run(settings, folder=folder, base=project.base, watch=watch)
             self.tell.say({"type": "saving", "text": "writing"})
             warnings = run_folder.write(settings, folder, result, import_s, project.base)
-        self.tell.frame("render", "saved", result.renders["edited"], self.lit.rows)
+        rows = tuple(view.rows for view in result.views)
+        self.tell.frame("render", "saved", result.renders["edited"], rows)
         self.tell.frame("map", "saved", result.maps["edited"])
         self._shown = None
         self.resting = True  # what is shown is what was saved

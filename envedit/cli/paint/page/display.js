@@ -141,15 +141,26 @@ export class Display {
       this.image = this.flat.createImageData(width, height);
       this.image.data.fill(255); // opaque
     }
-    const earlier = this.before && this.before.width === width ? this.before.pixels : null;
-    const edge = earlier ? this.settings.split * width : 0, bytes = this.bytes(), data = this.image.data;
+    const bytes = this.bytes(), data = this.image.data;
     for (let i = 0, to = 0, of = 0; i < width * height; i++, to += 4, of += 3) {
-      const from = i % width < edge ? earlier : pixels;
-      data[to] = bytes[from[of]];
-      data[to + 1] = bytes[from[of + 1]];
-      data[to + 2] = bytes[from[of + 2]];
+      data[to] = bytes[pixels[of]];
+      data[to + 1] = bytes[pixels[of + 1]];
+      data[to + 2] = bytes[pixels[of + 2]];
     }
+    if (this.before) this.drawBefore(bytes, data, width, height);
     this.flat.putImageData(this.image, 0, 0);
+  }
+
+  // The left part as it was before, whose frame may have another size.
+  drawBefore(bytes, data, width, height) {
+    const { before } = this, edge = Math.min(width, Math.ceil(this.settings.split * width));
+    for (let y = 0; y < height; y++) {
+      const row = Math.floor(((y + 0.5) * before.height) / height) * before.width;
+      for (let x = 0; x < edge; x++) {
+        const of = 3 * (row + Math.floor(((x + 0.5) * before.width) / width)), to = 4 * (y * width + x);
+        for (let c = 0; c < 3; c++) data[to + c] = bytes[before.pixels[of + c]];
+      }
+    }
   }
 
   // What each half float is shown as, under the present exposure and tone mapping.

@@ -159,13 +159,15 @@ PAPER = Setting("paper", LONG, {"preset": "paper"}, 1300.0)
 def settings(count: int, quick: bool = False) -> list[Setting]:
     """List all settings but the standard preset itself and the paper's, the presets first."""
     if quick:
-        some = {"samples of T: 16", "map width: 128", "film width: 64", "steps at most: 4", "optimizer: adam"}
+        some = {"samples of T: 64", "map width: 128", "film width: 64", "steps at most: 4", "optimizer: adam"}
+        some |= {"gain without detail, cycles: 12", "samples of target and result: 64"}
         network = {"preset": "draft", "representation": {"kind": "siren"}}
         return [
             DRAFT,
             *(s for s in knobs() if s.name in some),
             Setting("siren: draft", "siren", network, 16.0),
             *joint(count),
+            *small(),
         ]
     return [DRAFT, *knobs(), *siren(), *joint(count), *small()]
 

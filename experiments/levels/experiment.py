@@ -1,11 +1,13 @@
 """Measure the levels of ``--budget``: what each costs and loses, for the table in ``envedit/cli/budget.py``.
 
 Three maps in two scenes, every level once, the transport traced anew; a run that compiled kernels is made
-again. Seconds are of the run's own stages; what is lost is judged alike for all
+again. Seconds are of the run's own stages, on the reference machine of ``budget.py``, as this one's speed is
+measured before every run; what is lost is judged alike for all
 (``experiments/tradeoff/judge.py``). Nothing else should run on the machine.
 """
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -48,12 +50,17 @@ def cases(given):
     ]
 
 
-def parts(timing: dict) -> dict:
-    """Seconds of rendering, of tracing and search, and of all else, as :class:`.budget.Level` has."""
+def parts(timing: dict, found: dict) -> dict:
+    """Seconds of rendering, of tracing and search, and of all else, as :class:`.budget.Level` has.
+
+    They are those of the reference machine: what was measured, over how much slower this one was just
+    before (``found``, a :class:`.budget.Calibration`).
+    """
+    slower = found["render"] / budget.REFERENCE_RENDER
     return {
-        "rendering": timing["target_s"] + timing["judge_s"],
-        "tracing": timing["transport_s"] + timing["start_s"],
-        "numbers": timing["fit_s"] + timing["edit_s"] + timing["report_s"],
+        "rendering": (timing["target_s"] + timing["judge_s"]) / slower,
+        "tracing": (timing["transport_s"] + timing["start_s"]) / slower,
+        "numbers": (timing["fit_s"] + timing["edit_s"] + timing["report_s"]) / found["machine"],
     }
 
 
@@ -66,8 +73,10 @@ def tabulate(made, out, given) -> str:
     for one in done:
         level, cell = one.case.about["level"], one.case.about["cell"]
         found, timing = judge(cell, one.folder), one.metrics["timing"]
+        calibration = json.loads((one.folder / "cost.json").read_text())["calibration"]
+        spent = list(parts(timing, calibration).values())
         judged[level, cell] = found["render"]["psnr_without_noise"], found["map"]["psnr"]
-        seconds.setdefault(level, []).append([*parts(timing).values(), timing["total_s"]])
+        seconds.setdefault(level, []).append([*spent, sum(spent)])
     lines = []
     for level in seconds:
         told = [f"{column.mean():.1f} to {column.max():.1f}" for column in np.transpose(seconds[level])]

@@ -16,6 +16,8 @@ import sys
 import time
 from pathlib import Path
 
+CALIBRATED = "levels"
+"""The session whose runs are measured beside a calibration of the machine."""
 AGAIN_BELOW = 180.0
 """Seconds up to which a run that had to compile kernels is made again: beyond, compiling is a small part."""
 DROPPED = (
@@ -63,6 +65,15 @@ def measure(argv: list[str]) -> tuple[int, dict]:
     }
 
 
+def calibrated(folder: Path) -> dict:
+    """Measure the machine as ``--budget`` does, just before the run: it may change its speed meanwhile."""
+    asked = [sys.executable, "-m", "experiments.levels.calibrate", str(folder / "job.toml")]
+    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    with_us = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    found = subprocess.run(asked, capture_output=True, text=True, check=True, env=with_us)
+    return {"calibration": json.loads(found.stdout.splitlines()[-1])}
+
+
 def kernels() -> int:
     """Count the kernels that Dr.Jit keeps on disk."""
     try:
@@ -82,6 +93,7 @@ def main(argv: list[str]) -> int:
     # Ctrl-C reaches the run as well, which ends by itself; a handler is not inherited, to ignore it would be.
     signal.signal(signal.SIGINT, lambda number, frame: None)
     run = command(folder, threads)
+    beside = calibrated(folder) if session == CALIBRATED else {}
     code, cost = measure(run)
     if code == 0 and cost["compiled"] and cost["wall_s"] < AGAIN_BELOW:
         first = cost
@@ -95,7 +107,9 @@ def main(argv: list[str]) -> int:
         (folder / name).unlink(missing_ok=True)
     (folder / "judged.json").unlink(missing_ok=True)  # of an earlier run in this folder
     temporary = folder / "cost.json.tmp"
-    temporary.write_text(json.dumps(cost | {"session": session, "threads": threads}, indent=1) + "\n")
+    temporary.write_text(
+        json.dumps(cost | beside | {"session": session, "threads": threads}, indent=1) + "\n"
+    )
     temporary.replace(folder / "cost.json")
     return 0
 

@@ -648,4 +648,7 @@ def test_a_level_of_the_budget_is_run_as_it_says(level, tmp_path):
     assert found.scene.parameters == {"roughness": 0.05} and not found.renderer.cache
     names = "target", "judge", "transport", "start", "fit", "edit", "report"
     times = {f"{name}_s": 2**i for i, name in enumerate(names)}
-    assert levels.parts(times) == {"rendering": 3, "tracing": 12, "numbers": 112}
+    alike = {"render": budget.REFERENCE_RENDER, "machine": 1.0}
+    assert levels.parts(times, alike) == {"rendering": 3, "tracing": 12, "numbers": 112}
+    slower = {"render": 2 * budget.REFERENCE_RENDER, "machine": 4.0}
+    assert levels.parts(times, slower) == {"rendering": 1.5, "tracing": 6, "numbers": 28}

@@ -67,7 +67,12 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
         assert front[6:14, 11:21].mean() > 0.05 and behind[10:18, 11:21].mean() < -0.02
         for asked, rest in zip((front, behind), left, strict=True):
             assert np.square(rest).sum() < 0.5 * np.square(asked).sum(), "not solved for together"
-        assert sizes_shown(server, 2) == {(0, 0): (32, 20), (0, 1): (32, 28), (1, 0): (64, 40), (1, 1): (64, 56)}
+        assert sizes_shown(server, 2) == {
+            (0, 0): (32, 20),
+            (0, 1): (32, 28),
+            (1, 0): (64, 40),
+            (1, 1): (64, 56),
+        }
         page.send(json.dumps({"type": "document", "document": {"strokes": [{**light, "view": 2}]}}))
         assert "got view 2, expected one of 0 (front), 1 (behind)" in heard(page, "error")["text"]
         toward = []

@@ -33,8 +33,9 @@ def sizes_shown(server, views=1):
 
 @pytest.mark.parametrize(("units", "shown"), [("fraction", (32, 64)), ("pixels", (48, 96))])
 def test_a_large_picture_is_painted_at_the_size_at_which_it_is_solved(units, shown, tmp_path):
-    stroke = f'kind = "strokes"\n[[target.strokes]]\ntype = "shadow"\nunits = "{units}"\npolygon = [[0, 0], [1, 0], [1, 1]]\n'
-    settings = SMALL.replace("[renderer]\n", f"{stroke}[renderer]\npixels = 1024\n")
+    stroke = f'type = "shadow"\nunits = "{units}"\npolygon = [[0, 0], [1, 0], [1, 1]]'
+    painted = f'kind = "strokes"\n[[target.strokes]]\n{stroke}\n'
+    settings = SMALL.replace("[renderer]\n", f"{painted}[renderer]\npixels = 1024\n")
     assert settings != SMALL
     (tmp_path / "edit.toml").write_text(settings)
     with served(tmp_path / "edit.toml") as server:

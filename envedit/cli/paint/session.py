@@ -5,8 +5,9 @@ Everything here runs on the thread that owns Dr.Jit. What an edit asks for at on
 new edit comes.
 
 While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
-target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit that is saved is the pipeline's, which paints on Mitsuba's
-rendering, tries several starts, and judges its result.
+target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit
+that is saved is the pipeline's, which paints on Mitsuba's rendering, tries several starts, and judges its
+result.
 
 Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
 """

@@ -26,7 +26,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "scene": {"width": 64},
         "representation": {"hidden": 64},
         "fit": {"epochs": 500},
-        "optimizer": {"iterations": 200},
     },
     "standard": {},
     "paper": {

@@ -79,7 +79,7 @@ MANY = ("siren", "pixels", "log-pixels")
     ("preset", "kind", "ssim", "iterations"),
     [
         ("standard", "layers", 0.1, 100),
-        ("draft", "layers", 0.1, 200),
+        ("draft", "layers", 0.1, 100),
         *(("standard", kind, 1.0, 600) for kind in MANY),
         *(("draft", kind, 1.0, 150) for kind in MANY),
         *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),

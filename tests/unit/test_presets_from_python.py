@@ -43,7 +43,7 @@ def test_a_preset_names_the_kind_where_none_is_given(preset, target):
 @pytest.mark.parametrize(
     ("preset", "kind", "iterations", "ssim"),
     [
-        ("draft", "layers", 200, 0.1),
+        ("draft", "layers", 100, 0.1),
         ("draft", "siren", 150, 1.0),
         ("standard", "layers", 100, 0.1),
         ("standard", "siren", 600, 1.0),

@@ -211,6 +211,7 @@ def loss(level: Level) -> str:
     parts = [
         f"{abs(db):.1f} dB {'less' if db > 0 else 'more'} of {what}"
         for db, what in ((level.render_db, "rendering"), (level.map_db, "map"))
+        if db
     ]
     return " and ".join(parts) + " than the standard preset, on average"
 

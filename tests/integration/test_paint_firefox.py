@@ -11,6 +11,12 @@ pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed
 
 STATUS = "const s = document.querySelector('[data-testid=status]'); "
 PIXELS = "return document.querySelector('[data-testid=map]').toDataURL();"
+DRAWN = """
+const map = document.querySelector('[data-testid=map]');
+const copy = document.createElement('canvas').getContext('2d');
+copy.drawImage(map, 0, 0);
+return copy.getImageData(0, 0, 300, 150).data.some((value, at) => at % 4 < 3 && value > 0);
+"""
 
 
 @pytest.mark.skipif(FIREFOX is None, reason="no firefox on this machine")
@@ -27,6 +33,7 @@ def test_the_map_follows_paint_and_lights(tmp_path):
 
         page("WebDriver:Navigate", url=server.url)
         settled()
+        until(lambda: page.run(DRAWN))  # the map is drawn with the next frame, after the status
         begun = page.run(PIXELS)
         page.run("document.querySelector('[data-testid=tool-shadow]').click();")
         x, y, width, height = page.box("#overlay")

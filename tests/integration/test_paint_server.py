@@ -75,6 +75,7 @@ def test_no_other_file_is_served_or_written(server):
 
 def test_bad_messages_are_told_and_huge_ones_end_the_connection(server):
     with connected(server) as page:
+        assert "Sec-WebSocket-Extensions" not in page.response.headers  # no frame is compressed
         page.send("{")
         assert "expected JSON" in heard(page, "refused")["text"]
         page.send(b"\x00" * 100)

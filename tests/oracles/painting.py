@@ -45,15 +45,11 @@ def served(name, **more):
     """Serve a configuration until the block ends; yields the server."""
     import uvicorn
 
-    from envedit.cli.paint import project
-    from envedit.cli.paint.protocol import MOST_BYTES
+    from envedit.cli.paint import project, settings
     from envedit.cli.paint.server import Server
 
     server = Server(None if name is None else project.opened(str(name)), **more)
-    settings = uvicorn.Config(
-        server.app(), log_level="warning", ws="websockets-sansio", ws_max_size=MOST_BYTES
-    )
-    running = uvicorn.Server(settings)
+    running = uvicorn.Server(settings(server, uvicorn))
     thread = threading.Thread(target=lambda: asyncio.run(running.serve([server.socket])), daemon=True)
     thread.start()
     until(lambda: running.started)

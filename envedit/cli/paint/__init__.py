@@ -61,20 +61,25 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def serve(server: Any, uvicorn: Any) -> None:
-    """Serve until Ctrl-C, then wait for what is being computed."""
+def settings(server: Any, uvicorn: Any) -> Any:
+    """Return how uvicorn serves the page: frames stay on this machine, and are not compressed."""
     from envedit.cli.paint.protocol import MOST_BYTES
 
-    settings = uvicorn.Config(
+    return uvicorn.Config(
         server.app(),
         log_level="warning",
         ws="websockets-sansio",
         ws_max_size=MOST_BYTES,
+        ws_per_message_deflate=False,
         timeout_graceful_shutdown=2,
         access_log=False,
     )
+
+
+def serve(server: Any, uvicorn: Any) -> None:
+    """Serve until Ctrl-C, then wait for what is being computed."""
     try:
-        uvicorn.Server(settings).run(sockets=[server.socket])
+        uvicorn.Server(settings(server, uvicorn)).run(sockets=[server.socket])
     except KeyboardInterrupt:
         pass
     finally:

@@ -27,6 +27,8 @@ CORES_A_JOB = 4
 """A run is parallel kernels with serial stretches between: two jobs on eight cores beat one."""
 AGAIN = 2.0
 """Seconds until a job that another call holds is looked at again."""
+FOREVER = 1e9
+"""Seconds that this process's own workers may be silent: the machine may have been suspended."""
 CONNECT = 10.0
 """Seconds in which a scheduler must answer at first."""
 
@@ -73,7 +75,7 @@ class _Dask:
             # Threads of this process, each of which waits for the process of a job.
             shape: dict[str, Any] = {"n_workers": 1, "threads_per_worker": workers, "processes": False}
             shape |= dict.fromkeys(("dashboard_address", "worker_dashboard_address"), "127.0.0.1:0")
-            shape |= {"scheduler_kwargs": {"dashboard": False}}
+            shape |= {"scheduler_kwargs": {"dashboard": False, "worker_ttl": FOREVER}}
             self._cluster = LocalCluster(**shape, silence_logs=logging.CRITICAL)
             self._client = Client(self._cluster, set_as_default=False)
         else:

@@ -210,6 +210,26 @@ def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub, held):
     assert files(jobs[1].folder(stub.out)) == ["done.json", "job.toml", "log.txt", "result"]
 
 
+@pytest.mark.slow
+@dask
+def test_a_driver_that_slept_goes_on(stub, monkeypatch):
+    """A closed laptop: Dask gives up workers that were silent for five minutes, here for as few as it can."""
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL", "1s")
+    stub.block("hold", 0, 1)
+    driver = stub.driver(4, "--workers", "2")
+    try:
+        until(lambda: len(stub.noted("begin")) == 2)
+        driver.send_signal(signal.SIGSTOP)
+        time.sleep(7)  # ten heartbeats are the least
+        stub.free()
+        driver.send_signal(signal.SIGCONT)
+        said, _ = driver.communicate(timeout=30)
+    finally:
+        driver.kill()
+    assert driver.returncode == 0, said
+    assert stub.counts("begin", 4) == stub.counts("end", 4) == [1] * 4
+
+
 def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
     stub.block("hold", 0)
     driver = stub.driver(4)

@@ -25,7 +25,7 @@ from envedit.representations.layers.lights import SPARE
 from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.scene.renderings import rendered
-from envedit.solve import gauss_newton, initialization, map_problem, turning
+from envedit.solve import initialization, map_problem, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
@@ -320,11 +320,8 @@ class Preparation:
 
 
 def _loss(edit: Edit) -> float:
-    """Return the loss where the steps of an edit end; inf if it cannot begin.
-
-    Its lights are placed, and others added, before the first step: the edit goes on from there.
-    """
+    """Return the loss where an edit ends, with every light that it adds; inf if it cannot begin."""
     try:
-        return edit.job.tried(edit.params, edit.crop, SPARE, gauss_newton.ITERATIONS)
+        return edit.job.tried(edit.params, edit.crop, SPARE, ended=True)
     except NumericalError:
         return np.inf

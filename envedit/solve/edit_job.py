@@ -198,15 +198,15 @@ class Job:
         """Whether the target is a rendering, and not painted."""
         return self.wanted.coverage is None
 
-    def tried(self, params: Params, crop: np.ndarray, most_added: int = 0, steps: int | None = None) -> float:
+    def tried(self, params: Params, crop: np.ndarray, most_added: int = 0, ended: bool = False) -> float:
         """Return the loss after some steps from a start, beside which so many lights may be added.
 
-        ``steps``: :attr:`trials` by default.
+        ``ended``: where no further step, and no further light, lowers F; otherwise after :attr:`trials`.
         """
-        steps = self.trials if steps is None else min(steps, self.settings.optimizer.iterations)
+        steps = self.settings.optimizer.iterations if ended else self.trials
         if self.newton:
             asked = self._problem(), params, self._sigma, steps
-            found = gauss_newton.solve(*asked, trial=True, most_added=most_added)
+            found = gauss_newton.solve(*asked, trial=not ended, most_added=most_added)
             self.begun = found.run
             return found.loss
         few = replace(self.settings.optimizer, iterations=steps)

@@ -303,6 +303,7 @@ class _Search:
                 if found is not None and found[1] >= WORTH:
                     run, point = self._better(run, point, *self._additions(run, found[0]))
             if run is before:
+                run.asked = self.most_added + 1  # what continues this run need not ask again
                 return self._without_faded(run, point)
 
     def _without_faded(self, run, point):

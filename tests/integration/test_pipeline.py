@@ -17,7 +17,7 @@ from envedit.core.errors import InputError
 from envedit.images import analytic_sky, images
 from envedit.representations.layers import gain
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, edit_job, gauss_newton
+from envedit.solve import adam_loop, checkpoint, edit_job, gauss_newton, turning
 from envedit.targets import target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
@@ -799,3 +799,25 @@ def test_keys_that_gauss_newton_does_not_use_are_named(tmp_path, rng):
     asked["optimizer"]["kind"] = "adam"
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **asked))
     assert not any("Gauss-Newton" in line for line in found.warnings)
+
+
+@pytest.mark.slow
+def test_turned_and_unturned_edits_are_compared_where_they_end(monkeypatch):
+    """The one that is taken makes no further step: what it was compared by is what it is."""
+    monkeypatch.setattr(turning, "find", lambda *_, **__: turning.Turn(90.0, error=0.1, still=0.3))
+    steps, solve = [], gauss_newton.solve
+
+    def solved(*given, **more):
+        found = solve(*given, **more)
+        steps.append(len(found.history))
+        return found
+
+    monkeypatch.setattr(gauss_newton, "solve", solved)
+    before = analytic_sky.sunsky(64, 90, 35)
+    after = before.copy()
+    after[6:9, 40:43] += 15  # lamps
+    after[9:11, 10:12] += 7.5
+    after[4:6, 20:22] += 7.5
+    api.edit({"scene": {"file": "pair", "width": 48}, "output": {"spp": 16}}, envmap=before, target_map=after)
+    turned, still, taken = steps
+    assert taken in (turned, still) and min(steps) > 0

@@ -140,7 +140,8 @@ def run(
             said.append(f"solved on a picture of {small.width}x{small.height} pixels")
     traced = start.renderer.transport
     if traced and solved.coverage is not None:
-        solved = replace(solved, compared=_as_seen(traced, original, solved))
+        traced.resolve(original)
+        solved = solved.seen_as(traced.apply(mi.TensorXf(original)).numpy(), solved.initial)
 
     # ---- The edit: where it starts, and its optimisation
     edit = start.edit(solved)
@@ -306,17 +307,6 @@ def _in_file_units(given):
     except (Interrupted, Stopped) as stop:
         stop.envmap = given.as_stored(stop.envmap)
         raise
-
-
-def _as_seen(traced, original, wanted):
-    """Return a painted picture as T sees it: its change added to T E_0.
-
-    What is not painted is then matched exactly by the map as it is, and no gain is spent on the noise of T
-    and of the rendering that was painted on.
-    """
-    traced.resolve(original)
-    seen = traced.apply(mi.TensorXf(original)).numpy()
-    return np.maximum(wanted.picture + (seen - wanted.initial), 0).astype(np.float32)
 
 
 def _perceptual(settings):

@@ -26,8 +26,9 @@ class Seeds:
         :func:`columns`. Of a path tracer, ``sample_tea_32(2 step, transport)``: rendering and gradient.
     second_recording : int
         T once more, to see what in it is noise.
-    step_check, turn_check : int
-        Renderings that decide about the solver's steps, and about the turn of the sky.
+    step_check, turn_check, solution_check : int
+        Renderings that decide about the solver's steps, and about the turn of the sky, and that show what T
+        misses of the solution.
     target : int
         The target, rendered under another map.
     exported : int
@@ -45,6 +46,7 @@ class Seeds:
     second_recording: int
     step_check: int
     turn_check: int
+    solution_check: int
     target: int
     exported: int
     painted_initial: int
@@ -60,6 +62,7 @@ class Seeds:
             second_recording=(seed + 500_009) % _WORDS,
             step_check=(seed + 700_001) % _WORDS,
             turn_check=(seed + 800_011) % _WORDS,
+            solution_check=(seed + 900_001) % _WORDS,
             target=seed + 7_000_003,
             exported=seed + 8_000_009,
             painted_initial=seed + 9_000_011,

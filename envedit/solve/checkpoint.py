@@ -21,7 +21,7 @@ from envedit.core.errors import InputError
 from envedit.solve.adam_loop import State
 
 NAME = "checkpoint.npz"
-_FORMAT = 5  # raise when what is stored, or what the loop makes of it, changes
+_FORMAT = 6  # raise when what is stored, or what the loop makes of it, changes
 
 
 def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:

@@ -1,4 +1,7 @@
-"""An edit in progress: its loop with checkpoints, Ctrl-C, and which of several starts to take."""
+"""An edit in progress: its loop with checkpoints, Ctrl-C, and which of several starts to take.
+
+Longer than 400 lines: the ways in which Adam and Gauss-Newton go on after an interruption stand side by side.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.lights import SPARE
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, map_problem
+from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, map_problem, transport_error
 from envedit.targets import target
 
 CHECKED_SPP = 64
@@ -282,7 +285,7 @@ class Job:
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, arrays, traced, picture = found
             self.renderer.restore(traced)
-            self.wanted = self.wanted.aimed_at(picture)
+            self.wanted = replace(self.wanted, picture=picture, compared=arrays.pop("aim"))
             run = gauss_newton.Run.of_arrays(arrays, state.history)
         elif run is not None:
             self._problem().evaluate(run.state)  # another trial may have taken the columns of its lights
@@ -304,28 +307,46 @@ class Job:
                 due = time.perf_counter() - saved >= chosen.checkpoint_s
                 due |= run.finished or done >= most  # what follows may be interrupted too
                 if self.folder and (due or interrupt.is_set()):
-                    kept = what, adam_loop.State(step=done, history=run.history), run.arrays()
-                    checkpoint.save(self.folder, *kept, self.renderer.state(), self.wanted.aim)
+                    reached_so_far = adam_loop.State(step=done, history=run.history)
+                    arrays = run.arrays() | {"aim": self.wanted.aim}
+                    kept = what, reached_so_far, arrays, self.renderer.state(), self.wanted.picture
+                    checkpoint.save(self.folder, *kept)
                     saved = time.perf_counter()
                 if interrupt.is_set():
                     raise Interrupted(point.edited, done)
 
-            # Paint is no noisy picture, and asks for what it shows.
-            more: dict[str, Any] = {"sparing": False}
-            if self._rendered:
-                more = {"most_added": SPARE, "judge": self._display_error}
             self._hold(run)
             asked = params, self._sigma, chosen.iterations, after_step
-            made = gauss_newton.solve(self._problem(), *asked, run, **more)
-            while (run := self._held_more(made.run)) is not None:
+            while True:
+                # Paint is no noisy picture, and asks for what it shows.
+                more: dict[str, Any] = {"sparing": False}
+                if self._rendered and not (run and run.corrected):
+                    more = {"most_added": SPARE, "judge": self._display_error}
                 made = gauss_newton.solve(self._problem(), *asked, run, **more)
-        self.posterior, self.note = made.posterior, made.note
+                further = self._corrected(made) if self._rendered else self._held_more(made.run)
+                if further is None:
+                    break
+                run = further
+        self.posterior, said = made.posterior, [made.note] if made.note else []
         if made.run.hold > 1:
-            self.note = f"what was not painted weighs {made.run.hold:.3g}: with less it would change visibly"
-        if "saturation" in made.params:
+            said.append(f"what was not painted weighs {made.run.hold:.3g}: with less it would change visibly")
+        if "saturation" in made.params and not made.note:
             kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))
-            self.note = f"saturation of the sky's colours: {kept:.0f} % of the original's"
+            said.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
+        self.note = "; ".join(said)
         return made.params, adam_loop.State(step=len(made.history), history=made.history)
+
+    def _corrected(self, made):
+        """Return a run that goes on towards the target without T's error; None where it need not."""
+        run, most = made.run, self.settings.optimizer.iterations
+        if made.note or run.corrected or not 0 < len(run.history) < most:
+            return None
+        point = self._problem().evaluate(run.state)
+        how = self.settings.seed, self.settings.renderer.cache
+        seen = point.edited, point.rendering
+        self.wanted = transport_error.corrected(self.wanted, self.lit, *seen, *how)
+        most = len(run.history) + transport_error.STEPS
+        return gauss_newton.Run(run.state, run.start, history=run.history, most=most, corrected=True)
 
     def _hold(self, run):
         """Take the weight of what was not painted that a run has come to."""
@@ -349,7 +370,7 @@ class Job:
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
         seed = Seeds.of(self.settings.seed).step_check
         shown = display_curve.to_display(tensor(self.lit.render(envmap, CHECKED_SPP, seed)))
-        off = shown.numpy() - display_curve.to_display(tensor(self.wanted.aim)).numpy()
+        off = shown.numpy() - display_curve.to_display(tensor(self.wanted.picture)).numpy()
         return float((np.square(off) * (1 if self.wanted.weight is None else self.wanted.weight)).mean())
 
     def _look_at_the_last(self, adam, state):

@@ -66,6 +66,8 @@ class Run:
         Steps after which it ends; more once a light was added or moved.
     hold : float
         Weight of what was not painted, where it is raised (:mod:`.hold`).
+    corrected : bool
+        The last steps, towards a target without T's error (:mod:`.transport_error`): no light is added.
     wide : bool
         Derivatives by a light's direction are wide differences: with narrow ones no step leads further.
     """
@@ -80,6 +82,7 @@ class Run:
     most: int = ITERATIONS
     hold: float = 1.0
     wide: bool = False
+    corrected: bool = False
 
     def elsewhere(self, state: dict, start: dict) -> Run:
         """Return a run that goes on from another state, with steps of its own."""
@@ -90,8 +93,8 @@ class Run:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
         scale = self.scale if np.isfinite(self.scale) else 0.0  # before the first step
-        numbers = self.damping, scale, self.finished, self.asked, self.most, self.hold, self.wide
-        return both | {"numbers": np.array(numbers)}
+        numbers = self.damping, scale, self.finished, self.asked, self.most, self.hold
+        return both | {"numbers": np.array([*numbers, self.wide, self.corrected])}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -100,8 +103,8 @@ class Run:
             {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
             for part in ("state", "start")
         )
-        damping, scale, finished, asked, most, hold, wide = arrays["numbers"].tolist()
-        done = bool(finished), list(history), int(asked), int(most), hold, bool(wide)
+        damping, scale, finished, asked, most, hold, wide, corrected = arrays["numbers"].tolist()
+        done = bool(finished), list(history), int(asked), int(most), hold, bool(wide), bool(corrected)
         return cls(state, start, damping, scale or np.inf, *done)
 
 

@@ -52,8 +52,8 @@ class Target:
     noise : ndarray (h, w) or None
         Standard error of the picture's display values; None where it is not known.
     compared : ndarray (h, w, 3) or None
-        What the loop compares T E with, linear radiance; None: the picture. Of paint, the picture as T sees
-        it: what was not painted is then matched exactly by the map as it is.
+        What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
+        (:meth:`seen_as`).
     """
 
     picture: np.ndarray
@@ -75,6 +75,13 @@ class Target:
     def aimed_at(self, picture: np.ndarray) -> Target:
         """Return the target with another :attr:`aim`."""
         return replace(self, picture=picture) if self.compared is None else replace(self, compared=picture)
+
+    def seen_as(self, seen: np.ndarray, rendering: np.ndarray) -> Target:
+        """Return the target as T sees it: with what T misses of a map's rendering, (h, w, 3), taken off.
+
+        T of this map matches its own rendering exactly then, and nothing is spent on the noise of both.
+        """
+        return replace(self, compared=np.maximum(self.picture + (seen - rendering), 0).astype(np.float32))
 
     def held(self, paint: float, hold: float) -> Target:
         """Return the target with other weights of paint and rest, among the pixels that count."""

@@ -17,7 +17,7 @@ from envedit.core.errors import InputError
 from envedit.images import analytic_sky, images
 from envedit.representations.layers import gain
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, edit_job, gauss_newton, turning
+from envedit.solve import adam_loop, checkpoint, edit_job, gauss_newton, transport_error, turning
 from envedit.targets import target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
@@ -819,5 +819,25 @@ def test_turned_and_unturned_edits_are_compared_where_they_end(monkeypatch):
     after[9:11, 10:12] += 7.5
     after[4:6, 20:22] += 7.5
     api.edit({"scene": {"file": "pair", "width": 48}, "output": {"spp": 16}}, envmap=before, target_map=after)
-    turned, still, taken = steps
-    assert taken in (turned, still) and min(steps) > 0
+    turned, still, taken, corrected = steps
+    assert taken in (turned, still) and min(steps) > 0 and corrected >= taken
+
+
+@pytest.mark.slow
+def test_the_map_does_not_make_up_for_what_the_transport_misses(monkeypatch):
+    """Few samples, and a large bright window: T errs by far more than the target's noise."""
+    before = analytic_sky.sunsky(64, 90, 35)
+    before[10:14, 30:40] = 8
+    after = before.copy()
+    after[4:8, 50:56] = 6
+    settings = {
+        "scene": {"file": "sphere", "width": 48},
+        "renderer": {"spp": 64},
+        "representation": {"turn": False},
+        "target": {"spp": 1024},
+        "output": {"spp": 1024},
+    }
+    psnr = api.edit(settings, envmap=before, target_map=after).metrics["render"]["psnr"]
+    monkeypatch.setattr(transport_error, "corrected", lambda wanted, *_: wanted)
+    without = api.edit(settings, envmap=before, target_map=after).metrics["render"]["psnr"]
+    assert psnr > without + 1

@@ -13,8 +13,8 @@ def test_seeds_are_those_that_results_were_made_with():
     """Another number here makes other bytes of every result."""
     expected = {
         "fit": 5, "transport": 5, "second_recording": 500_014, "step_check": 700_006,
-        "turn_check": 800_016, "target": 7_000_008, "exported": 8_000_014, "painted_initial": 9_000_016,
-        "judged": 9_000_017, "page": 9_000_026,
+        "turn_check": 800_016, "solution_check": 900_006, "target": 7_000_008, "exported": 8_000_014,
+        "painted_initial": 9_000_016, "judged": 9_000_017, "page": 9_000_026,
     }  # fmt: skip
     assert asdict(seeds.Seeds.of(5)) == expected
     assert (seeds.recording(5, 0), seeds.recording(5, 2)) == (5, 2_000_011)
@@ -30,8 +30,9 @@ def test_no_two_purposes_share_samples():
 
 def test_the_largest_seed_stays_one_where_it_goes_to_mitsuba_or_a_configuration():
     most = seeds.Seeds.of(2**32 - 1)
-    wrapped = most.second_recording, most.step_check, most.turn_check, most.pass_of_page(3)
-    assert wrapped == (500_008, 700_000, 800_010, 9_000_023)
+    checks = most.step_check, most.turn_check, most.solution_check
+    assert (most.second_recording, *checks) == (500_008, 700_000, 800_010, 900_000)
+    assert most.pass_of_page(3) == 9_000_023
 
 
 def test_no_other_module_adds_to_a_seed():

@@ -333,6 +333,9 @@ class Job:
         if "saturation" in made.params and not made.note:
             kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))
             said.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
+        if made.run.corrected:
+            missed = f"the stored transport's error at the solution ({transport_error.SPP} samples a pixel)"
+            said.append(f"{missed} was taken off the target for the last steps")
         self.note = "; ".join(said)
         return made.params, adam_loop.State(step=len(made.history), history=made.history)
 

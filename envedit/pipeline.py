@@ -28,7 +28,8 @@ from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
 from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
-from envedit.targets import target, working_size
+from envedit.targets import working_size
+from envedit.targets.target import make as make_target
 from envedit.targets.working_size import at_size
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
@@ -124,16 +125,16 @@ def run(
         small = working_size.smaller(settings, lit)
         renderers.check(settings, small, (height, width))
         watch.stage("rendering the target")
-        wanted = target.make(settings, lit, original, memory.picture, memory.mask, memory.target_map)
-        warnings += wanted.warnings
-        solved = wanted if small is lit else working_size.worked_on(settings, lit, small, original, wanted)
+        target = make_target(settings, lit, original, memory.picture, memory.mask, memory.target_map)
+        warnings += target.warnings
+        solved = target if small is lit else working_size.worked_on(settings, lit, small, original, target)
 
     # ---- Transport, at the size that the edit is solved at
     start = Preparation(settings, small, original, rows, folder, watch, dists, clock)
     start.trace()
     if small is not lit:
         if start.detailed(solved):
-            small, solved = lit, wanted
+            small, solved = lit, target
             start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
             start.trace()
         else:
@@ -154,9 +155,9 @@ def run(
         params, state = job.optimise(edit.params, edit.crop, resume)
         found_map = job.decode(params)
         edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
-        solved = job.wanted  # a resumed run has the picture that it began with
+        solved = job.target  # a resumed run has the picture that it began with
         if small is lit:
-            wanted = solved
+            target = solved
     predicted = None
     if traced:
         with _in_file_units(given), keeping(edited):
@@ -178,29 +179,29 @@ def run(
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, _ = lit.sampled(edited, spp, seed)
-        initial = wanted.initial
+        initial = target.initial
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         lights, core = _lights(original, edited, lit.to_world, edit.degrees)
 
     # ---- Notes
     notes += [job.note] if job.note else []
-    notes += [said_of] if (said_of := light_list.told(lights, height)) else []
+    notes += [said_of] if (said_of := light_list.summary(lights, height)) else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows.slice].all(axis=2).mean())
         notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
-    notes = [*said, wanted.source, *renderer.choices, *notes, *adjusted]
+    notes = [*said, target.source, *renderer.choices, *notes, *adjusted]
     notes.append(f"result rendered with {judged} samples a pixel")
 
     # ---- Measures, and what to warn of
-    renders = {"initial": initial, "target": wanted.picture, "edited": final}
-    maps = {"initial": original, "target": wanted.envmap, "edited": edited}
+    renders = {"initial": initial, "target": target.picture, "edited": final}
+    maps = {"initial": original, "target": target.envmap, "edited": edited}
     with _in_file_units(given), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, wanted.coverage, within, lpips, lit)
+        measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit)
     rate = "; lower optimizer.lr" if job.raised_rate else ""
     pair = [measured[name] for name in ("render", "initial")]
-    measured["worse"] = wanted.coverage is None and metrics.worse(*pair)
+    measured["worse"] = target.coverage is None and metrics.worse(*pair)
     if measured["worse"]:
         after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
@@ -275,7 +276,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         *inputs.notes(settings.input, lit, given),
         said,
         *notes,
-        *filter(None, [light_list.told(lights, len(original))]),
+        *filter(None, [light_list.summary(lights, len(original))]),
         f"rendered with {judged} samples a pixel",
     ]
     measured |= {
@@ -322,11 +323,11 @@ def _perceptual(settings):
 def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
     tonemap = settings.output.tonemap
-    before, wanted, after = (renders[name] for name in ("initial", "target", "edited"))
+    before, target, after = (renders[name] for name in ("initial", "target", "edited"))
     seen = None if lit.alpha is None else lit.alpha > 0
     measured = {
-        "render": metrics.compare(after, wanted, tonemap, lpips, seen, lit.rows),
-        "initial": metrics.compare(before, wanted, tonemap, lpips, seen, lit.rows),
+        "render": metrics.compare(after, target, tonemap, lpips, seen, lit.rows),
+        "initial": metrics.compare(before, target, tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.first, rows.last],
@@ -336,7 +337,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
     if len(lit.views) > 1:
         measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap)
     if coverage is not None:
-        measured["painted"] = metrics.painted(after, wanted, before, coverage, tonemap, seen)
+        measured["painted"] = metrics.painted(after, target, before, coverage, tonemap, seen)
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
         original, true, edited = (maps[name][rows.slice] for name in ("initial", "target", "edited"))
@@ -350,15 +351,15 @@ def _of_views(views, renders, coverage, lpips, seen, tonemap):
     """Compare the renderings of each view."""
     found = []
     for view in views:
-        before, wanted, after = (renders[name][view.rows] for name in ("initial", "target", "edited"))
+        before, target, after = (renders[name][view.rows] for name in ("initial", "target", "edited"))
         counts = None if seen is None else seen[view.rows]
         some = tonemap, lpips, counts
         of_view = {"name": view.name}
-        of_view |= {"render": metrics.compare(after, wanted, *some)}
-        of_view |= {"initial": metrics.compare(before, wanted, *some), "painted": None}
+        of_view |= {"render": metrics.compare(after, target, *some)}
+        of_view |= {"initial": metrics.compare(before, target, *some), "painted": None}
         if coverage is not None:
             painted = coverage[view.rows], tonemap, counts
-            of_view["painted"] = metrics.painted(after, wanted, before, *painted)
+            of_view["painted"] = metrics.painted(after, target, before, *painted)
         found.append(of_view)
     return found
 

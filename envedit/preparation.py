@@ -116,7 +116,7 @@ class Preparation:
             shape = self.original.shape[:2]
             self.renderer = renderers.make(self.settings, self.lit, shape, self._count)
 
-    def detailed(self, wanted: Target) -> bool:
+    def detailed(self, target: Target) -> bool:
         """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""
         if self.settings.representation.kind != "layers":
             return False
@@ -126,14 +126,14 @@ class Preparation:
             )
             representation.encode(self.original[self.rows.slice], self.settings.seed)
         with self.clock("transport_s"):
-            found = self._recorded(representation, wanted)
+            found = self._recorded(representation, target)
         return bool(found and found.octaves)
 
-    def edit(self, wanted: Target) -> Edit:
+    def edit(self, target: Target) -> Edit:
         """Prepare the edit; the sky is turned where that explains the target better."""
-        turn, settings = self._turn(wanted), self.settings
+        turn, settings = self._turn(target), self.settings
         idle = replace(self, settings=replace(settings, optimizer=replace(settings.optimizer, iterations=0)))
-        noise = self._noise(wanted, turn)
+        noise = self._noise(target, turn)
         worth = (
             turn is not None
             and turn.degrees != 0
@@ -144,20 +144,20 @@ class Preparation:
             )
         )
         if not worth:
-            if noise > 0 and self._still(turn, wanted) <= TO_NOISE * noise:
+            if noise > 0 and self._still(turn, target) <= TO_NOISE * noise:
                 said = "nothing changed: the map already renders to the target within noise"
                 said += f" (display residual of the stored transport {noise:.4f})"
-                return idle._prepared(wanted, 0.0, [said], search=False, ask=False)
-            return self._prepared(wanted, 0.0, [])
+                return idle._prepared(target, 0.0, [said], search=False, ask=False)
+            return self._prepared(target, 0.0, [])
         said = f"sky turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
-        if self._explained(turn, noise, wanted.weight):
+        if self._explained(turn, noise, target.weight):
             said += "; the rest is noise, nothing else changed"
-            return idle._prepared(wanted, turn.degrees, [said], search=False, ask=False)
-        turned = self._prepared(wanted, turn.degrees, [said], search=False)
+            return idle._prepared(target, turn.degrees, [said], search=False, ask=False)
+        turned = self._prepared(target, turn.degrees, [said], search=False)
         if settings.representation.turn is True or not turned.job.newton:
             return turned
-        still = self._prepared(wanted, 0.0, [])
+        still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
             loss, other = _loss(turned), _loss(still)
@@ -165,42 +165,42 @@ class Preparation:
         chosen.notes.append(f"AIC (lower is better): {loss:.5g} with the sky turned, {other:.5g} without")
         return chosen
 
-    def _turn(self, wanted):
+    def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""
         asked, transport = self.settings.representation.turn, self.renderer.transport
         if asked is False or transport is None or not self.rows.all:
             return None
-        if asked == "auto" and wanted.coverage is not None:  # most of a painted picture is to stay
+        if asked == "auto" and target.coverage is not None:  # most of a painted picture is to stay
             return None
         with self.clock("start_s"):
             self.watch.stage("testing turns of the sky")
-            seen = self.original, wanted.picture, wanted.weight
+            seen = self.original, target.picture, target.weight
             return turning.find(transport, *seen, thorough=asked is True)
 
-    def _noise(self, wanted, turn):
+    def _noise(self, target, turn):
         """Return the residual of T against Mitsuba's rendering of the map; 0 where an edit is made anyway.
 
         That is where the target is painted, where nothing is left as it is (a network is no exact copy), and
         where neither the map nor its turn come near the target.
         """
         transport = self.renderer.transport
-        if self.settings.representation.kind != "layers" or transport is None or wanted.coverage is not None:
+        if self.settings.representation.kind != "layers" or transport is None or target.coverage is not None:
             return 0.0
         with self.clock("start_s"):
             cache, seed = self.settings.renderer.cache, Seeds.of(self.settings.seed).turn_check
             shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
-            near = turning.apart(shown, wanted.picture, wanted.weight) < 2 * TO_NOISE * NOISIEST
+            near = turning.apart(shown, target.picture, target.weight) < 2 * TO_NOISE * NOISIEST
             if not near and (turn is None or turn.error > DOUBTFUL * NOISIEST):
                 return 0.0
-            found = turning.residual(transport, self.original, shown, wanted.weight)
+            found = turning.residual(transport, self.original, shown, target.weight)
         return found if found <= NOISIEST else QUIET
 
-    def _still(self, turn, wanted):
+    def _still(self, turn, target):
         """Return the residual of the map as it is."""
         if turn is not None:
             return turn.still
         with self.clock("start_s"):
-            return turning.residual(self.renderer.transport, self.original, wanted.picture, wanted.weight)
+            return turning.residual(self.renderer.transport, self.original, target.picture, target.weight)
 
     def _explained(self, turn, noise, weight):
         """Whether the turn alone gives the target, to the noise."""
@@ -212,7 +212,7 @@ class Preparation:
             asked = self.renderer.transport, turned, shown, weight
             return turn.error <= TO_NOISE * turning.residual(*asked)
 
-    def _prepared(self, wanted, degrees, notes, search=True, ask=True):
+    def _prepared(self, target, degrees, notes, search=True, ask=True):
         """Prepare the edit of the turned map; ``ask``: how fine its gain may be."""
         settings = self.settings
         original = latlong.rotate(self.original, degrees)
@@ -233,7 +233,7 @@ class Preparation:
             if kind == "layers" and representation.below is not None:
                 notes.append(f"rows below the horizon {representation.below.said}")
         with self.clock("transport_s"):
-            recordings = self._recorded(representation, wanted) if ask else None
+            recordings = self._recorded(representation, target) if ask else None
         traced = self.renderer.transport
         job = Job(
             settings=settings,
@@ -241,7 +241,7 @@ class Preparation:
             original=original,
             first=self.rows.first,
             free=None,
-            wanted=wanted,
+            target=target,
             representation=representation,
             renderer=self.renderer,
             folder=self.folder,
@@ -264,13 +264,13 @@ class Preparation:
             notes += found
         return Edit(job, params, crop, degrees, frozen, notes)
 
-    def _recorded(self, representation, wanted):
+    def _recorded(self, representation, target):
         """Return what is looked through for where layers start; None for what is fitted."""
         if not representation.models_edit:
             return None
         if self._recordings is None:
             shape, traced = self.original.shape[:2], self.renderer.transport
-            asked = self.settings, self.lit, shape, representation, wanted, traced, self._count
+            asked = self.settings, self.lit, shape, representation, target, traced, self._count
             self._recordings = initialization.recordings(*asked)
             if traced:
                 self.renderer = self._recordings.transport
@@ -282,7 +282,7 @@ class Preparation:
             self.watch.stage("solving for lights and coarse gain")
             alone = replace(recordings, octaves=[])
             found = initialization.find(
-                job.representation, params, alone, job.wanted, job.original, only_own=True
+                job.representation, params, alone, job.target, job.original, only_own=True
             )
             try:
                 return job.solved(job.best(found.starts, crop)[0])
@@ -297,9 +297,9 @@ class Preparation:
             if not search:
                 return params, recordings.notes
             self.watch.stage("searching for lights")
-            asked = job.representation, params, recordings, job.wanted, job.original
+            asked = job.representation, params, recordings, job.target, job.original
             ready = initialization.find(*asked, only_own=job.newton)
-            job.wanted = ready.wanted
+            job.target = ready.target
             if smooth is not None:
                 # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
                 kept = {name: value for name, value in smooth.items() if name != "ground"}

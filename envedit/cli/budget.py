@@ -59,10 +59,10 @@ class Level:
 
 
 LEVELS = (
-    Level("coarse", 96, 48, 64, 1.0, 2.4, 3.9, 1.5),
-    Level("draft", 128, 64, "auto", 2.9, 5.9, 3.4, 1.0),
-    Level("fine", 256, 128, 64, 9.3, 6.7, 0.4, 0.0),
-    Level("standard", 256, 128, "auto", 9.3, 6.7, 0.0, 0.0),
+    Level("coarse", 96, 48, 64, 1.6, 3.2, 4.1, 1.8),
+    Level("draft", 128, 64, "auto", 4.4, 5.6, 3.3, 0.8),
+    Level("fine", 256, 128, 64, 15.1, 6.6, 0.6, 0.1),
+    Level("standard", 256, 128, "auto", 15.1, 6.6, 0.0, 0.0),
 )
 """The standard preset is the finest: larger pictures are solved on 128x128 pixels in any case. A map of 96
 and a picture of 32 across took as long as the coarsest and lost 2.7 dB more. What "fine" saves are samples of

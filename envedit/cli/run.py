@@ -70,8 +70,8 @@ def _progress(arguments):
     """Return what shows progress."""
     from envedit.cli.progress import JsonProgress, Progress
 
-    wanted = arguments.progress == "json" and not arguments.quiet
-    return JsonProgress() if wanted else Progress(quiet=arguments.quiet)
+    as_json = arguments.progress == "json" and not arguments.quiet
+    return JsonProgress() if as_json else Progress(quiet=arguments.quiet)
 
 
 def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[config.Config, Path | None, Path]:
@@ -275,7 +275,7 @@ def _dry_run(settings, arguments):
     from envedit import inputs
     from envedit.images import images
     from envedit.report import preview
-    from envedit.targets import target
+    from envedit.targets.target import make as make_target
 
     folder = Path(settings.output.dir)
     with output_folder.alone(folder), _progress(arguments) as progress:
@@ -283,19 +283,19 @@ def _dry_run(settings, arguments):
         lit = inputs.load_scene(settings.scene, arguments.base)
         envmap, warnings = inputs.load_map(settings.input, lit)
         notes = inputs.notes(settings.input, lit)
-        wanted = target.make(settings, lit, envmap)
+        target = make_target(settings, lit, envmap)
         files = {name: folder / name for name in ("dry_run.png", "dry_run.exr")}
         preview.preview(
             files["dry_run.png"],
-            {"initial": wanted.initial, "target": wanted.picture},
-            {"initial": envmap, "target": wanted.envmap},
+            {"initial": target.initial, "target": target.picture},
+            {"initial": envmap, "target": target.envmap},
             settings.output.tonemap,
             views=[view.rows for view in lit.views],
         )
-        images.write_exr(files["dry_run.exr"], wanted.picture, {"content": "target"}, panorama=False)
-    for line in (*warnings, *wanted.warnings):
+        images.write_exr(files["dry_run.exr"], target.picture, {"content": "target"}, panorama=False)
+    for line in (*warnings, *target.warnings):
         _tell(arguments, "warning", line)
-    for line in (*notes, wanted.source, *(str(file.resolve()) for file in files.values())):
+    for line in (*notes, target.source, *(str(file.resolve()) for file in files.values())):
         _say(arguments, line)
     arguments.facts["files"] = {name: str(file.resolve()) for name, file in files.items()}
     return 0

@@ -127,10 +127,10 @@ def spread(core: np.ndarray, degrees: float) -> np.ndarray:
 
 def _lights(envmap, degrees, most):
     """Soften the lights of a map and bound what it shows; ``most`` 0: no bound."""
-    told = separate(envmap)
-    rest = envmap - told.core
+    separated = separate(envmap)
+    rest = envmap - separated.core
     cores = []
-    for light in told.lights:
+    for light in separated.lights:
         core = np.zeros_like(envmap)
         core.reshape(-1, 3)[light.texels] = light.radiance
         cores.append(spread(core, degrees) if degrees else core)

@@ -16,8 +16,8 @@ from envedit.representations.layers.separation import Separation
 
 FARTHEST = math.pi + 1
 """Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
-MOST_TOLD = 8
-"""Lights that :func:`told` names."""
+MOST_NAMED = 8
+"""Lights that :func:`summary` names."""
 
 
 def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +127,7 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
     }
 
 
-def told(lights: dict[str, list[dict]], height: int) -> str | None:
+def summary(lights: dict[str, list[dict]], height: int) -> str | None:
     """Say which lights moved, stayed, came and went, those with most flux first; None without any.
 
     Parameters
@@ -149,8 +149,8 @@ def told(lights: dict[str, list[dict]], height: int) -> str | None:
         ratio = sum(end["flux"]) / max(sum(light["flux"]), 1e-30)
         parts.append(f"{_named(light)} {how}" + (f", flux x {ratio:.2g}" if abs(ratio - 1) > 0.1 else ""))
     parts += [f"{_named(light)} is new" for light in after.values()]
-    more = f"; and {len(parts) - MOST_TOLD} more in lights.json" if len(parts) > MOST_TOLD else ""
-    return "; ".join(parts[:MOST_TOLD]) + more if parts else None
+    more = f"; and {len(parts) - MOST_NAMED} more in lights.json" if len(parts) > MOST_NAMED else ""
+    return "; ".join(parts[:MOST_NAMED]) + more if parts else None
 
 
 def _named(light):

@@ -213,7 +213,7 @@ def log_rmse(a: np.ndarray, b: np.ndarray) -> float | None:
 
 def painted(
     edited: np.ndarray,
-    wanted: np.ndarray,
+    target: np.ndarray,
     initial: np.ndarray,
     coverage: np.ndarray,
     tonemap: str = "gamma",
@@ -225,7 +225,7 @@ def painted(
 
     Parameters
     ----------
-    edited, wanted, initial : array (h, w, 3)
+    edited, target, initial : array (h, w, 3)
         The result's rendering, the painted picture and what it was painted on; linear radiance.
     coverage : array (h, w, 1)
         How much each pixel was painted.
@@ -237,7 +237,7 @@ def painted(
     Returns
     -------
     dict
-        ``towards``: 1 - sum c |edited - wanted| / sum c |initial - wanted|, None where nothing was asked;
+        ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None where nothing was asked;
         ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
 
     Raises
@@ -245,9 +245,9 @@ def painted(
     InputError
         As `mse`.
     """
-    edited, wanted = _pair(edited, wanted)
+    edited, target = _pair(edited, target)
     _, initial = _pair(edited, initial)
-    d, t, before = (apply_tonemap(image, tonemap) for image in (edited, wanted, initial))
+    d, t, before = (apply_tonemap(image, tonemap) for image in (edited, target, initial))
     counts = 1.0 if seen is None else np.asarray(seen, np.float64)[..., None]
     cover = counts * np.broadcast_to(coverage, d.shape).astype(np.float64)
     left = np.broadcast_to(counts - cover, d.shape)

@@ -298,11 +298,11 @@ def _verdict(metrics):
     known = [one for one in (before, after) if one]
     total = number((metrics.get("timing") or {}).get("total_s"))
 
-    def told(one):
+    def as_text(one):
         return "unknown" if one is None else score(one, known)
 
     kind = "log RMSE: a display shows little of what differs" if saturated(known) else "PSNR"
-    parts = [f"Rendering against the target: {told(before)} → <strong>{told(after)}</strong> {kind}"]
+    parts = [f"Rendering against the target: {as_text(before)} → <strong>{as_text(after)}</strong> {kind}"]
     if true_map:
         since = f"{score(unedited, [])} → " if unedited else ""
         parts.append(f"map against the true one: {since}{score(true_map, [])}")

@@ -42,8 +42,8 @@ _MOST_WIDTH_PER_HEIGHT = 1.5
 # Words for errors
 
 
-def told(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any:
-    """Call the parser, and say in one line what it says in many."""
+def called(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any:
+    """Call a function of the parser; its errors become an InputError of one line that names the file."""
     try:
         return call(*arguments, **filled)
     except (RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
@@ -234,7 +234,7 @@ def fit_to_stage(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> Non
         transform = _matrix(props["to_world"], where) @ transform
     props["to_world"] = mi.ScalarTransform4d(transform)
     probe = {k: v for k, v in props.items() if not isinstance(v, mi.Properties.ResolvedReference)}
-    box = told(where, mi.load_dict, {"type": props.plugin_name(), **probe}).bbox()
+    box = called(where, mi.load_dict, {"type": props.plugin_name(), **probe}).bbox()
     low, high = (np.array(v, np.float64).ravel() for v in (box.min, box.max))
     extent = high - low
     if not (np.isfinite(extent).all() and extent[1] > 0):

@@ -45,8 +45,8 @@ def rendered(
     size = scene.height, scene.width
 
     def whole(arrays):
-        told = (0,) if arrays["noise"].size == 0 else size
-        kept = {"picture": ("f4", (*size, 3)), "spp": ("i8", ()), "noise": ("f8", told)}
+        of_noise = (0,) if arrays["noise"].size == 0 else size
+        kept = {"picture": ("f4", (*size, 3)), "spp": ("i8", ()), "noise": ("f8", of_noise)}
         return holds(arrays, kept) and arrays["spp"] > 0
 
     if (found := cache.load(key, whole)) is not None:

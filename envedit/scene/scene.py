@@ -387,7 +387,7 @@ def load(
             node.props.mark_queried(key, False)
 
     with _two_threads(), quiet_libraries():  # libjpeg prints about odd textures
-        built = parser.told(where, mi.parser.instantiate, config, state)
+        built = parser.called(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
     if scene.environment() is None or scene.environment().id() != name:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
@@ -395,13 +395,13 @@ def load(
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    told = views, own, asked.max_depth, asked.hide_emitters, notes
+    rest = views, own, asked.max_depth, asked.hide_emitters, notes
     given: dict[str, Any] = dict(parameters or {})
 
     def again(width: int, height: int) -> Scene:
         return load(file, width, height, parameters, base, sampler, sensors)
 
-    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *told, given, again)
+    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *rest, given, again)
 
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
@@ -430,15 +430,15 @@ def _parsed(file, parameters, base):
         path, where, folders = None, "scene dict", (base,)
         installed_plugins.come_first()
         installed_plugins.check_dict(file, where)
-        state = parser.told(where, mi.parser.parse_dict, config, file)
+        state = parser.called(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
         filled, searched = _check_parameters(path, parameters or {})
         where, folders = str(path), (path.parent, base, *searched)
         with installed_plugins.restored():
-            state = parser.told(where, mi.parser.parse_file, config, str(path), **filled)
+            state = parser.called(where, mi.parser.parse_file, config, str(path), **filled)
     scene_text.check_references(state, where)
-    parser.told(where, mi.parser.transform_all, config, state)
+    parser.called(where, mi.parser.transform_all, config, state)
     parser.lower_names(state)
     installed_plugins.come_first()
     for node in state.nodes:

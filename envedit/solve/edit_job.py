@@ -6,6 +6,7 @@ Longer than 400 lines: the ways in which Adam and Gauss-Newton go on after an in
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -27,8 +28,16 @@ from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.lights import SPARE
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, map_problem, transport_error
-from envedit.targets import target
+from envedit.solve import (
+    adam_loop,
+    block_jacobian,
+    checkpoint,
+    gauss_newton,
+    hold,
+    map_problem,
+    transport_error,
+)
+from envedit.targets.target import Target
 
 CHECKED_SPP = 64
 """Samples a pixel of renderings by which start and solution are compared."""
@@ -89,7 +98,7 @@ class Job:
         Its first active row.
     free : ndarray of bool (rows, W), optional
         Active texels that may change; None: all.
-    wanted : target.Target
+    target : Target
         What the renderer is to make.
     representation, renderer : Representation, Renderer
         As :func:`.adam_loop.optimise` takes them; of layers, more than the protocol is used.
@@ -112,7 +121,7 @@ class Job:
     original: np.ndarray
     first: int
     free: np.ndarray | None
-    wanted: target.Target
+    target: Target
     representation: Any
     renderer: Renderer
     folder: Path | None
@@ -199,7 +208,7 @@ class Job:
     @property
     def _rendered(self):
         """Whether the target is a rendering, and not painted."""
-        return self.wanted.coverage is None
+        return self.target.coverage is None
 
     def tried(self, params: Params, crop: np.ndarray, most_added: int = 0, ended: bool = False) -> float:
         """Return the loss after some steps from a start, beside which so many lights may be added.
@@ -213,8 +222,8 @@ class Job:
             self.begun = found.run
             return found.loss
         few = replace(self.settings.optimizer, iterations=steps)
-        wanted = self.wanted.aim, self.wanted.weight
-        objective = adam_loop.Objective(self.settings.loss, *wanted, crop, steps, self.dists, self.lit.rows)
+        target = self.target.aim, self.target.weight
+        objective = adam_loop.Objective(self.settings.loss, *target, crop, steps, self.dists, self.lit.rows)
         return self._loop(params, objective, few)[1].history[-1]["loss"]
 
     def solved(self, params: Params) -> Params:
@@ -228,16 +237,16 @@ class Job:
         """Optimise from the start, or from the checkpoint; returns parameters and state."""
         if self.newton:
             return self._solve(params, resume)
-        chosen, wanted = self.settings.optimizer, self.wanted
+        chosen, target = self.settings.optimizer, self.target
         adam, state = adam_loop.adam_for(self.representation, params, chosen), adam_loop.State()
-        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *wanted.asked])
+        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *target.asked])
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, optimiser, traced, picture = found
             adam.load_state_dict(optimiser)
             self.renderer.restore(traced)
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
-            wanted = self.wanted = wanted.aimed_at(picture)
-        asked = wanted.aim, wanted.weight, crop, chosen.iterations, self.dists, self.lit.rows
+            target = self.target = target.aimed_at(picture)
+        asked = target.aim, target.weight, crop, chosen.iterations, self.dists, self.lit.rows
         objective = adam_loop.Objective(self.settings.loss, *asked)
         saved = time.perf_counter()
 
@@ -250,7 +259,7 @@ class Job:
                 due |= state.step == chosen.iterations  # what follows may be interrupted too
                 if self.folder and (stop or due):
                     traced = self.renderer.state()
-                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, wanted.aim)
+                    checkpoint.save(self.folder, what, state, adam.state_dict(), traced, target.aim)
                     saved = time.perf_counter()
                 if stop:
                     raise Interrupted(self.last_good(adam), state.step)
@@ -267,25 +276,32 @@ class Job:
         return adam.params, state
 
     def _problem(self):
-        wanted = self.wanted.aim, self.wanted.weight, self.representation.free
-        asked = self.representation, self.renderer.transport, self.original, *wanted
+        target = self.target.aim, self.target.weight, self.representation.free
+        asked = self.representation, self.renderer.transport, self.original, *target
         whole = self._rendered and self.representation.free is None
-        return map_problem.Problem(*asked, saturates=whole, robust=self._rendered)
+        more: dict[str, Any] = {"saturates": whole, "robust": self._rendered}
+        return map_problem.Problem(*asked, **more, blocks=self._blocks)
+
+    @functools.cached_property
+    def _blocks(self):
+        """The blocks of all problems of this job: they depend on layers and transport alone."""
+        shape = self.original.shape[:2]
+        return block_jacobian.BlockJacobian(self.representation, self.renderer.transport, shape)
 
     @property
     def _sigma(self):
         """Standard error of display values: what was measured of the target, but not below the usual."""
-        noise = self.wanted.noise
+        noise = self.target.noise
         return map_problem.SIGMA if noise is None else max(map_problem.SIGMA, float(np.median(noise)))
 
     def _solve(self, params, resume):
         """Make Gauss-Newton steps from the start, or from the checkpoint."""
         chosen, run = self.settings.optimizer, self.begun
-        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *self.wanted.asked])
+        what = checkpoint.digest(self.settings, self.lit.digest, [self.original, *self.target.asked])
         if self.folder and resume and (found := checkpoint.load(self.folder, what)):
             state, arrays, traced, picture = found
             self.renderer.restore(traced)
-            self.wanted = replace(self.wanted, picture=picture, compared=arrays.pop("aim"))
+            self.target = replace(self.target, picture=picture, compared=arrays.pop("aim"))
             run = gauss_newton.Run.of_arrays(arrays, state.history)
         elif run is not None:
             self._problem().evaluate(run.state)  # another trial may have taken the columns of its lights
@@ -308,8 +324,8 @@ class Job:
                 due |= run.finished or done >= most  # what follows may be interrupted too
                 if self.folder and (due or interrupt.is_set()):
                     reached_so_far = adam_loop.State(step=done, history=run.history)
-                    arrays = run.arrays() | {"aim": self.wanted.aim}
-                    kept = what, reached_so_far, arrays, self.renderer.state(), self.wanted.picture
+                    arrays = run.arrays() | {"aim": self.target.aim}
+                    kept = what, reached_so_far, arrays, self.renderer.state(), self.target.picture
                     checkpoint.save(self.folder, *kept)
                     saved = time.perf_counter()
                 if interrupt.is_set():
@@ -347,23 +363,23 @@ class Job:
         point = self._problem().evaluate(run.state)
         how = self.settings.seed, self.settings.renderer.cache
         seen = point.edited, point.rendering
-        self.wanted = transport_error.corrected(self.wanted, self.lit, *seen, *how)
+        self.target = transport_error.corrected(self.target, self.lit, *seen, *how)
         most = len(run.history) + transport_error.STEPS
         return gauss_newton.Run(run.state, run.start, history=run.history, most=most, corrected=True)
 
     def _hold(self, run):
         """Take the weight of what was not painted that a run has come to."""
         if run is not None and run.hold > 1:
-            self.wanted = self.wanted.held(self.settings.target.paint, run.hold)
+            self.target = self.target.held(self.settings.target.paint, run.hold)
         return run
 
     def _held_more(self, run):
         """Return a run that goes on with more weight on what was not painted; None where it need not."""
-        chosen, wanted, most = self.settings.target, self.wanted, self.settings.optimizer.iterations
+        chosen, target, most = self.settings.target, self.target, self.settings.optimizer.iterations
         if self._rendered or len(run.history) >= most:
             return None
         seen = self._problem().evaluate(run.state, resolve=False).rendering
-        more = hold.further(chosen, run.hold, seen, wanted.aim, wanted.coverage, wanted.weight)
+        more = hold.further(chosen, run.hold, seen, target.aim, target.coverage, target.weight)
         if more is None:
             return None
         most = len(run.history) + gauss_newton.ITERATIONS
@@ -373,8 +389,8 @@ class Job:
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
         seed = Seeds.of(self.settings.seed).step_check
         shown = display_curve.to_display(tensor(self.lit.render(envmap, CHECKED_SPP, seed)))
-        off = shown.numpy() - display_curve.to_display(tensor(self.wanted.picture)).numpy()
-        return float((np.square(off) * (1 if self.wanted.weight is None else self.wanted.weight)).mean())
+        off = shown.numpy() - display_curve.to_display(tensor(self.target.picture)).numpy()
+        return float((np.square(off) * (1 if self.target.weight is None else self.target.weight)).mean())
 
     def _look_at_the_last(self, adam, state):
         """Take the last step back if it led to no map: the loop sees only what a next step starts from."""

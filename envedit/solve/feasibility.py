@@ -149,7 +149,7 @@ def reachable(
     original : ndarray (H, W, 3)
         The map, linear radiance.
     target : ndarray (h, w, 3)
-        The picture wanted, linear radiance.
+        The target, linear radiance.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts; all the same by default.
     rows : Rows, optional
@@ -358,17 +358,17 @@ def _solve(model, x, picture):
     question = model.question
     weight = question.weights(picture)
     white = question.target >= 1  # any value above will do
-    wanted = np.minimum(question.target, 1) - model.base
+    aim = np.minimum(question.target, 1) - model.base
 
     def rest(light):
-        r = wanted - light
+        r = aim - light
         return np.where(white, np.maximum(r, 0), r)
 
     # ---- Metric (De Pierro)
     one = model.render(np.stack([np.zeros((model.count, 3)), np.ones((model.count, 3))]))
     light = picture - model.base
     # A sky of one radiance that is as bright as the picture or the target.
-    bright = (weight * np.maximum(light, wanted)).sum(axis=(0, 1))
+    bright = (weight * np.maximum(light, aim)).sum(axis=(0, 1))
     mean = np.maximum(bright / np.maximum((weight * one).sum(axis=(0, 1)), 1e-30), 1e-12)
     # A single texel can grow by as much light as a cell.
     size = np.bincount(model.groups.ravel(), minlength=model.count)[:, None]
@@ -399,9 +399,9 @@ def _solve(model, x, picture):
         r = rest(light)
         before, value = value, 0.5 * (weight * r * r).sum()
         slope = np.where(seen, model.adjoint(weight * r) / np.maximum(pulled, 1e-300), 0)
-        with np.errstate(over="ignore", invalid="ignore"):  # no dual point where all is wanted white
+        with np.errstate(over="ignore", invalid="ignore"):  # no dual point where all is to be white
             dual = r - np.maximum(slope.max(axis=(0, 1)), 0) * slack
-            along, power = (weight * dual * wanted).sum(axis=(0, 1)), (weight * dual * dual).sum(axis=(0, 1))
+            along, power = (weight * dual * aim).sum(axis=(0, 1)), (weight * dual * dual).sum(axis=(0, 1))
             least = np.nan_to_num(0.5 * np.maximum(along, 0) ** 2 / np.maximum(power, 1e-300), posinf=0).sum()
         bound = float(np.clip((value - least) / max(start, 1e-300), 0, 1))
         if bound < ENOUGH or before - value < ENOUGH * start / 4:
@@ -440,10 +440,10 @@ def _around_light(question, model, x, found):
     towards /= np.linalg.norm(towards)
     sky = [model.render_map(np.repeat(g[..., None], 3, 2)) for g in _smooth(directions)]
     mixed = np.stack([*sky, question.initial - model.base]).reshape(len(sky) + 1, -1, 3)
-    wanted, known = np.minimum(question.target, 1), question.target.reshape(-1, 3)
+    aim, known = np.minimum(question.target, 1), question.target.reshape(-1, 3)
     first, last = np.flatnonzero(active.any(axis=1))[[0, -1]]
     place, flux = light_search.refine(
-        transport, (wanted - model.base).reshape(-1, 3), known, question.weight.reshape(-1, 1), mixed,
+        transport, (aim - model.base).reshape(-1, 3), known, question.weight.reshape(-1, 1), mixed,
         towards, np.ones(3), int(first), int(last),
     )  # fmt: skip
     # ---- Single texels there

@@ -82,13 +82,13 @@ def octaves(
         down, across = splines(size, (height, width))
         least = LEAST_SHARE if found else FIRST_SHARE
         around = down.T @ omega
-        told = np.zeros(size)
+        total = np.zeros(size)
         # Drawn anew for each octave: of a large map all of them together would take gigabytes.
         for drawn, pair in enumerate(_pulled_back(transport, second, slope, background, rows[0]), 1):
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
-            told += _alternating(*on_nodes)
+            total += _alternating(*on_nodes)
             # Where nothing is identifiable, a product of two estimates may well be negative.
-            mean = np.maximum(_smooth(told / drawn), 0) * CONTRAST**2
+            mean = np.maximum(_smooth(total / drawn), 0) * CONTRAST**2
             known = mean**2 / (mean**2 + ENOUGH**2)
             share = float((known.mean(axis=1) * around).sum() / around.sum())
             if drawn >= FEW_PROBES and share < least / 2:

@@ -63,14 +63,14 @@ class Starts:
     ----------
     starts : list of (dict, list of str)
         Parameters, and notes on them; one is to be taken (:meth:`.edit_job.Job.best`).
-    wanted : Target
+    target : Target
         The target; its pixels may be weighed.
     notes : list of str
         What was chosen, whichever start is taken.
     """
 
     starts: list[tuple[dict, list[str]]]
-    wanted: Target
+    target: Target
     notes: list[str] = field(default_factory=list)
 
 
@@ -79,7 +79,7 @@ def recordings(
     lit: scene.Scene,
     shape: tuple[int, int],
     layers: Layers,
-    wanted: Target,
+    target: Target,
     traced: LightTransport | None,
     progress: Progress | None = None,
 ) -> Recordings:
@@ -99,7 +99,7 @@ def recordings(
         Rows and columns of the maps.
     layers : Layers
         The representation, after :meth:`.Layers.encode`.
-    wanted : Target
+    target : Target
         What the picture should be. What is painted need not be what any light does: detail would follow it.
     traced : LightTransport, optional
         T, where the run renders through it; of no use any more if another one is returned.
@@ -115,7 +115,7 @@ def recordings(
     # A path tracer's samples a pixel are not meant for T.
     transport = traced or trace(settings.seed, spp="auto")
     fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
-    if not fits or wanted.coverage is not None or settings.representation.cycles != "auto":
+    if not fits or target.coverage is not None or settings.representation.cycles != "auto":
         return Recordings(transport)
     pixels, few = lit.width * lit.height, min(AGAIN_SPP, transport.spp)
     second = trace(
@@ -125,15 +125,15 @@ def recordings(
         memory_gb=recording.gigabytes(pixels, few, min(AGAIN_COLUMNS, transport.capacity) + 1),
         refresh=0,
     )
-    asked = layers.separation.background, layers.rows, wanted.picture, wanted.weight
-    told = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
-    shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in told)
+    asked = layers.separation.background, layers.rows, target.picture, target.weight
+    octaves = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
+    shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in octaves)
     least = f"below {100 * gain_bandwidth.FIRST_SHARE:.0f} % at {2 * CYCLES} cycles"
     notes = [f"sky area with identifiable detail: {shares or least}"]
-    if told and told[0].share < MIRRORED:
-        told = []
+    if octaves and octaves[0].share < MIRRORED:
+        octaves = []
         notes[0] += f"; gain limited to {CYCLES} cycles ({100 * MIRRORED:.0f} % needed)"
-    if told and traced and settings.renderer.spp == "auto":
+    if octaves and traced and settings.renderer.spp == "auto":
         most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:
             notes.append(
@@ -143,14 +143,14 @@ def recordings(
             transport = trace(settings.seed, spp=most)
     # Columns of both are compared: their paths are in the ratio of the samples.
     second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
-    return Recordings(transport, second, told, notes, lit.rows)
+    return Recordings(transport, second, octaves, notes, lit.rows)
 
 
 def find(
     layers: Layers,
     params: dict,
     recordings: Recordings,
-    wanted: Target,
+    target: Target,
     original: np.ndarray,
     only_own: bool = False,
 ) -> Starts:
@@ -162,7 +162,7 @@ def find(
         The representation, with its finer grids, and its parameters.
     recordings : Recordings
         Of :func:`recordings`; their bright columns may change.
-    wanted : Target
+    target : Target
         What the picture should be.
     original : ndarray (H, W, 3)
         The map.
@@ -170,19 +170,19 @@ def find(
         As of :func:`.light_search.start`.
     """
     transport, notes = recordings.transport, list(recordings.notes)
-    starts = _searched(layers, params, transport, wanted, original, only_own)
+    starts = _searched(layers, params, transport, target, original, only_own)
     if recordings.octaves:  # a mirror: images of lights, and caustics, are where the lights are now found
         began = original.copy()
         began[layers.active] = layers.decode(starts[0][0]).numpy()
-        weight, said = _trusted(began, recordings, wanted)
+        weight, said = _trusted(began, recordings, target)
         if weight is not None:
             notes.append(said)
-            wanted = replace(wanted, weight=weight)
-            starts = _searched(layers, params, transport, wanted, original)
-    return Starts(starts, wanted, notes)
+            target = replace(target, weight=weight)
+            starts = _searched(layers, params, transport, target, original)
+    return Starts(starts, target, notes)
 
 
-def _trusted(envmap, recordings, wanted):
+def _trusted(envmap, recordings, target):
     """Weigh a rendered target's pixels by what is known of them; returns weights, or None, and a note."""
     pictures = []
     for one in (recordings.transport, recordings.second):
@@ -190,28 +190,28 @@ def _trusted(envmap, recordings, wanted):
         pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
     first, second = pictures
-    asked = wanted.picture, wanted.noise, recordings.views
+    asked = target.picture, target.noise, recordings.views
     weight = pixel_confidence.weights(first, second, share, *asked)
     if weight is None:
         return None, ""
     noisy = 100 * float((weight < 0.5).mean())
     said = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
-    weight = weight if wanted.weight is None else weight * wanted.weight
+    weight = weight if target.weight is None else weight * target.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
         return None, ""
     return (weight / max(float(weight.mean()), 1e-30)).astype(np.float32), said
 
 
-def _searched(layers, params, transport, wanted, original, only_own=False):
+def _searched(layers, params, transport, target, original, only_own=False):
     """List the starts of the searches, (parameters, notes)."""
-    problem = light_search.SearchProblem(layers, transport, wanted.picture, wanted.weight, original)
-    if wanted.coverage is None:
+    problem = light_search.SearchProblem(layers, transport, target.picture, target.weight, original)
+    if target.coverage is None:
         searched = light_search.start(problem, params, only_own)
         several = only_own and len(layers.separation.lights) > 1 and searched[0]["turn"].numpy().any()
         # Of several lights one may have changed, and the search have moved others to make up for it.
         still = (params, ["all lights initialised at their places in the map"])
         return [still, searched] if several else [searched]
-    return painted_starts(replace(problem, initial=wanted.initial), params, wanted.coverage)
+    return painted_starts(replace(problem, initial=target.initial), params, target.coverage)
 
 
 def painted_starts(

@@ -95,7 +95,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
     scene = Question(problem)
     overview, lights = transport.overview(), layers.separation.lights
     spare = 0 if only_own else SPARE
-    places = place(scene.given(), scene.wanted, lights, spare, layers.lights.flux[-1])
+    places = place(scene.given(), scene.target, lights, spare, layers.lights.flux[-1])
     notes, pictures = [], []
     factor = np.ones((len(overview.omega), 3))
     for i, (light, found) in enumerate(zip(lights, places, strict=False)):
@@ -138,7 +138,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
         if np.prod(layers.gain.sizes[level]) > len(overview.omega):
             break  # finer than the overview resolves
         hats = scene.hats(level) * factor.T[..., None]
-        gain, strength = spread(overview, scene.wanted, weight, picture, hats, stack)
+        gain, strength = spread(overview, scene.target, weight, picture, hats, stack)
         gain = np.clip(gain, LEAST, MOST)
         name = f"gain.{level}"
         logs = np.log(gain).reshape(*layers.gain.sizes[level], 3) / layers.scales[name]
@@ -166,7 +166,7 @@ class Question:
         rest[explained] = 0
         painted = problem.initial is not None
         self.known = problem.initial if painted else problem.picture
-        self.wanted = problem.picture - (
+        self.target = problem.picture - (
             problem.initial if painted else transport.apply(tensor(rest)).numpy()
         )
         self.active: np.ndarray = np.zeros(envmap.shape[:2], bool)
@@ -216,10 +216,10 @@ class Question:
             shine = glow_at(glow, self.directions @ direction).reshape(-1, 3)
             mixed.append(self.render(self.background * shine).reshape(-1, 3))
         weight = None if self.weight is None else self.weight.reshape(-1, 1)
-        wanted, known = self.wanted.reshape(-1, 3), self.known.reshape(-1, 3)
+        target, known = self.target.reshape(-1, 3), self.known.reshape(-1, 3)
         last = self.rows.stop - 1
         direction, factors = refine(
-            self.transport, wanted, known, weight, np.stack(mixed), direction, flux, self.rows.start, last
+            self.transport, target, known, weight, np.stack(mixed), direction, flux, self.rows.start, last
         )
         factor = float(np.median(factors))
         kept = 1 / KEPT_FLUX < factor < KEPT_FLUX
@@ -305,7 +305,7 @@ def rotations(lights: Lights, places: Sequence[Place]) -> tuple[np.ndarray, np.n
 
 def spread(
     overview: Overview,
-    wanted: np.ndarray,
+    target: np.ndarray,
     weight: np.ndarray | None,
     known: np.ndarray,
     hats: np.ndarray,
@@ -320,7 +320,7 @@ def spread(
     ----------
     overview : Overview
         T at a glance.
-    wanted, known : ndarray (h, w, 3)
+    target, known : ndarray (h, w, 3)
         The picture, less the light of all that cannot change; and as it is.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts.
@@ -334,9 +334,9 @@ def spread(
     hats, lights : ndarray (n, 3), (m, 3)
         Strengths.
     """
-    wanted = np.maximum(overview.to_blocks(wanted), 0)
+    target = np.maximum(overview.to_blocks(target), 0)
     # Lucy's own weights, counts of photons, are the pixels' brightness.
-    w = relative(overview.to_blocks(known), wanted, None if weight is None else overview.to_blocks(weight))
+    w = relative(overview.to_blocks(known), target, None if weight is None else overview.to_blocks(weight))
     n = hats.shape[2]
     found = np.ones((n + lights.shape[2], 3))
     for c in range(3):
@@ -346,14 +346,14 @@ def spread(
         a = found[:, c]
         for _ in range(UPDATES):
             picture = h @ a
-            ratio = wanted[:, c] / np.maximum(picture, 1e-6 * max(picture.max(), 1e-30))
+            ratio = target[:, c] / np.maximum(picture, 1e-6 * max(picture.max(), 1e-30))
             a[seen] *= (h.T @ (w * ratio))[seen] / down[seen]
     return found[:n], found[n:]
 
 
 def refine(
     transport: LightTransport,
-    wanted: np.ndarray,
+    target: np.ndarray,
     known: np.ndarray,
     weight: np.ndarray | None,
     gains: np.ndarray,
@@ -368,10 +368,10 @@ def refine(
     ----------
     transport : LightTransport
         T; gets exact columns for the texels that are looked at.
-    wanted : ndarray (pixels, 3)
+    target : ndarray (pixels, 3)
         The picture, less all that is not this light or the background.
     known : ndarray (pixels, 3)
-        The picture wanted as it is.
+        The target itself.
     weight : ndarray (pixels, 1) or None
         How much each pixel counts.
     gains : ndarray (n, pixels, 3)
@@ -392,13 +392,13 @@ def refine(
     """
     height, width = transport.grid.height, transport.grid.width
     omega = latlong.lookup_solid_angles(height, width)
-    scale = relative(known, wanted, weight)
+    scale = relative(known, target, weight)
     spans, rest = [], []
     for c in range(3):
         q, r = np.linalg.qr((gains[..., c] * scale).T)
         q = q[:, np.abs(np.diag(r)) > 1e-6 * np.abs(r).max()]
         spans.append(q)
-        y = wanted[:, c] * scale
+        y = target[:, c] * scale
         rest.append(y - q @ (q.T @ y))
 
     def score(texels):

@@ -94,6 +94,8 @@ class Problem(Unknowns):
     robust : bool
         Pixels that no light can explain have limited weight (Huber); else every residual counts by its
         square, as where the picture was painted: what is far from the paint is what was asked about.
+    blocks : BlockJacobian, optional
+        Of another problem of these layers and this transport; made where None.
     """
 
     def __init__(
@@ -107,6 +109,7 @@ class Problem(Unknowns):
         prior: Prior = None,
         saturates: bool = False,
         robust: bool = True,
+        blocks: BlockJacobian | None = None,
     ):
         super().__init__(layers, saturates)
         self.robust = robust
@@ -116,7 +119,7 @@ class Problem(Unknowns):
         shape = picture.shape[:2]
         self.weight = _on_average_one(weight, shape)
         self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
-        self.blocks = BlockJacobian(layers, transport, envmap.shape[:2])
+        self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks, free)
         self._precisions = self.prior.gain_precisions(self.sizes, self.ground)
 

@@ -110,7 +110,7 @@ def place(
     given : Given
         What the search is given.
     picture : ndarray (h, w, 3)
-        What is wanted, less the light of everything that cannot change.
+        The target, less the light of everything that cannot change.
     lights : list of Light
         The map's lights.
     spare : int
@@ -178,14 +178,14 @@ def place(
     return places + [Place(None, np.zeros(3))] * (len(lights) + spare - len(places))
 
 
-def relative(known: np.ndarray, wanted: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+def relative(known: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Weigh pixels, or blocks of them, so that equal relative errors count alike.
 
     That is weight / (brightness + floor).
 
     Parameters
     ----------
-    known, wanted : ndarray (..., 3)
+    known, target : ndarray (..., 3)
         The picture, whose channels' mean is the brightness, and what is to be explained of it. The floor is
         :data:`FAINT` of the mean brightness; of paint on black, of the paint's own.
     weight : ndarray (..., 1), optional
@@ -197,7 +197,7 @@ def relative(known: np.ndarray, wanted: np.ndarray, weight: np.ndarray | None = 
         ``weight`` itself where there is nothing at all.
     """
     bright = known.mean(axis=-1, dtype=np.float64)
-    mean = bright.mean() or np.abs(wanted).mean()
+    mean = bright.mean() or np.abs(target).mean()
     count = np.ones(bright.shape) if weight is None else weight[..., 0]
     return count / (bright + FAINT * mean) if mean > 0 else count
 
@@ -221,16 +221,16 @@ class Pursuit:
         blocks = overview.to_blocks(picture)
         count = None if given.weight is None else overview.to_blocks(given.weight)
         self.weight = relative(overview.to_blocks(given.known), blocks, count)
-        wanted = blocks.T
-        self.light = float(np.abs(wanted * self.weight).sum())
+        target = blocks.T
+        self.light = float(np.abs(target * self.weight).sum())
         cells = overview.to_cells(given.background, omega)
         self.background = np.where(np.isfinite(cells), cells, 0)
         share = overview.to_cells(given.active[:, None].astype(float), omega)[:, 0]
         self.candidates = np.flatnonzero(share >= 0.5 * max(share.max(), 1e-30))
         self.directions = d = given.directions
         self.cosine = mi.Float(np.float32(d @ d[self.candidates].T).ravel())
-        self.wanted = [w * self.weight for w in wanted]
-        self.residual = list(self.wanted)
+        self.target = [w * self.weight for w in target]
+        self.residual = list(self.target)
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
         self.allow(products(d, order))
 
@@ -314,19 +314,19 @@ class Pursuit:
 
     def asked(self) -> float:
         """Squared picture."""
-        return sum(float(w @ w) for w in self.wanted)
+        return sum(float(w @ w) for w in self.target)
 
     def solve(self, atoms: Sequence[np.ndarray], signed: bool = False) -> np.ndarray:
         """Strength of each atom per channel, (n, 3), not negative, beside any gain of the background.
 
-        ``signed``: what is wanted is a change, and the background may become darker.
+        ``signed``: the target is a change, and the background may become darker.
         """
         found = np.zeros((len(atoms), 3))
         for c in range(3):
             span = self.overview.matrix[c] @ self.background[:, c] * self.weight
             spans = [span, -span] if signed else [span]
             columns = np.stack([*spans, *(a[c] for a in atoms)], axis=1)
-            found[:, c] = not_negative(columns, self.wanted[c])[len(spans) :]
+            found[:, c] = not_negative(columns, self.target[c])[len(spans) :]
         return found
 
 

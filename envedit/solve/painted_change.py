@@ -56,7 +56,7 @@ def start(problem: SearchProblem, params: dict, bold: bool = False) -> tuple[dic
     weight = None if weight is None or (weight > 0).all() else (weight > 0).astype(np.float32)
     scene = Question(replace(problem, weight=weight))
     lights = layers.separation.lights
-    places = place(scene.given(), scene.wanted, lights, SPARE, layers.lights.flux[-1], bold)
+    places = place(scene.given(), scene.target, lights, SPARE, layers.lights.flux[-1], bold)
     notes, moved = [], {i for i, found in enumerate(places) if found.direction is not None}
     there = [scene.light(i, Place(None, np.ones(3))) for i in range(len(lights))]
     new: dict = {}
@@ -160,7 +160,7 @@ def _strengths(scene, there, new):
     which are gone from where they were.
     """
     background = scene.render(scene.background)
-    scale = relative(scene.known, scene.wanted, scene.weight)
+    scale = relative(scene.known, scene.target, scene.weight)
     stay = [i for i in range(len(there)) if i not in new]
     found = {i: np.ones(3) for i in [*stay, *new]}
     for c in range(3):
@@ -168,7 +168,7 @@ def _strengths(scene, there, new):
         spans = [background[..., c], *(there[i][..., c] for i in stay)]
         columns = [*spans, *(-span for span in spans), *(picture[..., c] for picture in new.values())]
         a = np.stack([(column * scale).ravel() for column in columns], axis=1)
-        x = not_negative(a, ((scene.wanted[..., c] + gone) * scale).ravel())
+        x = not_negative(a, ((scene.target[..., c] + gone) * scale).ravel())
         grown = x[: len(spans)] - x[len(spans) : 2 * len(spans)]
         for i, value in zip(stay, grown[1:], strict=True):
             found[i][c] = np.clip(1 + value, LEAST, MOST)

@@ -27,14 +27,14 @@ STEPS = 6
 
 
 def corrected(
-    wanted: Target, lit: Scene, envmap: np.ndarray, seen: np.ndarray, seed: int, keep: bool = True
+    target: Target, lit: Scene, envmap: np.ndarray, seen: np.ndarray, seed: int, keep: bool = True
 ) -> Target:
     """Return a target whose aim is the picture as T would show it near a map.
 
     Parameters
     ----------
-    wanted : Target
-        What is wanted; its picture stays.
+    target : Target
+        The target; its picture stays.
     lit : Scene
         The scene.
     envmap : ndarray (H, W, 3)
@@ -47,4 +47,4 @@ def corrected(
         Keep I on disk: a run that is killed and resumed has the same.
     """
     shown, _, _ = rendered(lit, envmap, SPP, Seeds.of(seed).solution_check, keep)
-    return wanted.seen_as(seen, shown)
+    return target.seen_as(seen, shown)

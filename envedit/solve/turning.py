@@ -61,7 +61,7 @@ def find(
     envmap : ndarray (H, W, 3)
         The map.
     picture : ndarray (h, w, 3)
-        What is wanted, linear radiance.
+        The target, linear radiance.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts.
     thorough : bool
@@ -132,7 +132,7 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
     count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
     overview = transport.overview()
     height, width, _ = envmap.shape
-    wanted, own = (
+    target, own = (
         overview.to_blocks(display_curve.to_display(tensor(one)).numpy()) for one in (picture, rendering)
     )
     share = overview.to_blocks(count)
@@ -154,6 +154,6 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
         means = turned.reshape(cells, width) / total[:, None]
         blocks = overview.matrix[c] @ means.astype(np.float32) + lamps[:, c : c + 1]
         shown = display_curve.to_display(tensor(blocks)).numpy()
-        result += (share * np.square(shown - wanted[:, c : c + 1])).sum(axis=0)
+        result += (share * np.square(shown - target[:, c : c + 1])).sum(axis=0)
         least += float((share[:, 0] * np.square(shown[:, 0] - own[:, c])).sum())
     return np.where(np.isfinite(result), result, np.inf), least

@@ -148,9 +148,9 @@ def make(
         raise InputError(
             "target: all paint lies where no surface is seen (hide_emitters): paint on a surface"
         )
-    untold = found.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
+    uncounted = found.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
     hold = first_hold(chosen)
-    weight = pixel_weight(coverage, untold if hidden is None else untold | hidden, chosen.paint, hold)
+    weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
     return _seen(Target(picture, weight, None, source, warnings, initial, coverage, asked), hidden)
@@ -239,9 +239,9 @@ def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold:
     weight = paint c / sum(c) + hold (1 - c) / sum(1 - c), where c is coverage, over the pixels that are not
     ``excluded``.
     """
-    told = ~np.asarray(excluded, bool)[..., None]
-    weight = np.zeros(told.shape)
-    for share, part in ((paint, coverage * told), (hold, (1 - coverage) * told)):
+    counted = ~np.asarray(excluded, bool)[..., None]
+    weight = np.zeros(counted.shape)
+    for share, part in ((paint, coverage * counted), (hold, (1 - coverage) * counted)):
         total = part.sum(dtype=np.float64)
         if total > 0:
             weight += share * part / total

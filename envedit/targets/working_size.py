@@ -66,7 +66,7 @@ def scaled(lit: Scene, factor: float) -> Scene | None:
 
 
 def worked_on(
-    settings: config.Config, lit: Scene, small: Scene, envmap: np.ndarray, wanted: Target
+    settings: config.Config, lit: Scene, small: Scene, envmap: np.ndarray, target: Target
 ) -> Target:
     """Return the target (of ``lit``) as the picture of a smaller scene.
 
@@ -81,26 +81,26 @@ def worked_on(
         The scene, and it on a smaller film.
     envmap : ndarray (H, W, 3)
         The map that is edited.
-    wanted : Target
+    target : Target
         What was asked for.
     """
     chosen = settings.target
     hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0
-    if wanted.coverage is None or wanted.initial is None or wanted.weight is None:
-        assert wanted.envmap is not None, "what was not painted was rendered"
+    if target.coverage is None or target.initial is None or target.weight is None:
+        assert target.envmap is not None, "what was not painted was rendered"
         asked = chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
-        picture, _, noise = rendered(small, wanted.envmap, *asked)
+        picture, _, noise = rendered(small, target.envmap, *asked)
         weight = None
-        if wanted.weight is not None:
-            weight = np.where(hidden[..., None], 0, at_size(wanted.weight, lit, small)).astype("f4")
-        return replace(wanted, picture=picture, noise=noise, weight=weight)
+        if target.weight is not None:
+            weight = np.where(hidden[..., None], 0, at_size(target.weight, lit, small)).astype("f4")
+        return replace(target, picture=picture, noise=noise, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
-    change = at_size(wanted.picture - wanted.initial, lit, small)
+    change = at_size(target.picture - target.initial, lit, small)
     picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))
-    coverage = np.where(hidden[..., None], 0, at_size(wanted.coverage, lit, small))
-    untold = at_size((wanted.weight == 0).astype(np.float32), lit, small)[..., 0] > 0.5
-    weight = pixel_weight(coverage, untold | hidden, chosen.paint, first_hold(chosen))
-    return replace(wanted, picture=picture, initial=initial, coverage=coverage, weight=weight)
+    coverage = np.where(hidden[..., None], 0, at_size(target.coverage, lit, small))
+    uncounted = at_size((target.weight == 0).astype(np.float32), lit, small)[..., 0] > 0.5
+    weight = pixel_weight(coverage, uncounted | hidden, chosen.paint, first_hold(chosen))
+    return replace(target, picture=picture, initial=initial, coverage=coverage, weight=weight)
 
 
 def at_size(image: np.ndarray, of: Scene, to: Scene) -> np.ndarray:

@@ -5,7 +5,7 @@ r"""Draw the objective against steps and seconds, for Gauss-Newton and for Adam,
 
 Both minimise what they minimise in a run (Adam the losses of [loss]); shown is F of ``solve/gauss_newton.py``
 at its final sigma, and the map's PSNR against the true one, at every step. Seconds are of the optimisation
-alone.
+alone. Prints the milliseconds of a Gauss-Newton step beside those in which its bytes can be read.
 """
 
 import argparse
@@ -21,6 +21,8 @@ from envedit.representations import Layers
 from envedit.solve import adam_loop, gauss_newton, light_search, map_problem
 from envedit.targets import target
 from experiments import puresky
+from experiments.engine.floors import bandwidth
+from experiments.engine.transport import bytes_read
 
 
 def main():
@@ -62,7 +64,8 @@ def main():
                 arguments = layers, params, transport, objective, original, active.first, settings.optimizer
                 adam_loop.optimise(*arguments, after_step=seen.adam)
             else:
-                gauss_newton.solve(problem, params, after_step=seen.newton)
+                found = gauss_newton.solve(problem, params, after_step=seen.newton)
+                took = float(np.median([row["step_ms"] for row in found.history]))
         points = []
         for seconds, state in [(0.0, start), *seen.states]:
             point = problem.evaluate(state)
@@ -73,7 +76,25 @@ def main():
         seconds, loss, true = points[-1]
         course = f"F {points[0][1]:.4g} -> {loss:.4g}, map {true:.2f} dB"
         print(f"{name}: {len(points) - 1} steps, {seconds:.2f} s, {course}")
+    print(floor(problem, took))
     draw(given.out, curves)
+
+
+def floor(problem: map_problem.Problem, took: float) -> str:
+    """Compare the milliseconds of a step with those of reading once what it reads of T and of its blocks.
+
+    T for one rendering and one gradient, the block transport, the splines in its cells for every channel, and
+    the Jacobian, which is written and read again for the Hessian.
+    """
+    read = bytes_read(problem.transport)
+    of_t = read["apply"] + read["adjoint"]
+    of_blocks = problem.blocks.nbytes + 3 * 2 * 4 * problem.blocks.count * problem.nodes
+    rate = bandwidth()["read"]
+    least = 1000 * (of_t + of_blocks) / rate
+    return (
+        f"a Gauss-Newton step: {took:.0f} ms, {took / least:.1f} times the floor of {least:.1f} ms: "
+        f"{of_t / 1e6:.0f} MB of T, {of_blocks / 1e6:.0f} MB of blocks and Jacobian at {rate / 1e9:.1f} GB/s"
+    )
 
 
 class Seen:

@@ -67,16 +67,16 @@ def test_lights_that_come_go_and_stay_are_told():
     assert [one["removed"] for one in found["before"]] == [False, False, True]
     assert [row[:2] for row in numbers(found)] == [(1, False), (2, False), (4, True)]
     assert numbers(found)[2][2] is None
-    assert light_list.told(found, HEIGHT) == (
+    assert light_list.summary(found, HEIGHT) == (
         "light 1 at azimuth 90, elevation 35 stayed; light 2 at azimuth 200, elevation 60 stayed, flux x 2; "
         "light 3 at azimuth 300, elevation 10 is gone; light 4 at azimuth 20, elevation 80 is new"
     )
     moved = light_list.matched([light(90, 0)], [light(120, 0)])
-    assert "moved by 30.0 degrees to azimuth 120, elevation 0" in light_list.told(moved, HEIGHT)
+    assert "moved by 30.0 degrees to azimuth 120, elevation 0" in light_list.summary(moved, HEIGHT)
     many = light_list.matched([light(30 * k, 0) for k in range(12)], [])
-    assert light_list.told(many, HEIGHT).endswith("; and 4 more in lights.json")
-    assert light_list.told(light_list.matched([], []), HEIGHT) is None
+    assert light_list.summary(many, HEIGHT).endswith("; and 4 more in lights.json")
+    assert light_list.summary(light_list.matched([], []), HEIGHT) is None
     level = light_list.matched([], [light(359.9, -0.2)])
-    assert light_list.told(level, HEIGHT) == "light 1 at azimuth 0, elevation 0 is new"
+    assert light_list.summary(level, HEIGHT) == "light 1 at azimuth 0, elevation 0 is new"
     dark = light_list.matched([light(0, 0, 0.0)], [light(0, 0, 0.0)])
     assert numbers(dark) == [(1, False, 0.0)]

@@ -185,7 +185,7 @@ def test_digest_follows_what_the_rendering_depends_on(tmp_path):
 
 
 def test_a_scene_s_parameters_may_have_any_name():
-    assert parser.told("scene.xml", dict, where="1", call="2") == {"where": "1", "call": "2"}
+    assert parser.called("scene.xml", dict, where="1", call="2") == {"where": "1", "call": "2"}
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="may read everything")

@@ -265,9 +265,9 @@ class Server:
             opened = self.hub.last.get("opened")
             if opened is not None and request.painting in (0, opened["painting"]):
                 opened["document"] = request.document.plain()
-            told = {"type": "document", "client": request.client, "document": request.document.plain()}
+            message = {"type": "document", "client": request.client, "document": request.document.plain()}
             for other in self.hub.clients - {client}:
-                other.put("document", told)
+                other.put("document", message)
         self.worker.post(request)
 
 

@@ -40,6 +40,9 @@ FADED, NEEDED = -1.0, 1.1
 """Log flux below which a light of the map is put out if the rest of the sky can stand in for it, and how many
 times as large the noise must be without it for it to stay: under clouds there is no sun, and its disc would
 be seen."""
+STRAIN = 5.0
+"""By how much the penalty x' K x may rise where the sky stands in for an added light: two standard deviations
+of one node. What the sky can do with less strain is no light but brighter cloud."""
 SAME_PLACE = np.cos(np.radians(1.0))
 """Cosine of the angle below which an added light is where it would be added again."""
 
@@ -310,17 +313,26 @@ class _Search:
                 return self._without_faded(run, point)
 
     def _without_faded(self, run, point):
-        """Put out lights of the map that have faded (:data:`FADED`), where steps make up for them."""
+        """Put out lights that are no longer needed, where steps make up for them.
+
+        Tried are lights of the map that have faded (:data:`FADED`), and all that were added, those with
+        least flux first. An added one goes out only if the sky has to change little for it (:data:`STRAIN`).
+        """
         problem = self.problem
-        for k in problem.lit(run.state):
-            if k in problem.added(run.state) or run.state["flux"][k].mean() > FADED:
+        flux = (problem.layers.lights.flux * np.exp(run.state["flux"])).sum(axis=1)
+        added = sorted(problem.added(run.state), key=lambda k: flux[k])
+        own = [k for k in problem.lit(run.state) if k not in added]
+        for k in [*own, *added]:
+            if k in own and run.state["flux"][k].mean() > FADED:
                 continue
             without = _without(run.state, k)
             rival = replace(run.elsewhere(without, run.start), damping=1e-3)
             most = min(self.iterations, len(run.history) + ADDED_STEPS)
             end = self._descended(rival, problem.evaluate(without), most, self._tried)
             noise = problem.noise(point.residual, self.sigma)
-            if problem.loss(end, run.start, noise) < NEEDED**2 * problem.loss(point, run.start, noise):
+            loss, before = (problem.loss(one, run.start, noise) for one in (end, point))
+            strain = problem.penalty(end.state, run.start) - problem.penalty(point.state, run.start)
+            if loss < NEEDED**2 * before and (k in own or strain < STRAIN):
                 run, point = rival, end
         return run, point
 

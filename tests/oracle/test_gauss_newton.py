@@ -815,6 +815,22 @@ def test_a_faded_light_goes_out_where_the_sky_can_stand_in_for_it(rng, left, sta
     assert ends[1].history[-1]["residual"] < 1.2 * ends[0].history[-1]["residual"] + 1e-3
 
 
+@pytest.mark.parametrize(("there", "stays"), [(0.0005, False), (1.0, True)])
+def test_an_added_light_goes_out_where_the_sky_can_stand_in_for_it(rng, there, stays):
+    """So much of its flux is in the target: the sky makes up for little of it, and not for all."""
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    problem, params = problem_of(image, transport, shown(transport, image))
+    state, spare = problem.state(params), problem.layers.lights.count - SPARE
+    state["flux"][spare], state["size"][spare] = np.log(there), 1.5
+    noise = np.exp(rng.normal(0, 0.1, (*FILM, 3)))
+    problem, _ = problem_of(image, transport, np.float32(problem.evaluate(state).rendering * noise))
+    search = gauss_newton._Search(problem, 0.01, 16, 1, None)
+    run = Run(copy(state), copy(state))
+    point = search._descended(run, problem.evaluate(run.state), 6, None)
+    found, _ = search._without_faded(run, point)
+    assert problem.lit(found.state) == [spare] * stays
+
+
 def test_flux_that_no_sky_of_its_own_has_is_given_to_a_light_beside(case):
     problem, _, start, _ = case
     state, spare = copy(start), problem.layers.lights.count - SPARE

@@ -399,7 +399,7 @@ def test_perceptual_terms_are_used_where_their_weights_are_named(tmp_path, rng, 
 
 def test_weights_that_are_not_there_are_refused_before_anything_is_rendered(tmp_path, rng, monkeypatch):
     missing = {"perceptual": {"backbone": "alexnet.npz", "heads": "heads.npz"}}
-    monkeypatch.setattr(pipeline.target, "make", None)
+    monkeypatch.setattr(pipeline, "make_target", None)
     with pytest.raises(InputError, match=r"alexnet\.npz"):
         pipeline.run(settings_of(tmp_path, sunny(rng), **missing))
 

@@ -316,12 +316,15 @@ class _Search:
         """Put out lights that are no longer needed, where steps make up for them.
 
         Tried are lights of the map that have faded (:data:`FADED`), and all that were added, those with
-        least flux first. An added one goes out only if the sky has to change little for it (:data:`STRAIN`).
+        least flux first. An added one goes out only if the sky has to change little for it (:data:`STRAIN`),
+        and if the map has at most one light of its own: among several lamps a further lamp is likely.
         """
         problem = self.problem
         flux = (problem.layers.lights.flux * np.exp(run.state["flux"])).sum(axis=1)
         added = sorted(problem.added(run.state), key=lambda k: flux[k])
         own = [k for k in problem.lit(run.state) if k not in added]
+        if problem.layers.lights.own > 1:
+            added = []
         for k in [*own, *added]:
             if k in own and run.state["flux"][k].mean() > FADED:
                 continue

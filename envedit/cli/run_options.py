@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--preset",
         choices=("draft", "standard", "paper"),
-        help="named set of defaults: standard; draft, in a quarter of the time; paper, the paper's method",
+        help="named set of defaults: standard; draft, in half of the time; paper, the paper's method",
     )
     made.add_argument(
         "--set",

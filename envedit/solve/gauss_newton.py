@@ -323,9 +323,7 @@ class _Search:
         flux = (problem.layers.lights.flux * np.exp(run.state["flux"])).sum(axis=1)
         added = sorted(problem.added(run.state), key=lambda k: flux[k])
         own = [k for k in problem.lit(run.state) if k not in added]
-        if problem.layers.lights.own > 1:
-            added = []
-        for k in [*own, *added]:
+        for k in own if problem.layers.lights.own > 1 else [*own, *added]:
             if k in own and run.state["flux"][k].mean() > FADED:
                 continue
             without = _without(run.state, k)

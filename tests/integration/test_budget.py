@@ -1,7 +1,6 @@
 """A budget: the finest level that ends in time, or a refusal that says what would do."""
 
 import dataclasses
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,7 +36,8 @@ def test_the_standard_level_is_the_standard_preset_and_draft_s_the_draft():
 def test_what_a_level_loses_is_said_and_nothing_else():
     standard, fine = (next(level for level in LEVELS if level.name == name) for name in ("standard", "fine"))
     assert budget.loss(standard) == "the standard preset"
-    only_one, both = replace(fine, render_db=0.4, map_db=0.0), replace(fine, render_db=3.4, map_db=-1.0)
+    only_one = dataclasses.replace(fine, render_db=0.4, map_db=0.0)
+    both = dataclasses.replace(fine, render_db=3.4, map_db=-1.0)
     assert budget.loss(only_one) == "0.4 dB less of rendering than the standard preset, on average"
     assert (
         budget.loss(both)

@@ -228,7 +228,9 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
             had = f"the map has {count} light{'s' if count != 1 else ''}"
-            warnings.append(f"input.lights: got light = {lacking[0]}, but {had}; the entry is ignored")
+            named = ", ".join(map(str, lacking))
+            entries = "entry is" if len(lacking) == 1 else "entries are"
+            warnings.append(f"input.lights: got light = {named}, but {had}; the {entries} ignored")
         found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
     turned = latlong.rotate(found.stored, settings.rotate_degrees)
     return replace(given, stored=turned, warnings=warnings, placed=placed)

@@ -6,6 +6,7 @@ Nothing here prints or writes but the checkpoint; ``cli`` and ``report`` do, wit
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs, renderers
-from envedit.core.errors import unwrapped
+from envedit.core.errors import NumericalError, unwrapped
+from envedit.core.radiance import BRIGHTEST
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.export import adjustments, light_list
@@ -150,17 +152,19 @@ def run(
     renderer, within, notes = job.renderer, None, list(edit.notes)
     traced = renderer.transport
     warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
-    with clock("edit_s"), _in_file_units(given):
+    in_file_units = functools.partial(_in_file_units, given, edit.degrees)
+    with clock("edit_s"), in_file_units():
         watch.stage("editing")
         params, state = job.optimise(edit.params, edit.crop, resume)
         found_map = job.decode(params)
-        edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
+        with keeping(found_map):
+            edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
         solved = job.target  # a resumed run has the picture that it began with
         if small is lit:
             target = solved
     predicted = None
     if traced:
-        with _in_file_units(given), keeping(edited):
+        with in_file_units(), keeping(edited):
             predicted = traced.coarse_error(edited)
 
     # ---- What any light can do, under the weights of paint and rest that the edit has come to
@@ -175,7 +179,7 @@ def run(
             warnings += [within.warning] if within.warning else []
 
     # ---- The result, rendered with fresh samples
-    with clock("judge_s"), _in_file_units(given), keeping(edited):
+    with clock("judge_s"), in_file_units(), keeping(edited):
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, _ = lit.sampled(edited, spp, seed)
@@ -196,7 +200,7 @@ def run(
     # ---- Measures, and what to warn of
     renders = {"initial": initial, "target": target.picture, "edited": final}
     maps = {"initial": original, "target": target.envmap, "edited": edited}
-    with _in_file_units(given), keeping(edited):
+    with in_file_units(), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
         measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit)
     rate = "; lower optimizer.lr" if job.raised_rate else ""
@@ -258,7 +262,7 @@ def run(
 def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
     """Adjust a map without a target; compared with the initial rendering."""
     original = given.radiance
-    with clock("edit_s"), _in_file_units(given):
+    with clock("edit_s"):
         watch.stage("adjusting the map")
         edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
     with clock("judge_s"), _in_file_units(given), keeping(edited):
@@ -301,12 +305,20 @@ def _lights(original, edited, to_world, degrees=0.0):
 
 
 @contextlib.contextmanager
-def _in_file_units(given):
-    """Let an edit that is cut short carry its map in the units of the file."""
+def _in_file_units(given, degrees=0.0):
+    """Let an edit that is cut short carry its map in the units of the file, and whose units these are.
+
+    Where they leave float32, the map is cut at what the file could have been read with.
+    """
     try:
         yield
     except (Interrupted, Stopped) as stop:
-        stop.envmap = given.as_stored(stop.envmap)
+        stop.given = given
+        try:
+            stop.envmap = given.as_stored(stop.envmap, degrees)
+        except NumericalError:
+            most = np.float32(BRIGHTEST * min(given.scale, 1.0))
+            stop.envmap = given.as_stored(np.minimum(stop.envmap, most), degrees)
         raise
 
 

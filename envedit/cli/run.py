@@ -45,6 +45,8 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         fit = "an unfinished SIREN fit continues from its last saved state"
         before = f"interrupted before the first checkpoint; --resume would start anew ({fit})"
+        if arguments.dry_run or arguments.export_initial is not None:
+            before = "interrupted; run the same command again"
         _tell(arguments, "error", before)
         code = 130
     if arguments.json:
@@ -161,7 +163,6 @@ def _edit(settings, arguments, folder, allowed, start):
     mi.set_variant(settings.variant)
     mi.set_log_level(mi.LogLevel.Error)
     from envedit import pipeline
-    from envedit.images import images
 
     import_s = time.perf_counter() - start
     said, base = [], arguments.base
@@ -186,13 +187,13 @@ def _edit(settings, arguments, folder, allowed, start):
         except pipeline.Interrupted as stop:
             if not (folder / "checkpoint.npz").exists():  # nothing was found yet
                 return _interrupted(arguments, folder, again)
-            images.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
+            _keep_map(folder, stop)
             _tell(arguments, "error", f"{stop}; checkpoint and edited.exr so far are in {folder}{again}")
             return 130
         except KeyboardInterrupt:
             return _interrupted(arguments, folder, again)
         except pipeline.Stopped as stop:
-            images.write_exr(folder / "edited.exr", stop.envmap, {"source": settings.input.envmap})
+            _keep_map(folder, stop)
             raise
         result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
@@ -200,6 +201,16 @@ def _edit(settings, arguments, folder, allowed, start):
         return _write(arguments, settings, folder, result, import_s, said)
     except KeyboardInterrupt:
         return _interrupted(arguments, folder, again)
+
+
+def _keep_map(folder, stop):
+    """Write the map that an edit has come to which was cut short."""
+    from envedit.images import images
+
+    given = stop.given
+    images.write_exr(
+        folder / "edited.exr", stop.envmap, {"source": given.source}, chromaticities=given.chromaticities
+    )
 
 
 def _interrupted(arguments, folder, again):

@@ -105,7 +105,7 @@ STAGES = {
     "edit": "optimising",
     "solve": "searching and optimising",
     "judge": "rendering the result",
-    "full": "the edit at the resolution of the file",
+    "full": "writing the maps, also at the resolution of the file",
     "report": "writing the report",
     "total": "total",
     "per_iteration": "one iteration",

@@ -65,10 +65,11 @@ def write(
         **_roles("mask", settings.target.masks),
         **weights,
     }
-    inputs = {role: path for role, path in named.items() if os.path.isfile(path)}
-    facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, inputs, settings.variant)
+    files = {role: path for role, path in named.items() if os.path.isfile(path)}
+    facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, files, settings.variant)
     manifest.write_manifest(folder / "manifest.json", facts)
     timing["import_s"] = round(import_s, 3)
+    timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full")), 3)
     if settings.output.report:
         views = [view.rows for view in result.views]
         drawn = result.renders, result.maps, settings.output.tonemap
@@ -76,7 +77,7 @@ def write(
         report = html_report.Report.of(result, settings, facts)
         html_report.write_report(folder / "report.html", report)
     timing["report_s"] = round(time.perf_counter() - start, 3)
-    timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full", "report")), 3)
+    timing["total_s"] = round(timing["total_s"] + timing["report_s"], 3)
     lost = manifest.write_metrics(folder / "metrics.json", result.metrics)
     checkpoint.remove(folder)
     output_folder.tidy(folder)

@@ -32,7 +32,7 @@ MOST_BAD_STEPS = 20
 RECOVERY = 10
 """Good steps after which one halving of the learning rate is undone, as bad samples may be rare."""
 READ_EVERY, READ_SECONDS = 10, 1.0
-"""Losses are read back after so many steps or seconds: every read-back waits for the device."""
+"""Losses become rows of the history, and the caller hears of them, after so many steps or seconds."""
 
 
 class Objective:

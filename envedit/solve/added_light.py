@@ -55,6 +55,8 @@ def best(
         return None
     flux = flux / scale  # of any strength, in single precision
     _, directions = problem.blocks.sky
+    if not len(directions):  # so few rows are edited that they fill no cell by half
+        return None
     strength, fall = model.of_cells(flux)
     found = int(np.argmax(fall))
     if not fall[found] > 0:

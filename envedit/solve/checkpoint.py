@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +21,12 @@ from envedit.core.errors import InputError
 from envedit.solve.adam_loop import State
 
 NAME = "checkpoint.npz"
-_FORMAT = 6  # raise when what is stored, or what the loop makes of it, changes
+_FORMAT = 7  # raise when what is stored, or what the loop makes of it, changes
 
 
 def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:
-    """Hash what decides a run's result: its configuration but for the folder, scene and pixels."""
-    text = "\n".join(line for line in config.to_toml(settings).splitlines() if not line.startswith("dir ="))
+    """Hash what decides an edit: its configuration but for what is done with its result, scene and pixels."""
+    text = config.to_toml(replace(settings, output=config.Output(), lights=config.Lights()))
     sha = hashlib.sha256(f"{_FORMAT}\n{text}\n{scene}".encode())
     for array in inputs:
         sha.update(np.ascontiguousarray(array).tobytes())

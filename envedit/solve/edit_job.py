@@ -56,7 +56,12 @@ quickstart, four representations at rates of 0.1 to 1e38: it ends at 0.02 to 1.7
 
 
 class Interrupted(Exception):
-    """Ctrl-C during the edit; ``envmap`` is the map so far, that of the checkpoint where there is one."""
+    """Ctrl-C during the edit; ``envmap`` is the map so far, that of the checkpoint where there is one.
+
+    ``given`` is the input map in whose units ``envmap`` is, once the run has brought it there.
+    """
+
+    given: Any
 
     def __init__(self, envmap: np.ndarray, step: int):
         super().__init__(f"interrupted at iteration {step}")
@@ -64,7 +69,9 @@ class Interrupted(Exception):
 
 
 class Stopped(NumericalError):
-    """The optimisation could not go on; ``envmap`` is the last good map."""
+    """The optimisation could not go on; ``envmap`` is the last good map, ``given`` as of Interrupted."""
+
+    given: Any
 
     def __init__(self, message: str, envmap: np.ndarray):
         super().__init__(message)

@@ -178,7 +178,7 @@ def find(
         if weight is not None:
             notes.append(said)
             target = replace(target, weight=weight)
-            starts = _searched(layers, params, transport, target, original)
+            starts = _searched(layers, params, transport, target, original, only_own)
     return Starts(starts, target, notes)
 
 

@@ -34,7 +34,7 @@ from envedit.solve.derivatives import Derivatives
 from envedit.solve.normal_equations import Blocks, Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import Point, Unknowns, in_numpy
-from envedit.transport.light_transport import LightTransport
+from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
@@ -141,7 +141,7 @@ class Problem(Unknowns):
         if not np.isfinite(crop).all():
             return Point(state, edited, sky, None, None)
         if resolve:
-            self.transport.resolve(edited, limit=32)
+            self.transport.resolve(edited, limit=COLUMNS_A_LOOK)
         rendering = self.transport.apply(tensor(edited))
         shown = display_curve.to_display(rendering).numpy()
         if not np.isfinite(shown).all():

@@ -317,7 +317,9 @@ class Pursuit:
         return sum(float(w @ w) for w in self.target)
 
     def solve(self, atoms: Sequence[np.ndarray], signed: bool = False) -> np.ndarray:
-        """Strength of each atom per channel, (n, 3), not negative, beside any gain of the background.
+        """Strength of each atom per channel, (n, 3), not negative, beside one gain of the background.
+
+        The gain is a factor per channel that is the same everywhere.
 
         ``signed``: the target is a change, and the background may become darker.
         """

@@ -255,7 +255,7 @@ def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold:
 def _rendered(settings, scene, envmap, other):
     """Render the scene under another map."""
     chosen = settings.target
-    if chosen.file:
+    if chosen.file or other is not None:
         file = chosen.file if other is None else other
         true, info = images.load_envmap(file, envmap.shape[1], settings.input.repair, name="target_map")
         require_radiance(true, str(chosen.file), brightest=BRIGHTEST)

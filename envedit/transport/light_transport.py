@@ -4,7 +4,7 @@ T is traced once for a scene, its camera and a texel grid, without looking at an
 matrix product and its adjoint is exact. Nothing changes from step to step, so that the objective has no Monte
 Carlo noise (see docs/light_transport.md).
 
-Two tiers, both unbiased:
+Two tiers, both unbiased for paths up to the path depth:
 
 * the **coarse** tier is a sparse matrix of recorded samples (``recording.py``), spread evenly over
   directions; it renders the smooth part of a map with little error, but a single bright texel is hit by few
@@ -435,8 +435,12 @@ class LightTransport:
                 self._exact.trace(most, count, self.seed)
 
     def state(self) -> dict:
-        """Return what a checkpoint must hold: the exact columns, their order and paths, looks, and epoch."""
-        return {**self._exact.state(), "looks": self._looks, "epoch": np.int64(self.epoch)}
+        """Return what a checkpoint must hold.
+
+        The exact columns, their order and paths; looks, bright texels, which keep their columns; and epoch.
+        """
+        more = {"looks": self._looks, "bright": self._bright, "epoch": np.int64(self.epoch)}
+        return {**self._exact.state(), **more}
 
     def restore(self, state: dict) -> None:
         """Trace the columns of an earlier :meth:`state`.
@@ -446,24 +450,26 @@ class LightTransport:
         InputError
             If it is no state of such a transport.
         """
-        columns, paths = (np.asarray(state.get(name, 0)) for name in ("columns", "paths"))
+        columns, paths, bright = (np.asarray(state.get(name, 0)) for name in ("columns", "paths", "bright"))
         own = {k: np.asarray(v) for k, v in state.items()}
-        kept = {name: (own[name].dtype, (None,)) for name in ("columns", "paths", "looks") if name in own}
+        arrays = "columns", "paths", "looks", "bright"
+        kept = {name: (own[name].dtype, (None,)) for name in arrays if name in own}
         if not (
-            own.keys() == {"columns", "paths", "looks", "epoch"}
+            own.keys() == {*arrays, "epoch"}
             and holds(own, kept | {"epoch": ("i8", ())})
             and all(a.dtype.kind in "iu" for a in own.values())
             and len(columns) == len(paths) == len(np.unique(columns)) <= self.capacity
             and len(own["looks"]) == self.grid.texels
             and 0 <= own["epoch"] < 2**31
             and (len(columns) == 0 or 0 <= columns.min() <= columns.max() < self.grid.texels)
+            and (len(bright) == 0 or 0 <= bright.min() <= bright.max() < self.grid.texels)
             and (len(paths) == 0 or 0 < paths.min() <= paths.max() <= max(*COLUMN_PATHS, *FEW_PATHS))
         ):
             raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
         if int(state["epoch"]) != self.epoch:
             self.epoch = int(state["epoch"])
             self._record()
-        self._looks = np.array(state["looks"], np.uint8)
+        self._looks, self._bright = np.array(state["looks"], np.uint8), bright.astype(np.int64)
         self._exact.restore(state, self.seed)
 
     def _apply(self, envmap, offset=True):

@@ -29,6 +29,8 @@ ELEVATIONS, ELEVATION = (5, 10, 20, 50, 65, 80), 35
 """Of the analytic sky's sun, degrees: targets, and before."""
 WIDTH = 256
 KINDS = "turned", "another map", "elevation"
+SAME = 120.0
+"""PSNR from which two maps are taken to be the same, dB."""
 
 
 def options(parser):
@@ -89,24 +91,30 @@ def evenly(found: list[Case], count: int) -> list[Case]:
 
 
 def psnr(a, b) -> float:
-    """PSNR of display values."""
+    """PSNR of display values; at most :data:`SAME`."""
     shown = [np.clip(np.float64(m), 0, 1) ** (1 / 2.2) for m in (a, b)]
-    return float(-10 * np.log10(max(np.square(shown[0] - shown[1]).mean(), 1e-12)))
+    return float(-10 * np.log10(max(np.square(shown[0] - shown[1]).mean(), 10 ** (-SAME / 10))))
+
+
+def gained(done: Done, part: slice) -> float | None:
+    """Return how much nearer to the true map some rows came, dB; None where they were there before."""
+    original, edited, true = (one[part] for one in done.maps)
+    before = psnr(original, true)
+    return psnr(edited, true) - before if before < SAME else None
 
 
 def measure(done: Done) -> dict:
+    """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
     found = done.metrics
     original, edited, true = done.maps
-    halves = [slice(0, WIDTH // 4), slice(WIDTH // 4, None)]
-    upper, lower = (psnr(edited[h], true[h]) - psnr(original[h], true[h]) for h in halves)
     return found["natural"] | {
         "render": found["render"]["psnr"],
         "initial": found["initial"]["psnr"],
-        "psnr": found["envmap"]["psnr"],
-        "unedited": found["initial_envmap"]["psnr"],
-        "gain": found["envmap"]["psnr"] - found["initial_envmap"]["psnr"],
-        "upper": upper,
-        "lower": lower,
+        "psnr": psnr(edited, true),
+        "unedited": psnr(original, true),
+        "gain": gained(done, slice(None)),
+        "upper": gained(done, slice(0, WIDTH // 4)),
+        "lower": gained(done, slice(WIDTH // 4, None)),
         "off": found.get("sun_offset_texels"),
     }
 
@@ -118,7 +126,7 @@ COLUMNS = {
     "turn": "{turn}",
     "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
     "map (unedited), dB": "{psnr:.1f} ({unedited:.1f})",
-    "upper, lower half": "{upper:+.1f} / {lower:+.1f}",
+    "upper, lower half": lambda m: f"{number(m['upper'], '+.1f')} / {number(m['lower'], '+.1f')}",
     "sun off, texels": lambda m: number(m["off"]),
     "colours outside": lambda m: f"{100 * m['colours_outside']:.1f} %",
     "seam": lambda m: number(m["seam"]),
@@ -138,12 +146,9 @@ def summary(rows) -> str:
         some = [m for m in rows if m["kind"] == kind and m["turn"] == turn]
         if not some:
             continue
-        render, gain, lower, outside = (
-            np.array([m[key] for m in some]) for key in ("render", "gain", "lower", "colours_outside")
-        )
-        seam, sharp = (
+        render, gain, lower, outside, seam, sharp = (
             np.array([m[key] for m in some if m[key] is not None] or [np.nan])
-            for key in ("seam", "high_frequency")
+            for key in ("render", "gain", "lower", "colours_outside", "seam", "high_frequency")
         )
         lines.append(
             [

@@ -25,7 +25,7 @@ ABLATION = {
     "luminance + L1": ["loss.change=0", "loss.luminance=[1e-5, 1e-9]", "loss.l1=[1e-5, 1e-9]"],
     "change 0.1": ["loss.change=0.1"],
 }
-"""What the ablation sets."""
+"""What the ablation sets, with Adam: Gauss-Newton has the prior in place of these terms."""
 
 
 def options(parser):
@@ -54,11 +54,16 @@ def cases(given):
     for kind, edit, name in itertools.product(ABLATION if given.ablation else [""], given.edits, maps):
         tables = tomllib.loads((FOLDER / f"{edit}.toml").read_text(encoding="utf-8"))
         tables.pop("output", None)
-        tables = overridden(tables, [f"input.envmap={maps[name]}", *ABLATION.get(kind, [])])
+        tables = overridden(tables, [f"input.envmap={maps[name]}", *regularised(kind)])
         label = "-".join(part.replace(" ", "_") for part in (edit, name, kind) if part)
         shown = {"edit": f"{edit}, {kind}" if kind else edit, "map": name, "kind": kind}
         found.append(Case(label, tables, shown))
     return found
+
+
+def regularised(kind: str) -> list[str]:
+    """Return the settings of one kind of the ablation; none without one."""
+    return ["optimizer.kind=adam", *ABLATION[kind]] if kind else []
 
 
 def measure(done: Done) -> dict:

@@ -8,19 +8,23 @@ import types
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 
 from envedit import config, pipeline, representations
 from envedit.core.errors import NumericalError
+from envedit.core.primaries import ACES_AP1
 from envedit.core.seeds import Seeds
-from envedit.export import file_resolution
+from envedit.export import adjustments, file_resolution
+from envedit.images import images
 from envedit.losses import losses, optimizer
 from envedit.report import manifest
 from envedit.scene import scene
 from envedit.solve import adam_loop, edit_job
 from envedit.transport.light_transport import LightTransport
+from tests.oracles import users_scenes
 from tests.oracles.matrix_renderer import arrays, case, same
-from tests.oracles.runs import call, changed, measured, names, pixels, settings_of, sunny, world
+from tests.oracles.runs import TINY, call, changed, measured, names, pixels, settings_of, sunny, world
 from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_cache")
@@ -373,7 +377,7 @@ def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["judged rendering", "metrics", "transport's error"])
+@pytest.mark.parametrize("stage", ["adjustment", "judged rendering", "metrics", "transport's error"])
 def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
@@ -387,7 +391,9 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
     def judged_fails(self, envmap, spp, seed, *rest):
         return fails() if seed == Seeds.of(0).judged else sampled(self, envmap, spp, seed, *rest)
 
-    if stage == "judged rendering":
+    if stage == "adjustment":
+        monkeypatch.setattr(pipeline.adjustments, "adjust", fails)
+    elif stage == "judged rendering":
         monkeypatch.setattr(scene.Scene, "sampled", judged_fails)
     elif stage == "metrics":
         monkeypatch.setattr(pipeline.metrics, "compare", fails)
@@ -398,6 +404,58 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
     assert "row 1, column 2" in said and len(said.splitlines()) <= 2
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
     assert names(out) == {"edited.exr", "checkpoint.npz"}
+
+
+@pytest.mark.slow
+def test_what_is_done_with_a_map_is_no_part_of_its_checkpoint(tmp_path, rng, monkeypatch, capsys):
+    """An exposure that leaves float32 costs the run, and not the edit: with another one it goes on."""
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
+    adjust = adjustments.adjust
+
+    def brighter(envmap, lights, output, scale):
+        return adjust(envmap * np.float32(1e9 if output.exposure == 100 else 1), lights, output, scale)
+
+    monkeypatch.setattr(pipeline.adjustments, "adjust", brighter)
+    assert call(path, "--quiet", *changed(output__exposure=100)) == 5
+    assert "lower output.exposure" in capsys.readouterr().err.splitlines()[-1]
+    whole = pixels(tmp_path / "whole" / "edited.exr")
+    assert pixels(out / "edited.exr").tobytes() == whole.tobytes()
+    steps = []
+    monkeypatch.setattr(adam_loop.Objective, "__call__", lambda *a: steps.append(a))
+    assert call(path, "--quiet", "--resume", *changed(output__exposure=1)) == 0
+    assert not steps and np.array_equal(pixels(out / "edited.exr"), 2 * whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_a_map_that_is_kept_is_in_the_units_and_colours_of_its_file(
+    scale, tmp_path, rng, monkeypatch, capsys
+):
+    """Where a scene's scale is so small that the map leaves float32, it is cut and not lost."""
+    parts = users_scenes.PATH, users_scenes.SENSOR, users_scenes.BALL, users_scenes.light(scale)
+    path, out = users_scenes.write(tmp_path, parts), tmp_path / "out"
+    own = pixels(tmp_path / "own.exr")
+    images.write_exr(tmp_path / "own.exr", own, chromaticities=ACES_AP1)
+
+    def fails(*arguments, **keys):
+        raise NumericalError("not finite at row 1, column 2")
+
+    monkeypatch.setattr(pipeline.metrics, "compare", fails)
+    keys = {f"{table}__{key}": value for table, keys in TINY.items() for key, value in keys.items()}
+    if scale < 1:
+        monkeypatch.setattr(
+            pipeline.adjustments, "adjust", lambda envmap, *rest: (np.full_like(envmap, 3e38), [])
+        )
+    assert call(path, "--quiet", "--out", out, *changed(**keys)) == 5
+    with OpenEXR.File(str(out / "edited.exr"), separate_channels=True) as file:
+        assert np.allclose(file.header()["chromaticities"], ACES_AP1)
+        edited = np.stack([file.channels()[c].pixels for c in "RGB"], axis=2)
+    assert np.isfinite(edited).all() and edited.shape == own.shape
+    if scale == 1:
+        assert edited[4:].tobytes() == own[4:].tobytes()
+    else:
+        assert edited.max() > 1e29
 
 
 @pytest.mark.slow

@@ -351,6 +351,16 @@ def test_a_transport_is_traced_once_for_every_map_and_representation(tmp_path, r
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("rows", [[10, 10], [3, 4]])
+def test_rows_that_fill_no_cell_of_the_block_transport_can_be_edited(rows, tmp_path, rng):
+    picture = (0.1 + 0.3 * rng.random((128, 256, 1)) * np.ones(3)).astype(np.float32)
+    found = pipeline.run(settings_of(tmp_path, picture, input={"rows": rows, "width": 256}))
+    first, last = rows
+    assert np.isfinite(found.envmap).all() and found.metrics["active_rows"] == rows
+    others = np.delete(np.arange(128), np.arange(first, last + 1))
+    assert found.envmap[others].tobytes() == picture[others].tobytes()
+
+
 @pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
 def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp_path, rng, monkeypatch):
     places, plain = [], representations.make

@@ -74,6 +74,8 @@ def test_what_the_map_does_not_have_is_told(sky):
     given = inputs.read_map(settings, None, 64)
     assert missing(settings.lights, 1) == [5] and "got light = 5, but the map has" in given.warnings[-1]
     assert np.array_equal(given.radiance, sky)
+    two = config.Input(envmap="sunsky", width=64, lights=[{"light": k, "flux": [0, 0, 0]} for k in (5, 7)])
+    assert "got light = 5, 7, but" in inputs.read_map(two, None, 64).warnings[-1]
 
 
 def test_keys_that_cannot_be_are_named():

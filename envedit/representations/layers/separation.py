@@ -111,7 +111,7 @@ class Survey:
     rows : (int, int)
         First row of the copy in its map, and the rows of that map.
     centres, glows, shares : lists
-        Direction, :attr:`Light.glow` and share of the irradiance of each light.
+        Direction, :attr:`Light.glow` and :attr:`Light.share` of each light.
     """
 
     label: np.ndarray
@@ -159,16 +159,23 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int =
     core = np.where(lit[..., None], np.maximum(image - base * glow, 0), 0)
     background = np.where(lit[..., None], (image - core) / glow, image / glow)
     lights: list[Light] = []
-    kept = np.full(len(found.centres) + 1, -1)
+    kept, own = np.full(len(found.centres) + 1, -1), []
     for i, centre in enumerate(found.centres):
         texels = np.flatnonzero((here == i).ravel() & (core > 0).any(axis=2).ravel())
         if len(texels):
             kept[i] = len(lights)
+            own.append(i)
             radiance = core.reshape(-1, 3)[texels]
             lights.append(Light(centre, texels, radiance, found.glows[i], float(found.shares[i])))
         else:
             core.reshape(-1, 3)[(here == i).ravel()] = 0
-    found = replace(found, label=kept[found.label])  # the last, -1, for texels of none
+    found = replace(
+        found,
+        label=kept[found.label],  # the last, -1, for texels of none
+        centres=[found.centres[i] for i in own],
+        glows=[found.glows[i] for i in own],
+        shares=[found.shares[i] for i in own],
+    )
     return Separation(background, glow, core, lights, found)
 
 

@@ -15,7 +15,7 @@ from envedit.core import shipped
 TEMPLATE = """\
 # envedit run {name}
 # All keys with their meaning: envedit schema --markdown. Paths are relative to this file.
-preset = "standard"  # or "draft", half of the time; "paper", the method of the paper, minutes
+preset = "standard"  # or "draft", two fifths of the time; "paper", that of D'Orazio et al.
 
 [input]
 envmap = {envmap}  # EXR or Radiance HDR, lat-long; "scene", its own; "sunsky", analytic; "auto"

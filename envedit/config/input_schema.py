@@ -133,7 +133,7 @@ class Target(Table):
     spp: int | str = key(
         "auto",
         OrAuto(Integer(1, 1 << 20)),
-        "samples of the target's rendering; auto: until quiet",
+        "samples of the target's rendering; auto: 256 to 768, until noise is below 48 dB",
         "per pixel",
         EDITED,
     )

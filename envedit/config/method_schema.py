@@ -24,7 +24,7 @@ class Representation(Table):
     cycles: int | str = key(
         "auto",
         OrAuto(Integer(1, 256)),
-        "finest detail of the gain; auto: 12, or what is identifiable",
+        "finest detail of the gain; auto: 12, finer where the picture shows the sky itself, as in a mirror",
         "per horizon",
         LAYERS,
     )
@@ -148,7 +148,10 @@ class Optimizer(Table):
         when=ADAM_STEPS,
     )
     beta2: float = key(
-        0.99, Number(0, 0.999999), "Adam's decay of squared gradients; 0.999 spikes", when=ADAM_STEPS
+        0.99,
+        Number(0, 0.999999),
+        "Adam's decay of squared gradients; under 0.999 the loss may have spikes",
+        when=ADAM_STEPS,
     )
     schedule: str = key(
         "cosine",
@@ -171,7 +174,7 @@ class Renderer(Table):
     spp: int | str = key(
         "auto",
         OrAuto(Integer(1, 1 << 20)),
-        'samples, or "auto": most where detail is identifiable',
+        'samples, or "auto": as many as 4 million paths give, 256 at most',
         "per pixel",
         EDITED,
     )

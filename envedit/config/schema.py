@@ -44,7 +44,10 @@ class Output(Table):
     dir: str = key("", String(), "folder of the results; empty: `<config stem>_out` beside the file")
     tonemap: str = key("gamma", Choice(*TONEMAPS), "tonemap of previews and metrics")
     spp: int | str = key(
-        "auto", OrAuto(Integer(1, 1 << 20)), "samples of the judged rendering; auto: until quiet", "per pixel"
+        "auto",
+        OrAuto(Integer(1, 1 << 20)),
+        "samples of the judged rendering; auto: 256 to 768, until noise is below 48 dB",
+        "per pixel",
     )
     report: bool = key(True, Boolean(), "write preview.png and report.html")
     full: bool = key(True, Boolean(), "write edited_full.exr, at the resolution of the input's file")

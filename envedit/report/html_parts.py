@@ -269,9 +269,9 @@ def _circle(centre, radius, colour, dashed=False):
 
 
 def unreachable_figure(pixels: np.ndarray, share: float | None) -> str:
-    """Show what no light can do, display values (h, w, 3); ``share`` of the painted change is feasible."""
+    """Show what is not feasible, display values (h, w, 3); ``share`` of the painted change is feasible."""
     within = "" if share is None else f"; {100 * share:.0f} % of the painted change is feasible"
     ends = '<div class="ends"><span>red: stays darker than asked</span><span>blue: brighter</span></div>'
     return figure(
-        np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), f"what no light can do{within}", ends
+        np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), f"what is not feasible{within}", ends
     )

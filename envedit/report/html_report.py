@@ -187,7 +187,7 @@ def _determined(report: Report) -> list[str]:
 
 
 def _painted(report: Report, metrics: dict, parts: list[_Part]) -> list[str]:
-    """Draw what of the paint no light can do."""
+    """Draw what of the paint is not feasible."""
     if report.unreachable is None:
         return []
     reachable = (metrics.get("painted") or {}).get("reachable")

@@ -117,7 +117,8 @@ def state_files() -> dict[str, bytes]:
         f"{part}/a": np.ones((4, 3), np.float32) for part in ("params", "before", "m", "v")
     }
     looks = np.zeros(8 * 16, np.uint8)
-    renderer = {"columns": np.array([3, 9]), "paths": np.array([8, 48]), "looks": looks, "epoch": np.int64(0)}
+    renderer = {"columns": np.array([3, 9]), "paths": np.array([8, 48]), "looks": looks}
+    renderer |= {"bright": np.array([3]), "epoch": np.int64(0)}
     with tempfile.TemporaryDirectory() as folder:
         checkpoint.save(Path(folder), "what", state, optimiser, renderer, np.ones((6, 8, 3), np.float32))
         return {checkpoint.NAME: (Path(folder) / checkpoint.NAME).read_bytes()}

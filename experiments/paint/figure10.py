@@ -22,7 +22,7 @@ from experiments.paint import browser
 from experiments.painted_edits.experiment import EDITS, FOLDER, file_of
 
 CORNER_S, SETTING_S = 0.4, 1.0
-REACHED = "() => document.querySelector('[data-testid=status]').textContent.includes('is reachable')"
+REACHED = "() => document.querySelector('[data-testid=status]').textContent.includes('is feasible')"
 RENDERED = "() => document.querySelector('[data-testid=status]').textContent.includes('with 256 samples')"
 SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
 TITLES = dict(zip(EDITS, (

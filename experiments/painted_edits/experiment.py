@@ -95,7 +95,7 @@ EXPERIMENT = Experiment(
         "edit": "{edit}",
         "map": "{map}",
         "towards the paint": lambda m: f"{100 * m['towards']:.0f} %",
-        "reachable": lambda m: f"{100 * m['reachable']:.0f} %",
+        "feasible": lambda m: f"{100 * m['reachable']:.0f} %",
         "share of it": lambda m: f"{100 * m['share']:.0f} %",
         "change elsewhere": lambda m: number(m["elsewhere"], ".4f"),
         "map SSIM": "{ssim:.3f}",

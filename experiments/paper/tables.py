@@ -171,7 +171,7 @@ def _paint(name, out, cells, shared, spent):
                 f"{len(ready)}/{len(some)}",
             ]
         )
-    head = ["", "towards the paint", "reachable", "change elsewhere", "map SSIM", "high frequencies"]
+    head = ["", "towards the paint", "feasible", "change elsewhere", "map SSIM", "high frequencies"]
     return markdown([*head, "fit, s", "rest, s", "maps"], lines)
 
 

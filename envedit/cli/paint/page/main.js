@@ -176,7 +176,7 @@ function told(message) {
   const parts = [message.state === "solving" ? "Solving" : "Done"];
   if (message.iterations) parts.push(`${message.iterations} iterations`);
   if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
-  if (message.reachable != null) parts.push(`${Math.round(100 * message.reachable)} % of the paint is reachable`);
+  if (message.reachable != null) parts.push(`${Math.round(100 * message.reachable)} % of the paint is feasible`);
   if (message.state === "done" && message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
   return parts.join(" · ");
 }

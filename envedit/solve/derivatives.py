@@ -56,8 +56,6 @@ class Derivatives:
         T; gets columns, with the fewest paths, for texels that a light covers.
     blocks : BlockJacobian
         T of blocks of pixels.
-    free : ndarray of bool (rows, W), optional
-        Texels whose gain is free; None: all.
 
     Attributes
     ----------
@@ -65,10 +63,8 @@ class Derivatives:
         Rotation of the finite difference by a light's direction.
     """
 
-    def __init__(
-        self, unknowns: Unknowns, transport: LightTransport, blocks: BlockJacobian, free: np.ndarray | None
-    ):
-        self.unknowns, self.transport, self.blocks, self.free = unknowns, transport, blocks, free
+    def __init__(self, unknowns: Unknowns, transport: LightTransport, blocks: BlockJacobian):
+        self.unknowns, self.transport, self.blocks = unknowns, transport, blocks
         self.layers = unknowns.layers
         self.rows, self.shape = self.layers.active, transport.shape
         self.angle = ANGLE
@@ -94,8 +90,6 @@ class Derivatives:
         grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
         more = base + (gain - 1) * grey
         slopes[:own] = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
-        if self.free is not None:
-            slopes[:own] = np.where(self.free[:own, :, None], slopes[:own], 0)
         return slopes.reshape(-1, 3)
 
     def _profile(self, point, cores):

@@ -283,11 +283,10 @@ class Job:
         return adam.params, state
 
     def _problem(self):
-        target = self.target.aim, self.target.weight, self.representation.free
-        asked = self.representation, self.renderer.transport, self.original, *target
-        whole = self._rendered and self.representation.free is None
-        more: dict[str, Any] = {"saturates": whole, "robust": self._rendered}
-        return map_problem.Problem(*asked, **more, blocks=self._blocks)
+        asked = self.representation, self.renderer.transport, self.original
+        target = self.target.aim, self.target.weight
+        more: dict[str, Any] = {"saturates": self._rendered, "robust": self._rendered}
+        return map_problem.Problem(*asked, *target, **more, blocks=self._blocks)
 
     @functools.cached_property
     def _blocks(self):

@@ -85,8 +85,6 @@ class Problem(Unknowns):
         The target, linear radiance.
     weight : ndarray (h, w, 1), optional
         How much each pixel counts beside the others.
-    free : ndarray of bool (rows, W), optional
-        Active texels whose gain is free, as given to :meth:`.Layers.keep`; None: all.
     prior : Prior
         How far a sky changes.
     saturates : bool
@@ -105,7 +103,6 @@ class Problem(Unknowns):
         envmap: np.ndarray,
         picture: np.ndarray,
         weight: np.ndarray | None = None,
-        free: np.ndarray = None,
         prior: Prior = None,
         saturates: bool = False,
         robust: bool = True,
@@ -120,7 +117,7 @@ class Problem(Unknowns):
         self.weight = _on_average_one(weight, shape)
         self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
-        self.derivatives = Derivatives(self, transport, self.blocks, free)
+        self.derivatives = Derivatives(self, transport, self.blocks)
         self._precisions = self.prior.gain_precisions(self.sizes, self.ground)
 
     def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:

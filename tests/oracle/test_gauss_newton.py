@@ -48,12 +48,11 @@ def shown(transport, image):
     return transport.apply(mi.TensorXf(np.asarray(image, np.float32))).numpy()
 
 
-def problem_of(image, transport, target, cycles=3, free=None, **options):
+def problem_of(image, transport, target, cycles=3, **options):
     """Return a problem and the parameters to start from."""
     layers = Layers(cycles=cycles)
     params = layers.encode(image)
-    layers.keep(free)
-    return Problem(layers, transport, image, target, free=free, **options), params
+    return Problem(layers, transport, image, target, **options), params
 
 
 def copy(state):
@@ -77,13 +76,12 @@ def moved(problem, state, unknowns, k, h):
 
 @pytest.fixture(scope="module")
 def case():
-    """A sky with a lamp, part of it frozen, and a state where every unknown has moved."""
+    """A sky with a lamp, and a state where every unknown has moved."""
     rng = np.random.default_rng(0)
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
     target = shown(transport, image) * np.exp(rng.normal(0, 0.5, (*FILM, 3))).astype(np.float32)
     weight = 0.5 + rng.random((*FILM, 1))
-    free = latlong.directions(*GRID)[..., 1] > -0.7
-    problem, params = problem_of(image, transport, target, weight=weight, free=free)
+    problem, params = problem_of(image, transport, target, weight=weight)
     assert len(problem.layers.separation.lights) == 1 and not problem.layers.lights.glowing
     start = problem.state(params)
     state, centre = copy(start), problem.layers.lights.centres[0]
@@ -222,23 +220,6 @@ def plain_precision(problem, names, prior=PRIOR):
             matrix[k, k] = getattr(prior, names[k]) ** -2.0
             k += 1
     return matrix
-
-
-def test_frozen_texels_have_no_slope_and_lights_may_cross_them(case):
-    problem, params, start, state = case
-    frozen = ~problem.derivatives.free
-    assert (
-        frozen.any()
-        and not problem.derivatives._slopes(problem.evaluate(state)).reshape(*GRID, 3)[frozen].any()
-    )
-    edited = problem.evaluate(state).edited
-    np.testing.assert_array_equal(edited[frozen], problem.envmap[frozen])
-    away = copy(start)
-    down = latlong.directions(*GRID)[22, 10]
-    away["turn"][0] = rotation_vector(problem.layers.lights.centres[0], down)
-    edited = problem.evaluate(away).edited
-    assert frozen[22, 10] and edited[22, 10].max() > 10  # the map that a run ends with
-    np.testing.assert_array_equal(edited, problem.layers.decode(problem.params(away)).numpy())
 
 
 def test_state_and_params_are_inverse(case):
@@ -772,9 +753,7 @@ def test_the_maps_light_is_placed_with_the_prior_before_the_first_step(rng):
 def test_no_light_is_added_where_none_is_missing(case):
     problem, params, _, _ = case
     whole = problem.evaluate(problem.state(params)).rendering
-    there = Problem(
-        problem.layers, problem.transport, problem.envmap, whole * 0.9, free=problem.derivatives.free
-    )
+    there = Problem(problem.layers, problem.transport, problem.envmap, whole * 0.9)
     ends = [there.state(solve(there, params, 0.1, most_added=most).params) for most in (0, 2)]
     assert same(*ends)
 

@@ -88,9 +88,9 @@ class Run:
     corrected: bool = False
 
     def elsewhere(self, state: dict, start: dict) -> Run:
-        """Return a run that goes on from another state, with steps of its own."""
-        history = list(self.history)
-        return replace(self, state=state, start=start, history=history, finished=False, wide=False)
+        """Return a run that goes on from another state, with steps and a damping of its own."""
+        found = replace(self, state=state, start=start, history=list(self.history), finished=False)
+        return replace(found, damping=Run.damping, wide=False)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
@@ -327,9 +327,10 @@ class _Search:
             if k in own and run.state["flux"][k].mean() > FADED:
                 continue
             without = _without(run.state, k)
-            rival = replace(run.elsewhere(without, run.start), damping=1e-3)
+            rival = run.elsewhere(without, run.start)
             most = min(self.iterations, len(run.history) + ADDED_STEPS)
             end = self._descended(rival, problem.evaluate(without), most, self._tried)
+            point, end = self._again(run, point), self._again(rival, end)
             noise = problem.noise(point.residual, self.sigma)
             loss, before = (problem.loss(one, run.start, noise) for one in (end, point))
             strain = problem.penalty(end.state, run.start) - problem.penalty(point.state, run.start)
@@ -468,12 +469,18 @@ class _Search:
             run = replace(run, history=list(run.history))
             point = self._descended(run, point, most, self._tried)
         scale = max(one.scale for one, _ in [(run, point), *ends])
-        for rival, end in ends:
+        point = self._again(run, point)
+        for rival, end in ((one, self._again(one, end)) for one, end in ends):
             fewer = len(problem.added(rival.state)) < len(problem.added(run.state))
             loss, other = (problem.loss(p, r.start, scale) for p, r in ((point, run), (end, rival)))
             if other + (-WORTH if fewer else WORTH) < loss:
                 run, point = replace(rival, most=len(rival.history) + ITERATIONS - ADDED_STEPS), end
         return run, point
+
+    def _again(self, run, point):
+        """Render where a run is with the columns of T that there are now, as what it is compared with."""
+        again = self.problem.evaluate(run.state, resolve=False)
+        return point if again.residual is None else again
 
     def _tried(self, _, point):
         if self.after_step:
@@ -498,10 +505,8 @@ class _Search:
                     data = problem.misfit(tried.residual, run.scale)
                     penalty = problem.penalty(tried.state, run.start)
                     if data + penalty >= before:
-                        # Columns of T that were traced for it are not in what it is compared with.
-                        again = problem.evaluate(run.state, resolve=False)
-                        if again.residual is not None:
-                            point, before = again, problem.loss(again, run.start, run.scale)
+                        point = self._again(run, point)
+                        before = problem.loss(point, run.start, run.scale)
                     if data + penalty < before:
                         better = tried
                         break
@@ -509,7 +514,8 @@ class _Search:
             little = better is None or before - data - penalty < LITTLE * before
             ended = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
             run.finished = ended and (run.wide or not problem.lit(run.state))
-            run.wide |= ended
+            if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
+                run.wide, run.damping = True, Run.damping
             if better is not None:
                 point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
                 row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}

@@ -71,7 +71,7 @@ def weights(
     if trust.min() >= 0.5:
         return None
     brightest = np.concatenate([_windows(brightness[rows], 1).max(axis=(2, 3)) for rows in views])
-    shows_light = (brightest >= SHOWS_LIGHT * np.median(picture[lit])) & (beyond > 0)
+    shows_light = (brightest >= SHOWS_LIGHT * np.median(brightness[lit])) & (beyond > 0)
     trust = np.where(shows_light, 0, trust)
     return trust[..., None].astype(np.float32) if trust[lit].any() else None
 

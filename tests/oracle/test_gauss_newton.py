@@ -520,6 +520,44 @@ def test_a_step_that_raises_f_is_damped(case, monkeypatch):
     assert rises and min(rises) >= 10 * (1 - 1e-9)
 
 
+def test_damping_is_not_taken_to_other_states_or_other_derivatives(case, monkeypatch):
+    """What steps from one place needed says nothing of those from another, or with wide differences."""
+    problem, _, start, state = case
+    run = Run(state, start, damping=1e3, finished=True, wide=True, history=[{"iteration": 0}])
+    there = run.elsewhere(start, start)
+    assert (there.damping, there.finished, there.wide) == (Run.damping, False, False)
+    assert there.history == run.history and there.history is not run.history
+
+    dampings = []
+
+    def nowhere(self, state, normal, damping):
+        dampings.append(damping)
+        return state
+
+    monkeypatch.setattr(Problem, "step", nowhere)
+    point = problem.evaluate(state)
+    run = Run(state, start, scale=problem.noise(point.residual, 0.1))
+    gauss_newton.descended(problem, run, point, 0.1, steps=2)
+    assert run.finished and dampings.count(Run.damping) == 2 and max(dampings) >= 10
+
+
+def test_rivals_are_compared_under_the_same_columns_of_t(case, monkeypatch):
+    """The columns that a rival brings along are in the loss of what it is compared with."""
+    problem, _, start, state = case
+    resolved = []
+    evaluate = Problem.evaluate
+
+    def noted(self, one, resolve=True):
+        resolved.append(resolve)
+        return evaluate(self, one, resolve)
+
+    monkeypatch.setattr(Problem, "evaluate", noted)
+    run = Run(start, start, finished=True)
+    search = gauss_newton._Search(problem, 0.1, 4, 0, None)
+    search._better(run, evaluate(problem, start), (state, [0]))
+    assert resolved[-2:] == [False, False]
+
+
 def test_no_step_is_longer_than_its_limit(case):
     problem, _, start, state = case
     normal = problem.normal(problem.evaluate(state), start, 0.01)

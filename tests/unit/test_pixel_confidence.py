@@ -57,6 +57,16 @@ def test_pixels_that_show_the_light_itself_tell_nothing(rng):
     assert not found[2:5, 2:5].any() and found[6, 6] > 0.99
 
 
+def test_a_coloured_picture_shows_no_light_all_over(rng):
+    """Brightness is of the brightest channel, in a pixel and in the picture's median alike."""
+    (first, second), base = (list(p) if isinstance(p, list) else p for p in pictures(rng))
+    orange = np.array([1.0, 0.3, 0.05])
+    first, second, base = first * orange, second * orange, base * orange
+    first[10:13, 20:23] += 0.1
+    found = pixel_confidence.weights(first, second, 1 / 8, base)
+    assert 0 < found[11, 21] < 0.5 and found.min() > 0
+
+
 def test_what_is_bright_and_no_noise_counts_beside_what_is(rng):
     """A mirror in front of a dark wall."""
     (first, second), base = pictures(rng)

@@ -330,7 +330,6 @@ class _Search:
             rival = run.elsewhere(without, run.start)
             most = min(self.iterations, len(run.history) + ADDED_STEPS)
             end = self._descended(rival, problem.evaluate(without), most, self._tried)
-            point, end = self._again(run, point), self._again(rival, end)
             noise = problem.noise(point.residual, self.sigma)
             loss, before = (problem.loss(one, run.start, noise) for one in (end, point))
             strain = problem.penalty(end.state, run.start) - problem.penalty(point.state, run.start)
@@ -469,18 +468,12 @@ class _Search:
             run = replace(run, history=list(run.history))
             point = self._descended(run, point, most, self._tried)
         scale = max(one.scale for one, _ in [(run, point), *ends])
-        point = self._again(run, point)
-        for rival, end in ((one, self._again(one, end)) for one, end in ends):
+        for rival, end in ends:
             fewer = len(problem.added(rival.state)) < len(problem.added(run.state))
             loss, other = (problem.loss(p, r.start, scale) for p, r in ((point, run), (end, rival)))
             if other + (-WORTH if fewer else WORTH) < loss:
                 run, point = replace(rival, most=len(rival.history) + ITERATIONS - ADDED_STEPS), end
         return run, point
-
-    def _again(self, run, point):
-        """Render where a run is with the columns of T that there are now, as what it is compared with."""
-        again = self.problem.evaluate(run.state, resolve=False)
-        return point if again.residual is None else again
 
     def _tried(self, _, point):
         if self.after_step:
@@ -505,8 +498,10 @@ class _Search:
                     data = problem.misfit(tried.residual, run.scale)
                     penalty = problem.penalty(tried.state, run.start)
                     if data + penalty >= before:
-                        point = self._again(run, point)
-                        before = problem.loss(point, run.start, run.scale)
+                        # Columns of T that were traced for it are not in what it is compared with.
+                        again = problem.evaluate(run.state, resolve=False)
+                        if again.residual is not None:
+                            point, before = again, problem.loss(again, run.start, run.scale)
                     if data + penalty < before:
                         better = tried
                         break

@@ -541,23 +541,6 @@ def test_damping_is_not_taken_to_other_states_or_other_derivatives(case, monkeyp
     assert run.finished and dampings.count(Run.damping) == 2 and max(dampings) >= 10
 
 
-def test_rivals_are_compared_under_the_same_columns_of_t(case, monkeypatch):
-    """The columns that a rival brings along are in the loss of what it is compared with."""
-    problem, _, start, state = case
-    resolved = []
-    evaluate = Problem.evaluate
-
-    def noted(self, one, resolve=True):
-        resolved.append(resolve)
-        return evaluate(self, one, resolve)
-
-    monkeypatch.setattr(Problem, "evaluate", noted)
-    run = Run(start, start, finished=True)
-    search = gauss_newton._Search(problem, 0.1, 4, 0, None)
-    search._better(run, evaluate(problem, start), (state, [0]))
-    assert resolved[-2:] == [False, False]
-
-
 def test_no_step_is_longer_than_its_limit(case):
     problem, _, start, state = case
     normal = problem.normal(problem.evaluate(state), start, 0.01)

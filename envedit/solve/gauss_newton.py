@@ -88,9 +88,9 @@ class Run:
     corrected: bool = False
 
     def elsewhere(self, state: dict, start: dict) -> Run:
-        """Return a run that goes on from another state, with steps and a damping of its own."""
-        found = replace(self, state=state, start=start, history=list(self.history), finished=False)
-        return replace(found, damping=Run.damping, wide=False)
+        """Return a run that goes on from another state, with steps of its own."""
+        history = list(self.history)
+        return replace(self, state=state, start=start, history=history, finished=False, wide=False)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
@@ -327,7 +327,7 @@ class _Search:
             if k in own and run.state["flux"][k].mean() > FADED:
                 continue
             without = _without(run.state, k)
-            rival = run.elsewhere(without, run.start)
+            rival = replace(run.elsewhere(without, run.start), damping=Run.damping)
             most = min(self.iterations, len(run.history) + ADDED_STEPS)
             end = self._descended(rival, problem.evaluate(without), most, self._tried)
             noise = problem.noise(point.residual, self.sigma)

@@ -150,7 +150,7 @@ class Optimizer(Table):
     beta2: float = key(
         0.99,
         Number(0, 0.999999),
-        "Adam's decay of squared gradients; under 0.999 the loss may have spikes",
+        "Adam's decay of squared gradients; with 0.999 the loss may have spikes",
         when=ADAM_STEPS,
     )
     schedule: str = key(

@@ -205,12 +205,10 @@ def _edit(settings, arguments, folder, allowed, start):
 
 def _keep_map(folder, stop):
     """Write the map that an edit has come to which was cut short."""
-    from envedit.images import images
+    from envedit import config
+    from envedit.report import map_files
 
-    given = stop.given
-    images.write_exr(
-        folder / "edited.exr", stop.envmap, {"source": given.source}, chromaticities=given.chromaticities
-    )
+    map_files.write_map(config.Output(), folder / "edited", stop.envmap, stop.given)
 
 
 def _interrupted(arguments, folder, again):

@@ -71,6 +71,7 @@ def measure(done: Done) -> dict:
     rows, painted = done.rows, done.metrics["painted"]
     before = metrics.high_frequency_energy(original[rows])
     return painted | {
+        "outside": 100 * done.metrics["natural"]["colours_outside"],
         "share": painted["towards"] / painted["reachable"] if painted["reachable"] else float("nan"),
         "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
         "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else float("nan"),
@@ -98,6 +99,7 @@ EXPERIMENT = Experiment(
         "feasible": lambda m: f"{100 * m['reachable']:.0f} %",
         "share of it": lambda m: f"{100 * m['share']:.0f} %",
         "change elsewhere": lambda m: number(m["elsewhere"], ".4f"),
+        "colours outside": "{outside:.1f} %",
         "map SSIM": "{ssim:.3f}",
         "high frequencies": lambda m: number(m["sharp"], ".2f"),
         "s": "{seconds:.0f}",

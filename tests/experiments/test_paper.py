@@ -358,6 +358,7 @@ def finish(out, made, row, sky=None, *, color=RED, numbers=SOME, fit_s=None, cac
             },
             "active_rows": [0, 3],
             "painted": {"towards": 0.8, "elsewhere": None, "reachable": 0.9},
+            "natural": {"colours_outside": 0.25, "seam": 1.0, "high_frequency": 0.9},
         }
         write_atomically(folder / "metrics.json", json.dumps(about).encode())
         write_atomically(folder / "done.json", json.dumps({"resumed": resumed}).encode())

@@ -35,6 +35,7 @@ from envedit.solve import (
     gauss_newton,
     hold,
     map_problem,
+    prior,
     transport_error,
 )
 from envedit.targets.target import Target
@@ -286,7 +287,8 @@ class Job:
         asked = self.representation, self.renderer.transport, self.original
         target = self.target.aim, self.target.weight
         more: dict[str, Any] = {"saturates": self._rendered, "robust": self._rendered}
-        return map_problem.Problem(*asked, *target, **more, blocks=self._blocks)
+        chosen = prior.Prior() if self._rendered else prior.PAINTED
+        return map_problem.Problem(*asked, *target, chosen, **more, blocks=self._blocks)
 
     @functools.cached_property
     def _blocks(self):

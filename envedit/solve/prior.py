@@ -15,6 +15,8 @@ AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 class Prior:
     """How far a sky changes: standard deviations, the same for every scene and map.
 
+    Those of a rendered target, which may be of quite another sky; :data:`PAINTED` are those of a painted one.
+
     Attributes
     ----------
     luminance : float
@@ -57,3 +59,7 @@ class Prior:
         """Inverse covariance of a light's log flux per channel, (3, 3)."""
         sd = np.array([np.sqrt(3) * self.flux, self.chroma, self.tint])
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
+
+
+PAINTED = Prior(chroma=0.1)
+"""Of painted targets: paint that asks for another brightness is no reason for another colour of the sky."""

@@ -40,6 +40,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import feasibility, gauss_newton, hold, initialization, map_problem
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.solve.light_search import SearchProblem
+from envedit.solve.prior import PAINTED
 from envedit.targets import strokes, working_size
 from envedit.targets.target import first_hold, pixel_weight
 
@@ -152,7 +153,8 @@ class Session:
         params = layers.encode(self.origin[self.rows.slice])
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
-        self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base, robust=False)
+        asked = layers, self.transport, self.origin, self.base
+        self.problem = map_problem.Problem(*asked, prior=PAINTED, robust=False)
         self.still = self.start = self.problem.state(params)
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)

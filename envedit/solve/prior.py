@@ -61,5 +61,5 @@ class Prior:
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-PAINTED = Prior(chroma=0.1)
+PAINTED = Prior(chroma=0.3 / 3, tint=0.1 / 3)
 """Of painted targets: paint that asks for another brightness is no reason for another colour of the sky."""

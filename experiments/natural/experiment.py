@@ -28,7 +28,6 @@ ANGLES, OTHERS = (60, 140), (1, 4, 8)
 ELEVATIONS, ELEVATION = (5, 10, 20, 50, 65, 80), 35
 """Of the analytic sky's sun, degrees: targets, and before."""
 WIDTH = 256
-KINDS = "turned", "another map", "elevation"
 SAME = 120.0
 """PSNR from which two maps are taken to be the same, dB."""
 
@@ -135,36 +134,39 @@ COLUMNS = {
 
 
 def summary(rows) -> str:
-    """Return means and extremes of every kind of target, with a turn of the sky and without."""
+    """Return means and extremes of every kind of target, with a turn and without, of every scene and map."""
     head = (
-        "target", "turn", "runs", "rendering, dB (worst)", "map over the unedited one, dB (worst)",
-        "worse than unedited", "lower half, dB", "colours outside (most), over 5 %", "seam (most), over 2.5",
+        "runs", "rendering, dB (worst)", "map over the unedited one, dB (worst)", "worse than unedited",
+        "lower half, dB", "colours outside (most), over 5 %", "seam (most), over 2.5",
         "high frequencies, outside 0.7 to 1.3",
     )  # fmt: skip
-    lines = []
-    for kind, turn in itertools.product(KINDS, ("auto", "false")):
-        some = [m for m in rows if m["kind"] == kind and m["turn"] == turn]
-        if not some:
-            continue
-        render, gain, lower, outside, seam, sharp = (
-            np.array([m[key] for m in some if m[key] is not None] or [np.nan])
-            for key in ("render", "gain", "lower", "colours_outside", "seam", "high_frequency")
-        )
-        lines.append(
-            [
-                kind,
-                turn,
-                str(len(some)),
-                f"{render.mean():.1f} ({render.min():.1f})",
-                f"{gain.mean():+.1f} ({gain.min():+.1f})",
-                str((gain < 0).sum()),
-                f"{lower.mean():+.1f}",
-                f"{100 * outside.mean():.1f} % ({100 * outside.max():.1f}), {(outside > 0.05).sum()}",
-                f"{number(seam.mean())} ({number(seam.max())}), {(seam > 2.5).sum()}",
-                f"{number(sharp.mean(), '.2f')}, {((sharp < 0.7) | (sharp > 1.3)).sum()}",
-            ]
-        )
-    return markdown(head, lines)
+    tables = []
+    for keys in (("kind", "turn"), ("scene",), ("map",)):
+        groups: dict[tuple, list] = {}
+        for m in rows:
+            groups.setdefault(tuple(m[key] for key in keys), []).append(m)
+        names = ["target" if key == "kind" else key for key in keys]
+        lines = [[*name, *_told(some)] for name, some in sorted(groups.items())]
+        tables.append(markdown((*names, *head), lines))
+    return "\n\n".join(tables)
+
+
+def _told(some):
+    """Return means and extremes of rows, as words."""
+    render, gain, lower, outside, seam, sharp = (
+        np.array([m[key] for m in some if m[key] is not None] or [np.nan])
+        for key in ("render", "gain", "lower", "colours_outside", "seam", "high_frequency")
+    )
+    return [
+        str(len(some)),
+        f"{render.mean():.1f} ({render.min():.1f})",
+        f"{gain.mean():+.1f} ({gain.min():+.1f})",
+        str((gain < 0).sum()),
+        f"{lower.mean():+.1f}",
+        f"{100 * outside.mean():.1f} % ({100 * outside.max():.1f}), {(outside > 0.05).sum()}",
+        f"{number(seam.mean())} ({number(seam.max())}), {(seam > 2.5).sum()}",
+        f"{number(sharp.mean(), '.2f')}, {((sharp < 0.7) | (sharp > 1.3)).sum()}",
+    ]
 
 
 EXPERIMENT = Experiment(

@@ -5,7 +5,9 @@ import inspect
 import json
 import signal
 import threading
+import tomllib
 import types
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -332,6 +334,20 @@ def test_a_highlight_that_matte_ground_cannot_show_leaves_the_rest(tmp_path):
         held[weight] = found.metrics["painted"]["elsewhere"]
         assert any("weighs" in line for line in found.notes) == (weight == "auto")
     assert held[1.0] > 0.05 and held["auto"] < 0.025
+
+
+@pytest.mark.slow
+def test_paint_that_asks_for_another_brightness_leaves_the_sky_its_colours():
+    """With a rendered target's prior, 30 % of this sky turn a darker blue; a colour that is painted comes."""
+    edits, towards = Path(__file__).parents[2] / "scenes" / "edits", {}
+    for edit, outside in (("enhance_shadow", 0.05), ("warmer", 1.0)):
+        tables = tomllib.loads((edits / f"{edit}.toml").read_text(encoding="utf-8"))
+        tables |= {"output": {"spp": 64}, "renderer": {"spp": 64}}
+        tables["input"]["width"], tables["scene"] = 64, tables.get("scene", {}) | {"width": 48}
+        found = pipeline.run(config.from_dict(tables)).metrics
+        assert found["natural"]["colours_outside"] <= outside
+        towards[edit] = found["painted"]["towards"] / found["painted"]["reachable"]
+    assert towards["enhance_shadow"] > 0.65 and towards["warmer"] > 0.8
 
 
 @pytest.mark.slow

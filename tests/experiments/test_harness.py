@@ -120,7 +120,6 @@ def test_every_experiment_makes_its_cases(tmp_path, monkeypatch, capsys):
         (tmp_path / "puresky" / f"{name}_puresky_1k.hdr").write_text(name)
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
     counts = {
-        "first_edit": 12,
         "interiors": 5,
         "layers": 40,
         "levels": 24,
@@ -133,7 +132,7 @@ def test_every_experiment_makes_its_cases(tmp_path, monkeypatch, capsys):
         assert command.main(asked) == 0
         assert capsys.readouterr().out.endswith(f"{count} jobs: {count} missing\n")
     assert command.main(["layer"]) == 2
-    assert "expected one of first_edit, interiors, layers" in capsys.readouterr().err
+    assert "expected one of interiors, layers" in capsys.readouterr().err
 
 
 def test_the_same_options_everywhere():

@@ -26,8 +26,10 @@ class Prior:
     tint : float
         Of its green-magenta difference, which skies hardly have.
     flux : float
-        Of a light's mean log flux; for the map's own lights around their original flux. Its colour changes as
-        the sky's does.
+        Of a light's mean log flux; for the map's own lights around their original flux.
+    flux_chroma : float
+        Of the blue-amber difference of a light's log flux: from the horizon to high above it, that of the sun
+        changes by a factor of e and more. Green-magenta is as of the sky.
     turn : float
         Of a light's direction, radians from where the search has put it.
     size, added_size : float
@@ -40,6 +42,7 @@ class Prior:
     chroma: float = 0.3
     tint: float = 0.1
     flux: float = 1.5
+    flux_chroma: float = 1.0
     turn: float = np.radians(10.0)
     size: float = 0.3
     added_size: float = 1.0
@@ -57,9 +60,9 @@ class Prior:
     @property
     def flux_precision(self) -> np.ndarray:
         """Inverse covariance of a light's log flux per channel, (3, 3)."""
-        sd = np.array([np.sqrt(3) * self.flux, self.chroma, self.tint])
+        sd = np.array([np.sqrt(3) * self.flux, self.flux_chroma, self.tint])
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-PAINTED = Prior(chroma=0.3 / 3, tint=0.1 / 3)
+PAINTED = Prior(chroma=0.3 / 3, tint=0.1 / 3, flux_chroma=0.3 / 3)
 """Of painted targets: paint that asks for another brightness is no reason for another colour of the sky."""

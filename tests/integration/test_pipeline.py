@@ -337,6 +337,29 @@ def test_a_highlight_that_matte_ground_cannot_show_leaves_the_rest(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_sun_at_the_horizon_that_rises_loses_its_colour_and_not_the_sky(tmp_path):
+    """The low sun has no blue: were its colour held as that of the sky, the sky would turn blue for it."""
+
+    def made(row, sun, glow):
+        d = latlong.directions(32, 64)
+        angle = np.degrees(np.arccos(np.clip(d @ d[row, 40], -1, 1)))
+        picture = 0.2 * np.ones(3) + glow * np.exp(-((angle / 20) ** 2))[..., None] * [1, 0.6, 0.3]
+        picture[16:] = 0.1
+        picture[row, 40] = sun
+        return picture.astype(np.float32)
+
+    images.write_exr(tmp_path / "day.exr", made(11, [2000, 1800, 1600], 0))
+    settings = settings_of(
+        tmp_path, made(15, [400, 60, 0], 3), input={"width": 64, "rows": "all"},
+        target={"file": "day.exr", "rotate_degrees": 0.0, "spp": 256}, scene={"file": "sphere", "width": 48},
+        renderer={"spp": 64}, optimizer={"iterations": 60}, output={"spp": 256},
+    )  # fmt: skip
+    found = pipeline.run(settings).metrics
+    assert found["render"]["psnr"] > 36
+    assert found["natural"]["colours_outside"] < 0.1
+
+
+@pytest.mark.slow
 def test_paint_that_asks_for_another_brightness_leaves_the_sky_its_colours():
     """With a rendered target's prior, 30 % of this sky turn a darker blue; a colour that is painted comes."""
     edits, towards = Path(__file__).parents[2] / "scenes" / "edits", {}

@@ -213,7 +213,7 @@ def plain_precision(problem, names, prior=PRIOR):
     k = 3 * n
     while k < len(names):
         if names[k] == "flux":  # three channels, one after the other
-            sd = np.array([np.sqrt(3) * prior.flux, prior.chroma, prior.tint])
+            sd = np.array([np.sqrt(3) * prior.flux, prior.flux_chroma, prior.tint])
             matrix[k : k + 3, k : k + 3] = axes.T @ np.diag(sd**-2) @ axes
             k += 3
         else:
@@ -295,7 +295,7 @@ def test_penalty_of_a_light(case):
         # A change of (a, b, c): its mean, a - c and a - 2 b + c, each over its deviation.
         "flux": (
             np.array([0.3, 0.0, -0.6]),
-            0.1**2 / PRIOR.flux**2 + 0.9**2 / 2 / PRIOR.chroma**2 + 0.3**2 / 6 / PRIOR.tint**2,
+            0.1**2 / PRIOR.flux**2 + 0.9**2 / 2 / PRIOR.flux_chroma**2 + 0.3**2 / 6 / PRIOR.tint**2,
         ),
         "size": (np.array([0.2]), (0.2 / PRIOR.size) ** 2),
         "turn": (

@@ -64,5 +64,8 @@ class Prior:
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-PAINTED = Prior(chroma=0.3 / 3, tint=0.1 / 3, flux_chroma=0.3 / 3)
-"""Of painted targets: paint that asks for another brightness is no reason for another colour of the sky."""
+PAINTED = Prior(chroma=Prior.chroma / 3, tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3)
+"""Of painted targets: paint that asks for another brightness is no reason for another colour of the sky.
+
+In colour a third of what a rendered target may change, and of a light as much as of the sky.
+"""

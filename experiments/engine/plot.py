@@ -21,6 +21,9 @@ def scaling(found: dict, file: Path) -> None:
         panel.loglog(across, [r["apply"]["median_s"] for r in rows], "o-", label="T E, s")
         panel.loglog(across, [r["adjoint"]["median_s"] for r in rows], "^-", label="T' I, s")
         panel.loglog(across, [r["bytes"] / 1e9 for r in rows], "x--", color="grey", label="read by both, GB")
+        ticks = sorted(set(across))
+        panel.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize="small")
+        panel.minorticks_off()
         panel.set_xlabel(label)
         panel.grid(alpha=0.3)
     panels[0].legend(fontsize="small")
@@ -38,6 +41,7 @@ def error_time(found: dict, file: Path) -> None:
         panel.loglog([r["step_s"] for r in rows], [100 * r["rmse"] for r in rows], style, label=kind)
         for r in rows:
             panel.annotate(f" {r['samples']} spp", (r["step_s"], 100 * r["rmse"]), fontsize="x-small")
+    panel.margins(x=0.1)
     panel.axhline(100 * found["curve"][0]["noise"], color="grey", ls=":", label="noise of the reference")
     panel.set_xlabel("seconds of a step: rendering and gradient")
     panel.set_ylabel("RMSE, % of the mean")

@@ -162,7 +162,9 @@ class Preparation:
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
             loss, other = _loss(turned), _loss(still)
         chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
-        chosen.notes.append(f"AIC (lower is better): {loss:.5g} with the sky turned, {other:.5g} without")
+        chosen.notes.append(
+            f"Akaike criterion (lower is better): {loss:.5g} with the sky turned, {other:.5g} without"
+        )
         return chosen
 
     def _turn(self, target):

@@ -166,7 +166,7 @@ def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple
                 "correct or unset DRJIT_LIBLLVM_PATH, or run: apt-get install libllvm19"
             )
     if "LLVM backend is inactive" in said or "LLVM shared library" in said:
-        return "no LLVM library was found", _MEND
+        return "no LLVM library was found", _MEND.replace("a newer one", "LLVM 19")
     if code < 0 or "LLVM ERROR" in said:
         name = f"exit code {code}"
         with contextlib.suppress(ValueError):

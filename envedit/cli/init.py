@@ -28,12 +28,12 @@ file = {scene}  # a Mitsuba XML file, or one of {shipped}
 width = 128  # of the rendering while editing, pixels
 # parameters = {{ roughness = 0.3 }}  # values for the <default>s of the scene
 
-# The target: how the rendering should look. Keep one of three.
+# The target: how the rendering should look. One of three: take the # from its lines, and delete the others'.
 [target]
 kind = "envmap"  # 1. lit by another map:
 rotate_degrees = 60.0  # the same one, turned about the vertical; or file = "another.hdr"
-# kind = "image"  # 2. painted: envedit run {name} --export-initial paint_me.png
-# file = "paint_me.png"  # and paint on that picture
+# kind = "image"  # 2. painted, on what "envedit run {name} --export-initial paint_me.png" writes
+# file = "paint_me.png"
 # kind = "strokes"  # 3. strokes, in fractions of the picture, as in the shipped edits/warmer
 # strokes = [{{ type = "shadow", ellipse = [0.6, 0.8, 0.1, 0.05] }}]
 

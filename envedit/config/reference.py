@@ -25,7 +25,8 @@ Every key of a TOML file, and so of `--set table.key=value`, `envedit.Config` an
 
 **Where a value comes from.** The last of these that gives it: the default; the preset (`--preset`, or the key
 `preset`); what the preset has for the kind of representation and of target ([below](#defaults-of-a-kind));
-the file; `--set`, of which the last counts. Paths are relative to the file, those in `--set` too.
+the file; `--set`, of which the last counts. Paths, those in `--set` too, are relative to the file, or
+to the working folder where a shipped name or a scene stands in its place.
 
 **Keys without effect.** A key that has a meaning *only where* another has some value changes nothing
 elsewhere. Where it is given, and differs from its default, the run names it in a warning. Keys that

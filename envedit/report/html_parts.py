@@ -72,7 +72,7 @@ NUMBERS = {
     "iterations": "iterations",
     "non_finite_steps": "steps that were not finite, and not taken",
     "turn_degrees": "turn of the whole sky (degrees)",
-    "sun_offset_texels": "brightest texel, edited to true map (texels)",
+    "sun_offset_texels": "distance between the brightest texels of the edited and of the true map (texels)",
     "active_rows": "rows that were edited, first and last",
     "natural colours_outside": "share of the sky in colours that neither map has",
     "natural seam": "step at the horizon over the original's",
@@ -84,14 +84,14 @@ NUMBERS = {
     "fit peak_ratio": "fit, peak over the map's",
     "fit epochs": "fit, epochs",
     "fit cached": "fit taken from disk",
-    "transport cached": "T taken from disk",
-    "transport entries": "T, entries",
-    "transport memory_bytes": "T, bytes",
-    "transport columns": "T, exact columns",
-    "transport samples": "T, samples a pixel",
-    "transport path_depth": "T, longest path",
-    "transport depth_error": "T, share of the light that longer paths would add",
-    "transport predicted_error": "T, predicted relative error",
+    "transport cached": "light transport (T) taken from disk",
+    "transport entries": "light transport, entries",
+    "transport memory_bytes": "light transport, bytes",
+    "transport columns": "light transport, exact columns",
+    "transport samples": "light transport, samples a pixel",
+    "transport path_depth": "light transport, longest path",
+    "transport depth_error": "light transport, share of the light that longer paths would add",
+    "transport predicted_error": "light transport, predicted relative error",
     "transport frozen": "share of texels that are frozen",
 }
 """Numbers of metrics.json in words; terms that are ours are in docs/glossary.md."""
@@ -99,7 +99,7 @@ STAGES = {
     "import": "importing",
     "target": "rendering the target",
     "fit": "fitting the representation",
-    "transport": "tracing T, or reading it from disk",
+    "transport": "tracing the light transport, or reading it from disk",
     "reach": "estimating what is feasible",
     "start": "searching for lights",
     "edit": "optimising",
@@ -271,7 +271,8 @@ def _circle(centre, radius, colour, dashed=False):
 def unreachable_figure(pixels: np.ndarray, share: float | None) -> str:
     """Show what is not feasible, display values (h, w, 3); ``share`` of the painted change is feasible."""
     within = "" if share is None else f"; {100 * share:.0f} % of the painted change is feasible"
-    ends = '<div class="ends"><span>red: stays darker than asked</span><span>blue: brighter</span></div>'
+    words = "<span>marked red: stays darker than painted</span><span>marked blue: brighter</span>"
+    ends = f'<div class="ends">{words}</div>'
     return figure(
         np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), f"what is not feasible{within}", ends
     )

@@ -353,7 +353,8 @@ class Job:
                 run = further
         self.posterior, said = made.posterior, [made.note] if made.note else []
         if made.run.hold > 1:
-            said.append(f"what was not painted weighs {made.run.hold:.3g}: with less it would change visibly")
+            used = f"target.hold = {made.run.hold:.3g} was used"
+            said.append(f"{used}: with less, pixels without paint would change visibly")
         if "saturation" in made.params and not made.note:
             kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))
             said.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")

@@ -210,8 +210,8 @@ def solve(
         least = _unlikeliness(problem, before, first, sigma)
         near = problem.noise(first.residual, sigma) < NEAR * problem.noise(point.residual, sigma)
         if least <= loss:
-            note = "kept the initialisation: the lower residual does not justify "
-            note += f"{normal.determined:.0f} parameters (AIC)"
+            note = "kept the initialisation: the better match of the rendering does not justify "
+            note += f"{normal.determined:.0f} parameters (Akaike criterion)"
         elif judge is not None and near and CLEARLY * judge(first.edited) <= judge(point.edited):
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:

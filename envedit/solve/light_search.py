@@ -99,7 +99,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
     notes, pictures = [], []
     factor = np.ones((len(overview.omega), 3))
     for i, (light, found) in enumerate(zip(lights, places, strict=False)):
-        name = f"light {i + 1} of {len(lights)} ({100 * light.share:.3g} % of the map's)"
+        name = f"light {i + 1} of {len(lights)} ({100 * light.share:.3g} % of the map's light)"
         if not found.flux.max() > 0:
             notes.append(f"{name}: removed, its estimated flux is zero")
             continue
@@ -111,9 +111,9 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
             others = list(scene.cores(places, i)) if len(lights) > 1 else []
             direction, flux = scene.refine(found.direction, layers.lights.flux[i], light.glow, others)
             angle = np.degrees(np.arccos(np.clip(direction @ light.direction, -1, 1)))
-            notes.append(f"{name}: initialised {angle:.1f} degrees from its place in the map")
+            notes.append(f"{name}: the steps start with it {angle:.1f} degrees from its place in the map")
         else:
-            notes.append(f"{name}: initialised at its place in the map")
+            notes.append(f"{name}: the steps start with it at its place in the map")
         places[i] = Place(direction if found.direction is not None else None, np.full(3, flux))
         if only_own:
             continue
@@ -122,7 +122,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
             factor *= 1 + glow_at(light.glow, scene.cells @ direction)
     for i in range(len(lights), len(places)):
         if places[i].flux.max() > 0:
-            notes.append("added a light: the target needs one where the map has none")
+            notes.append("added a light, in a direction in which the map has none")
             pictures.append((i, scene.light(i, places[i])))
 
     state = dict(params)

@@ -70,10 +70,11 @@ def start(problem: SearchProblem, params: dict, bold: bool = False) -> tuple[dic
         if i < len(lights):
             angle = np.degrees(np.arccos(np.clip(direction @ lights[i].direction, -1, 1)))
             notes.append(
-                f"light {i + 1} of {len(lights)}: initialised {angle:.1f} degrees from its place in the map"
+                f"light {i + 1} of {len(lights)}: the steps start with it {angle:.1f} degrees from "
+                "its place in the map"
             )
         else:
-            notes.append("added a light: the paint needs one where the map has none")
+            notes.append("added a light: in a direction in which the map has none")
     if moved:
         for i, factor in _strengths(scene, there, new).items():
             places[i] = Place(places[i].direction, places[i].flux * factor if i in new else factor)

@@ -207,15 +207,16 @@ What happens with scenes as people have them. Both tables are written from the t
 and by envedit, or the words of the refusal are looked for. The list of plugins is that of Mitsuba 3.9; those
 that are refused or replaced are tried one by one, the others are Mitsuba's own and are not touched.
 
-- **The map.** Without `[input] envmap`, or with `envmap = "scene"`, the file is edited that the scene's
-  `envmap` emitter names; a scene without one is lit by the analytic sky. Whatever the map, the emitter's
+- **The map.** The scene must have one environment emitter: `envmap`, `constant`, `sunsky` or `timed_sunsky`.
+  Without `[input] envmap`, or with `envmap = "scene"`, the file that an `envmap` emitter names is edited;
+  where there is none, as with the others, the analytic sky is taken. Whatever the map, the emitter's
   `to_world` and `scale` apply, and a run says so where `scale` is not 1. `edited.exr` is what takes the place
   of the file: `scale` is not in it.
 - **The picture** is the one that Mitsuba makes of the file, to its noise: camera, crop, path depth and hidden
   emitters are the file's, `[scene] width` is its size. Light of other lamps stays as it is.
 - **Several views.** `[scene] sensors = "all"`, or a list of sensors by `id` or by index from 0, makes every
-  one of them a picture, and one map explains all; without it the first sensor is used. Views need the same
-  width, which `[scene] width` gives to all; `renderer.kind = "path"` is refused with more than one.
+  one of them a picture, and one map is found for all; without it the first sensor is used. Views need the
+  same width, which `[scene] width` gives to all; `renderer.kind = "path"` is refused with more than one.
 - **Variants.** Everything runs in `llvm_ad_rgb`; `cuda_ad_rgb` can be chosen, and nothing was run with it
   yet. Spectra are converted to RGB when a scene is loaded, as Mitsuba does. Spectral and polarised rendering
   are not supported: polarising materials act on unpolarised light.

@@ -124,7 +124,7 @@ def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
     metrics = {"transport": {"entries": 12345, "cached": True}, "choices": ["path depth 5"]}
     page = write(tmp_path / "r.html", metrics=metrics, notes=["path depth 5"])
     assert page.text.count("path depth 5") == 1 and "choices" not in page.text
-    assert "T, entries 12345" in page.text
+    assert "light transport, entries 12345" in page.text
 
 
 def test_report_of_paint_says_how_far_it_was_followed(tmp_path):

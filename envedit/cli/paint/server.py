@@ -37,7 +37,7 @@ LARGEST_MAP = 1 << 30
 """Bytes of a map that is dropped on the page."""
 MAPS = "maps"
 """Folder, in the working folder, that maps are put in which are dropped on the start page."""
-_MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|pfm|png|jpg|jpeg)", re.IGNORECASE)
+_MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|png|jpg|jpeg)", re.IGNORECASE)
 _SAFE = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -205,7 +205,7 @@ class Server:
             return PlainTextResponse("a painting is open: maps are taken before that", 409, _SAFE)
         name = request.path_params["name"]
         if not _MAP_NAME.fullmatch(name):
-            wanted = "expected a plain name that ends in .exr, .hdr, .pfm, .png or .jpg"
+            wanted = "expected a plain name that ends in .exr, .hdr, .png or .jpg"
             return PlainTextResponse(wanted, 400, _SAFE)
         folder = Path.cwd() / MAPS
         folder.mkdir(exist_ok=True)

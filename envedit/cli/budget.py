@@ -59,9 +59,9 @@ class Level:
 
 
 LEVELS = (
-    Level("coarse", 96, 48, 64, 1.6, 3.2, 4.1, 1.8),
-    Level("draft", 128, 64, "auto", 4.4, 5.6, 3.3, 0.8),
-    Level("fine", 256, 128, 64, 15.1, 6.6, 0.6, 0.1),
+    Level("coarse", 96, 48, 64, 1.7, 3.1, 3.6, 1.9),
+    Level("draft", 128, 64, "auto", 4.3, 4.8, 2.6, 0.8),
+    Level("fine", 256, 128, 64, 15.1, 6.6, 1.3, 0.2),
     Level("standard", 256, 128, "auto", 15.1, 6.6, 0.0, 0.0),
 )
 """The standard preset is the finest: larger pictures are solved on 128x128 pixels in any case. A map of 96

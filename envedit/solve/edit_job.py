@@ -191,10 +191,10 @@ class Job:
             begun.append(self.begun)
         least = int(np.argmin(reached)) if self.better(min(reached), reached[0]) else 0
         self.begun = begun[least]
-        losses = ", ".join(f"{loss:.3g}" for loss in reached)
+        found = ", ".join(f"{loss:.3g}" for loss in reached)
         chosen = [
             *starts[least][1],
-            f"start {least + 1} of {len(starts)}: losses after {trials} steps {losses}",
+            f"start {least + 1} of {len(starts)} chosen; criterion after {trials} steps, lower is better: {found}",
         ]
         return starts[least][0], chosen
 

@@ -74,7 +74,7 @@ def start(problem: SearchProblem, params: dict, bold: bool = False) -> tuple[dic
                 "its place in the map"
             )
         else:
-            notes.append("added a light: in a direction in which the map has none")
+            notes.append("added a light, in a direction in which the map has none")
     if moved:
         for i, factor in _strengths(scene, there, new).items():
             places[i] = Place(places[i].direction, places[i].flux * factor if i in new else factor)

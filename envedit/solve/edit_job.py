@@ -192,11 +192,8 @@ class Job:
         least = int(np.argmin(reached)) if self.better(min(reached), reached[0]) else 0
         self.begun = begun[least]
         found = ", ".join(f"{loss:.3g}" for loss in reached)
-        chosen = [
-            *starts[least][1],
-            f"start {least + 1} of {len(starts)} chosen; criterion after {trials} steps, lower is better: {found}",
-        ]
-        return starts[least][0], chosen
+        said = f"start {least + 1} of {len(starts)} chosen; criterion after {trials} steps, lower is better: "
+        return starts[least][0], [*starts[least][1], said + found]
 
     @property
     def trials(self) -> int:

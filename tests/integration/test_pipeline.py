@@ -332,7 +332,7 @@ def test_a_highlight_that_matte_ground_cannot_show_leaves_the_rest(tmp_path):
         target = {"kind": "strokes", "strokes": [spot], "hold": weight}
         found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
         held[weight] = found.metrics["painted"]["elsewhere"]
-        assert any("weighs" in line for line in found.notes) == (weight == "auto")
+        assert any("target.hold = " in line for line in found.notes) == (weight == "auto")
     assert held[1.0] > 0.05 and held["auto"] < 0.025
 
 

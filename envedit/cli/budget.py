@@ -45,7 +45,7 @@ class Level:
         Seconds of separation, edit and report; likewise.
     render_db, map_db : float
         What it loses of the standard preset's PSNR, of rendering and map: mean over three maps and two
-        scenes, all judged alike.
+        scenes, all judged alike (``experiments/tradeoff``).
     """
 
     name: str

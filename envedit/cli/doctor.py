@@ -42,7 +42,7 @@ __all__ = ["Diagnosis", "check", "ensure", "main"]
 ALBEDO = 0.5
 _VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 _TIMEOUT = 300  # seconds; a cold start on a loaded machine takes ten
-_MEND = "install a newer one (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
+_MEND = "install LLVM 19 (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
 # Where Dr.Jit and the dynamic loader find libraries; a change there ends the validity of a remembered probe.
 _LIBRARIES = (
     "/usr/lib/*-linux-gnu/libLLVM*",
@@ -166,7 +166,7 @@ def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple
                 "correct or unset DRJIT_LIBLLVM_PATH, or run: apt-get install libllvm19"
             )
     if "LLVM backend is inactive" in said or "LLVM shared library" in said:
-        return "no LLVM library was found", _MEND.replace("a newer one", "LLVM 19")
+        return "no LLVM library was found", _MEND
     if code < 0 or "LLVM ERROR" in said:
         name = f"exit code {code}"
         with contextlib.suppress(ValueError):

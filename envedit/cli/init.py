@@ -28,7 +28,7 @@ file = {scene}  # a Mitsuba XML file, or one of {shipped}
 width = 128  # of the rendering while editing, pixels
 # parameters = {{ roughness = 0.3 }}  # values for the <default>s of the scene
 
-# The target: how the rendering should look. One of three: take the # from its lines, and delete the others'.
+# The target: how the rendering should look. Choose one of three: uncomment its lines, and delete the others.
 [target]
 kind = "envmap"  # 1. lit by another map:
 rotate_degrees = 60.0  # the same one, turned about the vertical; or file = "another.hdr"

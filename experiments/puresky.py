@@ -15,6 +15,26 @@ _NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|e
 _HOW = "python -m experiments.download_puresky DIR fetches them"
 
 
+def data(holds: str = "puresky/NAME_puresky_1k.hdr", give: str = "", how: str = _HOW) -> Path:
+    """Return the folder that ENVEDIT_DATA names.
+
+    Parameters
+    ----------
+    holds, how : str
+        What is looked for in it and how it is had, for the error.
+    give : str, optional
+        What may be given instead, for the error.
+
+    Raises
+    ------
+    ConfigError
+        ENVEDIT_DATA is not set.
+    """
+    if not (root := os.environ.get("ENVEDIT_DATA")):
+        raise ConfigError(f"no maps: {give}set ENVEDIT_DATA to a folder with {holds}; {how}")
+    return Path(root)
+
+
 def find(folder: str | Path | None = None, option: str = "") -> dict[str, Path]:
     """List the maps of a folder by name.
 
@@ -34,12 +54,7 @@ def find(folder: str | Path | None = None, option: str = "") -> dict[str, Path]:
         It is no folder, or holds no map.
     """
     if folder is None:
-        if not (root := os.environ.get("ENVEDIT_DATA")):
-            give = f"give {option} DIR, or " if option else ""
-            raise ConfigError(
-                f"no maps: {give}set ENVEDIT_DATA to a folder with puresky/NAME_puresky_1k.hdr; {_HOW}"
-            )
-        folder = Path(root) / "puresky"
+        folder = data(give=f"give {option} DIR, or " if option else "") / "puresky"
     folder = Path(folder).absolute()
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of maps; {_HOW}")

@@ -9,7 +9,7 @@ E(x) the map that the layers compose, minimised is
 r_p is the root mean square over the channels of d(T E(x))_p - d(t)_p.
 
 * rho_s is Huber's loss: quadratic up to s, linear beyond. Pixels that no light can explain (caustics, shadow
-  edges, paint) therefore have limited weight.
+  edges) therefore have limited weight; residuals of painted pictures count by their squares.
 * A is the number of pixels whose errors go together, a share of the picture (:data:`INDEPENDENT`).
 * K is the inverse covariance of a sky's change (:class:`Prior`): luminance, blue-amber and green-magenta each
   with their standard deviation, smaller by half for every finer grid; of lights flux, size and direction.
@@ -91,7 +91,7 @@ class Problem(Unknowns):
         The saturation of its colours is an unknown.
     robust : bool
         Pixels that no light can explain have limited weight (Huber); else every residual counts by its
-        square, as where the picture was painted: what is far from the paint is what was asked about.
+        square, as where the picture was painted: a large residual is the requested change there.
     blocks : BlockJacobian, optional
         Of another problem of these layers and this transport; made where None.
     """
@@ -148,8 +148,8 @@ class Problem(Unknowns):
     def noise(self, residual: np.ndarray, least: float) -> float:
         """Return the standard error under which the misfit is what independent residuals of it have.
 
-        Huber's concomitant scale (his proposal 2): the first part of F is then their number. At least
-        ``least``.
+        An M-estimate of scale with Huber's loss (not his proposal 2): the first part of F is then their
+        number. At least ``least``.
         """
         size = _sizes(residual)
         if self._huber(size, least) <= 3 * INDEPENDENT:

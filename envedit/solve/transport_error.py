@@ -1,12 +1,12 @@
 """What the stored transport misses of the solution's rendering, measured by Mitsuba and taken off the target.
 
 T is an estimate: it errs around bright areas that are too large for exact columns, at shadow edges, in
-caustics. An edit that compares T E with the target t makes up for these errors by the map. When its steps
-end, at E', a few more are made towards
+caustics. An edit that compares R(E) = T E + I_0 with the target t makes up for these errors by the map. When
+its steps end, at E^, a few more are made towards
 
-    t + T E' - I(E'),        I(E') Mitsuba's rendering,
+    t + R(E^) - I(E^),        R(E^) = T E^ + I_0 through T, I(E^) by Mitsuba,
 
-so that T's error cancels near E' (output space mapping, Bandler et al. 2004): where these steps end, it is
+so that T's error cancels near E^ (output space mapping, Bandler et al. 2004): where these steps end, it is
 the path-traced rendering that meets the target.
 """
 
@@ -38,9 +38,9 @@ def corrected(
     lit : Scene
         The scene.
     envmap : ndarray (H, W, 3)
-        E'.
+        E^.
     seen : ndarray (h, w, 3)
-        T E'.
+        R(E^).
     seed : int
         That of the configuration.
     keep : bool

@@ -185,7 +185,7 @@ def quality(found: dict) -> dict[str, str]:
     main = table("scene | sun at | exact columns | RMSE | of it the reference's noise | without it", rows)
     choices = _bullets(f"{name}: {c}" for name, lines in found["choices"].items() for c in lines)
     parts = table(
-        "scene | sun at | depth 2, | pixels | RMSE | of it the reference's noise | without it",
+        "scene | sun at | path depth 2: region | pixels | RMSE | of it the reference's noise | without it",
         [
             (
                 r["scene"],

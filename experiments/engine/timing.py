@@ -47,11 +47,6 @@ def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS, warm_up
     }
 
 
-def timed(function: Callable, repeats: int = REPEATS, warm_up: int = WARM_UP) -> dict:
-    """Time one function; see :func:`side_by_side`."""
-    return side_by_side({"it": function}, repeats, warm_up)["it"]
-
-
 def compiled(function: Callable, calls: int = 5) -> dict:
     """Count the kernels that calls launch, and those among them that were not in memory yet."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

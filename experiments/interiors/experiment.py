@@ -6,14 +6,13 @@ somewhere else, off, and one more, without a turn.
 
 import json
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 
 from envedit.core import latlong
 from envedit.core.color import tonemap
 from envedit.images import images
+from experiments import puresky
 from experiments.harness import Case, Done, Experiment, edit_panels, make, number
 
 WIDTH = 256
@@ -65,7 +64,8 @@ def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
 
 
 def cases(given):
-    folder, data = make(given.out / "maps").absolute(), Path(os.environ["ENVEDIT_DATA"])
+    data = puresky.data("hdri/NAME_1k.hdr", how="CONTRIBUTING.md lists the maps")
+    folder = make(given.out / "maps").absolute()
     rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
     for name, file in rooms.items():
         if not file.exists():

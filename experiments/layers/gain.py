@@ -1,4 +1,4 @@
-r"""Compare what may carry the gain of the sky: bilinear grids, or a small SIREN on the sphere.
+r"""Compare what may carry the gain of the sky: grids of quadratic B-splines, or a small SIREN on the sphere.
 
     ENVEDIT_DATA=... python -m experiments.layers.gain [--maps NAME ...] [--angle 140] [--scene sphere]
 
@@ -41,7 +41,7 @@ class SirenGain:
     def __init__(self, omega, hidden, depth, rate):
         self.omega, self.hidden, self.depth, self.rate = omega, hidden, depth, rate
 
-    def __call__(self, cycles, share):
+    def __call__(self, cycles, share, top=True):
         """Stand in for the class that the representation makes its gain of."""
         return self
 

@@ -78,7 +78,7 @@ def main(argv=None):
     parser.add_argument("--to", type=Path, default=Path("experiments/layers"), help="of large_map.jpg")
     given = parser.parse_args(argv)
     mi.set_variant("llvm_ad_rgb")
-    source = enlarged(images.load_envmap(str(puresky.find()[given.map]), 1024)[0])
+    source = enlarged(images.load_envmap(str(puresky.of_script([given.map])[given.map]), 1024)[0])
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "large.exr"
         images.write_exr(file, source)

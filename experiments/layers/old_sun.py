@@ -52,7 +52,8 @@ def under(made: layers.Layers, way: str) -> None:
     }[way]
     made.behind, made._prepared = replace(behind, offset=offset, slope=slope), {}
     if made.mirrored and way in WAYS[:2]:
-        made.below.reveal(np.zeros((*made.below.shape, 3)))
+        gone, near = np.ones((*made.below.shape, 1)), np.zeros((*made.below.shape, 1))
+        made.below.reveal(np.zeros((*made.below.shape, 3)), gone, near)
 
 
 def turned(made: layers.Layers, params: dict, columns: int, width: int) -> dict:

@@ -7,7 +7,6 @@ maps. With a turn of the sky allowed and without.
 
 import hashlib
 import itertools
-import os
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +38,7 @@ def options(parser):
 
 def cases(given):
     skies = {name: str(file) for name, file in puresky.chosen().items()}
-    names, data = sorted(skies), Path(os.environ["ENVEDIT_DATA"])
+    names, data = sorted(skies), puresky.data()
     ground = {file.stem.removesuffix("_1k"): str(file) for file in sorted((data / "hdri").glob("*_1k.hdr"))}
     analytic = {e: str(given.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
     make(given.out / "maps")

@@ -73,12 +73,10 @@ def place(page, selector, x, y):
 
 def moved(page, path, seconds):
     """Move the pointer along places for some time, about 60 times a second."""
-    end, i = time.perf_counter() + seconds, 0
+    end = time.perf_counter() + seconds
     while time.perf_counter() < end:
         page.mouse.move(*path(1 - (end - time.perf_counter()) / seconds))
         time.sleep(1 / 60)
-        i += 1
-    return i
 
 
 def put(file, name, text):

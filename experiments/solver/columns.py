@@ -30,7 +30,7 @@ def main(arguments=None):
     from experiments.engine.timing import side_by_side
 
     print("| scene | paths a pixel | paths kept, ms | paths anew, ms |\n|---|---|---|---|")
-    file = str(puresky.find()[given.map])
+    file = str(puresky.of_script([given.map])[given.map])
     for name in given.scenes:
         settings = config.from_dict({"input": {"envmap": file}, "scene": {"file": name}})
         lit = inputs.load_scene(settings.scene)

@@ -47,7 +47,7 @@ def main(arguments=None):
     from envedit import config, pipeline  # after the variant
     from experiments import puresky
 
-    files, rows = puresky.find(), []
+    files, rows = puresky.of_script(), []
     print("| edit | " + " | ".join(COLUMNS) + " |\n" + "|---" * (1 + len(COLUMNS)) + "|")
     for edit in EDITS:
         with tempfile.TemporaryDirectory() as folder:

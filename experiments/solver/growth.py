@@ -29,7 +29,7 @@ def main(arguments=None):
     from envedit import config, pipeline  # after the variant
     from experiments import puresky
 
-    file = puresky.find()[given.map]
+    file = puresky.of_script([given.map])[given.map]
     names = [f"{part}_s" for part in PARTS]
     print("| picture, map | steps | a step, ms | " + " | ".join(PARTS) + " |\n|" + "---|" * (3 + len(PARTS)))
     for size in given.sizes:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from argparse import Namespace
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +20,7 @@ from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
 from experiments import puresky
 from experiments.__main__ import main
+from experiments.interiors import experiment as interiors
 from experiments.paper import ceiling, measured, network, plan, sheets, skies, tables
 from experiments.paper.kinds import KINDS
 from experiments.paper.methods import METHODS
@@ -284,6 +286,8 @@ def test_without_maps_an_error_says_where_they_come_from(tmp_path, monkeypatch):
         build("table1", Question())
     with pytest.raises(SystemExit, match="^envedit: no maps: set ENVEDIT_DATA"):
         puresky.of_script()
+    with pytest.raises(ConfigError, match="^no maps: set ENVEDIT_DATA .* hdri/NAME_1k.hdr"):
+        interiors.EXPERIMENT.cases(Namespace(out=tmp_path))
     with pytest.raises(InputError, match="nowhere: no such folder of maps"):
         puresky.find(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no map NAME_puresky_1k"):

@@ -312,8 +312,8 @@ _VALUES = {
     "l1": (2e-7, "double throughout, then rounded"),
     "tv": (3e-7, _ROUNDING),
     "change": (3e-7, "a logarithm in single precision, and sqrt(d^2 + s^2) - s where d is small"),
-    "ssim": (3e-7, "variances merged from deviations: 1e-6, whatever the level"),
-    "log_ssim": (3e-7, "variances merged from deviations: 1e-6, whatever the level"),
+    "ssim": (3e-7, "variances merged from deviations, independent of the level"),
+    "log_ssim": (3e-7, "variances merged from deviations, independent of the level"),
 }
 _GRADIENTS = {
     "ssim": (3e-6, "1e-6 times level over local contrast"),

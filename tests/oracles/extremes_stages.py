@@ -297,7 +297,7 @@ def display(m):
 
 
 def lost(m, folder):
-    """Values within 1e-5, gradients within 1e-4 of the largest; losses of what an edit or fit gives them."""
+    """Values within 1e-5, gradients within 1e-4 of the largest; inputs as an edit or a fit passes them."""
     before = sky(*m.shape[:2])
     with np.errstate(all="ignore"):
         normal = fit.Normalisation.of(m if np.isfinite(m).all() and (m >= 0).all() else before)

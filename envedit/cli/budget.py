@@ -65,8 +65,8 @@ LEVELS = (
     Level("standard", 256, 128, "auto", 15.1, 6.6, 0.0, 0.0),
 )
 """The standard preset is the finest: larger pictures are solved on 128x128 pixels in any case. A map of 96
-and a picture of 32 across took as long as the coarsest and lost 2.7 dB more. What "fine" saves are samples of
-target and result, which the edit does not need and the reported PSNR does."""
+and a picture of 32 across took as long as the coarsest and lost 2.0 dB more of the rendering. What "fine"
+saves are samples of target and result, which the edit does not need and the reported PSNR does."""
 REFERENCE_RENDER = 1.66e-7
 """Seconds a pixel and sample of Mitsuba's path tracer on the reference machine (a sphere)."""
 REFERENCE_PRODUCT = 0.0134

@@ -97,7 +97,7 @@ def run(
     EnveditError
         With the exit code of its cause.
     Interrupted
-        After Ctrl-C during the edit; the checkpoint has been written.
+        After Ctrl-C during the edit; the checkpoint, where there is one, is of the last step that was kept.
     Stopped
         If the optimisation cannot go on.
     """
@@ -210,7 +210,7 @@ def run(
         after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
             f"the result is farther from the target than the input: {after} now, {before} before; "
-            f"the edited map is kept anyway{rate}"
+            f"the edited map is kept anyway: look at it before you use it{rate}"
         )
     if state.bad_steps:
         warnings.append(
@@ -251,7 +251,7 @@ def run(
         separation=representation.separation,
         scene=lit.path,
         reach=within,
-        found=Found(representation, params, rows.first, job.free, edit.degrees, found_map),
+        found=Found(representation, params, job.free, edit.degrees, found_map),
         posterior=job.posterior,
         settings=settings,
         memory=memory,

@@ -159,5 +159,5 @@ def resolve_paths(merged: dict[str, Any], base: Path, stem: str) -> None:
         shipped = table == "scene" and Path(value).name == value and not Path(value).suffix
         if value and not shipped and not (key == "envmap" and value in _MAPS):
             several = isinstance(value, tuple)
-            found = tuple(str(base / v) for v in value) if several else str(base / value)
+            found = tuple(v and str(base / v) for v in value) if several else str(base / value)
             merged[table] = merged[table] | {key: found}

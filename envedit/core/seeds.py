@@ -34,7 +34,7 @@ class Seeds:
     exported : int
         The rendering that is painted on.
     painted_initial : int
-        The initial rendering where the target is painted, or there is none.
+        The initial rendering where a map is only adjusted, without a target.
     judged : int
         The rendering of the result, and the initial one that it is compared with: the same samples.
     page : int

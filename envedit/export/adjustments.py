@@ -135,6 +135,8 @@ def _lights(envmap, degrees, most):
         core.reshape(-1, 3)[light.texels] = light.radiance
         cores.append(spread(core, degrees) if degrees else core)
     notes = [f"{len(cores)} lights softened by {degrees:g} degrees"] if degrees else []
+    if degrees and not cores:
+        notes = ["no light was found: lights.soften_degrees changes nothing"]
     total = rest + sum(cores)
     if not most:
         return total, notes

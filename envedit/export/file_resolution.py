@@ -28,7 +28,6 @@ class Found:
 
     representation: Representation
     params: dict[str, Any]
-    first_row: int
     free: np.ndarray | None
     turn_degrees: float = 0.0
     edited: np.ndarray | None = None

@@ -60,7 +60,8 @@ def carry(
     params : dict
         Its parameters.
     original_working, edited_working : ndarray (h, w, 3)
-        The working map before and after; the first is the source resized. Layers need neither.
+        The working map before and after; the first is the source resized. Of layers only
+        their shape is used.
     source : ndarray (H, W, 3) float32
         Linear radiance, finite and not negative.
     rows_working : Rows
@@ -111,7 +112,8 @@ def carry(
             made = np.where(free[grid.row[band]][:, grid.column][..., None], made, source[band])
         if (bad := ~np.isfinite(made)).any():
             raise NumericalError(
-                f"the edit at full resolution is not finite at {place_of(bad, start)}; lower [optimizer] lr"
+                f"the edit at full resolution is not finite at {place_of(bad, start)}; lower "
+                "[optimizer] lr if you have raised it, else scale the map down"
             )
         result[fresh : start + size] = made[fresh - start :]
     return result

@@ -21,7 +21,7 @@ POINTS_AT_ONCE = 1 << 20
 
 @dataclass(frozen=True)
 class _Points:
-    """Points of one light, placed; ``omega`` is the solid angle of each, or None where they are few."""
+    """Points of one light, placed; ``omega`` is the solid angle of each, None of an added light's."""
 
     light: int
     places: tuple

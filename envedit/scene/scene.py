@@ -45,8 +45,6 @@ from envedit.scene import film, parser, scene_text, supported
 
 __all__ = ["Scene", "load"]
 
-"""Names of the scenes that come with the package."""
-
 QUIET_DECIBELS = 48.0
 """PSNR of a rendering that is quiet, against one without noise: beyond what an edit reaches under a sun."""
 QUIET_LEAST, QUIET_MOST = 256, 768

@@ -174,7 +174,7 @@ class Derivatives:
     def _apart(self, pictures, whole):
         """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
 
-        By direction, size, and flux per channel; in memory channel by channel. Pictures (h, w, 3) of
+        By direction, size, and flux per channel; in memory channel by channel. Pictures (h * w, 3) of
         unknowns that are no light's come last.
         """
         lights = 6 * len(pictures)

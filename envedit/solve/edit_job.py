@@ -51,9 +51,9 @@ CLEARLY = 6 * map_problem.INDEPENDENT * np.log(1.1)
 """By how much lower with Gauss-Newton for a rendered target, where lights that are moved may stand in for one
 another: as for a residual 10 % smaller."""
 RISEN = 2.0
-"""How many times the start's loss the end's may be where a user has raised Adam's rate. Measured on
-quickstart, four representations at rates of 0.1 to 1e38: it ends at 0.02 to 1.7 times, or runs away, to 7 to
-1e6 times."""
+"""Largest ratio of the last loss to the first where a user has raised Adam's rate. Measured on
+quickstart, four representations at rates of 0.1 to 1e38: it is 0.02 to 1.7, or the loss runs away, to 7 to
+1e6 times the first."""
 
 
 class Interrupted(Exception):
@@ -160,7 +160,8 @@ class Job:
             crop = np.where(self.free[..., None], crop, self.original[rows])
         if (bad := ~np.isfinite(crop)).any():
             where = place_of(bad, self.first)
-            raise NumericalError(f"the edited map is not finite at {where}: lower [optimizer] lr")
+            remedy = "scale the map down" if self.newton else "lower [optimizer] lr"
+            raise NumericalError(f"the edited map is not finite at {where}: {remedy}")
         edited = self.original.copy()
         edited[rows] = crop
         return unseen_kept(self.original, edited) if self.representation.models_edit else edited
@@ -350,8 +351,7 @@ class Job:
                 run = further
         self.posterior, said = made.posterior, [made.note] if made.note else []
         if made.run.hold > 1:
-            used = f"target.hold = {made.run.hold:.3g} was used"
-            said.append(f"{used}: with less, pixels without paint would change visibly")
+            said.append(hold.said(made.run.hold, hold.change(*self._without_paint(made.run))))
         if "saturation" in made.params and not made.note:
             kept = 100 * float(np.exp(made.params["saturation"].numpy()[0, 0]))
             said.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
@@ -381,15 +381,19 @@ class Job:
 
     def _held_more(self, run):
         """Return a run that goes on with more weight on what was not painted; None where it need not."""
-        chosen, target, most = self.settings.target, self.target, self.settings.optimizer.iterations
+        chosen, most = self.settings.target, self.settings.optimizer.iterations
         if self._rendered or len(run.history) >= most:
             return None
-        seen = self._problem().evaluate(run.state, resolve=False).rendering
-        more = hold.further(chosen, run.hold, seen, target.aim, target.coverage, target.weight)
+        more = hold.further(chosen, run.hold, *self._without_paint(run))
         if more is None:
             return None
         most = len(run.history) + gauss_newton.ITERATIONS
         return self._hold(gauss_newton.Run(run.state, run.start, history=run.history, most=most, hold=more))
+
+    def _without_paint(self, run):
+        """Return what :func:`.hold.change` compares, at the point of a run, through T."""
+        seen = self._problem().evaluate(run.state, resolve=False).rendering
+        return seen, self.target.aim, self.target.coverage, self.target.weight
 
     def _display_error(self, envmap):
         """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""

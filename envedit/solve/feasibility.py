@@ -85,6 +85,8 @@ class Reach:
         Steps of the two solutions, each a product with T and one with its adjoint.
     too_dark : float
         Share of the residual in the painted region that is positive.
+    all_painted : bool
+        No pixel is held.
     """
 
     share: float
@@ -94,6 +96,7 @@ class Reach:
     bound: float = 0.0
     steps: int = 0
     too_dark: float = 0.0
+    all_painted: bool = False
 
     @property
     def note(self) -> str:
@@ -105,10 +108,11 @@ class Reach:
         """One sentence if less than half is within reach, else None."""
         if self.share >= HALF:
             return None
-        left = "brighter without brightening" if self.too_dark >= HALF else "darker without darkening"
+        left = "brighter" if self.too_dark >= HALF else "darker"
+        without = "" if self.all_painted else f" without making pixels {left} that are held"
         return (
             f"only {_percent(self.share)} % of the painted change is feasible under any map: "
-            f"most of the rest cannot become {left} pixels that are held; see unreachable.png"
+            f"most of the rest cannot become {left}{without}; see unreachable.png"
         )
 
 
@@ -209,7 +213,8 @@ def reachable(
     too_dark = float(left[residual > 0].sum() / max(left.sum(), 1e-30))
     share = float(np.clip(1 - distance / asked, 0, 1)) if asked > 0 else 1.0
     shown, left_over, lit = (np.asarray(a, np.float32) for a in (picture, residual, envmap))
-    return Reach(share, shown, left_over, lit, bound, steps, too_dark)
+    all_painted = bool((question.painted > 0).all())
+    return Reach(share, shown, left_over, lit, bound, steps, too_dark, all_painted)
 
 
 class _Question:
@@ -330,7 +335,7 @@ class _Model:
 
 
 def _exposed(question, model):
-    """Start from the original, made brighter or darker where its exposure is far from the target's.
+    """Start from the original, made darker where it is brighter than the target by :data:`FAR` and more.
 
     Where a map is too bright by orders, a step that takes away nearly all of the difference in radiance takes
     away nothing of what a display shows.
@@ -339,7 +344,7 @@ def _exposed(question, model):
     weight = question.weights(question.target)
     along = (weight * light * (np.minimum(question.target, 1) - model.base)).sum(axis=(0, 1))
     gain = np.maximum(along, 0) / np.maximum((weight * light**2).sum(axis=(0, 1)), 1e-300)
-    gain = np.where((gain > 1 / FAR) & (gain < FAR), 1, np.minimum(gain, 1))
+    gain = np.where(gain > 1 / FAR, 1, gain)
     x[0] *= gain
     return x, model.base + gain * light
 

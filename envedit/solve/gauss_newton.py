@@ -33,7 +33,7 @@ the start's squared error that the solution's must be below."""
 WORTH, ADDED_STEPS = 20.0, 6
 """By how much a further light must lower F to be tried and to be kept: twice the logarithm of the places that
 it could have had, some 20,000, of which the best has been chosen; and the steps after which that is decided,
-by which a solution with one more light may be longer."""
+which are allowed beyond the others."""
 PLACINGS = 3
 """Most times that the map's light is placed, each time with the noise that the last has left."""
 FADED, NEEDED = -1.0, 1.1

@@ -44,6 +44,17 @@ def raised(hold: float, changed: float) -> float | None:
     return min(MOST, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST, MOST_AT_ONCE)))
 
 
+def said(weight: float, changed: float) -> str:
+    """Say with which weight an edit ended; ``changed`` is the :func:`change` of what was not painted."""
+    used = f"target.hold = {weight:.3g} was used"
+    if weight < MOST or changed <= VISIBLE:
+        return f"{used}: with less, pixels without paint would change visibly"
+    return (
+        f"{used}, the largest: pixels without paint still change by {changed:.2g} of a display value on "
+        f"average (visible from {VISIBLE:g} on); paint less, or set target.hold"
+    )
+
+
 def further(
     chosen: config.Target, weight: float, rendering: np.ndarray, aim: np.ndarray, *pixels: np.ndarray
 ) -> float | None:

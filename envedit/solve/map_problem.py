@@ -335,9 +335,9 @@ class Problem(Unknowns):
     def _within(self, step, now, damped, normal):
         """Return a step, solved anew for all else where it takes the saturation out of its bounds."""
         k = 3 * self.nodes + normal.unknowns.index(("saturation", 0, 0))
-        to = np.clip(now + step[k], *SATURATIONS) - now
-        if to == step[k]:
+        if SATURATIONS[0] <= now + step[k] <= SATURATIONS[1]:
             return step
+        to = np.clip(now + step[k], *SATURATIONS) - now
         rest = np.arange(len(step)) != k
         gradient = normal.gradient[rest] + damped[rest, k] * to
         step[rest] = -solved(np.linalg.cholesky(damped[np.ix_(rest, rest)]), gradient)

@@ -333,7 +333,10 @@ class Pursuit:
 
 
 def products(d: np.ndarray, order: int) -> np.ndarray:
-    """Return all products of powers of x, y, z up to an order, at unit vectors d: (n, functions)."""
+    """Return a basis of the polynomials up to an order on the sphere, at unit vectors d: (n, functions).
+
+    Products of powers of x, y and z, of which z^2 = 1 - x^2 - y^2 is left out.
+    """
     x, y, z = d.T
     powers = [(i, j, k) for i in range(order + 1) for j in range(order + 1 - i) for k in range(2)]
     return np.stack([x**i * y**j * z**k for i, j, k in powers if i + j + k <= order], axis=1)

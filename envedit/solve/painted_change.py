@@ -114,8 +114,8 @@ def place(
 
     ``difference`` (h, w, 3) is what was painted less what was there, 0 beside the paint. Beside a gain of the
     background, lights that are there may become stronger or weaker, and lights are added. If one is added
-    while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``:
-    :data:`BOLD` of what is left unexplained is enough.
+    while another loses more than :data:`TAKEN` of its strength, the other has moved there. ``bold``: of
+    the first added light :data:`BOLD` of what is left unexplained is enough.
     """
     overview, search = given.overview, Pursuit(given, difference, CHANGE_ORDER)
     stays = []

@@ -107,7 +107,7 @@ def read(
     if before is not None:
         painted &= differs(values, before, info, top)
         if not mask:
-            _check_painted(file, painted, before, values, info, top, name, initial, warnings)
+            _check_painted(file, painted, before, info, top, warnings)
     coverage = alpha * (read_mask(mask, shape)[..., 0] if mask else painted)
     if not coverage.any():
         raise InputError(f"{file}: nothing of it is painted; paint on it, or give a mask that is white there")
@@ -120,7 +120,10 @@ def read(
                 f"{file}: all that is painted is clipped, and says only 'at least so bright': "
                 'paint below white, or on an .exr, or under [target] tonemap = "reinhard"'
             )
-        warnings.append(f"{file}: {count} painted pixels are clipped ('at least so bright'): left out")
+        warnings.append(
+            f"{file}: {count} painted pixels are clipped ('at least so bright') and left out; to have them "
+            "count, paint below white, or on an .exr"
+        )
 
     picture = values if info["hdr"] else inverse_tonemap(values, name)
     if initial is not None:  # to the last bit, not as the file has rounded it
@@ -263,7 +266,7 @@ def _laid_over(values, alpha, before, premultiplied):
     return (values if premultiplied else alpha * values) + (1 - alpha) * before
 
 
-def _check_painted(file, painted, before, values, info, top, name, initial, warnings):
+def _check_painted(file, painted, before, info, top, warnings):
     """Warn where paint is recognised badly: in a JPEG, and where nearly all would be paint."""
     if info["format"] == "jpeg":
         warnings.append(f"{file}: paint is found but roughly in a JPEG, faint paint not at all: save a PNG")
@@ -283,20 +286,20 @@ def _check_painted(file, painted, before, values, info, top, name, initial, warn
 def _recognised(file, values, alpha, initial, declared, warnings):
     """Return the tonemap under which a picture that names none is the initial rendering, but for its paint.
 
-    That is the declared one, unless the median difference over the pixels is four times as large as under
-    another, which it equals to three steps of 8 bits: editors drop the name when they save.
+    That is the declared one, unless the median difference over the pixels is more than four times as large as
+    under another, which it equals to three steps of 8 bits: editors drop the name when they save. Pixels that
+    are black in the rendering are so under every tonemap, and do not count.
     """
-    where = alpha > 0
+    where = (alpha > 0) & (initial > 0).any(axis=2)
     if not where.any():
         return declared
     error = {name: _median_error(values, initial, name, where) for name in TONEMAPS}
     best = min(error, key=error.__getitem__)
-    if error[best] > min(3 / 255, error[declared] / 4):
+    if error[best] > 3 / 255 or 4 * error[best] >= error[declared]:
         if error[declared] > 3 / 255:
             warnings.append(f"{file}: names no tonemap: read under '{declared}', that of [target] tonemap")
         return declared
-    if best != declared:
-        warnings.append(f"{file}: is the initial rendering under '{best}', and read so, not '{declared}'")
+    warnings.append(f"{file}: is the initial rendering under '{best}', and read so, not '{declared}'")
     return best
 
 

@@ -120,6 +120,8 @@ def make(
     InputError
         If a file cannot be read, a picture does not fit the film, or the other map is brighter than
         :data:`.radiance.BRIGHTEST`. A picture that is so bright is cut there, with a warning.
+    ConfigError
+        If a view is not the scene's, or is given twice.
     """
     chosen, alpha = settings.target, scene.alpha
     hidden = None if alpha is None else alpha == 0
@@ -133,7 +135,7 @@ def make(
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
     elif chosen.kind == "image":
         found = _painted_files(scene, initial, chosen)
-        asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks))
+        asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
         source = f"painted: {', '.join(chosen.files)}"
     else:
         found = _painted_strokes(scene, initial, chosen)
@@ -156,15 +158,18 @@ def make(
     return _seen(Target(picture, weight, None, source, warnings, initial, coverage, asked), hidden)
 
 
+def _by_view(scene, views, given):
+    """Return what was given for each view, by the view's number."""
+    numbers = [scene.view(view, "target.view") for view in views]
+    if len(set(numbers)) < len(numbers):
+        raise ConfigError("target.view: got a view by index and by name, expected each once")
+    return dict(zip(numbers, given, strict=True))
+
+
 def _painted_files(scene, initial, chosen):
     """Read what was painted on views, each from its file."""
     masks = chosen.masks or ("",) * len(chosen.files)
-    painted = {
-        scene.view(view, "target.view"): (file, mask)
-        for view, file, mask in zip(chosen.views, chosen.files, masks, strict=True)
-    }
-    if len(painted) < len(chosen.files):
-        raise ConfigError("target.view: got a view by index and by name, expected each once")
+    painted = _by_view(scene, chosen.views, zip(chosen.files, masks, strict=True))
 
     def of_view(k, before):
         file, mask = painted[k]
@@ -269,9 +274,10 @@ def _rendered(settings, scene, envmap, other):
         scene, true, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
     )
     weights = np.ones((*picture.shape[:2], 1), np.float32)
-    for view, mask in zip(chosen.views, chosen.masks, strict=True):
-        rows = scene.rows[scene.view(view, "target.view")]
-        weights[rows] = painted_image.read_mask(mask, weights[rows].shape[:2])
+    for view, mask in _by_view(scene, chosen.views, chosen.masks).items():
+        if mask:
+            rows = scene.rows[view]
+            weights[rows] = painted_image.read_mask(mask, weights[rows].shape[:2])
     weight = weights if chosen.masks else None
     asked = (true,) if weight is None else (true, weight)
     source += f", {spp} samples a pixel"

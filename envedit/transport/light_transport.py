@@ -58,7 +58,7 @@ COLUMNS_A_LOOK = 32
 LEAST_LIGHT = 1 / 256
 """Light of a texel, as a share of the brightest's, below which it gets no column for a picture of its own."""
 TYPICAL_PIXELS = 128 * 128
-"""Beyond so many pixels the predicted error is the picture's: those of neighbours are independent."""
+"""Of larger pictures the error is predicted for the whole picture: errors of neighbours are independent."""
 _RECORDING = 1  # raise when the same scene, grid and seed give another recording, or other arrays of it
 
 
@@ -225,7 +225,7 @@ class LightTransport:
         return (
             holds(own, kept)
             and own["offset"].size in (1, 3 * pixels)
-            and own["lost"] >= 0 <= own["influence"].min()
+            and own["lost"] >= 0
             and all(ColourMatrix.whole(_under(arrays, part), shape) for part, shape in shapes.items())
         )
 
@@ -255,7 +255,7 @@ class LightTransport:
 
     @property
     def columns(self) -> np.ndarray:
-        """Texels that have an exact column, int64 (n,), in the order in which they were added."""
+        """Texels that have an exact column, int64 (n,), in the order of their places in memory."""
         return self._exact.texels
 
     @property

@@ -186,7 +186,7 @@ def record_all(
 
 
 def pilot(scene: Scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Measure where light comes from under a white sky, from a few samples of some 4096 pixels.
+    """Measure where light comes from under a white sky, from a few samples of 4,096 to 16,384 pixels, or all.
 
     Returns
     -------

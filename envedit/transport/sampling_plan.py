@@ -80,7 +80,7 @@ def white_sky(
         lambda found: (
             holds(found, known)
             and len(found["by_bounce"]) == MAX_BOUNCES + 1
-            and min(a.min() for a in found.values()) >= 0 < found["by_bounce"].sum()
+            and found["by_bounce"].sum() > 0
         ),
     )
     if light is None:

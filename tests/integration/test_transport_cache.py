@@ -154,6 +154,14 @@ def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp
     assert 0 < asked.depth_error <= recording.DEPTH_TOLERANCE < build(tmp_path, lit, max_depth=2).depth_error
 
 
+def test_a_filter_with_negative_lobes_is_kept_too(tmp_path):
+    sensor = SENSOR.replace('<rfilter type="box"/>', '<rfilter type="lanczos"/>')
+    lit = scene.load(write_scene(tmp_path, sensor, BALL, GROUND, LIGHT))
+    first = build(tmp_path, lit, 32, 64, spp=4)
+    assert first.influence.min() < 0
+    assert build(tmp_path, lit, 32, 64, spp=4).cached
+
+
 def test_a_later_version_records_anew(lit, tmp_path, monkeypatch):
     build(tmp_path, lit)
     monkeypatch.setattr(light_transport, "_RECORDING", light_transport._RECORDING + 1)

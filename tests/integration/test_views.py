@@ -153,6 +153,15 @@ def test_what_is_painted_belongs_to_a_view_and_the_others_hold(two):
         target.make(settings_of(two, target=twice), lit, envmap)
     found = target.make(settings_of(two, target={"mask": "m1.png", "view": 1}), lit, envmap)
     assert (found.weight[:24] == 1).all() and not found.weight[24:].any()
+    with pytest.raises(ConfigError, match="by index and by name"):
+        twice = {"mask": ["m0.png", "m1.png"], "view": [1, "behind"]}
+        target.make(settings_of(two, target=twice), lit, envmap)
+    for kind in ({"kind": "image", "file": ["p0.exr", "p1.exr"]}, {"rotate_degrees": 60}):
+        chosen = settings_of(two, target=kind | {"mask": ["m0.png", ""], "view": [0, 1]})
+        assert chosen.target.masks[1] == ""  # of a view without one every pixel counts, or is compared
+        found = target.make(chosen, lit, envmap)
+        counts = found.weight if found.coverage is None else found.coverage
+        assert not counts[4:20].any() and counts[24:].any()
 
 
 @pytest.mark.parametrize("keys, what", [

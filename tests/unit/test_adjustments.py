@@ -91,6 +91,13 @@ def test_what_is_no_light_is_cut_with_a_note(rng):
     assert found.max() <= np.float32(0.52) and "are cut" in notes[-1]
 
 
+def test_a_map_without_lights_is_not_softened():
+    envmap = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})
+    np.testing.assert_array_equal(found, envmap)
+    assert notes == ["no light was found: lights.soften_degrees changes nothing"]
+
+
 def test_lights_are_softened(rng):
     envmap = sunny(rng)
     found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})

@@ -52,3 +52,11 @@ def test_only_a_weight_that_the_user_left_open_is_raised(target, after):
     coverage = np.array([0.0, 1.0]).reshape(1, 2, 1)
     found = hold.further(config.Target(**target), 1.0, rendering, aim, coverage, pixels)
     assert found is None if after is None else found == pytest.approx(after)
+
+
+@pytest.mark.parametrize(
+    ("weight", "changed", "words"),
+    [(4.0, 0.01, "with less"), (hold.MOST, 0.01, "with less"), (hold.MOST, 0.05, "still change by 0.05")],
+)
+def test_what_even_the_largest_weight_does_not_hold_is_said(weight, changed, words):
+    assert words in hold.said(weight, changed)

@@ -304,6 +304,18 @@ def test_another_tonemap_is_recognised_by_what_was_not_painted(name, initial, tm
         assert (f"is the initial rendering under '{name}'" in told(found)) is (name != declared)
 
 
+@pytest.mark.parametrize("declared", TONEMAPS)
+def test_black_pixels_say_nothing_of_a_tonemap(declared, initial, tmp_path):
+    """Black is black under every one, and may be most of a picture."""
+    initial = initial.copy()
+    initial[3:] = 0
+    painted = np.where(brushed(initial)[1][..., None], np.float32(0.5), initial)
+    found = painted_image.read(png(tmp_path / "p.png", codes(painted, declared)), SIZE, declared, initial)
+    assert "and read so" not in told(found)
+    error = tonemap(found.picture, declared) - tonemap(painted, declared)
+    assert np.abs(error).max() <= 0.5 / 255 + 1e-6
+
+
 def test_another_rendering_is_noticed(initial, rng, tmp_path):
     other = initial * (1 + 0.3 * rng.standard_normal((*SIZE, 1))).astype(np.float32).clip(0.1)
     file = floats(tmp_path / "p.exr", other, header={"envedit.seed": 7, "envedit.tonemap": "linear"})

@@ -40,7 +40,7 @@ class BehindGlow:
     offset, slope : ndarray (rows, W, 3) float32
         Smooth; slope is c - 1.
     faint : float
-        Radiance that is nothing.
+        Added before logarithms, 1e-6 of the mean radiance.
     """
 
     offset: np.ndarray

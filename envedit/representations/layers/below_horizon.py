@@ -48,7 +48,7 @@ BLENDED = 5.0
 FADE = 10.0
 """Degrees below the horizon at which ground follows what it would mirror by 1/e."""
 UNLIT = 1e-3
-"""Share of light below which a glow has none."""
+"""Least share of a texel's light that a glow counts as: what is divided by it stays finite."""
 COLUMNS, COARSE = 96, 48
 """Columns of the grid on which K is applied, and on which its width is chosen."""
 

@@ -25,10 +25,10 @@ CONTRAST = 4.0
 SURROUNDINGS = 20.0
 """Radius of the surroundings, degrees: more than that of a sun's aureole or a softbox."""
 LEAST_SHARE = 0.005
-"""Share of the map's irradiance below which something bright is no light."""
+"""Share of the map's luminance, integrated over solid angle, below which something bright is no light."""
 AS_BRIGHT, MOST_CUT = 0.8, 0.1
-"""What is bright is no light by itself where more than the second share of the texels around it are brighter
-than the first of its own mean luminance: it is the edge of a window that is larger than the surroundings."""
+"""A bright region is no light by itself where more than :data:`MOST_CUT` of the texels around it are brighter
+than :data:`AS_BRIGHT` times its mean luminance: it is the edge of a window larger than the surroundings."""
 MOST_LIGHTS, MOVABLE = 8, 4
 """Most lights that are separated, and of these, those with most flux, that an edit may move: each costs
 time, and what is weaker is part of the background and its gain."""
@@ -67,7 +67,7 @@ class Light:
     glow : ndarray (len(GLOW_DEGREES), 3) or None
         Factor by which it brightens the sky, less 1, at :data:`GLOW_DEGREES` from its centre.
     share : float
-        Its share of the map's irradiance.
+        Its share of the map's luminance, integrated over solid angle.
     """
 
     direction: np.ndarray
@@ -281,7 +281,7 @@ def _find(small: _Small, most: int) -> tuple[np.ndarray, int, list[float]]:
     excess = np.maximum(lum - base, 0) * small.omega
     names, inverse = np.unique(parts, return_inverse=True)
     flux = np.bincount(inverse.ravel(), excess.ravel()) / total
-    order = [i for i in np.argsort(-flux) if names[i] >= 0 and flux[i] >= LEAST_SHARE]
+    order = [i for i in np.argsort(-flux, kind="stable") if names[i] >= 0 and flux[i] >= LEAST_SHARE]
     order = [i for i in order if not _cut_off(parts == names[i], lum, small.omega)][:most]
     label = nothing[0]
     for i, part in enumerate(order):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 UNSEEN = 1 / 512
-"""Relative change of radiance below a display's resolution: a step of 8 bits is twice as large."""
+"""Relative change of radiance below a display's resolution: a step of 8 bits is at least four times this."""
 
 
 def unseen_kept(original: np.ndarray, edited: np.ndarray) -> np.ndarray:

@@ -30,6 +30,8 @@ from .experiment import SCENES
 
 ITERATIONS = 150
 AMPLITUDE = 6.0
+PRESENT = "gain.0"
+"""By this parameter, the first grid's, layers know that there is a gain; a SIREN does not use it."""
 
 
 class SirenGain:
@@ -52,6 +54,7 @@ class SirenGain:
         found = {f"gain.{k}": v.numpy() for k, v in params.items()}
         for part in ("weight", "bias"):
             found[f"gain.{last}.{part}"] *= 0
+        found[PRESENT] = np.zeros(1, np.float32)
         return {k: v / self.rate for k, v in found.items()}
 
     def scales(self):
@@ -66,6 +69,7 @@ class SirenGain:
     def evaluate(self, params, x):
         """Return the log gain at every texel."""
         weights = {k.removeprefix("gain."): v for k, v in params.items() if k.startswith("gain.")}
+        del weights[PRESENT.removeprefix("gain.")]
         y = siren.evaluate(weights, x, self.omega).array
         i = dr.arange(mi.UInt32, x.shape[0]) * 3
         return mi.Color3f(*(2 * AMPLITUDE * (dr.gather(mi.Float, y, i + c) - 0.5) for c in range(3)))

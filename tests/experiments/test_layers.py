@@ -35,3 +35,8 @@ def test_every_gain_that_is_compared_starts_from_no_change(sky, name):
     made = type("Variant", (Layers,), {"Gain": gain.VARIANTS[name]})((0, len(sky)))
     params = made.encode(up)
     np.testing.assert_allclose(made.decode(params).numpy(), up, rtol=1e-3)
+    # The last of the gain's parameters is a bias, or the nodes of the finest grid.
+    last = max(key for key in params if key.startswith("gain."))
+    last = last.replace("weight", "bias")
+    changed = made.decode(params | {last: params[last] + 1}).numpy()
+    assert (changed > 1.01 * up).mean() > 0.9  # all but the sun, which is no sky

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -18,7 +19,6 @@ import mitsuba as mi
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError
 from envedit.sweep import DONE
-from experiments import puresky
 from experiments.harness import Case, Done, Experiment, done_of, make
 
 from . import plan, plot
@@ -44,7 +44,9 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def folder_of_maps(given) -> Path:
     """Return the folder of ``--maps``, or of ENVEDIT_DATA."""
-    return given.maps or puresky.data(give="name their folder with --maps, or ") / "puresky"
+    if given.maps is None and not (root := os.environ.get("ENVEDIT_DATA")):
+        raise InputError("no maps: name their folder with --maps, or set ENVEDIT_DATA")
+    return given.maps or Path(root) / "puresky"
 
 
 def pairs(given) -> list[tuple[Cell, Setting]]:

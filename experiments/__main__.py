@@ -7,15 +7,22 @@ from pathlib import Path
 from experiments import harness
 
 
+def modules() -> dict[str, str]:
+    """Return the modules of all experiments by name: FOLDER for ``experiment.py``, or FOLDER.MODULE."""
+    files = sorted(Path(__file__).parent.glob("*/*.py"))
+    found = [(f.parent.name, f.stem) for f in files if "\nEXPERIMENT = " in f.read_text(encoding="utf-8")]
+    names = [folder if module == "experiment" else f"{folder}.{module}" for folder, module in found]
+    return {name: f"experiments.{'.'.join(one)}" for name, one in sorted(zip(names, found, strict=True))}
+
+
 def main(argv=None) -> int:
     """Run an experiment by name; returns the exit code."""
-    given = sys.argv[1:] if argv is None else argv
-    names = sorted(path.parent.name for path in Path(__file__).parent.glob("*/experiment.py"))
-    if not given or given[0] not in names:
+    given, known = sys.argv[1:] if argv is None else argv, modules()
+    if not given or given[0] not in known:
         got = f"got {given[0]}" if given else "got no name"
-        print(f"python -m experiments NAME ...: {got}, expected one of {', '.join(names)}", file=sys.stderr)
+        print(f"python -m experiments NAME ...: {got}, expected one of {', '.join(known)}", file=sys.stderr)
         return 0 if given[:1] in (["-h"], ["--help"]) else 2
-    return harness.main(importlib.import_module(f"experiments.{given[0]}.experiment").EXPERIMENT, given[1:])
+    return harness.main(importlib.import_module(known[given[0]]).EXPERIMENT, given[1:])
 
 
 if __name__ == "__main__":

@@ -17,18 +17,22 @@ interrupted continues, and results of another configuration or version are never
        measure=lambda done: {"psnr": done.metrics["render"]["psnr"]},
        columns={"map": "{map}", "rendering, dB": "{psnr:.1f}"},
    )
+
+What a run does not measure is a function, called in a process of its own (:func:`calling`).
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib.util
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -42,6 +46,7 @@ from envedit.core.atomic_files import write_atomically
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, EnveditError, InputError
 from envedit.images import images
+from experiments import call
 
 GAP = 3
 """Pixels between the rows of a sheet."""
@@ -78,6 +83,26 @@ class Case:
         """Return its job under overrides ``table.key=value``."""
         how = {"version": self.version, "command": self.command}
         return sweep.job(self.name, overridden(self.tables, overrides), **how)
+
+
+def calling(name: str, function: str, tables: dict, about: dict | None = None, **arguments) -> Case:
+    """Make a case that calls a function in place of ``envedit run``.
+
+    Parameters
+    ----------
+    name, tables, about
+        As of :class:`Case`.
+    function : str
+        ``package.module:name`` of a function (settings, folder, **arguments) -> dict; what it returns are the
+        metrics of the case. The Python files beside its module are part of the version.
+    **arguments
+        Of JSON.
+    """
+    beside = sorted(Path(importlib.util.find_spec(function.partition(":")[0]).origin).parent.glob("*.py"))
+    code = hashlib.sha256(b"\0".join(file.read_bytes() for file in beside)).hexdigest()
+    given = json.dumps(arguments, sort_keys=True)
+    command = "{python}", str(Path(call.__file__).absolute()), function, "{folder}", "{threads}", given
+    return Case(name, tables, about or {}, command, f"{code} {function} {given}", call.RESULT)
 
 
 @dataclass(frozen=True)
@@ -156,11 +181,15 @@ class Experiment:
     cases : callable
         Parsed command line -> list of Case.
     measure : callable
-        Done -> dict, of which, with the case's ``about``, the columns are made.
+        Done -> dict, or a list of them where a case is several rows; with the case's ``about``, the columns
+        are made of them.
     columns : dict
-        Heading -> format string, or callable of the row's dict that returns the text.
+        Heading -> format string, or callable of the row's dict that returns the text; or of each group
+        (a dict of dicts).
     group : callable
         Row -> heading of the part of the table that it belongs to; "" for one table.
+    failures : callable, optional
+        All rows -> a sentence for each thing that must hold and does not: exit code 1 if there are any.
     summary : callable, optional
         All rows -> Markdown that precedes the table.
     panels : callable
@@ -174,14 +203,17 @@ class Experiment:
         Markdown, or, with the folder of the sheets before the command line, -> files.
     file : callable
         Command line -> name of the table's file, without ending.
+    alone : bool
+        Times are measured: a case at a time, unless the command line says otherwise.
     """
 
     name: str
     description: str
     cases: Callable[[argparse.Namespace], list[Case]]
-    measure: Callable[[Done], dict] = lambda done: done.metrics
-    columns: dict[str, str | Callable[[dict], str]] = field(default_factory=dict)
+    measure: Callable[[Done], dict | list[dict]] = lambda done: done.metrics
+    columns: dict[str, Any] = field(default_factory=dict)
     group: Callable[[dict], str] = lambda row: ""
+    failures: Callable[[list[dict]], list[str]] | None = None
     summary: Callable[[list[dict]], str] | None = None
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
     sheet: Callable[[Case], str] = lambda case: "sheet"
@@ -189,6 +221,7 @@ class Experiment:
     tabulate: Callable[[list, Path, argparse.Namespace], str] | None = None
     draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
     file: Callable[[argparse.Namespace], str] = lambda given: "table"
+    alone: bool = False
 
 
 def overridden(tables: dict, overrides: Iterable[str]) -> dict:
@@ -241,17 +274,23 @@ def number(value: float | None, form: str = ".1f") -> str:
     return "-" if value is None or value != value else format(value, form)
 
 
-def table(experiment: Experiment, done: Iterable[Done]) -> str:
+def rows_of(experiment: Experiment, done: Iterable[Done]) -> list[dict]:
+    """Return what is known of each case, a row or several."""
+    found = [(one.case.about, experiment.measure(one)) for one in done]
+    return [about | row for about, rows in found for row in (rows if isinstance(rows, list) else [rows])]
+
+
+def table(experiment: Experiment, rows: list[dict]) -> str:
     """Return the summary and a table for each group."""
-    rows = [one.case.about | experiment.measure(one) for one in done]
     if not rows:
         return "no case is done by this version of the program; run computes them"
     parts = [experiment.summary(rows)] if experiment.summary else []
     for heading in dict.fromkeys(map(experiment.group, rows)):
         some = [row for row in rows if experiment.group(row) == heading]
-        forms = [form.format_map if isinstance(form, str) else form for form in experiment.columns.values()]
+        columns = experiment.columns.get(heading, experiment.columns)
+        forms = [form.format_map if isinstance(form, str) else form for form in columns.values()]
         lines = [[form(row) for form in forms] for row in some]
-        parts += [f"{heading}:"] * bool(heading) + [markdown(list(experiment.columns), lines)]
+        parts += [f"{heading}:"] * bool(heading) + [markdown(list(columns), lines)]
     return "\n\n".join(parts)
 
 
@@ -338,6 +377,8 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
     experiment.options(parser)
     given = parser.parse_args(argv)
     options.check_options(parser, given)
+    if experiment.alone and not given.scheduler:
+        given.workers = given.workers or 1
     return options.exit_code(experiment.name, lambda: _act(experiment, given))
 
 
@@ -366,8 +407,11 @@ def _act(experiment, given):
         draw = experiment.draw
         print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
     else:
-        tabulate = experiment.tabulate
-        text = tabulate(cases, out, given) if tabulate else table(experiment, done)
+        tabulate, rows = experiment.tabulate, [] if experiment.tabulate else rows_of(experiment, done)
+        text = tabulate(cases, out, given) if tabulate else table(experiment, rows)
         write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
         print(text)
+        wrong = experiment.failures(rows) if experiment.failures else []
+        print(*(f"FAILED: {line}" for line in wrong), sep="\n", end="\n" * bool(wrong), file=sys.stderr)
+        return 1 if missing or wrong else 0
     return 1 if missing else 0

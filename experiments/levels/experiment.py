@@ -20,7 +20,6 @@ from experiments.tradeoff.experiment import folder_of_maps
 
 def options(parser):
     parser.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps ($ENVEDIT_DATA/puresky)")
-    parser.set_defaults(workers=1)
 
 
 def tables_of(cell, level) -> dict:
@@ -95,4 +94,5 @@ EXPERIMENT = Experiment(
     cases,
     options=options,
     tabulate=tabulate,
+    alone=True,
 )

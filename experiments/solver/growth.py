@@ -1,53 +1,50 @@
-r"""How the parts of a run grow with the picture and with the map.
+"""How the parts of a run grow with the picture and with the map.
 
-    ENVEDIT_DATA=... python -m experiments.solver.growth [--scene sphere] [--sizes 128x256 256x256 ...] \
-        [--set table.key=value ...]
-
-Every size, pixels by columns of the map, is run twice and the second time counts: kernels, T and the target's
-rendering are on disk then. Prints a table of seconds. Nothing else may run on the machine.
+Every size is run twice and the second time counts: kernels, T and the target's rendering are on disk then.
+Nothing else may run on the machine.
 """
 
-import argparse
-import tempfile
-from pathlib import Path
+from envedit import pipeline
+from experiments import puresky
+from experiments.harness import Experiment, calling
 
-import mitsuba as mi
-
-SIZES = ("128x256", "256x256", "512x256", "128x512", "512x512")
+SIZES = ((128, 256), (256, 256), (512, 256), (128, 512), (512, 512))
+"""Pixels and texels across."""
 PARTS = ("target", "fit", "transport", "start", "edit", "judge", "total")
 
 
-def main(arguments=None):
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scene", default="sphere")
-    parser.add_argument("--map", default="sunflowers")
-    parser.add_argument("--sizes", nargs="+", default=SIZES)
-    parser.add_argument("--set", action="append", default=[], metavar="TABLE.KEY=VALUE")
-    given = parser.parse_args(arguments)
-    mi.set_variant("llvm_ad_rgb")
-    from envedit import config, pipeline  # after the variant
-    from experiments import puresky
+def second(settings, folder) -> dict:
+    """Run a configuration twice; returns the metrics of the second run."""
+    return [pipeline.run(settings).metrics for _ in range(2)][1]
 
-    file = puresky.of_script([given.map])[given.map]
-    names = [f"{part}_s" for part in PARTS]
-    print("| picture, map | steps | a step, ms | " + " | ".join(PARTS) + " |\n|" + "---|" * (3 + len(PARTS)))
-    for size in given.sizes:
-        pixels, columns = (int(n) for n in size.split("x"))
-        text = (
-            f'[input]\nenvmap = "{file}"\nwidth = {columns}\n[scene]\nfile = "{given.scene}"\n'
-            f"width = {pixels}\n[target]\nrotate_degrees = 60\n[representation]\nturn = false\n"
+
+def cases(given):
+    file = str(puresky.chosen(["sunflowers"])["sunflowers"])
+    return [
+        calling(
+            f"{pixels}x{texels}",
+            "experiments.solver.growth:second",
+            {
+                "input": {"envmap": file, "width": texels},
+                "scene": {"file": "sphere", "width": pixels},
+                "target": {"rotate_degrees": 60},
+                "representation": {"turn": False},
+            },
+            {"size": f"{pixels}², {texels}x{texels // 2}"},
         )
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "growth.toml"
-            path.write_text(text)
-            for _ in range(2):
-                found = pipeline.run(config.load(path, overrides=given.set)).metrics
-        timing = found["timing"]
-        seconds = " | ".join(f"{timing[name]:.2f}" for name in names)
-        row = f"| {pixels}², {columns}x{columns // 2} | {found['iterations']} "
-        print(f"{row}| {timing['per_iteration_ms'] or 0:.0f} | {seconds} |", flush=True)
+        for pixels, texels in SIZES
+    ]
 
 
-if __name__ == "__main__":
-    main()
+EXPERIMENT = Experiment(
+    "solver.growth",
+    "How the parts of a run grow with the picture and with the map.",
+    cases,
+    columns={
+        "picture, map": "{size}",
+        "steps": "{iterations}",
+        "a step, ms": lambda m: f"{m['timing']['per_iteration_ms'] or 0:.0f}",
+    }
+    | {part: f"{{timing[{part}_s]:.2f}}" for part in PARTS},
+    alone=True,
+)

@@ -39,7 +39,6 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--paper", choices=("one", "all", "none"), default="one", help="cells of this preset")
     scenes = tuple(plan.SCENES)
     parser.add_argument("--siren-scenes", nargs="+", choices=scenes, default=["glossy"], help="of SIRENs")
-    parser.set_defaults(workers=1)
 
 
 def folder_of_maps(given) -> Path:
@@ -214,4 +213,5 @@ EXPERIMENT = Experiment(
     tabulate=tabulate,
     draw=draw,
     file=lambda given: "tables",
+    alone=True,
 )

@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,6 +75,38 @@ def test_a_case_that_fails_does_not_stop_the_others(run):
     code, said = run("run", seeds=(13, 4))
     assert code == 1 and "| 4 | 8.0 |" in said.out
     assert "seed-13  failed" in said.err and "exit code 1: unlucky" in said.err
+
+
+def seeds_of(settings, folder, times):
+    return {"seeds": [{"seed": settings.seed, "n": n} for n in range(times)], "odd": math.nan}
+
+
+def calling(times=2, tables=None):
+    name = f"{__name__}:{seeds_of.__name__}"
+    return harness.calling("call", name, tables or {"seed": 5}, {"what": "x"}, times=times)
+
+
+def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    made = Experiment(
+        "calls",
+        "Call a function.",
+        lambda given: [calling()],
+        lambda done: done.metrics["seeds"],
+        {"x": {"seed": "{seed}", "n": "{n}"}},
+        group=lambda row: row["what"],
+        failures=lambda rows: [f"n is {row['n']}" for row in rows if row["n"] > 0],
+        alone=True,
+    )
+    assert harness.main(made, ["run", "--out", str(tmp_path), "--set", "seed=9"]) == 1
+    said = capsys.readouterr()
+    assert said.out == "x:\n\n| seed | n |\n| --- | --- |\n| 9 | 0 |\n| 9 | 1 |\n"
+    assert said.err.endswith("FAILED: n is 1\n")
+    folder = calling().job(["seed=9"]).folder(tmp_path)
+    assert json.loads((folder / "result.json").read_text())["odd"] is None
+    keys = {calling(n).job().key for n in (2, 3)} | {calling(tables={"seed": 6}).job().key}
+    assert len(keys) == 3
 
 
 def test_user_errors_are_one_line(run, tmp_path):

@@ -18,10 +18,16 @@ def modules() -> dict[str, str]:
 def main(argv=None) -> int:
     """Run an experiment by name; returns the exit code."""
     given, known = sys.argv[1:] if argv is None else argv, modules()
+    if given[:1] in (["-h"], ["--help"]):
+        print("python -m experiments NAME run|table|sheet: compute, print the table, draw the sheets\n")
+        width = max(map(len, known))
+        for name, module in known.items():
+            print(f"  {name:<{width}}  {importlib.import_module(module).EXPERIMENT.description}")
+        return 0
     if not given or given[0] not in known:
         got = f"got {given[0]}" if given else "got no name"
         print(f"python -m experiments NAME ...: {got}, expected one of {', '.join(known)}", file=sys.stderr)
-        return 0 if given[:1] in (["-h"], ["--help"]) else 2
+        return 2
     return harness.main(importlib.import_module(known[given[0]]).EXPERIMENT, given[1:])
 
 

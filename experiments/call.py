@@ -1,14 +1,14 @@
 """Carry out a case that is a function: ``call.py MODULE:FUNCTION FOLDER THREADS ARGUMENTS``.
 
 Called by :mod:`envedit.sweep` for cases of :func:`experiments.harness.calling`. The function gets the case's
-configuration, its folder and the arguments, a JSON object; what it returns is ``result.json`` there.
+configuration, its folder and the arguments, a JSON object; what it returns is ``result.json`` there, with
+null for numbers that are not finite.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
-import math
 import sys
 from pathlib import Path
 
@@ -22,18 +22,10 @@ from envedit import config
 from envedit.cli import doctor
 from envedit.cli.sweep import exit_code
 from envedit.core.atomic_files import write_atomically
+from envedit.report.manifest import plain
 from envedit.sweep.process import CONFIG
 
 RESULT = "result.json"
-
-
-def finite(value):
-    """Replace numbers that JSON has no word for by None, and its keys by text."""
-    if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def main(argv: list[str]) -> int:
@@ -48,7 +40,7 @@ def main(argv: list[str]) -> int:
         dr.set_thread_count(int(threads))
         called = getattr(importlib.import_module(module), function)
         found = called(settings, Path(folder), **json.loads(arguments))
-        write_atomically(Path(folder) / RESULT, json.dumps(finite(found), indent=1, allow_nan=False).encode())
+        write_atomically(Path(folder) / RESULT, json.dumps(plain(found, "", []), indent=1).encode())
         return 0
 
     return exit_code(name, act)

@@ -12,7 +12,7 @@ interrupted continues, and results of another configuration or version are never
        "Turn maps by 60 degrees.",
        cases=lambda given: [
            Case(name, {"input": {"envmap": str(file)}, "target": {"rotate_degrees": 60}}, {"map": name})
-           for name, file in puresky.chosen(given).items()
+           for name, file in puresky.find().items()
        ],
        measure=lambda done: {"psnr": done.metrics["render"]["psnr"]},
        columns={"map": "{map}", "rendering, dB": "{psnr:.1f}"},
@@ -24,9 +24,12 @@ What a run does not measure is a function, called in a process of its own (:func
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import hashlib
 import importlib.util
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -48,6 +51,7 @@ from envedit.core.errors import ConfigError, EnveditError, InputError
 from envedit.images import images
 from experiments import call
 
+NOTHING = "no case is done by this version of the program; run computes them"
 GAP = 3
 """Pixels between the rows of a sheet."""
 
@@ -94,15 +98,24 @@ def calling(name: str, function: str, tables: dict, about: dict | None = None, *
         As of :class:`Case`.
     function : str
         ``package.module:name`` of a function (settings, folder, **arguments) -> dict; what it returns are the
-        metrics of the case. The Python files beside its module are part of the version.
+        metrics of the case. The code of its folder, and of the experiments that this imports from, is part
+        of the version.
     **arguments
         Of JSON.
     """
-    beside = sorted(Path(importlib.util.find_spec(function.partition(":")[0]).origin).parent.glob("*.py"))
-    code = hashlib.sha256(b"\0".join(file.read_bytes() for file in beside)).hexdigest()
+    folder = Path(importlib.util.find_spec(function.partition(":")[0]).origin).parent
+    imported = re.findall(rb"^from experiments\.(\w+)", code_of(folder), re.M)
+    folders = [folder, *(Path(__file__).parent / one.decode() for one in sorted(set(imported)))]
+    code = hashlib.sha256(b"".join(map(code_of, folders))).hexdigest()
     given = json.dumps(arguments, sort_keys=True)
     command = "{python}", str(Path(call.__file__).absolute()), function, "{folder}", "{threads}", given
     return Case(name, tables, about or {}, command, f"{code} {function} {given}", call.RESULT)
+
+
+@functools.cache
+def code_of(folder: Path) -> bytes:
+    """Return the Python files of a folder, one after the other."""
+    return b"\0".join(file.read_bytes() for file in sorted(folder.glob("*.py")))
 
 
 @dataclass(frozen=True)
@@ -192,10 +205,12 @@ class Experiment:
         All rows -> a sentence for each thing that must hold and does not: exit code 1 if there are any.
     summary : callable, optional
         All rows -> Markdown that precedes the table.
+    combine : callable
+        All rows -> rows of the table, such as means over cases.
     panels : callable
-        Done -> pictures of display values, of any size; a row of the sheet.
+        Done -> pictures of display values, of any size; a row of the sheet. None: no row.
     sheet : callable
-        Case -> name of the sheet, without ending.
+        Case -> name of the sheet, a PNG; or with the ending .jpg.
     options : callable
         Adds the experiment's own options to the parser.
     tabulate, draw : callable, optional
@@ -215,6 +230,7 @@ class Experiment:
     group: Callable[[dict], str] = lambda row: ""
     failures: Callable[[list[dict]], list[str]] | None = None
     summary: Callable[[list[dict]], str] | None = None
+    combine: Callable[[list[dict]], list[dict]] = lambda rows: rows
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
     sheet: Callable[[Case], str] = lambda case: "sheet"
     options: Callable[[argparse.ArgumentParser], None] = lambda parser: None
@@ -283,8 +299,9 @@ def rows_of(experiment: Experiment, done: Iterable[Done]) -> list[dict]:
 def table(experiment: Experiment, rows: list[dict]) -> str:
     """Return the summary and a table for each group."""
     if not rows:
-        return "no case is done by this version of the program; run computes them"
+        return NOTHING
     parts = [experiment.summary(rows)] if experiment.summary else []
+    rows = experiment.combine(rows)
     for heading in dict.fromkeys(map(experiment.group, rows)):
         some = [row for row in rows if experiment.group(row) == heading]
         columns = experiment.columns.get(heading, experiment.columns)
@@ -317,10 +334,40 @@ def sheets(experiment: Experiment, done: Sequence[Done], folder: Path) -> list[P
     """Draw every sheet of which a case is done; returns the files."""
     files = []
     for name in dict.fromkeys(experiment.sheet(one.case) for one in done):
-        some = [one for one in done if experiment.sheet(one.case) == name]
-        files.append(folder / f"{name}.png")
-        write_atomically(files[-1], images.png(montage([experiment.panels(one) for one in some])))
+        rows = [experiment.panels(one) for one in done if experiment.sheet(one.case) == name]
+        picture = montage([row for row in rows if row])
+        files.append(folder / (name if name.endswith(".jpg") else f"{name}.png"))
+        if name.endswith(".jpg"):
+            mi.Bitmap(picture).write(str(files[-1]), quality=88)
+        else:
+            write_atomically(files[-1], images.png(picture))
     return files
+
+
+@contextlib.contextmanager
+def figure(file: Path, rows: int, columns: int, size: tuple[float, float], **subplots):
+    """Give the panels of a figure to draw in, as ``matplotlib.pyplot.subplots``, and write it.
+
+    Parameters
+    ----------
+    size : (float, float)
+        Width and height, inches.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigError("no figure: matplotlib is missing: run pip install '.[report]'") from None
+    drawn = Figure(figsize=size, layout="constrained", dpi=110)
+    panels = drawn.subplots(rows, columns, **subplots)
+    for panel in np.ravel(panels):
+        panel.grid(alpha=0.3)
+    yield panels
+    drawn.savefig(file)
 
 
 # ---- command line ------------------------------------------------------------------------------------------
@@ -348,12 +395,6 @@ def make(folder: Path) -> Path:
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder") from None
     return folder
-
-
-def own_folder(out: Path, *asked: str) -> Path:
-    """Make the folder in ``out`` that belongs to what was asked and to this version of the program."""
-    said = "\n".join([sweep.program(), *asked])
-    return make(out.absolute() / hashlib.sha256(said.encode()).hexdigest()[:16])
 
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
@@ -405,13 +446,17 @@ def _act(experiment, given):
     done, to = done_of(cases, out), make(given.to or out)
     if given.action == "sheet":
         draw = experiment.draw
+        if not draw and experiment.panels is edit_panels and cases[0][0].result == call.RESULT:
+            raise ConfigError(f"there is no sheet of {experiment.name}; give run or table")
+        if not done:
+            raise InputError(f"{out}: {NOTHING}")
         print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
-    else:
-        tabulate, rows = experiment.tabulate, [] if experiment.tabulate else rows_of(experiment, done)
-        text = tabulate(cases, out, given) if tabulate else table(experiment, rows)
-        write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
-        print(text)
-        wrong = experiment.failures(rows) if experiment.failures else []
-        print(*(f"FAILED: {line}" for line in wrong), sep="\n", end="\n" * bool(wrong), file=sys.stderr)
-        return 1 if missing or wrong else 0
-    return 1 if missing else 0
+        return 0
+    rows = [] if experiment.tabulate else rows_of(experiment, done)
+    text = experiment.tabulate(cases, out, given) if experiment.tabulate else table(experiment, rows)
+    write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
+    print(text)
+    wrong = experiment.failures(rows) if experiment.failures else []
+    for line in wrong:
+        print(f"FAILED: {line}", file=sys.stderr)
+    return 1 if missing or wrong else 0

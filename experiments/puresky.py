@@ -5,25 +5,21 @@ from __future__ import annotations
 import difflib
 import os
 import re
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 
-from envedit.core.errors import ConfigError, EnveditError, InputError
+from envedit.core.errors import ConfigError, InputError
 
 _NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
 _HOW = "python -m experiments.download_puresky DIR fetches them"
 
 
-def data(holds: str = "puresky/NAME_puresky_1k.hdr", give: str = "", how: str = _HOW) -> Path:
+def data(holds: str = "puresky/NAME_puresky_1k.hdr", how: str = _HOW) -> Path:
     """Return the folder that ENVEDIT_DATA names.
 
     Parameters
     ----------
     holds, how : str
         What is looked for in it and how it is had, for the error.
-    give : str, optional
-        What may be given instead, for the error.
 
     Raises
     ------
@@ -31,11 +27,11 @@ def data(holds: str = "puresky/NAME_puresky_1k.hdr", give: str = "", how: str = 
         ENVEDIT_DATA is not set.
     """
     if not (root := os.environ.get("ENVEDIT_DATA")):
-        raise ConfigError(f"no maps: {give}set ENVEDIT_DATA to a folder with {holds}; {how}")
+        raise ConfigError(f"no maps: set ENVEDIT_DATA to a folder with {holds}; {how}")
     return Path(root)
 
 
-def find(folder: str | Path | None = None, option: str = "") -> dict[str, Path]:
+def find(folder: str | Path | None = None) -> dict[str, Path]:
     """List the maps of a folder by name.
 
     Parameters
@@ -43,8 +39,6 @@ def find(folder: str | Path | None = None, option: str = "") -> dict[str, Path]:
     folder : path, optional
         With files NAME_puresky_1k.hdr (or .exr, or of another resolution: of several the smallest is taken);
         None: the folder ``puresky`` of ENVEDIT_DATA.
-    option : str, optional
-        What names the folder on the command line, for the error.
 
     Raises
     ------
@@ -53,9 +47,7 @@ def find(folder: str | Path | None = None, option: str = "") -> dict[str, Path]:
     InputError
         It is no folder, or holds no map.
     """
-    if folder is None:
-        folder = data(give=f"give {option} DIR, or " if option else "") / "puresky"
-    folder = Path(folder).absolute()
+    folder = Path(folder or data() / "puresky").absolute()
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of maps; {_HOW}")
     matches = [match for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))]
@@ -68,37 +60,17 @@ def find(folder: str | Path | None = None, option: str = "") -> dict[str, Path]:
     return found
 
 
-def pick(found: dict[str, Path], names: Iterable[str], option: str = "--maps") -> dict[str, Path]:
-    """Pick maps of :func:`find` by the names that ``option`` gave.
-
-    Raises
-    ------
-    ConfigError
-        A name is not among them.
-    """
-    names = list(dict.fromkeys(names))
-    for name in names:
-        if name not in found:
-            close = difflib.get_close_matches(name, found, 1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(found)}"
-            raise ConfigError(f"{option}: no map {name}; {hint}")
-    return {name: found[name] for name in names}
-
-
-def of_script(names: Iterable[str] | None = None) -> dict[str, Path]:
-    """Return the maps of ENVEDIT_DATA, all or some, or end the program with one line that says why not."""
-    try:
-        return chosen(names)
-    except EnveditError as error:
-        sys.exit(f"envedit: {error}")
-
-
-def chosen(names: Iterable[str] | None = None) -> dict[str, Path]:
-    """Return the maps of ENVEDIT_DATA, all or some.
+def file(name: str) -> str:
+    """Return the file of a map of ENVEDIT_DATA.
 
     Raises
     ------
     ConfigError, InputError
-        As :func:`find` and :func:`pick`.
+        As :func:`find`; or there is no map of this name.
     """
-    return pick(find(), names) if names else find()
+    found = find()
+    if name not in found:
+        close = difflib.get_close_matches(name, found, 1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(found)}"
+        raise ConfigError(f"no map {name}; {hint}")
+    return str(found[name])

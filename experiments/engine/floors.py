@@ -3,8 +3,7 @@
 A program that has to read so many bytes, or to multiply so many numbers, cannot be quicker than these.
 """
 
-from __future__ import annotations
-
+import functools
 from pathlib import Path
 
 import drjit as dr
@@ -21,27 +20,22 @@ SHAPES = ((256, 16384), (128, 16384), (64, 16384))
 """(width, points) of the hidden layers: the paper's network, the standard one, the draft's."""
 
 
-def measure(quick: bool = False) -> dict:
-    """Measure all floors; see the functions."""
+def measure(settings, quick: bool = False) -> dict:
+    """Return the rows of the tables ``bandwidth``, ``matmul`` and ``rays``."""
+    memory = bandwidth(1 << 20 if quick else None, 3 if quick else 7)
+    sizes = {key: memory[key] for key in ("array_bytes", "cache_bytes")}
     return {
-        "bandwidth": bandwidth(1 << 20 if quick else None, 3 if quick else 7),
+        "bandwidth": [{"streaming": name, "rate": rate} | sizes for name, rate in memory["rates"].items()],
         "matmul": matmul(((16, 256),) if quick else SHAPES, 3 if quick else 9),
         "rays": rays(1 << 12 if quick else 1 << 20, 3 if quick else 7),
     }
 
 
-# ---------------------------------------------------------------------- memory
-
-
 def bandwidth(elements: int | None = None, repeats: int = 7) -> dict:
     """Measure bytes a second between memory and cores, on float32 arrays larger than the caches.
 
-    Parameters
-    ----------
-    elements : int, optional
-        Floats in an array; by default twice the largest cache, but no more than an eighth of the free memory.
-    repeats : int
-        Times each is measured.
+    ``elements`` is the number of floats in an array; by default twice the largest cache, but no more than an
+    eighth of the free memory.
 
     Returns
     -------
@@ -93,7 +87,7 @@ def _read_packets(packed, rows, lanes):
 
 
 def largest_cache() -> int | None:
-    """Return the size of the processor's largest cache in bytes; None where the system does not tell."""
+    """Return the size of the processor's largest cache in bytes; None where the system does not report it."""
     found = []
     for file in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size"):
         text = file.read_text().strip()
@@ -113,57 +107,40 @@ def _beyond(cache):
     return elements // 2**20 * 2**20
 
 
-# ---------------------------------------------------------------------- arithmetic
-
-
 def matmul(shapes=SHAPES, repeats: int = 9) -> list[dict]:
     """Measure Dr.Jit's matrix products of a hidden layer: forward, and the two of the reverse pass.
 
     Returns
     -------
     list of dict
-        A row for each shape, layout and product: ``width``, ``points``, ``layout`` ("rows": a point a row),
-        ``product``, ``seconds`` (median), ``gflops`` (of the median) and ``gflops_best``.
+        A row for each shape and layout: ``width``, ``points``, ``layout`` ("rows": a point a row), and for
+        each product ``gflops`` (of the median) and ``gflops_best``.
     """
-    rows, rng = [], np.random.default_rng(0)
+    found, rng = [], np.random.default_rng(0)
     for width, points in shapes:
         operands = {
             (layout, product): (network.operand(rng, a), network.operand(rng, b), flags)
             for layout in network.LAYOUTS
             for product, a, b, flags in network.products(layout, points, width, width)
         }
-        jobs = {key: _product(*value) for key, value in operands.items()}
+        jobs = {key: functools.partial(dr.matmul, a, b, **flags) for key, (a, b, flags) in operands.items()}
+        rows = {layout: {"width": width, "points": points, "layout": layout} for layout in network.LAYOUTS}
+        work = 2 * width * width * points / 1e9
         for (layout, product), taken in side_by_side(jobs, repeats).items():
-            work = 2 * width * width * points
-            rows.append(
-                {
-                    "width": width,
-                    "points": points,
-                    "layout": layout,
-                    "product": product,
-                    "seconds": taken["median_s"],
-                    "gflops": work / taken["median_s"] / 1e9,
-                    "gflops_best": work / taken["min_s"] / 1e9,
-                }
-            )
-    return rows
+            rates = {"gflops": work / taken["median_s"], "gflops_best": work / taken["min_s"]}
+            rows[layout][product] = rates
+        found += rows.values()
+    return found
 
 
-def _product(a, b, flags):
-    return lambda: dr.matmul(a, b, **flags)
-
-
-# ---------------------------------------------------------------------- rays
-
-
-def rays(count: int = 1 << 20, repeats: int = 7) -> dict:
+def rays(count: int = 1 << 20, repeats: int = 7) -> list[dict]:
     """Measure rays a second in the scene ``sphere``.
 
     Returns
     -------
-    dict
-        ``rays``, and rays a second: ``camera`` (coherent, nearest hit), ``random`` (from anywhere to
-        anywhere, nearest hit), ``shadow`` (the same, any hit).
+    list of dict
+        ``rays``: coherent from the camera or from anywhere to anywhere, nearest hit or any; ``count``;
+        ``rate``: rays a second.
     """
     lit = scene.load("sphere", 256)
     rng = np.random.default_rng(0)
@@ -176,10 +153,12 @@ def rays(count: int = 1 << 20, repeats: int = 7) -> dict:
     camera, scattered = dr.opaque(mi.Ray3f(camera)), dr.opaque(scattered)
     taken = side_by_side(
         {
-            "camera": lambda: lit.mi.ray_intersect(camera).t,
-            "random": lambda: lit.mi.ray_intersect(scattered).t,
-            "shadow": lambda: lit.mi.ray_test(scattered),
+            "from the camera, nearest hit": lambda: lit.mi.ray_intersect(camera).t,
+            "from anywhere, nearest hit": lambda: lit.mi.ray_intersect(scattered).t,
+            "from anywhere, any hit": lambda: lit.mi.ray_test(scattered),
         },
         repeats,
     )
-    return {"rays": count, **{name: count / found["median_s"] for name, found in taken.items()}}
+    return [
+        {"rays": name, "count": count, "rate": count / found["median_s"]} for name, found in taken.items()
+    ]

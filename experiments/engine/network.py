@@ -6,107 +6,82 @@ for the first, whose input needs no gradient. What is above them is what the eng
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.errors import ConfigError
 from envedit.representations.siren import network as siren
 
 from .timing import compiled, growth, side_by_side
 
-NETWORKS = {"paper": (256, 6), "standard": (128, 3), "draft": (64, 3)}
-"""Width and hidden sine layers after the first, by preset."""
 MAP = (64, 256)
 """Active texels of a 256x128 map: 16,384 points."""
-OMEGA = 30.0
 LAYOUTS = ("columns", "rows")
 """A point a column of an activation, (width, N), or a point a row, (N, width)."""
 
 
-def measure(quick: bool = False, torch: str | None = None) -> dict:
-    """Measure every network.
+def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
+    """Measure ``siren.forward`` and ``siren.backward``, in turns with their products alone.
 
     Parameters
     ----------
-    quick : bool
-        One tiny network, for the self-check.
     torch : str, optional
-        An interpreter that has PyTorch; by default this one, if it has it.
+        An interpreter that has PyTorch, to compare with.
 
     Returns
     -------
     dict
-        ``networks``: a row each, see :func:`step`; ``torch``: what PyTorch took for the same by name, or
-        None; ``not_compared``: why it is None.
+        ``siren``: a row with the times of ``forward``, ``step`` and ``own``, the products in the network's
+        layout; ``ratio``: median of the step over that; ``ratio_best``: over the products of the quicker
+        layout; ``kernels`` after warm-up; ``memory`` over 200 steps; ``torch``: the peer, or None.
     """
-    networks = {"tiny": (16, 2)} if quick else NETWORKS
+    hidden, depth, omega = (getattr(settings.representation, key) for key in ("hidden", "depth", "omega"))
     shape = (8, 32) if quick else MAP
+    job = {"hidden": hidden, "depth": depth, "omega": omega, "shape": shape, "threads": dr.thread_count()}
     # Before and after: a subprocess cannot take turns with this one, and the machine may have slowed down.
-    peers = [] if quick else [_peer(torch, networks, shape)]
-    rows = [step(name, *size, shape, quick) for name, size in networks.items()]
-    if peers and peers[0]:
-        peers.append(_peer(torch, networks, shape))
-    both = [peer for peer in peers if peer]
-    return {
-        "points": shape[0] * shape[1],
-        "networks": rows,
-        "torch": _quicker(both) if both else None,
-        "not_compared": None if both else "PyTorch (not asked for)" if quick else "PyTorch (not installed)",
-    }
-
-
-def step(name: str, hidden: int, depth: int, shape=MAP, quick: bool = False) -> dict:
-    """Measure ``siren.forward`` and ``siren.backward`` of one network, in turns with their products alone.
-
-    Returns
-    -------
-    dict
-        ``name``, ``hidden``, ``depth``, ``layout``; times of ``forward``, ``step`` and, by layout, of
-        ``products``; ``ratio``: median of the step over that of its own products; ``ratio_best``: over those
-        of the quicker layout; ``gflop``: arithmetic of the products; ``kernels`` after warm-up; ``memory``
-        over 200 steps.
-    """
-    params = siren.init(0, hidden, depth, OMEGA)
+    peers = [_peer(torch, job)] if torch else []
+    params = siren.init(0, hidden, depth, omega)
     x = dr.opaque(siren.coordinates(*shape))
     points = shape[0] * shape[1]
     layout = "rows" if x.shape[0] == points else "columns"
-    ones = dr.opaque(mi.TensorXf, 1, siren.forward(params, x, OMEGA)[0].shape)
+    ones = dr.opaque(mi.TensorXf, 1, siren.forward(params, x, omega)[0].shape)
 
     def forward():
-        return siren.forward(params, x, OMEGA)[0]
+        return siren.forward(params, x, omega)[0]
 
     def both():
-        _, tape = siren.forward(params, x, OMEGA)
+        _, tape = siren.forward(params, x, omega)
         return siren.backward(params, tape, ones)
 
     sizes = [2] + [hidden] * (depth + 1) + [3]
-    jobs = {"forward": forward, "step": both} | {
-        layout_: _products_alone(layout_, points, sizes) for layout_ in LAYOUTS
-    }
-    taken = side_by_side(jobs, 3 if quick else 11)
-    floor = {name_: taken[name_]["median_s"] for name_ in LAYOUTS}
+    alone = {name: _products_alone(name, points, sizes) for name in LAYOUTS}
+    taken = side_by_side({"forward": forward, "step": both} | alone, 3 if quick else 11)
+    peers += [_peer(torch, job)] if torch else []
     weights = sum(a * b for a, b in zip(sizes[:-1], sizes[1:], strict=True))
     work = 2 * points * (3 * weights - sizes[0] * sizes[1])
-    return {
-        "name": name,
+    step = taken["step"]["median_s"]
+    row = {
+        "preset": settings.preset,
         "hidden": hidden,
         "depth": depth,
+        "points": points,
         "layout": layout,
         "forward": taken["forward"],
         "step": taken["step"],
-        "products": {name_: taken[name_] for name_ in LAYOUTS},
-        "ratio": taken["step"]["median_s"] / floor[layout],
-        "ratio_best": taken["step"]["median_s"] / min(floor.values()),
-        "gflop": work / 1e9,
+        "own": taken[layout],
+        "ratio": step / taken[layout]["median_s"],
+        "ratio_best": step / min(taken[name]["median_s"] for name in LAYOUTS),
+        "gflops": work / step / 1e9,
         "kernels": compiled(both),
         "memory": growth(both, 20 if quick else 200, 5 if quick else 20),
+        "torch": min(peers, key=lambda peer: peer["median_s"], default=None),
     }
+    return {"siren": [row]}
 
 
 def products(layout: str, points: int, inputs: int, outputs: int) -> list[tuple]:
@@ -148,33 +123,14 @@ def operand(rng, shape) -> mi.TensorXf:
     return dr.opaque(mi.TensorXf(rng.uniform(-0.1, 0.1, shape).astype(np.float32)))
 
 
-# ---------------------------------------------------------------------- the peer
-
-
-def _peer(interpreter, networks, shape):
-    """Time PyTorch in a process of its own; None where it is not installed."""
-    if not interpreter:
-        if importlib.util.find_spec("torch") is None:
-            return None
-        interpreter = sys.executable
-    job = {"networks": networks, "shape": shape, "omega": OMEGA, "threads": dr.thread_count()}
-    script = Path(__file__).with_name("torch_peer.py")
+def _peer(interpreter, job):
+    """Time PyTorch in a process of its own."""
+    command = [interpreter, str(Path(__file__).with_name("torch_peer.py")), json.dumps(job)]
     try:
-        ran = subprocess.run(
-            [interpreter, str(script), json.dumps(job)], capture_output=True, text=True, check=False
-        )
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
-        sys.exit(f"--torch {interpreter}: cannot be started ({error.strerror})")
+        raise ConfigError(f"--torch {interpreter}: cannot be started ({error.strerror})") from None
     if ran.returncode:
         said = ran.stderr.strip().splitlines() or [f"ended with {ran.returncode}"]
-        sys.exit(f"--torch {interpreter}: {said[-1]}")
+        raise ConfigError(f"--torch {interpreter}: {said[-1]}")
     return json.loads(ran.stdout.splitlines()[-1])
-
-
-def _quicker(runs):
-    """Merge runs of the peer: the quicker one of each network."""
-    names = runs[0]["networks"]
-    merged = {
-        name: min((run["networks"][name] for run in runs), key=lambda row: row["median_s"]) for name in names
-    }
-    return {**runs[0], "networks": merged}

@@ -1,79 +1,58 @@
-"""Draw what was measured: ``python -m experiments.engine.plot [--out DIR]``; needs envedit[report]."""
+"""Draw how T grows, and error against time: the figures of docs/engine.md."""
 
-import argparse
-import json
 from pathlib import Path
 
+from experiments.harness import figure
 
-def scaling(found: dict, file: Path) -> None:
+GROWTH = {
+    "pixels": ("pixels", lambda row: row["pixels"] ** 2),
+    "texels": ("texels", lambda row: row["texels"][0] * row["texels"][1]),
+    "spp": ("paths a pixel", lambda row: row["spp"]),
+}
+"""Label and value of what is varied."""
+CURVES = {
+    "tracing, s": ("s-", lambda row: row["trace_s"]),
+    "T E, s": ("o-", lambda row: row["apply_s"]),
+    "T' I, s": ("^-", lambda row: row["adjoint_s"]),
+    "read by both, GB": ("x--", lambda row: row["bytes"] / 1e9),
+}
+
+
+def growth(rows: list[dict], file: Path) -> None:
     """Draw seconds and bytes of T against pixels, texels and samples, one panel each."""
-    import matplotlib.pyplot as plt
-
-    variables = {"pixels": "pixels", "width": "texels", "spp": "paths a pixel"}
-    figure, panels = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained", sharey=True)
-    for panel, (variable, label) in zip(panels, variables.items(), strict=True):
-        rows = [r for r in found["rows"] if r["variable"] == variable]
-        across = [
-            {"pixels": r["pixels"] ** 2, "width": r["texels"][0] * r["texels"][1], "spp": r["spp"]}[variable]
-            for r in rows
-        ]
-        panel.loglog(across, [r["trace_s"] for r in rows], "s-", label="tracing, s")
-        panel.loglog(across, [r["apply"]["median_s"] for r in rows], "o-", label="T E, s")
-        panel.loglog(across, [r["adjoint"]["median_s"] for r in rows], "^-", label="T' I, s")
-        panel.loglog(across, [r["bytes"] / 1e9 for r in rows], "x--", color="grey", label="read by both, GB")
-        ticks = sorted(set(across))
-        panel.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize="small")
-        panel.minorticks_off()
-        panel.set_xlabel(label)
-        panel.grid(alpha=0.3)
-    panels[0].legend(fontsize="small")
-    figure.savefig(file, dpi=120)
-    plt.close(figure)
+    with figure(file, 1, 3, (12, 3.6), sharey=True) as panels:
+        for panel, (variable, (label, value)) in zip(panels, GROWTH.items(), strict=True):
+            some = [row for row in rows if row["variable"] == variable]
+            across = [value(row) for row in some]
+            for name, (style, height) in CURVES.items():
+                panel.loglog(across, [height(row) for row in some], style, label=name)
+            panel.set_xticks(across, [f"{tick:,}" for tick in across], fontsize="small")
+            panel.minorticks_off()
+            panel.set_xlabel(label)
+        panels[0].legend(fontsize="small")
 
 
-def error_time(found: dict, file: Path) -> None:
+def error_time(rows: list[dict], file: Path) -> None:
     """Draw error against the seconds of a step, T and prb."""
-    import matplotlib.pyplot as plt
-
-    figure, panel = plt.subplots(figsize=(5.5, 4), layout="constrained")
-    for kind, style in (("prb", "s-"), ("T", "o-")):
-        rows = [r for r in found["curve"] if r["kind"] == kind]
-        panel.loglog([r["step_s"] for r in rows], [100 * r["rmse"] for r in rows], style, label=kind)
-        for r in rows:
-            panel.annotate(f" {r['samples']} spp", (r["step_s"], 100 * r["rmse"]), fontsize="x-small")
-    panel.margins(x=0.1)
-    panel.axhline(100 * found["curve"][0]["noise"], color="grey", ls=":", label="noise of the reference")
-    panel.set_xlabel("seconds of a step: rendering and gradient")
-    panel.set_ylabel("RMSE, % of the mean")
-    panel.grid(alpha=0.3)
-    panel.legend(fontsize="small")
-    figure.savefig(file, dpi=120)
-    plt.close(figure)
+    with figure(file, 1, 1, (5.5, 4)) as panel:
+        for kind, style in (("prb", "s-"), ("T", "o-")):
+            some = [row for row in rows if row["kind"] == kind]
+            points = [(row["step_s"], 100 * row["rmse"]) for row in some]
+            panel.loglog(*zip(*points, strict=True), style, label=kind)
+            for row, point in zip(some, points, strict=True):
+                panel.annotate(f" {row['samples']} spp", point, fontsize="x-small")
+        panel.margins(x=0.1)
+        panel.axhline(100 * rows[0]["noise"], color="grey", ls=":", label="noise of the reference")
+        panel.set_xlabel("seconds of a step: rendering and gradient")
+        panel.set_ylabel("RMSE, % of the mean")
+        panel.legend(fontsize="small")
 
 
-def draw(results: dict, folder: Path) -> list[Path]:
-    """Draw what there is; returns the files, none without matplotlib."""
-    try:
-        import matplotlib
-    except ImportError:
-        return []
-    matplotlib.use("agg")
+def draw(rows: list[dict], folder: Path) -> list[Path]:
+    """Draw what there are rows for; returns the files."""
     files = []
-    for section, name, plot in (("scaling", "scaling", scaling), ("quality", "error_time", error_time)):
-        if section in results:
-            files.append(folder / f"{name}.png")
-            plot(results[section]["found"], files[-1])
+    for table, plot in (("scaling", growth), ("error-time", error_time)):
+        if some := [row for row in rows if row["table"] == table]:
+            files.append(folder / f"engine_{table.replace('-', '_')}.png")
+            plot(some, files[-1])
     return files
-
-
-def main():
-    """Draw the results of an earlier run."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.engine.plot", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/engine"))
-    folder = parser.parse_args().out
-    for file in draw(json.loads((folder / "results.json").read_text()), folder):
-        print(file)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,59 +1,32 @@
 """How T grows: with the pixels, the texels and the samples, one at a time."""
 
-from __future__ import annotations
-
 import gc
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.scene import scene
+from envedit.inputs import load_map
 
-from . import maps
 from .timing import side_by_side
-from .transport import build, bytes_read
-
-BASE = {"pixels": 128, "width": 256, "spp": "auto"}
-RANGES = {"pixels": (64, 128, 256, 512), "width": (128, 256, 512), "spp": (16, 32, 64, 128, 256)}
-SLOW = 20
-"""Seconds above which T is not traced a second time to leave out compilation."""
+from .transport import build, bytes_read, load_scene
 
 
-def measure(quick: bool = False) -> dict:
-    """Return ``rows``, one for each value of each variable, see :func:`one_size`; the others as in BASE."""
-    base, ranges = BASE, RANGES
-    if quick:
-        base = {"pixels": 16, "width": 32, "spp": 16}
-        ranges = {"pixels": (16, 32), "width": (16, 32), "spp": (16, 32)}
-    return {
-        "base": base,
-        "rows": [
-            {"variable": variable, "value": value, **one_size(**base | {variable: value}, quick=quick)}
-            for variable, values in ranges.items()
-            for value in values
-        ],
-    }
-
-
-def one_size(pixels: int, width: int, spp, quick: bool = False) -> dict:
-    """Trace the scene ``sphere`` at one size and measure it under a clear sky with its exact columns.
+def measure(settings, quick: bool = False) -> dict:
+    """Trace a scene at one size and measure T under a clear sky with its exact columns.
 
     Returns
     -------
     dict
-        ``trace_s`` and ``cold``, whether kernels were compiled in it; ``spp``, ``columns``, ``bytes`` that
-        both products read, ``held``, ``apply``, ``adjoint``, ``choices``.
+        ``scaling``: a row with ``trace_s`` (kernels compiled), ``spp``, ``columns``, ``bytes`` that both
+        products read, ``held``, and seconds ``apply_s`` and ``adjoint_s``.
     """
-    lit = scene.load("sphere", pixels, pixels, sampler="independent")
-    height = width // 2
-    transport, trace = build(lit, height, width, spp)
-    cold = trace > SLOW
-    if not cold:
-        del transport
-        gc.collect()
-        transport, trace = build(lit, height, width, spp)
-    _, sky = maps.sunny(width, real=not quick)
+    lit, (sky, _) = load_scene(settings), load_map(settings.input)
+    height, width, _ = sky.shape
+    transport, _ = build(lit, height, width, settings.renderer.spp)
+    del transport
+    gc.collect()
+    transport, trace = build(lit, height, width, settings.renderer.spp)
     transport.resolve(sky)
     env = dr.opaque(mi.TensorXf(sky))
     picture = np.random.default_rng(0).random((*transport.shape, 3), np.float32)
@@ -63,16 +36,16 @@ def one_size(pixels: int, width: int, spp, quick: bool = False) -> dict:
         3 if quick else 7,
     )
     reads = bytes_read(transport)
-    return {
-        "pixels": pixels,
+    row = {
+        "pixels": lit.width,
         "texels": [height, width],
         "spp": transport.spp,
         "columns": len(transport.columns),
         "trace_s": trace,
-        "cold": cold,
         "bytes": reads["apply"] + reads["adjoint"],
         "held": transport.memory_bytes,
-        "apply": taken["apply"],
-        "adjoint": taken["adjoint"],
+        "apply_s": taken["apply"]["median_s"],
+        "adjoint_s": taken["adjoint"]["median_s"],
         "choices": transport.choices,
     }
+    return {"scaling": [row]}

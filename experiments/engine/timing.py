@@ -32,7 +32,7 @@ def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS, warm_up
     Returns
     -------
     dict
-        For each name ``median_s``, ``min_s`` and ``repeats``.
+        For each name ``median_s`` and ``min_s``.
     """
     for function in functions.values():
         for _ in range(warm_up):
@@ -41,10 +41,7 @@ def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS, warm_up
     for _ in range(repeats):
         for name, function in functions.items():
             seconds[name].append(once(function))
-    return {
-        name: {"median_s": float(np.median(taken)), "min_s": min(taken), "repeats": repeats}
-        for name, taken in seconds.items()
-    }
+    return {name: {"median_s": float(np.median(s)), "min_s": min(s)} for name, s in seconds.items()}
 
 
 def compiled(function: Callable, calls: int = 5) -> dict:
@@ -59,10 +56,10 @@ def compiled(function: Callable, calls: int = 5) -> dict:
 
 
 def resident_bytes() -> int | None:
-    """Return the memory that the process occupies now; None where the system does not tell."""
+    """Return the memory that the process occupies now; None where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
+    except OSError:
         return None
 
 
@@ -73,6 +70,4 @@ def growth(function: Callable, calls: int, settle: int) -> dict:
     before = resident_bytes()
     for _ in range(calls):
         once(function)
-    after = resident_bytes()
-    known = before is not None and after is not None
-    return {"calls": calls, "bytes": after - before if known else None}
+    return {"calls": calls, "bytes": None if before is None else resident_bytes() - before}

@@ -1,7 +1,7 @@
 """One step of the same networks in PyTorch on the same cores; run by ``network.py`` in another interpreter.
 
-Imports PyTorch and nothing else that has to be installed. Argument: JSON with ``networks`` (name: [hidden,
-depth]), ``shape``, ``omega`` and ``threads``; prints one line of JSON.
+Imports PyTorch and nothing else that has to be installed. Argument: JSON with ``hidden``, ``depth``,
+``shape``, ``omega`` and ``threads``; prints one line of JSON.
 """
 
 import json
@@ -31,17 +31,6 @@ def siren(hidden, depth, omega):
     return layers, evaluate
 
 
-def seconds(function):
-    """Return the seconds of each repeat after warm-up."""
-    taken = []
-    for i in range(WARM_UP + REPEATS):
-        start = time.perf_counter()
-        function()
-        if i >= WARM_UP:
-            taken.append(time.perf_counter() - start)
-    return {"median_s": statistics.median(taken), "min_s": min(taken), "repeats": REPEATS}
-
-
 def main():
     """Measure and print."""
     job = json.loads(sys.argv[1])
@@ -51,17 +40,16 @@ def main():
     y = (2 * torch.arange(height) + 1) / height - 1
     x = (2 * torch.arange(width) + 1) / width - 1
     points = torch.stack(torch.meshgrid(y, x, indexing="ij"), dim=-1).reshape(-1, 2)
-    found = {}
-    for name, (hidden, depth) in job["networks"].items():
-        layers, evaluate = siren(hidden, depth, job["omega"])
-        params = [p for layer in layers for p in layer.parameters()]
-
-        def step(params=params, evaluate=evaluate):
-            value = evaluate(points)
-            torch.autograd.grad(value, params, torch.ones_like(value))
-
-        found[name] = seconds(step)
-    print(json.dumps({"version": torch.__version__, "threads": torch.get_num_threads(), "networks": found}))
+    layers, evaluate = siren(job["hidden"], job["depth"], job["omega"])
+    params = [p for layer in layers for p in layer.parameters()]
+    taken = []
+    for _ in range(WARM_UP + REPEATS):
+        start = time.perf_counter()
+        value = evaluate(points)
+        torch.autograd.grad(value, params, torch.ones_like(value))
+        taken.append(time.perf_counter() - start)
+    about = {"version": torch.__version__, "threads": torch.get_num_threads()}
+    print(json.dumps(about | {"median_s": statistics.median(taken[WARM_UP:])}))
 
 
 if __name__ == "__main__":

@@ -13,68 +13,44 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
+from envedit.inputs import load_map
 from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
 from envedit.transport.light_transport import RESOLVE_EVERY, LightTransport
 
-from . import floors, maps
+from . import floors
+from .tables import si
 from .timing import compiled, side_by_side
 
-PIXELS, WIDTH, PRB_SPP = 256, 256, 16
+PRB_SPP = 16
 
 
-def measure(quick: bool = False, bandwidth: dict | None = None) -> dict:
-    """Measure the scenes ``sphere`` and, with data, ``mesh``.
-
-    Parameters
-    ----------
-    quick : bool
-        One scene at a tiny size.
-    bandwidth : dict, optional
-        :func:`.floors.bandwidth` of this run; measured if it is not given.
-
-    Returns
-    -------
-    dict
-        ``read``: the bandwidth, bytes a second; ``scenes``: a row each, see :func:`one_scene`; ``skipped``.
-    """
-    bandwidth = bandwidth or floors.bandwidth(1 << 20 if quick else None)
-    chosen, skipped = {"sphere": {}}, []
-    if not quick:
-        if mesh := maps.mesh():
-            chosen["mesh"] = mesh
-        else:
-            skipped.append("scene mesh: ENVEDIT_DATA names no folder with meshes")
-    size = (32, 32, 64) if quick else (PIXELS, WIDTH, "auto")
-    rows = [
-        one_scene(name, parameters, *size, bandwidth["read"], quick) for name, parameters in chosen.items()
-    ]
-    return {"read": bandwidth["read"], "scenes": rows, "skipped": skipped}
+def load_scene(settings):
+    """Load a configuration's scene in a square picture, with Mitsuba's default sampler."""
+    file, width = settings.scene.file, settings.scene.width
+    return scene.load(file, width, width, settings.scene.parameters, sampler="independent")
 
 
-def one_scene(name, parameters, pixels, width, spp, read, quick=False) -> dict:
+def measure(settings, quick: bool = False) -> dict:
     """Measure one scene under a clear sky.
 
     Returns
     -------
     dict
-        What was traced (``spp``, ``depth``, ``columns``, ``choices``), seconds (``trace``, ``resolve_s``,
-        ``disk``), bytes (``held``, and those that ``apply`` and ``adjoint`` read), times of everything, and:
-
-        ``floor_s``
-            the seconds that reading these bytes once takes;
-        ``step_s``
-            a rendering and its gradient through T, with its share of looking for texels grown bright;
-        ``prb_step_s``
-            the same by path tracing, map set as an edit has to (Mitsuba builds its sampling table anew);
-            ``prb_bare_step_s`` is without setting the map, which no edit can do.
+        ``transport``: a row with what was traced (``spp``, ``depth``, ``columns``, ``choices``), seconds
+        (``first_s``, ``again_s`` of tracing, ``resolve_s``, ``load_s``), bytes (``held``, and those that
+        ``apply`` and ``adjoint`` read), and ``floor_s``: the seconds that reading these bytes once takes.
+        ``transport-time``: rows ``what``, ``median_s`` and ``note``. A step is a rendering and its gradient;
+        through T with its share of looking for texels grown bright, by path tracing with the map set as an
+        edit has to (Mitsuba builds its sampling table anew), and without setting it, which no edit can do.
     """
-    lit = scene.load(name, pixels, pixels, parameters, sampler="independent")  # Mitsuba's default
-    height = width // 2
-    map_name, sky = maps.sunny(width, real=not quick)
+    bandwidth = floors.bandwidth(1 << 20 if quick else None)["read"]
+    lit, spp = load_scene(settings), settings.renderer.spp
+    sky, _ = load_map(settings.input)
+    height, width, _ = sky.shape
     transport, first = build(lit, height, width, spp)
     del transport
-    disk = from_disk(lit, height, width, spp)
+    load = from_disk(lit, height, width, spp)
     gc.collect()
     transport, again = build(lit, height, width, spp)
 
@@ -90,7 +66,7 @@ def one_scene(name, parameters, pixels, width, spp, read, quick=False) -> dict:
     resolve = time.perf_counter() - start
     depth = transport.bounces + 1
     tracer = PathTracer(lit, PRB_SPP, depth, one_thread=False)
-    steps, bare = itertools.count(), bare_prb(lit.path, parameters, pixels, sky, depth, weight)
+    steps, bare = itertools.count(), bare_prb(settings, sky, depth, weight)
     times = side_by_side(
         {
             **applied,
@@ -104,52 +80,57 @@ def one_scene(name, parameters, pixels, width, spp, read, quick=False) -> dict:
         repeats,
     )
     reads = bytes_read(transport)
-    floor = (reads["apply"] + reads["adjoint"]) / read
-    both = times["apply"]["median_s"] + times["adjoint"]["median_s"]
-    look = times["T look"]["median_s"] / RESOLVE_EVERY
-    step = times["T step"]["median_s"] + look
-    prb, prb_bare = (times[key]["median_s"] for key in ("prb step", "prb bare step"))
-    return {
-        "scene": name,
-        "pixels": pixels,
-        "texels": [height, width],
-        "map": map_name,
+    read = reads["apply"] + reads["adjoint"]
+    median = {name: found["median_s"] for name, found in times.items()}
+    look = median["T look"] / RESOLVE_EVERY
+    step = median["T step"] + look
+    floor = read / bandwidth
+    spent = [
+        {"what": "T E, coarse tier", **coarse["apply"]},
+        {"what": "T' I, coarse tier", **coarse["adjoint"]},
+        {"what": "T E", **times["apply"]},
+        {"what": "T' I", **times["adjoint"]},
+        {
+            "what": f"floor of both: {si(read, 'B')} at {si(bandwidth, 'B/s')}",
+            "median_s": floor,
+            "above_floor": (median["apply"] + median["adjoint"]) / floor,
+        },
+        {"what": "a step through T", "median_s": step},
+        {"what": "of it: looking for bright texels", "median_s": look, "every": RESOLVE_EVERY},
+        {"what": f"prb, {PRB_SPP} spp, forward", **times["prb forward"]},
+        {"what": f"prb, {PRB_SPP} spp, a step", **times["prb step"], "ratio": median["prb step"] / step},
+        {
+            "what": "the same, the map never set",
+            **times["prb bare step"],
+            "ratio": median["prb bare step"] / step,
+        },
+    ]
+    size = {"pixels": lit.width, "texels": [height, width]}
+    row = {
         "spp": transport.spp,
         "depth": depth,
         "columns": len(transport.columns),
         "choices": transport.choices,
-        "trace": {"first_s": first, "again_s": again},
+        "first_s": first,
+        "again_s": again,
         "resolve_s": resolve,
-        "disk": disk,
+        "load_s": load,
         "bytes": {"held": transport.memory_bytes, **reads},
-        "coarse": coarse,
-        "times": times,
         "floor_s": floor,
-        "above_floor": both / floor,
-        "step_s": step,
-        "look_s": look,
-        "look_every": RESOLVE_EVERY,
-        "prb_spp": PRB_SPP,
-        "prb_step_s": prb,
-        "prb_bare_step_s": prb_bare,
-        "ratio": prb / step,
-        "ratio_bare": prb_bare / step,
-        "trace_in_prb_steps": again / prb,
+        "trace_in_prb_steps": again / median["prb step"],
         "adjointness": adjointness(transport),
         "kernels": compiled(lambda: gradient(transport.apply, env, weight)),
     }
+    return {"transport": [size | row], "transport-time": [size | line for line in spent]}
 
 
-def from_disk(lit, height: int, width: int, spp, repeats: int = 3) -> dict | None:
-    """Measure how long T takes from its file, which the system still has in memory.
+def from_disk(lit, height: int, width: int, spp, repeats: int = 3) -> float | None:
+    """Return the median seconds in which T comes from its file, which the system still has in memory.
 
-    Returns
-    -------
-    dict or None
-        ``load_s`` (median) and ``file_bytes``; None if T was not kept.
+    None if T was not kept.
     """
     with tempfile.TemporaryDirectory() as folder:
-        LightTransport.build(lit, height, width, spp=spp, memory_gb=2.0, folder=Path(folder))
+        build(lit, height, width, spp, Path(folder))
         taken = []
         for _ in range(repeats):
             gc.collect()
@@ -158,8 +139,7 @@ def from_disk(lit, height: int, width: int, spp, repeats: int = 3) -> dict | Non
                 return None
             taken.append(seconds)
             del built
-        size = sum(file.stat().st_size for file in Path(folder).iterdir())
-    return {"load_s": float(np.median(taken)), "file_bytes": size}
+    return float(np.median(taken))
 
 
 def build(lit, height: int, width: int, spp, folder: Path | None = None):
@@ -180,11 +160,9 @@ def gradient(render, env: mi.TensorXf, weight: mi.TensorXf):
     return dr.detach(picture), dr.grad(leaf)
 
 
-def bare_prb(file, parameters, pixels, sky, depth, weight):
+def bare_prb(settings, sky, depth, weight):
     """Return a function that renders and differentiates by prb under a map that was set once."""
-    lit = scene.load(
-        file, pixels, pixels, parameters, sampler="independent"
-    )  # its own: the other one's map is set at every step
+    lit = load_scene(settings)  # its own: the other one's map is set at every step
     leaf = mi.TensorXf(latlong.to_envmap_data(sky))
     dr.enable_grad(leaf)
     lit.params[lit.envmap_key] = leaf

@@ -2,7 +2,10 @@
 
 import numpy as np
 
+from envedit import config
+
 from . import mutate
+from .mutate import one_of
 
 WRITTEN = """\
 preset = "draft"
@@ -50,12 +53,15 @@ VALUES = (
     '[{ type = "blur" }]', '[{ type = "shadow", points = [[0, 0]], width = 1e9 }]', "[[1]]", "'../../etc'",
 )  # fmt: skip
 """What a value becomes."""
+ODD = (
+    "\0", "\x1b[31m", "\ufeff", "\u2028", "\udcff", "\udcc3(", "\x7f", "\x85", "\u202e", "\t", "\\", '"',
+    "\r",
+)  # fmt: skip
+"""What is put into a line."""
 
 
 def toml_files() -> dict[str, bytes]:
     """Return whole configurations: by hand, and presets and kinds with every key spelled out."""
-    from envedit import config
-
     files = {"written.toml": WRITTEN.encode()}
     for preset in config.preset_names():
         for kind in ("layers", "siren", "pixels"):
@@ -77,7 +83,7 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
         return mutate.mutated(data, rng)
     lines = data.decode().splitlines()
     for _ in range(mutate.few(rng)):
-        _LINES[rng.integers(len(_LINES))](lines, rng)
+        _damage(lines, rng.integers(11), rng)
     raw = "\n".join(lines).encode("utf-8", "surrogateescape")
     if rng.random() < 0.1:
         raw = raw.replace(b"\n", b"\r\n" if rng.random() < 0.5 else b"\r")
@@ -86,103 +92,64 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
 
 def _pick(lines, rng, equals=True):
     """Return the index of a line; of one with a key, if there is any."""
-    keyed = [i for i, line in enumerate(lines) if "=" in line] if equals else []
-    choices = keyed or range(len(lines) or 1)
     if not lines:
         lines.append("")
-    return choices[rng.integers(len(choices))]
+    keyed = [i for i, line in enumerate(lines) if "=" in line] if equals else []
+    return one_of(keyed or range(len(lines)), rng)
 
 
-def _long(rng):
-    return int(2 ** rng.uniform(5, 15))
+def _damage(lines, kind, rng):
+    """Change lines in one of nine ways, of which three numbers mean the first."""
+    match kind:
+        case 0 | 1 | 2:
+            at = _pick(lines, rng)
+            lines[at] = f"{lines[at].partition('=')[0]}= {one_of(VALUES, rng)}"
+        case 3:
+            one, other = _pick(lines, rng), _pick(lines, rng)
+            (a, _, b), (c, _, d) = lines[one].partition("="), lines[other].partition("=")
+            lines[one], lines[other] = f"{a}={d}", f"{c}={b}"
+        case 4:
+            at = _pick(lines, rng)
+            key, _, value = lines[at].partition("=")
+            keys = (
+                key[:-2], key.strip() * 2, value, key.upper(), "", f'"{key}"', "a.b", "'\t'", "é",
+                "input.width", "scene.parameters.x", "preset", '"\\u2028\\n"', f"{key.strip()}.more",
+            )  # fmt: skip
+            lines[at] = f"{one_of(keys, rng)}={value}"
+        case 5:
+            lines.insert(rng.integers(len(lines) + 1), lines[_pick(lines, rng, rng.random() < 0.5)])
+        case 6:
+            del lines[_pick(lines, rng, rng.random() < 0.5)]
+        case 7:
+            name = one_of([line for line in lines if line.startswith("[")] or ["[input]"], rng).strip("[]")
+            forms = (
+                f"[{name}]", f"[[{name}]]", f"[{name}.more]", f"[{name.upper()}]", "[]", "[", f"[{name}",
+                f"{name} = 1",
+            )  # fmt: skip
+            lines.insert(rng.integers(len(lines) + 1), one_of(forms, rng))
+        case 8 | 9:
+            at, count = _pick(lines, rng), int(2 ** rng.uniform(5, 15))
+            key = lines[at].partition("=")[0] or "a"
+            lines[at] = one_of((_deep if kind == 8 else _wide)(key, count), rng)
+        case 10:
+            at = _pick(lines, rng, False)
+            place = rng.integers(len(lines[at]) + 1)
+            lines[at] = lines[at][:place] + one_of(ODD, rng) + lines[at][place:]
 
 
-def _value(lines, rng):
-    at = _pick(lines, rng)
-    lines[at] = f"{lines[at].partition('=')[0]}= {VALUES[rng.integers(len(VALUES))]}"
-
-
-def _exchange(lines, rng):
-    one, other = _pick(lines, rng), _pick(lines, rng)
-    (a, _, b), (c, _, d) = lines[one].partition("="), lines[other].partition("=")
-    lines[one], lines[other] = f"{a}={d}", f"{c}={b}"
-
-
-def _key(lines, rng):
-    at = _pick(lines, rng)
-    key, _, value = lines[at].partition("=")
-    keys = (
-        key[:-2], key.strip() * 2, value, key.upper(), "", f'"{key}"', "a.b", "'\t'", "é", "input.width",
-        "scene.parameters.x", "preset", '"\\u2028\\n"', f"{key.strip()}.more",
-    )  # fmt: skip
-    lines[at] = f"{keys[rng.integers(len(keys))]}={value}"
-
-
-def _double(lines, rng):
-    lines.insert(rng.integers(len(lines) + 1), lines[_pick(lines, rng, rng.random() < 0.5)])
-
-
-def _remove(lines, rng):
-    del lines[_pick(lines, rng, rng.random() < 0.5)]
-
-
-def _table(lines, rng):
-    names = [line for line in lines if line.startswith("[")] or ["[input]"]
-    name = names[rng.integers(len(names))].strip("[]")
-    forms = (
-        f"[{name}]",
-        f"[[{name}]]",
-        f"[{name}.more]",
-        f"[{name.upper()}]",
-        "[]",
-        "[",
-        f"[{name}",
-        f"{name} = 1",
-    )
-    lines.insert(rng.integers(len(lines) + 1), forms[rng.integers(len(forms))])
-
-
-def _deep(lines, rng):
-    at, count = _pick(lines, rng), _long(rng)
-    key = lines[at].partition("=")[0] or "a"
-    forms = (
+def _deep(key, count):
+    """Return lines with arrays, tables and keys nested in one another."""
+    return (
         f"{key}= {'[' * count}{']' * count}", f"{key}= {'{a=' * count}1{'}' * count}", f"{'a.' * count}a = 1",
         f"[{'a.' * count}a]\n[{'a.' * count}a]", f"{key}= {'[' * count}", f'{key}{".b" * count} = {{}}',
     )  # fmt: skip
-    lines[at] = forms[rng.integers(len(forms))]
 
 
-def _wide(lines, rng):
-    at, count = _pick(lines, rng), _long(rng)
-    key = lines[at].partition("=")[0] or "a"
-    forms = (
+def _wide(key, count):
+    """Return lines with long numbers, names, arrays and tables."""
+    return (
         f"{key}= {'9' * count}", f"{key}= 0x{'f' * count}", f"{key}= 0.{'3' * count}", f"{'x' * count} = 1",
         f'{key}= "{"x" * count}"', f"{key}= [{'0, ' * count}]", f"{key}= {' ' * count}", "[[a]]\n" * count,
         f"{key}= 1e{'9' * count}", f"{key}= 1979-05-27T07:32:00.{'9' * count}Z", f"{key}= '{'/a' * count}'",
         f"{key}= {{{', '.join(f'k{i} = {i}' for i in range(count))}}}",
     )  # fmt: skip
-    lines[at] = forms[rng.integers(len(forms))]
-
-
-def _characters(lines, rng):
-    at = _pick(lines, rng, False)
-    odd = (
-        "\0",
-        "\x1b[31m",
-        "\ufeff",
-        "\u2028",
-        "\udcff",
-        "\udcc3(",
-        "\x7f",
-        "\x85",
-        "\u202e",
-        "\t",
-        "\\",
-        '"',
-        "\r",
-    )
-    place = rng.integers(len(lines[at]) + 1)
-    lines[at] = lines[at][:place] + odd[rng.integers(len(odd))] + lines[at][place:]
-
-
-_LINES = (_value, _value, _value, _exchange, _key, _double, _remove, _table, _deep, _wide, _characters)

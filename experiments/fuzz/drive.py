@@ -4,96 +4,21 @@ import contextlib
 import json
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import zlib
 from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
-from . import documents, headers, mutate, pictures, scenes, worker
+from . import headers, worker
+from .kinds import case, seeds
 
 ROOT = Path(__file__).parents[2]
 FAULTS = ("crashed", "hung", "traceback", "unclear", "wrong", "memory", "printed")
 """Outcomes that must not be; the others are "read" and "refused"."""
 WHOLE = -2
 """The index of a seed itself, which must be read."""
-
-
-@dataclass
-class Tally:
-    """How the cases of one kind went.
-
-    Attributes
-    ----------
-    counts : Counter
-        Cases by outcome.
-    kinds : Counter
-        Refusals by the name of the error.
-    peak : int
-        Most memory that a case took, bytes.
-    beyond : int
-        Most memory that a case took beyond the image that its file declares, bytes.
-    faults : list of (int, str, str)
-        Index, outcome and error of every case that went wrong.
-    """
-
-    counts: Counter = field(default_factory=Counter)
-    kinds: Counter = field(default_factory=Counter)
-    peak: int = 0
-    beyond: int = 0
-    faults: list = field(default_factory=list)
-
-    def add(self, index: int, answer: dict, declared: int) -> None:
-        """Count one case."""
-        outcome = answer["outcome"]
-        self.counts[outcome] += 1
-        if outcome == "refused":
-            self.kinds[answer["kind"]] += 1
-        self.peak = max(self.peak, answer.get("peak", 0))
-        self.beyond = max(self.beyond, answer.get("peak", 0) - declared)
-        if outcome in FAULTS:
-            self.faults.append((index, outcome, answer.get("error", "")))
-
-
-def seeds(what: str) -> list[tuple[str, bytes]]:
-    """Return the whole files of a kind, (name, content), in a fixed order."""
-    with tempfile.TemporaryDirectory() as folder:
-        made = {
-            "exr": lambda: pictures.exr_files(Path(folder)),
-            "hdr": pictures.hdr_files,
-            "toml": documents.toml_files,
-            "painted": lambda: pictures.painted_files(Path(folder)),
-            "weights": pictures.weight_files,
-            "checkpoint": lambda: pictures.checkpoint_files(Path(folder)),
-            "scene": scenes.scene_files,
-            "mesh": scenes.mesh_files,
-            "texture": lambda: pictures.painted_files(Path(folder)),
-            "entry": scenes.entry_files,
-            "state": scenes.state_files,
-        }[what]()
-    return sorted(made.items())
-
-
-def case(what: str, whole: list[tuple[str, bytes]], seed: int, index: int) -> tuple[str, bytes]:
-    """Return name and content of a damaged file: the same for the same seeds, kind, seed and index."""
-    rng = np.random.default_rng([seed, zlib.crc32(what.encode()), index])
-    name, data = whole[rng.integers(len(whole))]
-    return name, _MUTATED.get(what, mutate.mutated)(data, rng)
-
-
-_MUTATED = {
-    "toml": documents.mutated,
-    "scene": scenes.mutated_scene,
-    "entry": scenes.mutated_entry,
-    "state": scenes.mutated_state,
-}
-"""Damage of kinds that bytes alone would not reach."""
 
 
 class Worker:
@@ -126,12 +51,11 @@ class Worker:
         more = {"MALLOC_PERTURB_": "165", "MALLOC_MMAP_THRESHOLD_": "65536"}
         if self.heap_check:
             more |= {"LD_PRELOAD": self.heap_check, "MALLOC_CHECK_": "3"}
-        path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         self.printed = tempfile.TemporaryFile()  # noqa: SIM115 it lives as long as the process
         self.process = subprocess.Popen(
             [sys.executable, "-X", "faulthandler", "-m", "experiments.fuzz.worker", self.reader],
             cwd=ROOT,
-            env=os.environ | more | {"PYTHONPATH": path},
+            env=os.environ | more,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self.printed,
@@ -169,70 +93,59 @@ class Worker:
         said = self.printed.read().decode(errors="replace")
         self.stop()
         if code == -signal.SIGPROF:
-            return {
-                "outcome": "hung",
-                "error": f"{seconds:g} s of processor time\n{said}",
-            }
+            return {"outcome": "hung", "error": f"{seconds:g} s of processor time\n{said}"}
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         return {"outcome": "crashed", "error": f"{name}\n{said}"}
 
 
-def fuzz(
-    what: str,
-    indices,
-    seed: int = 0,
-    keep: Path | None = None,
-    reader: str = "",
-    heap_check: str = "",
-    tick=lambda: None,
-) -> Tally:
-    """Read many damaged files of one kind.
+def piece(
+    settings, folder, what: str, first: int, count: int, heap_check: str = "", reader: str = ""
+) -> dict:
+    """Read damaged files of one kind; those that go wrong, and why, are kept in ``folder``.
 
-    Every worker reads all whole files first; one that is not read is a fault, of index ``WHOLE``.
+    Every worker reads all whole files first; one that is not read is a fault as well.
 
     Parameters
     ----------
+    settings : Config
+        Its seed is that of the damage.
     what : str
-        One of ``readers.READERS``.
-    indices : iterable of int
-        Which cases; case i of a seed is the same file whichever others are made.
-    seed : int
-        Of the damage.
-    keep : Path, optional
-        Folder that receives the files that went wrong, and what went wrong with them.
-    reader : str
-        A reader in place of that of ``what``; see :mod:`.worker`.
-    heap_check : str
-        As for :class:`Worker`.
-    tick : callable
-        Called after every case.
+        One of ``kinds.KINDS``.
+    first, count : int
+        Which files; file i of a seed is the same whichever others are made.
+    heap_check, reader : str
+        As for :class:`Worker`; the reader in place of that of ``what``.
 
     Returns
     -------
-    Tally
+    dict
+        ``counts``: files by outcome; ``errors``: refusals by the name of the error; ``beyond``: the most
+        memory that a file took beyond the image that it declares, bytes; ``faults``: [index, outcome, error]
+        of every file that went wrong.
     """
-    tally, whole = Tally(), seeds(what)
-    with tempfile.TemporaryDirectory() as folder, Worker(reader or what, heap_check) as process:
+    counts, errors, beyond, faults, whole = Counter(), Counter(), 0, [], seeds(what)
+    with tempfile.TemporaryDirectory() as work, Worker(reader or what, heap_check) as process:
 
-        def one(name, data, index):
-            if process.process is None and index != WHOLE:
-                for warm, raw in whole:  # a reader's first call takes memory that later ones do not
-                    one(warm, raw, WHOLE)
-            (path := Path(folder) / name).write_bytes(data)
-            declared = headers.declared(data)
-            answer = process.read(path, index, declared, limited=index != WHOLE)
-            if index == WHOLE:
-                if answer["outcome"] != "read" and not name.startswith("deep"):
-                    tally.faults.append((index, answer["outcome"], f"{name}: {answer.get('error', '')}"))
-                return
-            tally.add(index, answer, declared)
-            if keep and answer["outcome"] in FAULTS:
-                kept = keep / f"{what}-{seed}-{index}-{answer['outcome']}-{name}"
-                keep.mkdir(parents=True, exist_ok=True)
-                shutil.copy(path, kept) if path.exists() else kept.write_bytes(data)
-                kept.with_name(kept.name + ".txt").write_text(answer.get("error", ""), errors="replace")
+        def read(name, data, index):
+            (path := Path(work) / name).write_bytes(data)
+            return process.read(path, index, headers.declared(data), limited=index != WHOLE)
 
-        for index in indices:
-            one(*case(what, whole, seed, index), index)
-            tick()
-    return tally
+        for index in range(first, first + count):
+            if process.process is None:  # a reader's first call takes memory that later ones do not
+                for name, data in whole:
+                    answer = read(name, data, WHOLE)
+                    if answer["outcome"] != "read" and not name.startswith("deep"):
+                        faults.append((name, answer["outcome"], answer.get("error", "")))
+            name, data = case(what, whole, settings.seed, index)
+            answer = read(name, data, index)
+            outcome, error = answer["outcome"], answer.get("error", "")
+            counts[outcome] += 1
+            if outcome == "refused":
+                errors[answer["kind"]] += 1
+            beyond = max(beyond, answer.get("peak", 0) - headers.declared(data))
+            if outcome in FAULTS:
+                faults.append((index, outcome, error))
+                kept = folder / f"{index}-{outcome}-{name}"
+                kept.write_bytes(data)
+                kept.with_name(kept.name + ".txt").write_text(error, errors="replace")
+    return {"counts": counts, "errors": errors, "beyond": beyond, "faults": faults}

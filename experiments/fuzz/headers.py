@@ -4,8 +4,10 @@ Apart from the readers under test, so that neither inherits the other's mistakes
 damaged file: what cannot be followed is left out.
 """
 
+import itertools
 import re
 import struct
+from collections import Counter
 from typing import NamedTuple
 
 _MOST_SITES = 4000
@@ -19,6 +21,11 @@ class Site(NamedTuple):
     offset: int
     size: int
     order: str = "little"
+
+
+def _row(at, count, size=1):
+    """Return numbers that follow one another."""
+    return [Site(at + i * size, size) for i in range(count)]
 
 
 # ---- OpenEXR -----------------------------------------------------------------------------------------------
@@ -46,47 +53,41 @@ def _exr_attributes(data):
         at = stop + 5 + length
 
 
-_EXR_NUMBERS = {
-    b"box2i": 4,
-    b"int": 4,
-    b"v2i": 4,
-    b"tiledesc": 4,
-    b"float": 4,
-    b"v2f": 4,
-    b"chromaticities": 4,
-}
+_EXR_NUMBERS = b"box2i", b"int", b"v2i", b"tiledesc", b"float", b"v2f", b"chromaticities"
+"""Types of attributes that are numbers of four bytes."""
+
+
+def _exr_channels(data, at, length):
+    """Yield where the names of the channels of a list end."""
+    place = at
+    while place < at + length and (end := data.find(b"\0", place, place + 256)) > place:
+        yield end
+        place = end + 17
 
 
 def _exr_sites(data):
-    sites = [Site(4, 1), Site(5, 1)]
+    sites = _row(4, 2)
     for name, kind, at, length, _ in _exr_attributes(data):
         if not name:  # the table of offsets follows, and the chunks that it points to
             table = [Site(i, 8) for i in range(at, min(at + 8 * 24, len(data) - 8), 8)]
             for entry in table:
                 (place,) = struct.unpack_from("<Q", data, entry.offset)
-                if place + 20 <= len(data):
-                    sites += [Site(place + i, 4) for i in range(0, 20, 4)]
+                sites += _row(place, 5, 4) if place + 20 <= len(data) else []
             return sites + table
         sites.append(Site(at, 4))
-        value = at + 4
-        if step := _EXR_NUMBERS.get(kind):
-            sites += [Site(value + i, step) for i in range(0, min(length, 64), step)]
+        if kind in _EXR_NUMBERS:
+            sites += _row(at + 4, -(-min(length, 64) // 4), 4)
         elif kind == b"chlist":
-            while value < at + 4 + length and (end := data.find(b"\0", value, value + 256)) > value:
-                sites += [Site(end + i, 4) for i in (1, 5, 9, 13)]
-                value = end + 17
+            sites += [Site(end + i, 4) for end in _exr_channels(data, at + 4, length) for i in (1, 5, 9, 13)]
         elif length <= 4:
-            sites += [Site(value + i, 1) for i in range(length)]
+            sites += _row(at + 4, length)
     return sites
 
 
 def _area(width, height):
     """Return the texels of an image; 0 if it is to be refused before memory is asked for."""
-    return (
-        width * height
-        if 0 < min(width, height) <= max(width, height) <= MOST_SIDE and width * height <= MOST_TEXELS
-        else 0
-    )
+    accepted = 0 < min(width, height) <= max(width, height) <= MOST_SIDE and width * height <= MOST_TEXELS
+    return width * height if accepted else 0
 
 
 def _box(data, at):
@@ -98,21 +99,17 @@ def _box(data, at):
 
 def _exr_declared(data):
     """Sum, over the parts, what data window, display window and one tile take in float32."""
-    parts = {}
+    channels, areas, display = Counter(), Counter(), {}
     for name, kind, at, length, part in _exr_attributes(data):
-        found = parts.setdefault(part, {"channels": 0, "areas": 0, "display": 0})
         if kind == b"chlist":
-            value = at + 4
-            while value < at + 4 + length and (end := data.find(b"\0", value, value + 256)) > value:
-                found["channels"] += 1
-                value = end + 17
+            channels[part] += len(list(_exr_channels(data, at + 4, length)))
         elif name == b"dataWindow":
-            found["areas"] += _box(data, at + 4)
+            areas[part] += _box(data, at + 4)
         elif name == b"displayWindow":
-            found["display"] = 16 * _box(data, at + 4)
-    if sum(p["areas"] for p in parts.values()) > MOST_TEXELS:
+            display[part] = 16 * _box(data, at + 4)
+    if areas.total() > MOST_TEXELS:
         return 0
-    return sum(p["display"] + 4 * max(p["channels"], 3) * p["areas"] for p in parts.values())
+    return sum(display.values()) + sum(4 * max(channels[part], 3) * area for part, area in areas.items())
 
 
 # ---- the others --------------------------------------------------------------------------------------------
@@ -120,10 +117,10 @@ def _exr_declared(data):
 
 def _hdr_sites(data):
     line = re.search(rb"\n\n([^\n]*)\n", data[:4096])
-    numbers = [Site(m.start(1), 0) for m in re.finditer(rb"(\d+)", data[: line.end()])] if line else []
-    size = [s for s in numbers if s.offset > line.start()] if line else []
-    rows = [m.start() for m in re.finditer(rb"\x02\x02", data)][:64]
-    return 4 * size + numbers + [Site(at, 1) for start in rows for at in range(start, start + 6)]
+    numbers = _digits(data, 0, line.end()) if line else []
+    size = [site for site in numbers if site.offset > line.start()]
+    rows = [found.start() for found in re.finditer(rb"\x02\x02", data)][:64]
+    return 4 * size + numbers + [site for row in rows for site in _row(row, 6)]
 
 
 def _hdr_declared(data):
@@ -131,9 +128,9 @@ def _hdr_declared(data):
     return 12 * _area(int(found[1]), int(found[2])) if found else 0
 
 
-def _png_chunks(data):
-    """Yield (offset, length, kind) of the chunks of a PNG."""
-    at = 8
+def png_chunks(data: bytes):
+    """Yield (offset, length, kind) of the chunks of a PNG; none of anything else."""
+    at = 8 if data.startswith(b"\x89PNG") else len(data)
     while at + 12 <= len(data):
         length = int.from_bytes(data[at : at + 4], "big")
         yield at, length, data[at + 4 : at + 8]
@@ -141,16 +138,14 @@ def _png_chunks(data):
 
 
 def _png_sites(data):
-    sites = [Site(16, 4, "big"), Site(20, 4, "big"), *(Site(at, 1) for at in range(24, 29))]
-    for at, length, _ in _png_chunks(data):
-        sites += [Site(at, 4, "big"), Site(at + 4, 4, "big")]
-        sites += [Site(at + 8 + i, 1) for i in range(min(length, 32))]
+    sites = [Site(16, 4, "big"), Site(20, 4, "big"), *_row(24, 5)]
+    for at, length, _ in png_chunks(data):
+        sites += [Site(at, 4, "big"), Site(at + 4, 4, "big"), *_row(at + 8, min(length, 32))]
     return sites
 
 
 def _png_declared(data):
-    width, height = struct.unpack_from(">2I", data.ljust(24, b"\0"), 16)
-    return 12 * _area(width, height)
+    return 12 * _area(*struct.unpack_from(">2I", data.ljust(24, b"\0"), 16))
 
 
 def _jpeg_segments(data):
@@ -167,46 +162,48 @@ def _jpeg_segments(data):
 def _jpeg_sites(data):
     sites = []
     for at, length, marker in _jpeg_segments(data):
-        sites += [Site(at + 1, 1), Site(at + 2, 2, "big")]
-        sites += [Site(at + 4 + i, 1) for i in range(min(length, 24))]
+        sites += [Site(at + 1, 1), Site(at + 2, 2, "big"), *_row(at + 4, min(length, 24))]
         if 0xC0 <= marker <= 0xCF:
             sites += 4 * [Site(at + 5, 2, "big"), Site(at + 7, 2, "big")]
     return sites
 
 
 def _jpeg_declared(data):
-    areas = [0]
-    for at, _, marker in _jpeg_segments(data):
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and at + 9 <= len(data):
-            height, width = struct.unpack_from(">2H", data, at + 5)
-            areas.append(_area(width, height))
-    return 12 * max(areas)
+    frames = [
+        struct.unpack_from(">2H", data, at + 5)
+        for at, _, marker in _jpeg_segments(data)
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and at + 9 <= len(data)
+    ]
+    return 12 * max((_area(*frame) for frame in frames), default=0)
+
+
+_ZIP = (
+    (b"PK\x03\x04", (2, 2, 2, 2, 2, 4, 4, 4, 2, 2)),
+    (b"PK\x01\x02", (2, 2, 2, 2, 2, 2, 4, 4, 4, 2, 2, 2, 2, 2, 4, 4)),
+    (b"PK\x05\x06", (2, 2, 2, 2, 4, 4, 2)),
+)
+"""Sizes of the numbers of a local header, of an entry of the central directory, and of its end."""
 
 
 def _zip_sites(data):
-    """Return the numbers of the local headers, the central directory and its end, and of npy headers."""
+    """Return the numbers of the archive's headers, and of the npy headers in it."""
     sites = []
-    for magic, sizes in (
-        (b"PK\x03\x04", (2, 2, 2, 2, 2, 4, 4, 4, 2, 2)),
-        (b"PK\x01\x02", (2, 2, 2, 2, 2, 2, 4, 4, 4, 2, 2, 2, 2, 2, 4, 4)),
-        (b"PK\x05\x06", (2, 2, 2, 2, 4, 4, 2)),
-    ):
+    for magic, sizes in _ZIP:
         for found in re.finditer(re.escape(magic), data):
-            at = found.end()
-            for size in sizes:
-                sites.append(Site(at, size))
-                at += size
+            sites += map(Site, itertools.accumulate(sizes, initial=found.end()), sizes)
     for found in re.finditer(rb"\x93NUMPY", data):
-        sites += [Site(found.end(), 1), Site(found.end() + 1, 1), Site(found.end() + 2, 2)]
-        digits = re.finditer(rb"\d+", data[found.end() : found.end() + 118])
-        sites += [Site(found.end() + digit.start(), 0) for digit in digits]
+        sites += [*_row(found.end(), 2), Site(found.end() + 2, 2)]
+        sites += _digits(data, found.end(), 118)
     return sites
 
 
 def _safetensors_sites(data):
     length = int.from_bytes(data[:8], "little")
-    numbers = re.finditer(rb"\d+", data[8 : 8 + min(length, 1 << 20)])
-    return 8 * [Site(0, 8)] + [Site(8 + number.start(), 0) for number in numbers]
+    return 8 * [Site(0, 8)] + _digits(data, 8, min(length, 1 << 20))
+
+
+def _digits(data, start, length):
+    return [Site(start + found.start(), 0) for found in re.finditer(rb"\d+", data[start : start + length])]
 
 
 _KINDS = (
@@ -230,12 +227,4 @@ def declared(data: bytes) -> int:
 
     An image larger than the readers accept counts as 0: it is to be refused before memory is asked for.
     """
-    for magic, _, found in _KINDS:
-        if data.startswith(magic):
-            return found(data)
-    return len(data)
-
-
-def png_chunks(data: bytes) -> list[tuple[int, int, bytes]]:
-    """Return (offset, length, kind) of the chunks of a PNG; none of anything else."""
-    return list(_png_chunks(data)) if data.startswith(b"\x89PNG") else []
+    return next((found(data) for magic, _, found in _KINDS if data.startswith(magic)), len(data))

@@ -2,11 +2,20 @@
 
 import base64
 import io
+import itertools
+import json
 import struct
+import tempfile
 import zlib
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
+import OpenEXR
+
+from envedit.images import images
+from envedit.solve import checkpoint
+from envedit.solve.adam_loop import State
 
 SIZE = 16, 32
 """Rows and columns of every picture: a lat-long map, two chunks of most compressions."""
@@ -47,57 +56,51 @@ def codes(channels=3) -> np.ndarray:
 # ---- OpenEXR -----------------------------------------------------------------------------------------------
 
 
-def exr_files(folder: Path) -> dict[str, bytes]:
+def exr_files() -> dict[str, bytes]:
     """Write OpenEXR files: every compression, tiles, halves, parts, layers, grey, windows, deep data."""
-    import OpenEXR
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        images.write_exr(folder / "ours.exr", radiance(), {"source": "sky.hdr", "seed": 3, "gamma": 0.5})
+        for name, parts in _exr_parts().items():
+            parts.write(str(folder / f"{name}.exr"))
+        return {file.name: file.read_bytes() for file in folder.iterdir()}
 
-    from envedit.images import images
 
+def _exr_parts():
     full = {c: np.ascontiguousarray(radiance()[..., i]) for i, c in enumerate("RGB")}
     half = {c: v.astype(np.float16) for c, v in full.items()}
-    scan, tiled = OpenEXR.scanlineimage, OpenEXR.tiledimage
+    scan, tiled, zips = OpenEXR.scanlineimage, OpenEXR.tiledimage, OpenEXR.ZIPS_COMPRESSION
     tiles = OpenEXR.TileDescription()
     tiles.xSize, tiles.ySize = 16, 8
 
     def header(kind=scan, compression=OpenEXR.ZIP_COMPRESSION, **more):
-        return {
-            "type": kind,
-            "compression": compression,
-            **more,
-            **({"tiles": tiles} if kind == tiled else {}),
-        }
+        more |= {"tiles": tiles} if kind == tiled else {}
+        return {"type": kind, "compression": compression, **more}
 
-    files = {}
-
-    def keep(name, parts):
-        parts.write(str(folder / "seed.exr"))
-        files[name + ".exr"] = (folder / "seed.exr").read_bytes()
-
-    images.write_exr(folder / "ours.exr", radiance(), {"source": "sky.hdr", "seed": 3, "gamma": 0.5})
-    files["ours.exr"] = (folder / "ours.exr").read_bytes()
-    methods = [name for name in sorted(dir(OpenEXR)) if name.endswith("_COMPRESSION")]
-    for method in methods:  # whatever this OpenEXR has
-        for kind, named in ((scan, "lines"), (tiled, "tiles")):
-            for planes, bits in ((full, "float"), (half, "half")):
-                if kind == scan or bits == "half":
-                    made = OpenEXR.File(header(kind, getattr(OpenEXR, method)), dict(planes))
-                    keep(f"{method.removesuffix('_COMPRESSION').lower()}-{named}-{bits}", made)
-    keep("alpha", OpenEXR.File(header(), half | {"A": half["R"]}))
-    keep("grey", OpenEXR.File(header(), {"Y": full["G"]}))
-    keep("layers", OpenEXR.File(header(), {f"{k}.{c}": v for k in ("a", "beauty") for c, v in half.items()}))
-    keep("uint", OpenEXR.File(header(), {c: v.astype(np.uint32) for c, v in full.items()}))
+    made, forms = {}, {"lines-float": (scan, full), "lines-half": (scan, half), "tiles-half": (tiled, half)}
+    for method in (name for name in dir(OpenEXR) if name.endswith("_COMPRESSION")):  # of this OpenEXR
+        for form, (kind, planes) in forms.items():
+            name = f"{method.removesuffix('_COMPRESSION').lower()}-{form}"
+            made[name] = OpenEXR.File(header(kind, getattr(OpenEXR, method)), dict(planes))
+    layers = {f"{layer}.{c}": v for layer in ("a", "beauty") for c, v in half.items()}
+    uint = {c: v.astype(np.uint32) for c, v in full.items()}
     windows = {"dataWindow": ((2, 1), (33, 16)), "displayWindow": ((0, 0), (31, 15))}
-    keep("window", OpenEXR.File(header(**windows), dict(half)))
-    parts = [OpenEXR.Part(header(), {"Z": full["R"]}, "depth"), OpenEXR.Part(header(), dict(half), "colour")]
-    keep("parts", OpenEXR.File(parts))
+    depth = OpenEXR.Part(header(), {"Z": full["R"]}, "depth")
+    colour = OpenEXR.Part(header(), dict(half), "colour")
     parts = [OpenEXR.Part(header(kind), dict(half), name) for kind, name in ((tiled, "a"), (scan, "b"))]
-    keep("parts-tiled", OpenEXR.File(parts))
     deep = np.empty(SIZE, object)
     for place in np.ndindex(*SIZE):
         deep[place] = np.full(sum(place) % 3, 0.5, np.float32)
-    zips = OpenEXR.ZIPS_COMPRESSION
-    keep("deep", OpenEXR.File(header(OpenEXR.deepscanline, zips), {c: deep for c in "RGB"}))
-    return files
+    return made | {
+        "alpha": OpenEXR.File(header(), half | {"A": half["R"]}),
+        "grey": OpenEXR.File(header(), {"Y": full["G"]}),
+        "layers": OpenEXR.File(header(), layers),
+        "uint": OpenEXR.File(header(), uint),
+        "window": OpenEXR.File(header(**windows), dict(half)),
+        "parts": OpenEXR.File([depth, colour]),
+        "parts-tiled": OpenEXR.File(parts),
+        "deep": OpenEXR.File(header(OpenEXR.deepscanline, zips), {c: deep for c in "RGB"}),
+    }
 
 
 # ---- Radiance ----------------------------------------------------------------------------------------------
@@ -115,33 +118,26 @@ def hdr_files() -> dict[str, bytes]:
     """Make Radiance files: run lengths new and old, flat pixels, other headers."""
     pixels = shared_exponent()
     rows, columns = SIZE
-    new = bytearray()
+    new, old = bytearray(), bytearray()
     for row in pixels:
         new += bytes([2, 2, columns >> 8, columns & 255])
-        for band in row.T:
-            for part in (band[:20], band[20:]):
-                same = (part == part[0]).all()
-                new += bytes([128 + len(part), part[0]]) if same else bytes([len(part)]) + part.tobytes()
-    old, flat = bytearray(), pixels.reshape(-1, 4)
-    at = 0
-    while at < len(flat):
-        run = 1
-        while at + run < len(flat) and (flat[at + run] == flat[at]).all():
-            run += 1
-        old += flat[at].tobytes()
-        repeats = run - 1
+        for part in (part for band in row.T for part in (band[:20], band[20:])):
+            same = (part == part[0]).all()
+            new += bytes([128 + len(part), part[0]]) if same else bytes([len(part)]) + part.tobytes()
+    for pixel, run in itertools.groupby(pixels.reshape(-1, 4).tolist()):
+        old += bytes(pixel)
+        repeats = len(list(run)) - 1
         while repeats:  # digits of base 256, the lowest first
             old += bytes([1, 1, 1, repeats & 255])
             repeats >>= 8
-        at += run
     plain = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n"
     talkative = plain + "# made by hand\nSOFTWARE= a program\nEXPOSURE= 1.0\nCOLORCORR=1 1 1\nVIEW= -vta\n"
     size = f"\n-Y {rows} +X {columns}\n"
     return {
-        "new.hdr": (plain + size).encode() + bytes(new),
-        "old.hdr": (plain + size).encode() + bytes(old),
+        "new.hdr": (plain + size).encode() + new,
+        "old.hdr": (plain + size).encode() + old,
         "flat.hdr": (plain + size).encode() + pixels.tobytes(),
-        "header.hdr": (talkative + size).encode() + bytes(new),
+        "header.hdr": (talkative + size).encode() + new,
     }
 
 
@@ -163,10 +159,8 @@ def png(pixels, colour: int, extra: bytes = b"", palette: bytes = b"") -> bytes:
     return b"\x89PNG\r\n\x1a\n" + body
 
 
-def painted_files(folder: Path) -> dict[str, bytes]:
+def painted_files() -> dict[str, bytes]:
     """Make painted pictures: PNG of every colour type with the chunks that are read, and others."""
-    import mitsuba as mi
-
     squeezed = zlib.compress("Ärger".encode() * 9)
     texts = chunk(b"tEXt", b"envedit.tonemap\0gamma") + chunk(b"zTXt", b"note\0\0" + squeezed)
     texts += chunk(b"iTXt", b"title\0\1\0de\0\0" + squeezed)
@@ -189,7 +183,7 @@ def painted_files(folder: Path) -> dict[str, bytes]:
         marked = b"\xff\xe1" + struct.pack(">H", len(exif) + 8) + b"Exif\0\0" + exif
         files[f"q{quality}.jpg"] = raw[:2] + (marked if quality == 95 else b"") + raw[2:]
     files["progressive.jpg"] = base64.b64decode(_PROGRESSIVE)
-    float_files = exr_files(folder) | hdr_files()
+    float_files = exr_files() | hdr_files()
     return files | {name: float_files[name] for name in ("alpha.exr", "ours.exr", "new.hdr")}
 
 
@@ -207,8 +201,6 @@ def tensors() -> dict[str, np.ndarray]:
 
 def weight_files() -> dict[str, bytes]:
     """Make files of weights: npz stored and compressed, safetensors of three precisions."""
-    import json
-
     files = {}
     for save in (np.savez, np.savez_compressed):
         stream = io.BytesIO()
@@ -217,20 +209,24 @@ def weight_files() -> dict[str, bytes]:
     for kind, dtype in (("F16", "<f2"), ("F32", "<f4"), ("F64", "<f8")):
         entries, data = {"__metadata__": {"format": "pt"}}, b""
         for name, values in tensors().items():
-            raw = values.astype(dtype).tobytes()
-            place = [len(data), len(data) + len(raw)]
+            start = len(data)
+            data += values.astype(dtype).tobytes()
+            place = [start, len(data)]
             entries[name] = {"dtype": kind, "shape": list(values.shape), "data_offsets": place}
-            data += raw
         text = json.dumps(entries).encode()
         files[f"{kind}.safetensors"] = struct.pack("<Q", len(text)) + text + data
     return files
 
 
-def checkpoint_files(folder: Path) -> dict[str, bytes]:
+def checkpoint_files() -> dict[str, bytes]:
     """Write a checkpoint as a run does."""
-    from envedit.solve import adam_loop, checkpoint
-
-    state = adam_loop.State(2, history=[{"iteration": 0, "loss": 0.5}, {"iteration": 1, "loss": 0.25}])
+    state = State(2, history=[{"iteration": 0, "loss": 0.5}, {"iteration": 1, "loss": 0.25}])
     optimiser = {"step": np.int64(2), "params/gain": radiance()[:4, :8, 0]}
-    checkpoint.save(folder, "what", state, optimiser, {"columns": np.arange(5)}, radiance()[:8])
-    return {checkpoint.NAME: (folder / checkpoint.NAME).read_bytes()}
+    return saved(state, optimiser, {"columns": np.arange(5)}, radiance()[:8])
+
+
+def saved(state: State, optimiser: dict, renderer: dict, target: np.ndarray) -> dict[str, bytes]:
+    """Return a checkpoint as a file of its name."""
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint.save(Path(folder), "what", state, optimiser, renderer, target)
+        return {checkpoint.NAME: (Path(folder) / checkpoint.NAME).read_bytes()}

@@ -9,9 +9,16 @@ import tempfile
 import zlib
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
-from . import documents
+from envedit.core import array_cache
+from envedit.scene import scene
+from envedit.solve.adam_loop import State
+from envedit.transport.light_transport import LightTransport
+
+from . import documents, pictures
+from .mutate import one_of
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/>
 <transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>
@@ -73,55 +80,43 @@ def mesh_files() -> dict[str, bytes]:
     lines = ["v {} {} {}".format(*p) for p in POINTS] + ["f {} {} {}".format(*f) for f in FACES + 1]
     files["a.obj"] = "\n".join([*lines, ""]).encode()
     values = np.linspace(0, 1, 8, dtype="<f4").tobytes()
-    files["a.vol"] = (
-        b"VOL\3" + struct.pack("<5i", 1, 2, 2, 2, 1) + struct.pack("<6f", 0, 0, 0, 1, 1, 1) + values
-    )
+    head = b"VOL\3" + struct.pack("<5i6f", 1, 2, 2, 2, 1, 0, 0, 0, 1, 1, 1)
+    files["a.vol"] = head + values
     return files
 
 
 @functools.cache
-def _world():
-    """Return a scene, a transport of it, and the folder of its cache."""
-    import mitsuba as mi
-
+def world():
+    """Return a function that takes a light transport from its cache or traces it anew, and one of it."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    from envedit.scene import scene
-
     folder = Path(tempfile.mkdtemp())
     (folder / "scene.xml").write_text(WRITTEN)
     lit = scene.load(folder / "scene.xml")
-    return lit, built(lit, folder), folder
+    build = functools.partial(LightTransport.build, lit, 8, 16, spp=16, max_depth=3, folder=folder / "cache")
+    return build, build()
 
 
-def built(lit, folder):
-    from envedit.transport.light_transport import LightTransport
-
-    return LightTransport.build(lit, 8, 16, spp=16, max_depth=3, folder=folder / "cache")
+def recording() -> Path:
+    """Return the file of the light transport's recording in its cache."""
+    cache, key = world()[1]._stored
+    return cache._path(key | {"part": "recording"})
 
 
 def entry_files() -> dict[str, bytes]:
     """Return the entry of a light transport."""
-    _, transport, _ = _world()
-    cache, key = transport._stored
-    return {"recording.arrays": cache._path(key | {"part": "recording"}).read_bytes()}
+    return {"recording.arrays": recording().read_bytes()}
 
 
 def state_files() -> dict[str, bytes]:
     """Return the checkpoint of a run through a light transport."""
-    from envedit.solve import checkpoint
-    from envedit.solve.adam_loop import State
-
     state = State(step=2, history=[{"iteration": 0, "loss": 1.0, "step_ms": 3.0}])
-    optimiser = {"step": np.int64(2)} | {
-        f"{part}/a": np.ones((4, 3), np.float32) for part in ("params", "before", "m", "v")
-    }
+    parts = ("params", "before", "m", "v")
+    optimiser = {"step": np.int64(2)} | {f"{part}/a": np.ones((4, 3), np.float32) for part in parts}
     looks = np.zeros(8 * 16, np.uint8)
     renderer = {"columns": np.array([3, 9]), "paths": np.array([8, 48]), "looks": looks}
     renderer |= {"bright": np.array([3]), "epoch": np.int64(0)}
-    with tempfile.TemporaryDirectory() as folder:
-        checkpoint.save(Path(folder), "what", state, optimiser, renderer, np.ones((6, 8, 3), np.float32))
-        return {checkpoint.NAME: (Path(folder) / checkpoint.NAME).read_bytes()}
+    return pictures.saved(state, optimiser, renderer, np.ones((6, 8, 3), np.float32))
 
 
 # ---- damage ------------------------------------------------------------------------------------------------
@@ -135,8 +130,7 @@ def mutated_scene(data: bytes, rng: np.random.Generator) -> bytes:
         word = str((NAMES, VALUES)[rng.integers(2)][rng.integers(min(len(NAMES), len(VALUES)))])
         match rng.integers(8):
             case 0:
-                quoted = re.sub(r'"[^"]*"', lambda _, w=word: f'"{w}"', tags[i], count=1)
-                tags[i] = quoted
+                tags[i] = re.sub(r'"[^"]*"', lambda _, w=word: f'"{w}"', tags[i], count=1)
             case 1:
                 tags[i] = re.sub(r"<\w+", lambda _, w=word: f"<{w}", tags[i])
             case 2:
@@ -150,11 +144,10 @@ def mutated_scene(data: bytes, rng: np.random.Generator) -> bytes:
                 tags.insert(i, '<bsdf type="twosided">' * depth + "</bsdf>" * depth)
             case 6:
                 tags.insert(i, word * int(2 ** rng.uniform(0, 12)))
-            case 7:
-                values = "".join(
-                    f'<default name="a{k + 1}" value="$a{k}$a{k}"/>' for k in range(rng.integers(40))
-                )
-                tags.insert(i, f'<default name="a0" value="{word}"/>{values}<include filename="{word}"/>')
+            case 7:  # defaults that double
+                names = [f'<default name="a{k + 1}" value="$a{k}$a{k}"/>' for k in range(rng.integers(40))]
+                first, include = f'<default name="a0" value="{word}"/>', f'<include filename="{word}"/>'
+                tags.insert(i, first + "".join(names) + include)
     return "".join(tags).encode("utf-8", "replace")
 
 
@@ -172,14 +165,12 @@ def _odd(array, rng):
     raw = np.atleast_1d(array).copy()
     words = raw.reshape(-1).view(np.uint32) if raw.nbytes % 4 == 0 else raw.reshape(-1).view(np.uint8)
     for _ in range(int(rng.integers(1, 4)) if words.size else 0):
-        words[rng.integers(words.size)] = bits[rng.integers(len(bits))] % 2 ** (8 * words.itemsize)
+        words[rng.integers(words.size)] = one_of(bits, rng) % 2 ** (8 * words.itemsize)
     return raw.reshape(array.shape)
 
 
 def mutated_entry(data: bytes, rng: np.random.Generator) -> bytes:
     """Change the arrays of a cache entry, and make the digests right again."""
-    from envedit.core import array_cache
-
     length = int.from_bytes(data[8:16], "little")
     text = json.loads(data[array_cache._START : array_cache._START + length])["key"]
     with tempfile.TemporaryDirectory() as folder:
@@ -199,7 +190,7 @@ def mutated_state(data: bytes, rng: np.random.Generator) -> bytes:
     meta = json.loads(arrays.pop("meta").tobytes())
     if rng.random() < 0.3:
         values = (-1, 2**70, "2", None, [], {}, 0.5, 1e400, True, [5], [{}])
-        meta["state"][str(rng.choice(list(meta["state"])))] = values[rng.integers(len(values))]
+        meta["state"][str(rng.choice(list(meta["state"])))] = one_of(values, rng)
     else:
         arrays = _some_odd(arrays, rng)
     out = io.BytesIO()
@@ -215,80 +206,3 @@ def _some_odd(arrays, rng):
         else:
             arrays[name] = _odd(arrays[name], rng)
     return arrays or {"nothing": np.zeros(0)}
-
-
-# ---- readers -----------------------------------------------------------------------------------------------
-
-
-def read_scene(path: Path, index: int) -> None:
-    """Load a scene."""
-    from envedit.scene import scene
-
-    _named(path, lambda: scene.load(path))
-
-
-def read_mesh(path: Path, index: int) -> None:
-    """Load a scene with a mesh or a volume."""
-    from envedit.scene import scene
-
-    kind = {".ply": "ply", ".obj": "obj", ".serialized": "serialized", ".vol": "gridvolume"}[path.suffix]
-    file = f'<string name="filename" value="{path}"/>'
-    shape = f'<shape type="{kind}">{file}</shape>'
-    if kind == "gridvolume":
-        volume = f'<volume type="gridvolume" name="sigma_t">{file}</volume>'
-        shape = f'<shape type="cube"><medium type="heterogeneous" name="interior">{volume}</medium></shape>'
-    outer = path.with_name("outer.xml")
-    outer.write_text(f'<scene version="3.0.0">{SENSOR}<emitter type="constant"/>{shape}</scene>')
-    _named(path, lambda: scene.load(outer))
-
-
-def read_texture(path: Path, index: int) -> None:
-    """Load a scene with a texture."""
-    from envedit.scene import scene
-
-    file = f'<string name="filename" value="{path}"/>'
-    texture = f'<texture type="bitmap" name="reflectance">{file}</texture>'
-    shape = f'<shape type="sphere"><bsdf type="diffuse">{texture}</bsdf></shape>'
-    outer = path.with_name("outer.xml")
-    outer.write_text(f'<scene version="3.0.0">{SENSOR}<emitter type="constant"/>{shape}</scene>')
-    _named(path, lambda: scene.load(outer))
-
-
-def _named(path, call):
-    """Let an error name the scene by the file's name alone, as those of parameters do."""
-    from envedit.core.errors import EnveditError
-
-    try:
-        call()
-    except EnveditError as error:
-        if path.name in str(error) or "outer.xml" in str(error):
-            raise type(error)(f"{path}: {error}" if str(path) not in str(error) else str(error)) from None
-        raise
-
-
-def read_entry(path: Path, index: int) -> None:
-    """Take a light transport from disk, or trace it anew, and use it."""
-    import mitsuba as mi
-
-    from .readers import WrongError
-
-    lit, transport, folder = _world()
-    cache, key = transport._stored
-    cache._path(key | {"part": "recording"}).write_bytes(path.read_bytes())
-    found = built(lit, folder)
-    picture = found.apply(mi.TensorXf(np.ones((8, 16, 3), np.float32))).numpy()
-    back = found.adjoint(mi.TensorXf(np.ones((6, 8, 3), np.float32))).numpy()
-    if not (np.isfinite(picture).all() and np.isfinite(back).all()):
-        raise WrongError("a transport that is not finite")
-
-
-def read_state(path: Path, index: int) -> None:
-    """Continue from a checkpoint."""
-    from envedit.core.errors import EnveditError
-    from envedit.solve import checkpoint
-
-    _, optimiser, renderer, _ = checkpoint.load(path.parent, "what")
-    try:
-        _world()[1].restore(renderer)
-    except EnveditError as error:
-        raise type(error)(f"{path}: {error}") from None

@@ -1,10 +1,8 @@
-"""A process that reads damaged files, one after another, and tells how each went.
+"""A process that reads damaged files, one after another, and reports how each went.
 
-    python -m experiments.fuzz.worker READER
-
-READER is a name of ``readers.READERS``, or ``module:function``. It reads requests from stdin and writes
-answers to stdout, a line of JSON each. A crash ends it by a signal, a hang by SIGPROF:
-the parent sees either.
+Started by :class:`.drive.Worker` with the name of a kind of files, or ``module:function``. Requests on stdin
+and answers on stdout are a line of JSON each. A crash ends it by a signal, a hang by SIGPROF: the parent sees
+either.
 """
 
 import importlib
@@ -16,20 +14,20 @@ import sys
 import warnings
 from pathlib import Path
 
+import mitsuba as mi
+
+from envedit.core.errors import ConfigError, InputError
+
+from .kinds import KINDS
+from .readers import WrongError
+
 MIB = 1 << 20
-MULTIPLE = 8
-"""Memory a reader may use, in units of the declared float32 image,"""
-ROOM = 64 * MIB
-"""and beyond that, whatever the file says."""
+MULTIPLE, ROOM = 8, 64 * MIB
+"""Memory a reader may use: in units of the declared float32 image, and beyond that whatever the file says."""
 ADDRESS_ROOM = 512 * MIB
 """Address space beyond the multiple: pools and stacks of threads take it, and do not touch it."""
 MOST_ADDRESS = 8192 * MIB
 LONGEST_MESSAGE = 600
-
-
-def allowance(declared: int) -> int:
-    """Bytes that reading a file may take that declares an image of so many bytes in float32."""
-    return ROOM + MULTIPLE * declared
 
 
 def cpu_limit(declared: int, least: float = 5.0) -> float:
@@ -39,14 +37,10 @@ def cpu_limit(declared: int, least: float = 5.0) -> float:
 
 def main(reader: str, answers) -> None:
     """Answer requests, as :meth:`.drive.Worker.read` makes them, until stdin ends."""
-    from .readers import READERS
-
-    if ":" in reader:
-        module, _, function = reader.partition(":")
-        read = getattr(importlib.import_module(module), function)
-    else:
-        read = READERS[reader]
-        _prepare(reader)
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    module, _, function = reader.partition(":")
+    read = getattr(importlib.import_module(module), function) if function else KINDS[reader].read
     warnings.simplefilter("always")  # each is a line on a user's terminal
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     for line in sys.stdin:
@@ -66,37 +60,26 @@ def main(reader: str, answers) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         answer["peak"] = _status("VmHWM") - start
-        if answer["peak"] > allowance(declared):
-            answer |= {
-                "outcome": "memory",
-                "error": f"{answer['peak'] >> 20} MiB for {declared} bytes declared",
-            }
+        if answer["peak"] > ROOM + MULTIPLE * declared:
+            error = f"{answer['peak'] >> 20} MiB for {declared} bytes declared"
+            answer |= {"outcome": "memory", "error": error}
         elif "not enough memory" in answer.get("error", "") and room < MOST_ADDRESS:
             answer["outcome"] = "memory"
         elif answer["outcome"] in ("read", "refused") and os.fstat(2).st_size > printed:
-            answer |= {"outcome": "printed", "error": _since(printed)}
+            answer |= {"outcome": "printed", "error": os.pread(2, 500, printed).decode(errors="replace")}
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 
 
 def judged(read, path: Path, index: int) -> dict:
     """Call a reader and say how it went: "read", "refused", "unclear", "wrong" or "traceback"."""
-    from envedit.core.errors import ConfigError, InputError
-
-    from .readers import WrongError
-
     try:
         read(path, index)
         return {"outcome": "read"}
     except (ConfigError, InputError) as error:
         fault = unclear(str(error), str(path))
-        kind = type(error).__name__
-        outcome = "unclear" if fault else "refused"
-        return {
-            "outcome": outcome,
-            "kind": kind,
-            "error": f"{fault}{error}"[:2000].encode("utf-8", "replace").decode(),
-        }
+        said = f"{fault}{error}"[:2000].encode("utf-8", "replace").decode()
+        return {"outcome": "unclear" if fault else "refused", "kind": type(error).__name__, "error": said}
     except WrongError as error:
         return {"outcome": "wrong", "error": str(error)}
     except Exception as error:  # what a user must never see
@@ -115,20 +98,6 @@ def unclear(message: str, path: str) -> str:
     return ""
 
 
-def _prepare(reader):
-    """Import what the reader imports when first used, which is no memory of a case's."""
-    import OpenEXR  # noqa: F401
-
-    from envedit.losses.perceptual import weights  # noqa: F401
-
-    if reader in ("painted", "checkpoint", "scene", "mesh", "texture", "entry", "state"):
-        import mitsuba as mi
-
-        mi.set_variant("llvm_ad_rgb")
-        mi.set_log_level(mi.LogLevel.Error)
-        from envedit.targets import painted_image  # noqa: F401
-
-
 def _status(key):
     """Return a field of /proc/self/status in bytes."""
     with open("/proc/self/status") as file:
@@ -140,11 +109,6 @@ def _reset_peak():
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")
     return _status("VmRSS")
-
-
-def _since(printed):
-    """Return what was written to stderr and stdout since, which are one file."""
-    return os.pread(2, 500, printed).decode(errors="replace")
 
 
 if __name__ == "__main__":

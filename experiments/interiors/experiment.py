@@ -85,7 +85,7 @@ def cases(given):
             if "file" in target:
                 tables["representation"] = {"turn": False}
             found.append(Case(f"{name}-{label}".replace(" ", "_"), tables, {"map": name, "label": label}))
-    return [case for case in found if not given.only or any(text in case.name for text in given.only)]
+    return found
 
 
 def lamps_found(about: dict, after: list[dict]) -> str:
@@ -157,4 +157,5 @@ EXPERIMENT = Experiment(
         "seam": lambda m: number(m["seam"]),
     },
     panels=panels,
+    sheet=lambda case: "sheet.jpg",
 )

@@ -18,27 +18,21 @@ NAMES = {"layers": "layers", "siren": "R-SIREN"}
 SCENES = {"sphere": {"file": "sphere", "parameters": {"roughness": 0.3}}, "statue": {"file": "statue"}}
 
 
-def options(parser):
-    parser.add_argument("--maps", nargs="+", metavar="NAME")
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--angles", nargs="+", type=int, default=[60, 140])
-    parser.add_argument("--kinds", nargs="+", default=list(NAMES), choices=NAMES)
-
-
 def cases(given):
-    maps = puresky.chosen(given.maps)
     return [
         Case(
-            f"{name}-{scene}-{angle}-{kind}",
+            f"{kind}-{scene}-{angle}-{name}",
             {
-                "input": {"envmap": str(maps[name]), "width": 256},
+                "input": {"envmap": str(file), "width": 256},
                 "scene": SCENES[scene],
                 "target": {"rotate_degrees": angle},
                 "representation": {"kind": kind},
             },
             {"map": name, "scene": scene, "angle": angle, "kind": NAMES[kind]},
         )
-        for scene, angle, name, kind in itertools.product(given.scenes, given.angles, maps, given.kinds)
+        for scene, angle, (name, file), kind in itertools.product(
+            SCENES, (60, 140), puresky.find().items(), NAMES
+        )
     ]
 
 
@@ -125,5 +119,4 @@ EXPERIMENT = Experiment(
     group=lambda m: f"{m['scene']}, turned by {m['angle']} degrees",
     summary=summary,
     sheet=lambda case: "{scene}_{angle}".format(**case.about),
-    options=options,
 )

@@ -1,32 +1,26 @@
-r"""Compare what may carry the gain of the sky: grids of quadratic B-splines, or a small SIREN on the sphere.
-
-    ENVEDIT_DATA=... python -m experiments.layers.gain [--maps NAME ...] [--angle 140] [--scene sphere]
+"""Compare what may carry the gain of the sky: grids of quadratic B-splines, or a small SIREN on the sphere.
 
 Every variant starts from the same lights, those that the search finds, and from a gain of zero; the last one
 is the product's, whose gain starts from the search's too. Rendering and map PSNR are against the truth, by
 Mitsuba with fresh samples; "sharp" is the energy of high frequencies over the original's.
 """
 
-import argparse
 import time
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import config
+from envedit import config, inputs
 from envedit.core import array_cache, latlong
-from envedit.inputs import load_map
 from envedit.losses import metrics
 from envedit.representations.layers.gain import GridGain
 from envedit.representations.layers.layers import Layers
 from envedit.representations.siren import network as siren
-from envedit.scene import scene
 from envedit.solve import adam_loop, light_search
 from envedit.transport.light_transport import LightTransport
 from experiments import puresky
-
-from .experiment import SCENES
+from experiments.harness import Experiment, calling
 
 ITERATIONS = 150
 AMPLITUDE = 6.0
@@ -84,18 +78,26 @@ VARIANTS = {
 }
 
 
-def one(lit, transport, original, true, picture, gain, from_search):
-    """Edit one map with one kind of gain; returns PSNRs, sharpness and milliseconds."""
-    height = original.shape[0]
-    crop = original[: height // 2]
-    rows = (0, height)
+SEARCHED = "grids, from the search's gain"
+
+
+def compare(settings, folder, variant) -> dict:
+    """Edit a map with one kind of gain; returns PSNRs in dB, sharpness and milliseconds."""
+    lit = inputs.load_scene(settings.scene)
+    original, _ = inputs.load_map(settings.input, lit)
+    height, width, _ = original.shape
+    true = np.ascontiguousarray(latlong.rotate(original, settings.target.degrees), np.float32)
+    picture = lit.render(true, spp=2048, seed=7)
+    kept = array_cache.cache_folder("transport")
+    transport = LightTransport.build(lit, height, width, few=True, folder=kept)
+    crop, rows = original[: height // 2], (0, height)
     plain = Layers(rows)
     encoded = plain.encode(crop)
     asked = light_search.SearchProblem(plain, transport, picture, None, original)
     begun, _ = light_search.start(asked, encoded)
-    layers = type("Variant", (Layers,), {"Gain": gain})(rows)
+    layers = type("Variant", (Layers,), {"Gain": VARIANTS.get(variant, GridGain)})(rows)
     params = layers.encode(crop)
-    params |= {k: v for k, v in begun.items() if from_search or not k.startswith("gain")}
+    params |= {k: v for k, v in begun.items() if variant == SEARCHED or not k.startswith("gain")}
     chosen = config.Optimizer(iterations=ITERATIONS)
     objective = adam_loop.Objective(config.Loss(), picture, None, crop, ITERATIONS)
     start = time.perf_counter()
@@ -105,40 +107,43 @@ def one(lit, transport, original, true, picture, gain, from_search):
     edited[: height // 2] = layers.decode(params).numpy()
     final = lit.render(edited, spp=2048, seed=11)
     sharp = [metrics.high_frequency_energy(m[: height // 2]) for m in (edited, original)]
-    return (
-        metrics.compare(final, picture)["psnr"],
-        metrics.compare(edited[: height // 2], true[: height // 2])["psnr"],
-        sharp[0] / sharp[1],
-        ms,
-    )
+    return {
+        "render": metrics.compare(final, picture)["psnr"],
+        "psnr": metrics.compare(edited[: height // 2], true[: height // 2])["psnr"],
+        "sharp": sharp[0] / sharp[1],
+        "ms": ms,
+    }
 
 
-def main():
-    """Compute and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--maps", nargs="+", metavar="NAME")
-    parser.add_argument("--angle", type=int, default=140)
-    parser.add_argument("--scene", default="sphere", choices=SCENES)
-    given = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
-    lit = scene.load(given.scene, 128, 0, {"roughness": 0.3} if given.scene == "sphere" else {}, None)
-    folder = array_cache.cache_folder("transport")
-    transport = LightTransport.build(lit, 128, 256, few=True, folder=folder)
-    print("| gain | map | rendering PSNR | map PSNR | sharp | ms a step |\n|---|---|---|---|---|---|")
-    for name, file in puresky.of_script(given.maps).items():
-        original, _ = load_map(config.Input(envmap=str(file), width=256))
-        true = np.ascontiguousarray(latlong.rotate(original, given.angle), np.float32)
-        picture = lit.render(true, spp=2048, seed=7)
-        for label, gain, searched in [
-            *((label, gain, False) for label, gain in VARIANTS.items()),
-            ("grids, from the search's gain", GridGain, True),
-        ]:
-            found = one(lit, transport, original, true, picture, gain, searched)
-            print(
-                "| {} | {} | {:.1f} dB | {:.1f} dB | {:.2f} | {:.0f} |".format(label, name, *found),
-                flush=True,
-            )
+def cases(given):
+    return [
+        calling(
+            f"{name}: {variant}",
+            "experiments.layers.gain:compare",
+            {
+                "input": {"envmap": str(file), "width": 256},
+                "scene": {"file": "sphere", "width": 128, "parameters": {"roughness": 0.3}},
+                "target": {"rotate_degrees": 140},
+            },
+            {"map": name, "gain": variant},
+            variant=variant,
+        )
+        for name, file in puresky.find().items()
+        for variant in (*VARIANTS, SEARCHED)
+    ]
 
 
-if __name__ == "__main__":
-    main()
+EXPERIMENT = Experiment(
+    "layers.gain",
+    "Compare what may carry the gain of the sky: grids, or a small SIREN on the sphere.",
+    cases,
+    columns={
+        "gain": "{gain}",
+        "map": "{map}",
+        "rendering PSNR": "{render:.1f} dB",
+        "map PSNR": "{psnr:.1f} dB",
+        "sharp": "{sharp:.2f}",
+        "ms a step": "{ms:.0f}",
+    },
+    alone=True,
+)

@@ -1,23 +1,20 @@
-r"""Look at an edit at 8192x4096 in crops: where the sun was, where it went, the horizon, the disc.
-
-    ENVEDIT_DATA=... python -m experiments.layers.large_map [--map NAME] [--turned 75]      # two minutes
+"""Look at an edit at 8192x4096 in crops: where the sun was, where it went, the horizon, the disc.
 
 The maps at hand are 1024 wide: one is enlarged eightfold, with fractal detail above the horizon and its sun
 drawn as a disc of 0.53 degrees of the same flux. The statue is edited towards the map turned, while the sky
-may not turn, so that the sun must move. Printed is what could betray the edit.
+may not turn, so that the sun must move. Measured is what could betray the edit.
 """
 
-import argparse
-import tempfile
-from pathlib import Path
+import shutil
 
 import mitsuba as mi
 import numpy as np
 
-import envedit
+from envedit import config, pipeline
 from envedit.core import latlong
 from envedit.images import images
 from experiments import puresky
+from experiments.harness import Experiment, calling
 
 WIDTH, HEIGHT = 8192, 4096
 RADIUS = 0.2665
@@ -26,7 +23,6 @@ GRAIN = 0.05
 """Standard deviation of log radiance in the first octave of detail; each further one has 0.57 of it."""
 AROUND, CORE = 500, 24
 """Half the size of the crops, texels."""
-PLACES = "where the sun was", "where it went", "horizon below it", "horizon where it went"
 
 
 def enlarged(small: np.ndarray) -> np.ndarray:
@@ -64,56 +60,71 @@ def crop(envmap: np.ndarray, row: int, column: int, around: int) -> np.ndarray:
     return envmap[rows][:, np.arange(column - around, column + around) % WIDTH]
 
 
-def _shown(*both):
+def shown(*both) -> np.ndarray:
     """Show crops beside each other, with one exposure and a curve that nothing is too bright for."""
     middle = np.median(both)
-    return np.concatenate([np.uint8(255 * (one / (one + middle)) ** (1 / 2.2)) for one in both], axis=1)
+    return np.concatenate([(one / (one + middle)) ** (1 / 2.2) for one in both], axis=1)
 
 
-def main(argv=None):
-    """Edit, print and draw."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--map", default="syferfontein_18d_clear", help="of a sun (%(default)s)")
-    parser.add_argument("--turned", type=float, default=75.0, metavar="DEGREES", help="the target's map (75)")
-    parser.add_argument("--to", type=Path, default=Path("experiments/layers"), help="of large_map.jpg")
-    given = parser.parse_args(argv)
-    mi.set_variant("llvm_ad_rgb")
-    source = enlarged(images.load_envmap(str(puresky.of_script([given.map])[given.map]), 1024)[0])
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "large.exr"
-        images.write_exr(file, source)
-        out = Path(folder) / "out"
-        settings = {
-            "input": {"envmap": str(file)},
-            "scene": {"file": "statue"},
-            "target": {"rotate_degrees": given.turned},
-            "representation": {"turn": False},
-        }
-        result = envedit.edit(settings)
-        result.save(out)
-        edited, _ = images.load_envmap(str(out / "edited_full.exr"), WIDTH)
+def look(settings, folder) -> dict:
+    """Enlarge a map, edit it, and measure the disc of the sun and the step across the horizon.
+
+    ``crops.exr``, display values, original and edited beside each other: where the sun was, where it went;
+    the horizon below both.
+    """
+    source = enlarged(images.load_envmap(settings.input.envmap, 1024)[0])
+    images.write_exr(folder / "large.exr", source)
+    given = ["input.envmap=large.exr"]
+    result = pipeline.run(config.load(folder / "job.toml", overrides=given))
+    result.save(folder / "out")
+    edited, _ = images.load_envmap(str(folder / "out" / "edited_full.exr"), WIDTH)
     old, new = (np.unravel_index(one.mean(axis=2).argmax(), one.shape[:2]) for one in (source, edited))
-    rendering, whole = (result.metrics[of]["psnr"] for of in ("render", "envmap"))
-    print(f"rendering {rendering:.1f} dB, map {whole:.1f} dB")
-    print(f"sun moved by {(old[1] - new[1]) % WIDTH / WIDTH * 360:.2f} degrees about the vertical")
-    omega = latlong.solid_angles(HEIGHT, WIDTH)[:, None]
+    omega, found = latlong.solid_angles(HEIGHT, WIDTH)[:, None], {}
     for name, one, (row, column) in (("source", source, old), ("edited", edited, new)):
         disc = crop(one.mean(axis=2), row, column, CORE)
         flux = (disc * omega[row - CORE : row + CORE]).sum()
-        texels = (disc > disc.max() / 2).sum()
-        print(f"{name}: disc of {texels} texels, peak {disc.max():.4g}, flux {flux:.4g}")
+        found[name] = [int((disc > disc.max() / 2).sum()), float(disc.max()), float(flux)]
     rows = slice(HEIGHT // 2 - 1, HEIGHT // 2 + 1)
     change = np.log2((edited[rows] + 1e-4) / (source[rows] + 1e-4)).mean(axis=2)
-    middle, most = np.percentile(np.abs(change[1] - change[0]), [50, 99.9])
-    print(f"step of the change across the horizon: median {middle:.4f}, 99.9 % {most:.4f} stops")
     crops = [
-        _shown(*(crop(one, *place, AROUND)[::2, ::2] for one in (source, edited)))
+        shown(*(crop(one, *place, AROUND)[::2, ::2] for one in (source, edited)))
         for place in (old, new, (HEIGHT // 2, old[1]), (HEIGHT // 2, new[1]))
     ]
     picture = np.concatenate([np.concatenate(crops[k : k + 2], axis=1) for k in (0, 2)])
-    mi.Bitmap(picture).write(str(given.to / "large_map.jpg"), quality=88)
-    print(f"{given.to / 'large_map.jpg'}, original and edited: {', '.join(PLACES)}")
+    images.write_exr(folder / "crops.exr", picture.astype(np.float32))
+    (folder / "large.exr").unlink()
+    shutil.rmtree(folder / "out")
+    return found | {
+        "render": result.metrics["render"]["psnr"],
+        "map": result.metrics["envmap"]["psnr"],
+        "degrees": float((old[1] - new[1]) % WIDTH / WIDTH * 360),
+        "step": [float(value) for value in np.percentile(np.abs(change[1] - change[0]), [50, 99.9])],
+    }
 
 
-if __name__ == "__main__":
-    main()
+def cases(given):
+    name = "syferfontein_18d_clear"
+    tables = {
+        "input": {"envmap": puresky.file(name)},
+        "scene": {"file": "statue"},
+        "target": {"rotate_degrees": 75},
+        "representation": {"turn": False},
+    }
+    return [calling(name, "experiments.layers.large_map:look", tables)]
+
+
+EXPERIMENT = Experiment(
+    "layers.large_map",
+    "Look at an edit at 8192x4096 in crops: where the sun was, where it went, the horizon, the disc.",
+    cases,
+    columns={
+        "rendering, dB": "{render:.1f}",
+        "map, dB": "{map:.1f}",
+        "sun moved, degrees": "{degrees:.2f}",
+        "disc before: texels, peak, flux": "{source[0]}, {source[1]:.4g}, {source[2]:.4g}",
+        "disc after": "{edited[0]}, {edited[1]:.4g}, {edited[2]:.4g}",
+        "step across the horizon, stops: median, 99.9 %": "{step[0]:.4f}, {step[1]:.4f}",
+    },
+    panels=lambda done: [done.picture("crops")],
+    sheet=lambda case: "large_map.jpg",
+)

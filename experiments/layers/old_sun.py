@@ -1,19 +1,16 @@
-r"""Compare what may be shown where a sun was: a table, and a picture of the old place.
-
-    ENVEDIT_DATA=... python -m experiments.layers.old_sun [--to experiments/layers]      # a minute
+"""Compare what may be shown where a sun was: a table, and a picture of the old place.
 
 Every light of a map is turned about the vertical, nothing is rendered, and the map is compared with the map
 turned as a whole. ``envedit/representations/layers/behind_glow.py`` is "elevation, contrast"; the others take
 parts of it, or a membrane through what surrounds the brighter part of the glow.
 """
 
-import argparse
+import itertools
 from dataclasses import replace
-from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
+from envedit import inputs
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import luminance
@@ -23,7 +20,7 @@ from envedit.losses import metrics, naturalness
 from envedit.representations.layers import behind_glow as product
 from envedit.representations.layers import below_horizon, layers, separation
 from experiments import puresky
-from experiments.harness import markdown
+from experiments.harness import Experiment, calling, markdown
 
 TURNS = 71, 143
 """Columns of 256."""
@@ -66,8 +63,11 @@ def turned(made: layers.Layers, params: dict, columns: int, width: int) -> dict:
     return params | {"turn": tensor(turn / layers.SCALES["turn"])}
 
 
+NUMBERS = "map, dB", "log radiance, up", "below", "seam", "high frequencies"
+
+
 def measured(edited, original, true, old) -> list[float]:
-    """Map PSNR over the unedited one's; RMS of log radiance at the old place, up and low; seam; detail."""
+    """Return :data:`NUMBERS`: map PSNR over the unedited one's, RMS of log radiance at the old place."""
     errors = [metrics.compare(one, true)["psnr"] for one in (edited, original)]
     off = np.square(np.log((edited + 1e-3) / (true + 1e-3)))
     rows = old.shape[0]
@@ -82,54 +82,75 @@ def measured(edited, original, true, old) -> list[float]:
     ]
 
 
-def main():
-    """Compute, print and draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--to", type=Path, default=Path("experiments/layers"))
-    given = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
-    found = {(way, held): [] for way in WAYS for held in ("others", "held out")}
-    pictures = []
-    for name, file in puresky.of_script().items():
-        original, _ = images.load_envmap(str(file), 256)
-        height, width, _ = original.shape
-        tiles = []
-        for way in WAYS:
-            made = layers.Layers((0, height), horizon=below_horizon.kind_of(original))
-            params = made.encode(original)
-            if made.behind is None:
-                break
-            under(made, way)
-            for columns in TURNS:
-                params = turned(made, params, columns, width)
-                edited = made.decode(params).numpy()
-                true = latlong.rotate(original, 360 * columns / width)
-                if metrics.sun_offset(edited, true) > width / 8:
-                    raise SystemExit(f"{name}: the light went elsewhere than the map")
-                glow = made.separation.glow @ [0.2126, 0.7152, 0.0722]
-                old = 1 - np.roll(glow, -columns, axis=1) / glow > OLD
-                found[way, "held out" if name in HELD else "others"].append(
-                    measured(edited, original, true, old)
-                )
-            tiles.append(edited)
-        if tiles:
-            centre = latlong.texel_position(made.separation.lights[0].direction, height, width)[1]
-            shown = [true, original, *tiles]
-            white = 4 * float(np.median(luminance(true)))
-            shown = [np.roll(m, width // 2 - round(float(centre)), axis=1) for m in shown]
-            cut = slice(width // 4, 3 * width // 4)
-            pictures.append(np.concatenate([np.clip(m[:, cut] / white, 0, 1) ** (1 / 2.2) for m in shown], 1))
-    lines = [
-        [way, f"{held}, {len(rows)}", *(f"{value:.2f}" for value in np.mean(rows, axis=0))]
-        for (way, held), rows in found.items()
-        if rows
+def compare(settings, folder) -> dict:
+    """Turn the lights of a map every way; returns ``numbers`` by way and turn, none without a light.
+
+    ``places.exr``, display values: the true map, the original, and each way, beside each other.
+    """
+    original, _ = inputs.load_map(settings.input)
+    height, width, _ = original.shape
+    tiles, found = [], {}
+    for way in WAYS:
+        made = layers.Layers((0, height), horizon=below_horizon.kind_of(original))
+        params = made.encode(original)
+        if made.behind is None:
+            return {"numbers": {}}
+        under(made, way)
+        found[way] = []
+        for columns in TURNS:
+            params = turned(made, params, columns, width)
+            edited = made.decode(params).numpy()
+            true = latlong.rotate(original, 360 * columns / width)
+            if metrics.sun_offset(edited, true) > width / 8:
+                raise ArithmeticError("the light went elsewhere than the map")
+            glow = made.separation.glow @ [0.2126, 0.7152, 0.0722]
+            old = 1 - np.roll(glow, -columns, axis=1) / glow > OLD
+            found[way].append(measured(edited, original, true, old))
+        tiles.append(edited)
+    centre = latlong.texel_position(made.separation.lights[0].direction, height, width)[1]
+    white = 4 * float(np.median(luminance(true)))
+    shown = [np.roll(m, width // 2 - round(float(centre)), axis=1) for m in (true, original, *tiles)]
+    cut = slice(width // 4, 3 * width // 4)
+    shown = [np.clip(m[:, cut] / white, 0, 1) ** (1 / 2.2) for m in shown]
+    images.write_exr(folder / "places.exr", np.concatenate(shown, axis=1).astype(np.float32))
+    return {"numbers": found}
+
+
+def cases(given):
+    return [
+        calling(
+            name,
+            "experiments.layers.old_sun:compare",
+            {"input": {"envmap": str(file), "width": 256}},
+            {"map": name, "held": "held out" if name in HELD else "others"},
+        )
+        for name, file in puresky.find().items()
     ]
-    head = "where the sun was", "maps", "map, dB", "log radiance, up", "below", "seam", "high frequencies"
-    print(markdown(head, lines))
-    pixels = (np.concatenate(pictures) * 255 + 0.5).astype(np.uint8)
-    mi.Bitmap(pixels).write(str(given.to / "old_sun.jpg"), quality=88)
-    print(given.to / "old_sun.jpg")
 
 
-if __name__ == "__main__":
-    main()
+def measure(done) -> list[dict]:
+    found = done.metrics["numbers"].items()
+    return [{"way": way, "numbers": numbers} for way, turns in found for numbers in turns]
+
+
+def summary(rows) -> str:
+    """Return means of every way, over the maps that nothing was chosen by and over the others."""
+    lines = []
+    for way, held in itertools.product(WAYS, ("others", "held out")):
+        some = [row["numbers"] for row in rows if (row["way"], row["held"]) == (way, held)]
+        if some:
+            lines.append([way, f"{held}, {len(some)}", *(f"{v:.2f}" for v in np.mean(some, axis=0))])
+    return markdown(["where the sun was", "maps", *NUMBERS], lines)
+
+
+EXPERIMENT = Experiment(
+    "layers.old_sun",
+    "Compare what may be shown where a sun was.",
+    cases,
+    measure,
+    {"map": "{map}", "where the sun was": "{way}"}
+    | {name: f"{{numbers[{i}]:.2f}}" for i, name in enumerate(NUMBERS)},
+    summary=summary,
+    panels=lambda done: [done.picture("places")] if done.metrics["numbers"] else [],
+    sheet=lambda case: "old_sun.jpg",
+)

@@ -2,50 +2,34 @@
 
 Three maps in two scenes, every level once, the transport traced anew; a run that compiled kernels is made
 again. Seconds are of the run's own stages, on the reference machine of ``budget.py``, as this one's speed is
-measured before every run; what is lost is judged alike for all
-(``experiments/tradeoff/judge.py``). Nothing else should run on the machine.
+measured before every run; what is lost is judged alike for all (``experiments/tradeoff/judge.py``). Nothing
+else should run on the machine.
 """
-
-import hashlib
-import json
-from pathlib import Path
 
 import numpy as np
 
 from envedit.cli import budget
-from experiments.harness import Case, Experiment, done_of, markdown
+from envedit.config.presets import overlaid
+from experiments.harness import Experiment, calling, number
 from experiments.tradeoff import plan
-from experiments.tradeoff.experiment import folder_of_maps
+from experiments.tradeoff.analyse import by
 
 
-def options(parser):
-    parser.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps ($ENVEDIT_DATA/puresky)")
-
-
-def tables_of(cell, level) -> dict:
-    """Return the configuration of a cell's run at a level."""
-    return {
-        "input": {"envmap": str(cell.file), "width": level.map},
-        "scene": {**plan.SCENES[cell.scene], "width": level.film},
-        "target": {"rotate_degrees": plan.ANGLE, "spp": level.spp},
-        "representation": {"turn": False},  # what the target is made by; other targets take as long
-        "output": {"spp": level.spp, "report": True},
-        "renderer": {"cache": False},
-    }
+def tables_of(base: dict, level: budget.Level) -> dict:
+    """Return the configuration of a run at a level, in the cell of a configuration of :func:`.plan.cells`."""
+    return overlaid(base, plan.sizes(level.map, level.film) | plan.samples(level.spp))
 
 
 def cases(given):
-    command, version = (*plan.COMMAND, "levels"), hashlib.sha256(plan.MEASURED.read_bytes()).hexdigest()
     return [
-        Case(
-            f"{cell.name}: {level.name}",
-            tables_of(cell, level),
-            {"cell": cell, "level": level.name},
-            command,
-            version,
+        calling(
+            f"{', '.join(names)}: {level.name}",
+            "experiments.tradeoff.runs:level",
+            tables_of(base, level),
+            {"cell": names, "level": level.name},
         )
         for level in budget.LEVELS
-        for cell in plan.cells(folder_of_maps(given))
+        for names, base in plan.cells().items()
     ]
 
 
@@ -63,36 +47,34 @@ def parts(timing: dict, found: dict) -> dict:
     }
 
 
-def tabulate(made, out, given) -> str:
-    """Return a line for each level: seconds, mean to most of the cells, and mean losses."""
-    from experiments.tradeoff.judge import Judge
+def measure(done) -> dict:
+    found = done.metrics
+    seconds = parts(found["timing"], found["calibration"])
+    psnr = {"rendering": found["render"]["psnr_without_noise"], "map": found["map"]["psnr"]}
+    return {"seconds": seconds | {"total": sum(seconds.values())}, "psnr": psnr}
 
-    judge, judged, seconds = Judge(out, spp=512, true_spp=2048), {}, {}
-    done = done_of(made, out)
-    for one in done:
-        level, cell = one.case.about["level"], one.case.about["cell"]
-        found, timing = judge(cell, one.folder), one.metrics["timing"]
-        calibration = json.loads((one.folder / "cost.json").read_text())["calibration"]
-        spent = list(parts(timing, calibration).values())
-        judged[level, cell] = found["render"]["psnr_without_noise"], found["map"]["psnr"]
-        seconds.setdefault(level, []).append([*spent, sum(spent)])
-    lines = []
-    for level in seconds:
-        told = [f"{column.mean():.1f} to {column.max():.1f}" for column in np.transpose(seconds[level])]
-        cells = [cell for name, cell in judged if name == level and ("standard", cell) in judged]
-        lost = [np.subtract(judged["standard", cell], judged[level, cell]) for cell in cells]
-        loss = [f"{value:.1f}" for value in np.mean(lost, axis=0)] if lost else ["-", "-"]
-        lines.append([f"{level}, {len(seconds[level])} runs", *told, *loss])
-    return markdown(
-        ["level", "rendering s", "tracing s", "numbers s", "total s", "rendering dB", "map dB"], lines
-    )
+
+def combine(rows: list[dict]) -> list[dict]:
+    """Return a row for each level: seconds, mean to most of the cells, and mean losses."""
+    best, found = {row["cell"]: row["psnr"] for row in rows if row["level"] == "standard"}, []
+    for some in by(rows, "level"):
+        seconds = {part: [row["seconds"][part] for row in some] for part in some[0]["seconds"]}
+        paired = [(best[row["cell"]], row["psnr"]) for row in some if row["cell"] in best]
+        lost = {k: np.mean([a[k] - b[k] for a, b in paired]) if paired else None for k in some[0]["psnr"]}
+        spent = {part: f"{np.mean(values):.1f} to {max(values):.1f}" for part, values in seconds.items()}
+        found.append({"level": some[0]["level"], "runs": len(some), "lost": lost} | spent)
+    return found
 
 
 EXPERIMENT = Experiment(
     "levels",
     "Measure the levels of --budget: what each costs and loses.",
     cases,
-    options=options,
-    tabulate=tabulate,
+    measure,
+    {"level": "{level}, {runs} runs"}
+    | {f"{part} s": f"{{{part}}}" for part in ("rendering", "tracing", "numbers", "total")}
+    | {"rendering dB": lambda row: number(row["lost"]["rendering"])}
+    | {"map dB": lambda row: number(row["lost"]["map"])},
+    combine=combine,
     alone=True,
 )

@@ -37,7 +37,7 @@ def options(parser):
 
 
 def cases(given):
-    skies = {name: str(file) for name, file in puresky.chosen().items()}
+    skies = {name: str(file) for name, file in puresky.find().items()}
     names, data = sorted(skies), puresky.data()
     ground = {file.stem.removesuffix("_1k"): str(file) for file in sorted((data / "hdri").glob("*_1k.hdr"))}
     analytic = {e: str(given.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
@@ -175,6 +175,6 @@ EXPERIMENT = Experiment(
     measure,
     COLUMNS,
     summary=summary,
-    sheet=lambda case: case.about["scene"],
+    sheet=lambda case: case.about["scene"] + ".jpg",
     options=options,
 )

@@ -29,8 +29,6 @@ ABLATION = {
 
 
 def options(parser):
-    parser.add_argument("--edits", nargs="+", default=list(EDITS), choices=EDITS)
-    parser.add_argument("--maps", nargs="+", default=list(MAPS))
     parser.add_argument("--ablation", action="store_true", help="regularisers on the analytic sky (Figure 9)")
 
 
@@ -46,12 +44,12 @@ def file_of(name: str) -> str | None:
 
 
 def cases(given):
-    maps = {name: file_of(name) for name in (given.maps[:1] if given.ablation else given.maps)}
+    maps = {name: file_of(name) for name in (MAPS[:1] if given.ablation else MAPS)}
     for name in [name for name in maps if not maps[name]]:
         print(f"{name}: skipped, ENVEDIT_DATA has no puresky/{name}_puresky_1k.hdr", file=sys.stderr)
         maps.pop(name)
     found = []
-    for kind, edit, name in itertools.product(ABLATION if given.ablation else [""], given.edits, maps):
+    for kind, edit, name in itertools.product(ABLATION if given.ablation else [""], EDITS, maps):
         tables = tomllib.loads((FOLDER / f"{edit}.toml").read_text(encoding="utf-8"))
         tables.pop("output", None)
         tables = overridden(tables, [f"input.envmap={maps[name]}", *regularised(kind)])

@@ -1,18 +1,12 @@
-r"""Carry an edit to an 8k map: seconds, memory, and light against the working map, in rendered pixels.
-
-    ENVEDIT_DATA=... python -m experiments.painted_edits.full_resolution [--width 8192] [--kind layers] \
-        [--map kloofendal_48d_partly_cloudy] [--out runs/full]
+"""Carry an edit to an 8k map: seconds, memory, and light against the working map, in rendered pixels.
 
 The map is a real one enlarged, with procedural detail, so that it has something to keep. The edit turns it by
 40 degrees. Measured is what the program does after an edit: reading the file, carrying, writing.
 """
 
-import argparse
 import resource
 import time
-from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs, pipeline
@@ -20,9 +14,11 @@ from envedit.core import latlong
 from envedit.export import full_resolution
 from envedit.images import images, layered_exr
 from envedit.losses import metrics
-from envedit.scene import scene
+from experiments import puresky
+from experiments.harness import Experiment, calling
 
-from .experiment import file_of
+WIDTH = 8192
+KINDS = "layers", "log-pixels"
 
 
 def large(file: str, width: int) -> np.ndarray:
@@ -34,64 +30,69 @@ def large(file: str, width: int) -> np.ndarray:
     return base
 
 
-def main():
-    """Make, edit, carry, compare."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--width", type=int, default=8192)
-    parser.add_argument("--kind", default="layers")
-    parser.add_argument("--map", default="kloofendal_48d_partly_cloudy")
-    parser.add_argument("--out", type=Path, default=Path("runs/full"))
-    given = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
-    given.out.mkdir(parents=True, exist_ok=True)
-    file = given.out / f"{given.map}_{given.width}.exr"
-    if not file.exists():
-        if not (small := file_of(given.map)):
-            parser.error("ENVEDIT_DATA has no such map")
-        layered_exr.write(file, {"edited": large(small, given.width)})
-        print(f"{file} made; run again, so that its making does not count")
-        return
-    settings = config.from_dict(
-        {
-            "input": {"envmap": str(file.absolute())},
-            "scene": {"file": "sphere"},
-            "target": {"rotate_degrees": 40.0},
-            "representation": {"kind": given.kind},
-        }
-    )
-    result = pipeline.run(settings)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    start = time.perf_counter()
+def gigabytes() -> float:
+    """Return the most memory that this process has occupied."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def carry(settings, folder) -> dict:
+    """Make the large map, edit, carry, compare; returns seconds, gigabytes, shares of light and texels."""
+    file = folder / "large.exr"
+    layered_exr.write(file, {"edited": large(settings.input.envmap, WIDTH)})
+    result = pipeline.run(config.load(folder / "job.toml", overrides=[f"input.envmap={file.name}"]))
+    before, times = gigabytes(), [time.perf_counter()]
     source, _ = images.load_envmap(str(file))
-    read = time.perf_counter() - start
+    times.append(time.perf_counter())
     found, rows = result.found, inputs.active_rows(settings.input.rows, result.envmap.shape[0])
     original, edited = result.maps["initial"], result.envmap
-    start = time.perf_counter()
     full = full_resolution.carry(
         found.representation, found.params, original, edited, source, rows, found.free
     )
-    carried = time.perf_counter() - start
-    start = time.perf_counter()
-    layered_exr.write(given.out / "edited_full.exr", {"edited": full})
-    written = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(
-        f"{given.width} x {given.width // 2}, {given.kind}: "
-        f"read {read:.1f} s, carry {carried:.1f} s, write {written:.1f} s"
-    )
-    print(f"memory: {before:.2f} GB at most before, {peak:.2f} GB after")
-    same = (full == source).all(axis=2)
-    print(f"texels with the bits of the source: {100 * same.mean():.1f} %")
-    lit = scene.load("sphere", 128)
+    times.append(time.perf_counter())
+    layered_exr.write(file, {"edited": full})
+    times.append(time.perf_counter())
+    after = gigabytes()
+    file.unlink()
+    read, carried, written = (float(seconds) for seconds in np.diff(times))
+    lit = inputs.load_scene(settings.scene)
     a, b = (lit.render(m, spp=1024, seed=s) for m, s in ((edited, 1), (full, 2)))
-    light = np.abs(b.mean(axis=(0, 1)) / a.mean(axis=(0, 1)) - 1).max()
     coarse = [p.reshape(16, 8, 16, 8, 3).mean(axis=(1, 3)) for p in (a, b)]
-    worst = np.abs(coarse[1] / coarse[0] - 1).max()
-    print(
-        f"rendered: light {100 * light:.2f} % apart, blocks of 8x8 pixels at most {100 * worst:.1f} %, "
-        f"{metrics.compare(b, a)['psnr']:.1f} dB"
-    )
+    return {
+        "seconds": [read, carried, written],
+        "gigabytes": [before, after],
+        "same": 100 * float((full == source).all(axis=2).mean()),
+        "light": 100 * float(np.abs(b.mean(axis=(0, 1)) / a.mean(axis=(0, 1)) - 1).max()),
+        "blocks": 100 * float(np.abs(coarse[1] / coarse[0] - 1).max()),
+        "psnr": metrics.compare(b, a)["psnr"],
+    }
 
 
-if __name__ == "__main__":
-    main()
+def cases(given):
+    name = "kloofendal_48d_partly_cloudy"
+    tables = {
+        "input": {"envmap": puresky.file(name)},
+        "scene": {"file": "sphere", "width": 128},
+        "target": {"rotate_degrees": 40.0},
+    }
+    function = "experiments.painted_edits.full_resolution:carry"
+    return [
+        calling(kind, function, tables | {"representation": {"kind": kind, "turn": False}}, {"kind": kind})
+        for kind in KINDS
+    ]
+
+
+EXPERIMENT = Experiment(
+    "painted_edits.full_resolution",
+    "Carry an edit to an 8k map: seconds, memory, and light against the working map.",
+    cases,
+    columns={
+        "representation": "{kind}",
+        "read, carry, write, s": "{seconds[0]:.1f}, {seconds[1]:.1f}, {seconds[2]:.1f}",
+        "memory before and after, GB": "{gigabytes[0]:.2f}, {gigabytes[1]:.2f}",
+        "texels with the source's bits": "{same:.1f} %",
+        "light apart": "{light:.2f} %",
+        "blocks of 8x8 pixels, at most": "{blocks:.1f} %",
+        "rendering against the working map's, dB": "{psnr:.1f}",
+    },
+    alone=True,
+)

@@ -1,16 +1,7 @@
-"""One fit for Figures 4 and 5, as a job of a sweep.
-
-``python -m experiments.paper.network STORE FOLDER THREADS``: FOLDER has a job.toml; STORE says what is
-fitted, "fits": the configuration's own recipe, "stock" or "stock-scaled": a stock SIREN. Left there:
-``fit.json``, and the pictures ``original.exr``, ``fitted.exr`` and ``noisy.exr``, the network with noise on
-its weights; active rows.
-"""
+"""One network for Figures 4 and 5, a stock SIREN or a fit by a configuration, with and without noise."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import sys
 import time
 from pathlib import Path
 
@@ -19,8 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.inputs import active_rows, load_map
 from envedit.losses import metrics, optimizer
@@ -29,17 +18,6 @@ from envedit.representations.siren import network as siren
 
 NOISE, NOISE_SEEDS = 1e-3, 5
 """Standard deviation of the noise on weights and biases (Fig. 5), and how many draws are measured."""
-COMMAND = "{python}", "-m", "experiments.paper.network"
-
-
-def command(store: str) -> tuple[str, ...]:
-    """Return what a sweep calls for a fit of one kind."""
-    return (*COMMAND, store, "{folder}", "{threads}")
-
-
-def version(store: str) -> str:
-    """Return what else decides the results of :func:`command`: kind and the content of this file."""
-    return f"{store} {hashlib.sha256(Path(__file__).read_bytes()).hexdigest()}"
 
 
 def stock(
@@ -105,18 +83,26 @@ def perturbed(params: dict, seed: int) -> dict:
     }
 
 
-def carry_out(folder: Path, store: str) -> None:
-    """Fit, measure, and write what :func:`carry_out`'s module says."""
-    settings = config.load(folder / "job.toml")
-    mi.set_variant(settings.variant)
+def measure(settings: config.Config, folder: Path, recipe: str) -> dict:
+    """Fit the active rows of a map; write ``original.exr``, ``fitted.exr``, and ``noisy.exr``.
+
+    Parameters
+    ----------
+    recipe : str
+        "configured": by the configuration's own; "stock" or "stock-scaled": a stock SIREN (:func:`stock`).
+
+    Returns
+    -------
+    dict
+        ``log_psnr`` (dB), ``peak_ratio`` and ``mean_ratio`` of luminance; ``noisy``: log-PSNR with noise on
+        the weights, of each draw; ``seconds``.
+    """
     original, _ = load_map(settings.input)
     active = active_rows(settings.input.rows, original.shape[0])
     crop, network = np.ascontiguousarray(original[active.slice]), settings.representation
     shape, rows = crop.shape[:2], active.place
-    if store == "fits":
-        found = fit.fit(
-            crop, network, settings.fit, settings.seed, rows, folder=fit.default_folder(), progress=_tell
-        )
+    if recipe == "configured":
+        found = fit.fit(crop, network, settings.fit, settings.seed, rows, folder=fit.default_folder())
         params = {name: mi.TensorXf(value) for name, value in found.params.items()}
         seconds, x = found.seconds, fit.points(network, shape, rows)
 
@@ -124,7 +110,7 @@ def carry_out(folder: Path, store: str) -> None:
             return fit.evaluate(weights, found.normalisation, x, shape, network.omega).numpy()
     else:
         begun = time.perf_counter()
-        params, (low, span) = stock(crop, network, settings.fit, settings.seed, store == "stock-scaled")
+        params, (low, span) = stock(crop, network, settings.fit, settings.seed, recipe == "stock-scaled")
         dr.eval(params)
         dr.sync_thread()
         seconds, x = time.perf_counter() - begun, fit.points(network, shape)
@@ -137,33 +123,10 @@ def carry_out(folder: Path, store: str) -> None:
     noisy = [picture(perturbed(params, seed)) for seed in range(NOISE_SEEDS)]
     for name, content in (("original", crop), ("fitted", fitted), ("noisy", noisy[0])):
         images.write_exr(folder / f"{name}.exr", content, panorama=False)
-    text = {
+    return {
         "log_psnr": metrics.log_psnr(fitted, crop),
         "peak_ratio": metrics.peak_ratio(fitted, crop),
         "mean_ratio": metrics.mean_luminance_ratio(fitted, crop),
         "noisy": [metrics.log_psnr(one, crop) for one in noisy],
         "seconds": seconds,
-        "epochs": settings.fit.epochs,
     }
-    write_atomically(folder / "fit.json", (json.dumps(text, indent=1) + "\n").encode())
-
-
-def _tell(done, total, loss):
-    if done % 200 == 1 or done == total:
-        print(f"epoch {done} of {total}, loss {loss:.4g}", flush=True)
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Carry out one job; returns the exit code."""
-    store, folder, threads = argv or sys.argv[1:]
-    dr.set_thread_count(int(threads))
-    try:
-        carry_out(Path(folder), store)
-    except EnveditError as error:
-        print(f"network: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

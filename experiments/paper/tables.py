@@ -2,189 +2,168 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from experiments.harness import markdown
+from envedit.sweep import DONE
+from experiments.harness import Done, done_of, markdown, number
+from experiments.painted_edits import experiment as painted_edits
 
-from . import measured
-from .kinds import KINDS
-from .plan import Cell
 from .published import COLUMNS, PUBLISHED
 
-_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "mse": 5}
-_WORDS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "mse": "MSE"}
-_BETTER = {"psnr": max, "ssim": max, "lpips": min, "mse": min}
-_SETTINGS = {"paper": "the paper's settings", "ours": "our settings"}
+
+@dataclass(frozen=True)
+class Column:
+    """A number of :func:`measure`, how it is written, and what picks the best of several, if it is marked."""
+
+    key: str | tuple[str, str]
+    form: str
+    best: Callable | None = None
 
 
-def text(name: str, out, cells: list[Cell]) -> str:
+_METRICS = {
+    "psnr": ("PSNR", ".2f", max),
+    "lpips": ("LPIPS", ".3f", min),
+    "mse": ("MSE", ".5f", min),
+    "ssim": ("SSIM", ".3f", max),
+}
+_IMAGES = {"envmap": "map", "render": "rendering"}
+_UNEDITED = {"envmap": "initial_envmap", "render": "initial"}
+_TIMES = {"fit, s": Column("fit_s", ".0f"), "rest, s": Column("rest_s", ".0f")}
+EDITS = {
+    f"{_IMAGES[image]} {_METRICS[name][0]}": Column((image, name), *_METRICS[name][1:])
+    for image, name in COLUMNS
+} | _TIMES
+FITS = {
+    "log PSNR, dB": Column("log_psnr", ".1f"),
+    "peak": Column("peak_ratio", ".3f"),
+    "mean luminance": Column("mean_ratio", ".3f"),
+    "log PSNR with noise, dB": Column("noisy_psnr", ".1f"),
+    "s": Column("seconds", ".0f"),
+}
+PAINTED = {
+    "towards the paint": Column("towards", ".0%"),
+    "feasible": Column("reachable", ".0%"),
+    "change elsewhere": Column("elsewhere", ".4f"),
+    "map SSIM": Column("ssim", ".3f"),
+    "high frequencies": Column("sharp", ".2f"),
+} | _TIMES
+_OF_FIGURES = {"figure4": FITS, "figure5": FITS, "figure9": PAINTED}
+
+
+def measure(name: str, done: Done) -> dict:
+    """Return the numbers of a run for table ``name``, by the keys of its columns."""
+    found = done.metrics
+    if name in ("figure4", "figure5"):
+        return found | {"noisy_psnr": mean(found["noisy"])}
+    if name == "figure9":
+        return painted_edits.measure(done) | seconds(done)
+    images = (*_IMAGES, *_UNEDITED.values())
+    return {(i, metric): (found[i] or {}).get(metric) for i in images for metric in _METRICS} | seconds(done)
+
+
+def seconds(done: Done) -> dict[str, float | None]:
+    """Return the seconds of the fit, and of all the rest, of an edit.
+
+    A fit that was on disk has the seconds that are kept with it; None where there is no fit. The rest is NaN
+    where a run was interrupted and resumed, whose time is not known.
+    """
+    fit, timing = done.metrics["fit"], done.metrics["timing"]
+    resumed = json.loads((done.folder / DONE).read_bytes())["resumed"]
+    rest = timing["total_s"] - (timing["fit_s"] if fit else 0)
+    return {"fit_s": fit and fit["seconds"], "rest_s": math.nan if resumed else rest}
+
+
+def rows_of(name: str, made, out: Path) -> list[dict]:
+    """Return what is known of each case: its ``about``, and its numbers, ``found``: None if not done."""
+    found = {one.case.name: measure(name, one) for one in done_of(made, out)}
+    return [case.about | {"found": found.get(case.name)} for case, _ in made]
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """Average numbers; None if there is none or one is None: an average is of all maps or of no map.
+
+    NaN, the time of a resumed run, is left out.
+    """
+    values = list(values)
+    if not values or None in values:
+        return None
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else None
+
+
+def shared(rows: list[dict]) -> set[str]:
+    """Return the maps that are done in every method's row that has any done."""
+    ready: dict[str, set[str]] = {}
+    for row in rows:
+        if row["found"]:
+            ready.setdefault(row["row"], set()).add(row["map"])
+    return set.intersection(*ready.values()) if ready else set()
+
+
+def text(name: str, title: str, rows: list[dict]) -> str:
     """Write the tables of one table or figure: one for either settings and every roughness.
 
-    Averages are over the maps that are done in every row that has any, so that rows can be compared; how many
-    of a row's own are done stands last. The best of a column is in bold.
+    Averages are over the maps of :func:`shared`, so that methods can be compared; how many of a method's own
+    are done stands last. The best of a column is in bold.
     """
-    kind = KINDS[name]
-    spent = measured.seconds(out, cells)  # of all: a fit may have been made for another roughness
-    build = {"figure4": _fits, "figure5": _fits, "figure9": _paint}.get(name, _methods)
-    parts = [f"## {kind.title}"]
-    for settings in dict.fromkeys(cell.settings for cell in cells):
-        some = [cell for cell in cells if cell.settings == settings]
-        names = sorted({cell.map for cell in some})
-        maps = names[0] if len(names) == 1 else f"{len(names)} maps"
-        for roughness in sorted({cell.roughness for cell in some}, key=lambda r: -1 if r is None else r):
-            at = "" if roughness is None else f", roughness {roughness:g}"
-            here = [c for c in some if c.roughness == roughness and c.row in kind.rows]
-            shared = common(out, here)
-            count = len({cell.map for cell in shared})
-            over = "" if count in (0, len(names)) else f", averages over {count} of them"
-            if not count and measured.done(out, here):
-                over = ", no map is done in every row"
-            parts.append(f"{_SETTINGS[settings][0].upper()}{_SETTINGS[settings][1:]}{at}, {maps}{over}:")
-            parts.append(build(name, out, here, shared, spent))
+    parts = [f"## {title}"]
+    for group in dict.fromkeys((row["settings"], row["roughness"]) for row in rows):
+        some = [row for row in rows if (row["settings"], row["roughness"]) == group]
+        parts += [_heading(*group, some), _table(name, group[1], some)]
     return "\n\n".join(parts)
 
 
-def common(out, cells: list[Cell]) -> list[Cell]:
-    """Return the cells of the maps that are done in every row, or at every roughness, that has any done."""
-    ready: dict[tuple, set[str]] = {}
-    for cell in measured.done(out, cells):
-        ready.setdefault((cell.row, cell.roughness), set()).add(cell.map)
-    shared = set.intersection(*ready.values()) if ready else set()
-    return [cell for cell in cells if cell.map in shared]
+def _heading(settings, roughness, rows):
+    names, count = sorted({row["map"] for row in rows}), len(shared(rows))
+    maps = names[0] if len(names) == 1 else f"{len(names)} maps"
+    at = "" if roughness is None else f", roughness {roughness:g}"
+    over = "" if count in (0, len(names)) else f", averages over {count} of them"
+    if not count and any(row["found"] for row in rows):
+        over = ", no map is done in every row"
+    whose = {"paper": "The paper's settings", "ours": "Our settings"}[settings]
+    return f"{whose}{at}, {maps}{over}:"
 
 
-def rows_of(name: str, cells: list[Cell]) -> dict[str, list[Cell]]:
-    """Group cells by row, in the order of the table."""
-    return {row: some for row in KINDS[name].rows if (some := [cell for cell in cells if cell.row == row])}
-
-
-def mean(values: Sequence[float | None]) -> float | None:
-    """Average numbers; None where there are none or one is missing: an average is of all maps or of none."""
-    if not values or any(value is None for value in values):
-        return None
-    return float(np.mean(values))
-
-
-def averages(out, cells: list[Cell], which=("envmap", "render")) -> tuple[dict, int]:
-    """Average a row's metrics over its maps.
-
-    Parameters
-    ----------
-    which : (str, str)
-        Tables of metrics.json that hold the numbers of map and rendering.
-
-    Returns
-    -------
-    found : dict
-        Column of :data:`published.COLUMNS` -> number or None.
-    count : int
-        Maps that are done.
-    """
-    reads = [measured.numbers(out, cell) for cell in measured.done(out, cells)]
-    places = dict(zip(("envmap", "render"), which, strict=True))
-    found = {
-        (image, column): mean([(read[places[image]] or {}).get(column) for read in reads])
-        for image, column in COLUMNS
+def _table(name, roughness, rows):
+    columns = _OF_FIGURES.get(name, EDITS)
+    published = PUBLISHED.get(name, {}).get(roughness, {})
+    maps, over = {row["map"] for row in rows}, shared(rows)
+    methods = {row["row"]: row["title"] for row in rows}
+    done = {method: [r for r in rows if r["row"] == method and r["found"]] for method in methods}
+    averages = {
+        method: {c.key: mean(r["found"][c.key] for r in some if r["map"] in over) for c in columns.values()}
+        for method, some in done.items()
     }
-    return found, len(reads)
-
-
-def _methods(name, out, cells, shared, spent):
-    published = PUBLISHED.get(name, {}).get(cells[0].roughness, {})
-    head = [f"{'map' if image == 'envmap' else 'rendering'} {_WORDS[column]}" for image, column in COLUMNS]
-    rows = rows_of(name, cells)
-    found = {row: averages(out, [cell for cell in some if cell in shared])[0] for row, some in rows.items()}
     best = {}
-    for column in COLUMNS:
-        numbers = [row[column] for row in found.values() if row[column] is not None]
-        best[column] = _BETTER[column[1]](numbers) if len(numbers) > 1 else None
-    lines = [_unedited(out, shared, len({cell.map for cell in cells}))]
-    for row, some in rows.items():
-        numbers, count = found[row], len(measured.done(out, some))
-        cells_ = []
-        for column in COLUMNS:
-            own = _show(numbers[column], column[1])
-            bold = numbers[column] is not None and numbers[column] == best[column]
-            own = f"**{own}**" if bold else own
-            theirs = published.get(row, {}).get(column)
-            cells_.append(own if theirs is None else f"{own} ({_show(theirs, column[1])})")
-        title, times = KINDS[name].methods[row].title, _times(spent, [c for c in some if c in shared])
-        lines.append([title, *cells_, *times, f"{count}/{len(some)}"])
-    return markdown(["", *head, "fit, s", "rest, s", "maps"], lines)
+    for column in columns.values():
+        values = [one[column.key] for one in averages.values() if one[column.key] is not None]
+        best[column.key] = column.best(values) if column.best and len(values) > 1 else None
+    lines = [_unedited(rows, over, len(maps))] if columns is EDITS else []
+    for method, title in methods.items():
+        cells = []
+        for column in columns.values():
+            own, theirs = averages[method][column.key], published.get(method, {}).get(column.key)
+            shown = number(own, column.form)
+            shown = f"**{shown}**" if own is not None and own == best[column.key] else shown
+            cells.append(shown if theirs is None else f"{shown} ({number(theirs, column.form)})")
+        lines.append([title, *cells, f"{len(done[method])}/{sum(row['row'] == method for row in rows)}"])
+    return markdown(["", *columns, "maps"], lines)
 
 
-def _unedited(out, cells, maps):
+def _unedited(rows, over, count):
     """Return the row before any edit: of every map the numbers of the first run that is done."""
-    first = {}
-    for cell in measured.done(out, cells):
-        first.setdefault(cell.map, cell)
-    numbers, count = averages(out, list(first.values()), ("initial_envmap", "initial"))
-    shown = [_show(numbers[column], column[1]) for column in COLUMNS]
-    return ["unedited", *shown, "-", "-", f"{count}/{maps}"]
-
-
-def _fits(name, out, cells, shared, spent):
-    lines = []
-    for row, some in rows_of(name, cells).items():
-        ready = measured.done(out, some)
-        reads = [measured.numbers(out, cell) for cell in ready if cell in shared]
-        values = [mean([read[key] for read in reads]) for key in ("log_psnr", "peak_ratio", "mean_ratio")]
-        noisy = [mean(read["noisy"]) for read in reads]
-        shown = [
-            f"{value:.{d}f}" if value is not None else "-" for value, d in zip(values, (1, 3, 3), strict=True)
-        ]
-        with_noise = mean(noisy)
-        lines.append(
-            [
-                KINDS[name].methods[row].title,
-                *shown,
-                "-" if with_noise is None else f"{with_noise:.1f}",
-                _seconds([read["seconds"] for read in reads]),
-                f"{len(ready)}/{len(some)}",
-            ]
-        )
-    head = ["", "log PSNR, dB", "peak", "mean luminance", "log PSNR with noise, dB", "s", "maps"]
-    return markdown(head, lines)
-
-
-def _paint(name, out, cells, shared, spent):
-    lines = []
-    for row, some in rows_of(name, cells).items():
-        ready = measured.done(out, some)
-        told = [cell for cell in ready if cell in shared]
-        painted = [measured.numbers(out, cell)["painted"] for cell in told]
-        against = [measured.of_paint(out, cell) for cell in told]
-        share = [mean([p[key] for p in painted]) for key in ("towards", "reachable")]
-        elsewhere = mean([p["elsewhere"] for p in painted])
-        ssim, sharp = (mean([a[key] for a in against]) for key in ("ssim", "sharp"))
-        lines.append(
-            [
-                KINDS[name].methods[row].title,
-                *("-" if s is None else f"{100 * s:.0f} %" for s in share),
-                "-" if elsewhere is None else f"{elsewhere:.4f}",
-                "-" if ssim is None else f"{ssim:.3f}",
-                "-" if sharp is None or math.isnan(sharp) else f"{sharp:.2f}",
-                *_times(spent, told),
-                f"{len(ready)}/{len(some)}",
-            ]
-        )
-    head = ["", "towards the paint", "feasible", "change elsewhere", "map SSIM", "high frequencies"]
-    return markdown([*head, "fit, s", "rest, s", "maps"], lines)
-
-
-def _show(value, column):
-    return "-" if value is None else f"{value:.{_DIGITS[column]}f}"
-
-
-def _times(spent, cells):
-    """Average the seconds of fits and of the rest, those that are known."""
-    taken = [spent[cell] for cell in cells if cell in spent]
-    fits = [fit for fit, _ in taken if fit is not None]
-    return _seconds(fits), _seconds([rest for _, rest in taken if not math.isnan(rest)])
-
-
-def _seconds(values):
-    return f"{np.mean(values):.0f}" if values else "-"
+    first: dict[str, dict] = {}
+    for row in rows:
+        if row["found"] and row["map"] in over:
+            first.setdefault(row["map"], row["found"])
+    cells = []
+    for image, name in COLUMNS:
+        value = mean(found[_UNEDITED[image], name] for found in first.values())
+        cells.append(number(value, _METRICS[name][1]))
+    return ["unedited", *cells, "-", "-", f"{len(first)}/{count}"]

@@ -1,17 +1,13 @@
-r"""Times and errors of nine edits, to compare two versions of the solver.
-
-    ENVEDIT_DATA=... OPENBLAS_NUM_THREADS=1 python -m experiments.solver.edits [--set table.key=value ...]
+"""Times and errors of nine edits, to compare two versions of the solver.
 
 Every edit is run twice and the second time counts: kernels, T and the target's rendering are on disk then.
-Prints a table, and the mean of its columns. Run it on either version, in one go, where nothing else runs.
+Run it on either version, in one go, where nothing else runs.
 """
 
-import argparse
-import tempfile
-from pathlib import Path
-
-import mitsuba as mi
 import numpy as np
+
+from experiments import puresky
+from experiments.harness import Experiment, calling, markdown
 
 EDITS = (  # map, scene, target (degrees or another map), whether the sky may turn
     ("sunflowers", "sphere", "60", False),
@@ -24,10 +20,17 @@ EDITS = (  # map, scene, target (degrees or another map), whether the sky may tu
     ("syferfontein_18d_clear", "pair", "kloofendal_48d_partly_cloudy", True),
     ("kloppenheim_06", "sphere", "60", True),
 )
-COLUMNS = "solve, s", "total, s", "steps", "a step, ms", "rendering, dB", "map, dB"
+NUMBERS = {
+    "solve, s": "{solve_s:.2f}",
+    "total, s": "{total_s:.2f}",
+    "steps": "{iterations:.1f}",
+    "a step, ms": "{per_iteration_ms:.0f}",
+    "rendering, dB": "{render:.2f}",
+    "map, dB": "{envmap:.2f}",
+}
 
 
-def tables(files, name, scene, target, turn):
+def tables(files, name, scene, target, turn) -> dict:
     """Return the configuration of an edit."""
     wanted = {"rotate_degrees": float(target)} if target.isdigit() else {"file": str(files[target])}
     return {
@@ -38,33 +41,40 @@ def tables(files, name, scene, target, turn):
     }
 
 
-def main(arguments=None):
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--set", action="append", default=[], metavar="TABLE.KEY=VALUE")
-    given = parser.parse_args(arguments)
-    mi.set_variant("llvm_ad_rgb")
-    from envedit import config, pipeline  # after the variant
-    from experiments import puresky
-
-    files, rows = puresky.of_script(), []
-    print("| edit | " + " | ".join(COLUMNS) + " |\n" + "|---" * (1 + len(COLUMNS)) + "|")
-    for edit in EDITS:
-        with tempfile.TemporaryDirectory() as folder:
-            settings = config.from_dict(tables(files, *edit), Path(folder), overrides=given.set)
-            for _ in range(2):
-                found = pipeline.run(settings).metrics
-        timing = found["timing"]
-        row = timing["solve_s"], timing["total_s"], found["iterations"], timing["per_iteration_ms"] or 0
-        rows.append((*row, found["render"]["psnr"], found["envmap"]["psnr"]))
-        print(_line(f"{edit[0]}, {edit[1]}, {edit[2]}", rows[-1]), flush=True)
-    print(_line("mean", np.mean(rows, axis=0)))
+def cases(given):
+    files = puresky.find()
+    return [
+        calling(f"{name}, {scene}, {target}", "experiments.solver.growth:second", tables(files, *edit))
+        for edit in EDITS
+        for name, scene, target, _ in [edit]
+    ]
 
 
-def _line(name, row):
-    digits = 2, 2, 1, 0, 2, 2
-    return f"| {name} | " + " | ".join(f"{v:.{n}f}" for v, n in zip(row, digits, strict=True)) + " |"
+def measure(done) -> dict:
+    found, timing = done.metrics, done.metrics["timing"]
+    return {
+        "edit": done.case.name,
+        "solve_s": timing["solve_s"],
+        "total_s": timing["total_s"],
+        "iterations": found["iterations"],
+        "per_iteration_ms": timing["per_iteration_ms"] or 0,
+        "render": found["render"]["psnr"],
+        "envmap": found["envmap"]["psnr"],
+    }
 
 
-if __name__ == "__main__":
-    main()
+def summary(rows) -> str:
+    means = {key: np.mean([row[key] for row in rows]) for key in rows[0] if key != "edit"}
+    lines = [[f"mean of {len(rows)}", *(form.format_map(means) for form in NUMBERS.values())]]
+    return markdown(["", *NUMBERS], lines)
+
+
+EXPERIMENT = Experiment(
+    "solver.edits",
+    "Times and errors of nine edits, to compare two versions of the solver.",
+    cases,
+    measure,
+    {"edit": "{edit}"} | NUMBERS,
+    summary=summary,
+    alone=True,
+)

@@ -19,7 +19,7 @@ def second(settings, folder) -> dict:
 
 
 def cases(given):
-    file = str(puresky.chosen(["sunflowers"])["sunflowers"])
+    file = puresky.file("sunflowers")
     return [
         calling(
             f"{pixels}x{texels}",

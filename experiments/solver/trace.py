@@ -1,21 +1,15 @@
-r"""Draw the objective against steps and seconds, for Gauss-Newton and for Adam, from the same start.
-
-    ENVEDIT_DATA=... python -m experiments.solver.trace [--out experiments/solver/trace.png] \
-        [--map sunflowers] [--scene sphere] [--angle 60]
+"""The objective against steps and seconds, for Gauss-Newton and for Adam, from the same start.
 
 Both minimise what they minimise in a run (Adam the losses of [loss]); shown is F of ``solve/gauss_newton.py``
 at its final sigma, and the map's PSNR against the true one, at every step. Seconds are of the optimisation
-alone. Prints the milliseconds of a Gauss-Newton step beside those in which its bytes can be read.
+alone. A Gauss-Newton step stands beside the milliseconds in which its bytes can be read.
 """
 
-import argparse
 import time
-from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
-from envedit import config, inputs, renderers
+from envedit import inputs, renderers
 from envedit.losses import metrics
 from envedit.representations import Layers
 from envedit.solve import adam_loop, gauss_newton, light_search, map_problem
@@ -23,24 +17,11 @@ from envedit.targets import target
 from experiments import puresky
 from experiments.engine.floors import bandwidth
 from experiments.engine.transport import bytes_read
+from experiments.harness import Experiment, calling, done_of, figure
 
 
-def main():
-    """Compute and draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("experiments/solver/trace.png"))
-    parser.add_argument("--map", default="sunflowers")
-    parser.add_argument("--scene", default="sphere")
-    parser.add_argument("--angle", type=float, default=60.0)
-    given = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
-    settings = config.from_dict(
-        {
-            "input": {"envmap": str(puresky.of_script([given.map])[given.map])},
-            "scene": {"file": given.scene},
-            "target": {"rotate_degrees": given.angle},
-        }
-    )
+def trace(settings, folder) -> dict:
+    """Return ``curves``, by solver rows of (seconds, F, map PSNR in dB), and what :func:`floor` does."""
     lit = inputs.load_scene(settings.scene)
     original, _ = inputs.load_map(settings.input, lit)
     wanted = target.make(settings, lit, original)
@@ -71,17 +52,13 @@ def main():
             point = problem.evaluate(state)
             loss = problem.misfit(point.residual, map_problem.SIGMA) + problem.penalty(state, start)
             true = metrics.compare(point.edited[rows], wanted.envmap[rows], "gamma")["psnr"]
-            points.append((seconds, loss, true))
-        curves[name] = np.array(points)
-        seconds, loss, true = points[-1]
-        course = f"F {points[0][1]:.4g} -> {loss:.4g}, map {true:.2f} dB"
-        print(f"{name}: {len(points) - 1} steps, {seconds:.2f} s, {course}")
-    print(floor(problem, took))
-    draw(given.out, curves)
+            points.append((seconds, float(loss), true))
+        curves[name] = points
+    return {"curves": curves, "step_ms": took, **floor(problem)}
 
 
-def floor(problem: map_problem.Problem, took: float) -> str:
-    """Compare the milliseconds of a step with those of reading once what it reads of T and of its blocks.
+def floor(problem: map_problem.Problem) -> dict:
+    """Return the milliseconds of reading once what a step reads of T and of its blocks, and the bytes.
 
     T for one rendering and one gradient, the block transport, the splines in its cells for every channel, and
     the Jacobian, which is written and read again for the Hessian.
@@ -90,11 +67,7 @@ def floor(problem: map_problem.Problem, took: float) -> str:
     of_t = read["apply"] + read["adjoint"]
     of_blocks = problem.blocks.nbytes + 3 * 2 * 4 * problem.blocks.count * problem.nodes
     rate = bandwidth()["read"]
-    least = 1000 * (of_t + of_blocks) / rate
-    return (
-        f"a Gauss-Newton step: {took:.0f} ms, {took / least:.1f} times the floor of {least:.1f} ms: "
-        f"{of_t / 1e6:.0f} MB of T, {of_blocks / 1e6:.0f} MB of blocks and Jacobian at {rate / 1e9:.1f} GB/s"
-    )
+    return {"floor_ms": 1000 * (of_t + of_blocks) / rate, "of_t": of_t, "of_blocks": of_blocks, "rate": rate}
 
 
 class Seen:
@@ -110,28 +83,60 @@ class Seen:
         self.states.append((time.perf_counter() - self.began, self.problem.state(adam.params)))
 
 
-def draw(path: Path, curves) -> None:
-    """Draw F against steps and seconds, and the map's PSNR against seconds."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, panels = pyplot.subplots(1, 3, figsize=(12, 3.6), constrained_layout=True)
-    for name, points in curves.items():
-        panels[0].plot(np.arange(len(points)), points[:, 1], marker=".", label=name)
-        panels[1].plot(points[:, 0], points[:, 1], marker=".", label=name)
-        panels[2].plot(points[:, 0], points[:, 2], marker=".", label=name)
-    for panel, x, y in zip(panels, ("steps", "seconds", "seconds"), ("F", "F", "map PSNR, dB"), strict=True):
-        panel.set_xlabel(x)
-        panel.set_ylabel(y)
-        panel.grid(alpha=0.3)
-    panels[0].set_yscale("log")
-    panels[1].set_yscale("log")
-    panels[0].legend()
-    figure.savefig(path, dpi=100)
-    print(path)
+def cases(given):
+    tables = {
+        "input": {"envmap": puresky.file("sunflowers")},
+        "scene": {"file": "sphere"},
+        "target": {"rotate_degrees": 60.0},
+    }
+    return [calling("trace", "experiments.solver.trace:trace", tables)]
 
 
-if __name__ == "__main__":
-    main()
+def measure(done) -> list[dict]:
+    return [
+        {"solver": name, "steps": len(points) - 1, "first": points[0], "last": points[-1]}
+        | {key: value for key, value in done.metrics.items() if key != "curves"}
+        for name, points in done.metrics["curves"].items()
+    ]
+
+
+def summary(rows) -> str:
+    return (
+        "a Gauss-Newton step: {step_ms:.0f} ms, floor {floor_ms:.1f} ms: {of_t:.3g} bytes of T, "
+        "{of_blocks:.3g} of blocks and Jacobian at {rate:.3g} bytes a second"
+    ).format_map(rows[0])
+
+
+def draw(made, out, to, given):
+    """Draw F against steps and seconds, and the map's PSNR against seconds: ``trace.png``."""
+    with figure(to / "trace.png", 1, 3, size=(12, 3.6)) as panels:
+        for name, points in done_of(made, out)[0].metrics["curves"].items():
+            seconds, loss, psnr = np.transpose(points)
+            for panel, x, y in zip(
+                panels, (np.arange(len(loss)), seconds, seconds), (loss, loss, psnr), strict=True
+            ):
+                panel.plot(x, y, marker=".", label=name)
+        labels = ("steps", "F"), ("seconds", "F"), ("seconds", "map PSNR, dB")
+        for panel, (x, y) in zip(panels, labels, strict=True):
+            panel.set(xlabel=x, ylabel=y, yscale="log" if y == "F" else "linear")
+        panels[0].legend()
+    return [to / "trace.png"]
+
+
+EXPERIMENT = Experiment(
+    "solver.trace",
+    "The objective against steps and seconds, for Gauss-Newton and for Adam, from the same start.",
+    cases,
+    measure,
+    {
+        "solver": "{solver}",
+        "steps": "{steps}",
+        "seconds": "{last[0]:.2f}",
+        "F at the start": "{first[1]:.4g}",
+        "F at the end": "{last[1]:.4g}",
+        "map, dB": "{last[2]:.2f}",
+    },
+    summary=summary,
+    draw=draw,
+    alone=True,
+)

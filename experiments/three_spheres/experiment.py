@@ -25,27 +25,20 @@ SPHERES = {
 TASKS = {"turned": "turned by 140 degrees, without `turn`", "another": "the light of another map"}
 
 
-def options(parser):
-    parser.add_argument("--maps", nargs="+", metavar="NAME")
-    parser.add_argument("--scene", default="statue")
-
-
 def cases(given):
-    maps = puresky.chosen(given.maps)
-    files = list(maps.items())
-    found = []
+    files, found = list(puresky.find().items()), []
     for i, (name, file) in enumerate(files):
         other, other_file = files[(i + len(files) // 2) % len(files)]
         targets = {"turned": {"rotate_degrees": 140}, "another": {"file": str(other_file)}}
         for task, target in targets.items():
             tables = {
                 "input": {"envmap": str(file), "width": 256},
-                "scene": {"file": given.scene},
+                "scene": {"file": "statue"},
                 "target": target,
                 "representation": {"turn": False},
             }
             about = {"map": name, "task": TASKS[task], "other": other if task == "another" else ""}
-            found.append(Case(f"{name}-{given.scene}-{task}", tables, about))
+            found.append(Case(f"{name}-{task}", tables, about))
     return found
 
 
@@ -148,5 +141,4 @@ EXPERIMENT = Experiment(
     group=lambda row: row["task"],
     summary=summary,
     panels=panels,
-    options=options,
 )

@@ -1,29 +1,32 @@
-"""Ratios to the standard preset, means over cells, fronts, and the tables."""
+"""Ratios to the standard preset, means over cells, fronts, and the rows of the tables."""
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable
 
-from experiments.engine.tables import table
+from experiments.harness import Done, number
 
-from .plan import references
-
-TIMES = {"time": "whole run", "again": "run again, T and fit at hand"}
-"""Kinds of time: of a run from nothing but compiled kernels; of one that finds T and fit on disk."""
 MOST_PSNR = 55.0
-"""Most dB of a rendering that are told: beyond, the estimate without noise may itself be noise (57 dB for the
-true map, where the judge has most of it)."""
+"""Most dB of a rendering that are shown: beyond, the estimate without noise may itself be noise (57 dB for
+the true map, where the judge has most of it)."""
 UNDISTURBED = 0.85
 """Share of its setting's usual processor time, by wall time, that a run is to have had."""
-PAIRED = references(0).name
-"""The run of the standard preset whose seed all other settings have."""
 SHARES = (2.0, 1.5, 1.0, 0.75, 0.5, 0.35)
 """Times, as multiples of the standard preset's, for which the best setting is looked up."""
+COSTS = ("time", "again", "memory")
+WORTH = ("psnr", "map_psnr", "map_ssim")
 
 
-# ---- one run -----------------------------------------------------------------------------------------------
+def by(rows: list[dict], *keys: str) -> list[list[dict]]:
+    """Group rows that are equal in some keys."""
+    found: dict[tuple, list[dict]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return list(found.values())
+
+
+# ---- runs --------------------------------------------------------------------------------------------------
 
 
 def flat(cost: dict, judged: dict) -> dict:
@@ -35,86 +38,105 @@ def flat(cost: dict, judged: dict) -> dict:
         ``time`` and ``again`` in seconds: the latter less what fit and tracing took (a run that finds them on
         disk takes a tenth of a second to load them, which is left out); ``memory`` in bytes; ``psnr`` of the
         rendering, without the judge's noise and at most :data:`MOST_PSNR`, and ``map_psnr``, in dB;
-        ``map_ssim``; ``sun`` in degrees and ``noise`` of the loss, or None.
+        ``map_ssim``; ``sun`` in degrees and ``noise`` of the loss, or None; ``share`` of the processor.
     """
     timing = judged["timing"]
-    ready = timing["fit_s"] + timing["transport_s"]
     return {
         "time": cost["wall_s"],
-        "again": cost["wall_s"] - ready,
+        "again": cost["wall_s"] - timing["fit_s"] - timing["transport_s"],
         "memory": cost["peak_bytes"],
         "psnr": min(judged["render"]["psnr_without_noise"], MOST_PSNR),
         "map_psnr": judged["map"]["psnr"],
         "map_ssim": judged["map"]["ssim"],
         "sun": judged["sun_degrees"],
         "noise": judged["loss_noise"],
+        "share": cost["cpu_s"] / cost["wall_s"],
     }
 
 
-def ratios(runs: list[dict]) -> list[dict]:
-    """Put every run beside the standard preset's of the same cell and session.
-
-    Parameters
-    ----------
-    runs : list of dict
-        ``setting``, ``group``, ``map``, ``scene``, ``session``, and the numbers of :func:`flat`.
+def compared(done: Done) -> list[dict]:
+    """Put every run of a case beside its runs of the standard preset.
 
     Returns
     -------
     list of dict
-        The same with ``ratio``: ``time``, ``again`` and ``memory`` over the median of the standard preset's
-        runs in that session; and ``change``: ``psnr``, ``map_psnr`` and ``map_ssim`` less those of the
-        standard preset with the same seed, :data:`PAIRED`, as the noise of the target, which both share, is
-        the largest difference under a sun (6 dB between seeds); of the same session, or of the last before
-        it that has this seed, as the program may have changed in between; less the median of all where that
-        seed was not run. Runs in whose session the standard preset was not measured are left out.
+        ``setting`` and ``group``, the numbers of :func:`flat`, and ``ratio``: :data:`COSTS` over the median
+        of the standard preset's runs; ``change``: :data:`WORTH` less that of its first run, which has the
+        seed of all other settings: the noise of the target, which both share, is the largest difference
+        under a sun (6 dB between seeds). The standard preset's own ratios are 1 and changes 0. All have the
+        case's ``name``, ``unedited`` and ``ceiling``.
     """
-    standard = [r for r in runs if r["group"] == "standard"]
-    found = []
+    found = done.metrics
+    same = {"name": done.case.name, "unedited": found["unedited"], "ceiling": found["ceiling"]}
+    runs = [
+        same | {"setting": r["setting"], "group": r["group"]} | flat(r["cost"], r["judged"])
+        for r in found["runs"]
+    ]
+    standard = [run for run in runs if run["group"] == "standard"]
+    median = {key: statistics.median(run[key] for run in standard) for key in COSTS}
     for run in runs:
-        same = [s for s in standard if _cell(s) == _cell(run)]
-        beside = [s for s in same if s["session"] == run["session"]]
-        if not beside:
-            continue
-        cost = ("time", "again", "memory")
-        ratio = {key: run[key] / statistics.median(s[key] for s in beside) for key in cost}
-        won = ("psnr", "map_psnr", "map_ssim")
-        paired = _last([s for s in same if s["setting"] == PAIRED and s["session"] <= run["session"]]) or same
-        change = {key: run[key] - statistics.median(s[key] for s in paired) for key in won}
-        found.append(run | {"ratio": ratio, "change": change})
-    return found
+        run["ratio"] = {key: run[key] / median[key] for key in COSTS}
+        run["change"] = {key: run[key] - standard[0][key] for key in WORTH}
+    for run in standard:
+        run |= {
+            "setting": "standard",
+            "ratio": dict.fromkeys(COSTS, 1.0),
+            "change": dict.fromkeys(WORTH, 0.0),
+        }
+    return runs
 
 
 def disturbed(runs: list[dict]) -> list[dict]:
     """List runs that had less of the processor than others of their setting: something else ran beside them.
 
     Processor time over wall time, of which a run had less than :data:`UNDISTURBED` of the median of its
-    setting's runs; settings of fewer than three runs are not told.
+    setting's runs; settings of fewer than three runs are not examined.
     """
     found = []
-    for name in dict.fromkeys(run["setting"] for run in runs):
-        some = [run for run in runs if run["setting"] == name]
-        shares = [run["cost"]["cpu_s"] / run["cost"]["wall_s"] for run in some]
-        usual = statistics.median(shares)
-        if len(some) >= 3:
-            found += [r for r, share in zip(some, shares, strict=True) if share < UNDISTURBED * usual]
+    for some in by(runs, "setting"):
+        usual = statistics.median(run["share"] for run in some)
+        found += [run for run in some if len(some) >= 3 and run["share"] < UNDISTURBED * usual]
     return found
 
 
-def _last(runs):
-    """Pick the runs of the last session among them."""
-    return [run for run in runs if run["session"] == max(other["session"] for other in runs)]
+def spread(runs: list[dict]) -> dict[str, float]:
+    """Return how far the standard preset's seeds differ in one cell, standard deviation, pooled over cells.
+
+    Returns
+    -------
+    dict
+        ``psnr``, ``map_psnr`` in dB, ``map_ssim``, and ``time`` relative to its mean.
+    """
+    variances: dict[str, list[float]] = {}
+    for some in by([run for run in runs if run["group"] == "standard"], "name"):
+        for key in (*WORTH, "time"):
+            values = [run[key] for run in some]
+            scale = statistics.fmean(values) if key == "time" else 1.0
+            variances.setdefault(key, []).append(statistics.variance(values) / scale**2)
+    return {key: math.sqrt(statistics.fmean(values)) for key, values in variances.items()}
 
 
-def _cell(run):
-    return run["map"], run["scene"]
+def summary(runs: list[dict]) -> str:
+    """Return how far seeds differ, and which runs were disturbed."""
+    differ = spread(runs)
+    lines = [
+        f"Standard deviation between seeds of the standard preset in one cell: rendering "
+        f"{differ['psnr']:.2f} dB, map {differ['map_psnr']:.2f} dB, map SSIM {differ['map_ssim']:.3f}, "
+        f"time {100 * differ['time']:.1f} %."
+    ]
+    lines += [
+        f"{run['name']}: {run['setting']} had less of the processor than others of its setting: if something "
+        f"else ran beside it, remove the folder of this case and run again."
+        for run in disturbed(runs)
+    ]
+    return "\n\n".join(lines)
 
 
 # ---- a setting in many cells -------------------------------------------------------------------------------
 
 
-def means(compared: list[dict]) -> list[dict]:
-    """Average every setting over its cells; of the standard preset, by which all is measured, the medians.
+def means(runs: list[dict]) -> list[dict]:
+    """Average every setting over its cells.
 
     Returns
     -------
@@ -122,24 +144,17 @@ def means(compared: list[dict]) -> list[dict]:
         ``setting``, ``group``, ``cells``: how many; ``ratio``: geometric means; ``change``: means;
         ``sun``: mean degrees over the cells that have a sun, None without one; ``noise``: median, or None.
     """
-    groups: dict[str, list[dict]] = {}
-    for run in compared:
-        name = "standard" if run["group"] == "standard" else run["setting"]
-        groups.setdefault(name, []).append(run)
     found = []
-    for name, some in groups.items():
-        suns = [r["sun"] for r in some if r["sun"] is not None]
-        noises = [r["noise"] for r in some if r["noise"] is not None]
-        if name == "standard":  # its median, by which all is measured
-            some = [r | {"ratio": dict.fromkeys(r["ratio"], 1.0)} for r in some]
-            some = [r | {"change": dict.fromkeys(r["change"], 0.0)} for r in some]
+    for some in by(runs, "setting"):
+        suns = [run["sun"] for run in some if run["sun"] is not None]
+        noises = [run["noise"] for run in some if run["noise"] is not None]
         found.append(
             {
-                "setting": name,
+                "setting": some[0]["setting"],
                 "group": some[0]["group"],
-                "cells": len({_cell(r) for r in some}),
-                "ratio": {k: _geometric(r["ratio"][k] for r in some) for k in some[0]["ratio"]},
-                "change": {k: statistics.fmean(r["change"][k] for r in some) for k in some[0]["change"]},
+                "cells": len({run["cell"] for run in some}),
+                "ratio": {key: statistics.geometric_mean(run["ratio"][key] for run in some) for key in COSTS},
+                "change": {key: statistics.fmean(run["change"][key] for run in some) for key in WORTH},
                 "sun": statistics.fmean(suns) if suns else None,
                 "noise": statistics.median(noises) if noises else None,
             }
@@ -147,170 +162,83 @@ def means(compared: list[dict]) -> list[dict]:
     return found
 
 
-def _geometric(values: Iterable[float]) -> float:
-    return math.exp(statistics.fmean(math.log(v) for v in values))
+def everywhere(averages: list[dict]) -> list[dict]:
+    """Pick the settings that ran in most cells, which alone can be compared with each other."""
+    most = max(row["cells"] for row in averages)
+    return [row for row in averages if row["cells"] == most]
 
 
-def front(points: list[tuple[float, float]]) -> list[int]:
-    """List the points (cost, worth) that no other beats in both, by rising cost.
-
-    Of points that are equal the first is listed.
-    """
-    order = sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1], i))
-    found: list[int] = []
-    for i in order:
-        if not found or points[i][1] > points[found[-1]][1]:
-            found.append(i)
+def front(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """List the points (cost, worth) that no other beats in both, by rising cost."""
+    found: list[tuple[float, float]] = []
+    for cost, worth in sorted(points, key=lambda point: (point[0], -point[1])):
+        if not found or worth > found[-1][1]:
+            found.append((cost, worth))
     return found
 
 
-def score(row: dict) -> float:
-    """Sum up what a setting is worth, dB: the changes of rendering and map PSNR."""
-    return row["change"]["psnr"] + row["change"]["map_psnr"]
-
-
-def best_within(rows: list[dict], share: float, time: str = "time") -> dict | None:
-    """Return the row of the highest :func:`score` among those that take at most a share of the time."""
-    quick = [r for r in rows if r["ratio"][time] <= share * (1 + 1e-9)]
-    return max(quick, key=score, default=None)
-
-
-def spread(runs: list[dict]) -> dict[str, float] | None:
-    """Tell how far the standard preset's seeds differ in one cell, standard deviation, pooled over cells.
-
-    Returns
-    -------
-    dict or None
-        ``psnr``, ``map_psnr`` in dB, ``map_ssim``, and ``time`` relative to its mean, within a session.
-    """
-    standard, pooled = [r for r in runs if r["group"] == "standard"], {}
-    for key in ("psnr", "map_psnr", "map_ssim", "time"):
-        variances = []
-        for cell in {(*_cell(r), r["session"]) for r in standard}:
-            values = [r[key] for r in standard if (*_cell(r), r["session"]) == cell]
-            if len(values) > 1:
-                scale = statistics.fmean(values) if key == "time" else 1.0
-                variances.append(statistics.variance(values) / scale**2)
-        if not variances:
-            return None
-        pooled[key] = math.sqrt(statistics.fmean(variances))
-    return pooled
+def best_within(rows: list[dict], share: float) -> dict | None:
+    """Return the setting of the highest sum of both PSNRs of those that take at most a share of the time."""
+    quick = [row for row in rows if row["ratio"]["time"] <= share * (1 + 1e-9)]
+    return max(quick, key=lambda row: row["change"]["psnr"] + row["change"]["map_psnr"], default=None)
 
 
 # ---- tables ------------------------------------------------------------------------------------------------
 
 
-def tables(results: dict) -> dict[str, str]:
-    """Return Markdown tables by the names of the markers in the README.
-
-    Parameters
-    ----------
-    results : dict
-        As ``results.json`` of :mod:`.experiment`.
-    """
-    compared = ratios(results["runs"])
-    rows = means(compared)
-    most = max((r["cells"] for r in rows), default=0)
-    whole = [r for r in rows if r["cells"] == most]
-    found = {f"halving-{kind}": halving(whole, kind) for kind in TIMES}
-    found["presets"] = presets(compared)
-    found["settings"] = every(rows)
-    found["cells"] = bounds(results)
-    if differ := spread(results["runs"]):
-        found["spread"] = (
-            f"Standard deviation between seeds of the standard preset in one cell: rendering "
-            f"{differ['psnr']:.2f} dB, map {differ['map_psnr']:.2f} dB, map SSIM {differ['map_ssim']:.3f}, "
-            f"time {100 * differ['time']:.1f} %."
-        )
-    return found
-
-
-_WORTH = "rendering, dB | map, dB | map SSIM | sun off, degrees"
-
-
-def _worth(row):
-    sun = "-" if row["sun"] is None else f"{row['sun']:.1f}"
-    change = row["change"]
-    return (f"{change['psnr']:+.2f}", f"{change['map_psnr']:+.2f}", f"{change['map_ssim']:+.3f}", sun)
-
-
-def halving(rows: list[dict], kind: str = "time") -> str:
-    """Return the table of what is lost when there is less time, over settings measured in the same cells."""
-    lines = []
-    for share in SHARES:
-        row = best_within(rows, share, kind)
-        if row is None:
-            quickest = min((r["ratio"][kind] for r in rows), default=math.nan)
-            lines.append((f"{share:g}", f"none: the quickest takes {quickest:.2f}", *["-"] * 6))
-            continue
-        ratio = row["ratio"]
-        lines.append(
-            (f"{share:g}", row["setting"], f"{ratio[kind]:.2f}", f"{ratio['memory']:.2f}", *_worth(row))
-        )
-    return table(f"time at most | best setting | time | memory | {_WORTH}", lines)
-
-
-def every(rows: list[dict]) -> str:
-    """Return the table of all settings, in the order in which they were run."""
-    lines = [
-        (
-            r["setting"],
-            r["cells"],
-            *(f"{r['ratio'][key]:.2f}" for key in ("time", "again", "memory")),
-            *_worth(r),
-            "-" if r["noise"] is None else f"{100 * r['noise']:.2g} %",
-        )
-        for r in rows
+def presets(runs: list[dict]) -> list[dict]:
+    """Return medians of the presets' runs in every cell."""
+    some = [run for run in runs if run["group"] in ("standard", "preset")]
+    return [
+        same[0]
+        | {"table": "presets"}
+        | {key: statistics.median(run[key] for run in same) for key in (*COSTS, *WORTH)}
+        | {"sun": same[0]["sun"] and statistics.median(run["sun"] for run in same)}
+        for same in by(some, "cell", "setting")
     ]
-    return table(f"setting | cells | time | again | memory | {_WORTH} | noise of the loss", lines)
 
 
-def presets(compared: list[dict]) -> str:
-    """Return the table of the presets in seconds and absolute numbers, cell by cell."""
-    lines = []
-    wanted = [r for r in compared if r["group"] in ("standard", "preset", "paper")]
-    for cell in dict.fromkeys(_cell(r) for r in wanted):
-        here = [r for r in wanted if _cell(r) == cell]
-        for name in ("draft", "standard", "paper"):
-            some = _last([r for r in here if r["setting"].split(",")[0] == name])
-            if not some:
-                continue
-            middle = {k: statistics.median(r[k] for r in some) for k in ("time", "again", "memory", "psnr")}
-            maps = [statistics.median(r[k] for r in some) for k in ("map_psnr", "map_ssim")]
-            suns = [r["sun"] for r in some if r["sun"] is not None]
-            lines.append(
-                (
-                    ", ".join(cell),
-                    name,
-                    f"{middle['time']:.1f}",
-                    f"{middle['again']:.1f}",
-                    f"{middle['memory'] / 1e9:.2f}",
-                    f"{middle['psnr']:.1f}",
-                    f"{maps[0]:.1f}",
-                    f"{maps[1]:.3f}",
-                    f"{statistics.median(suns):.1f}" if suns else "-",
-                )
-            )
-    head = "cell | preset | s | s again | GB | rendering, dB | map, dB | map SSIM | sun off, degrees"
-    return table(head, lines)
+def combine(runs: list[dict]) -> list[dict]:
+    """Return the rows of all tables, each with the name of its ``table``."""
+    averages = means(runs)
+    best = [(share, best_within(everywhere(averages), share)) for share in SHARES]
+    return [
+        *({"table": "halving", "share": share} | row for share, row in best if row),
+        *presets(runs),
+        *({"table": "settings"} | row for row in averages),
+        *({"table": "cells"} | row for row in {run["cell"]: run for run in runs}.values()),
+    ]
 
 
-def bounds(results: dict) -> str:
-    """Return the table of what the unedited map has, and of the judge's own noise.
-
-    The latter is the PSNR of one rendering of the true map against another, which is left out elsewhere.
-    """
-    lines = []
-    for cell in results["cells"]:
-        before, most = cell["unedited"], cell["ceiling"]
-        lines.append(
-            (
-                f"{cell['map']}, {cell['scene']}",
-                f"{before['render']['psnr_without_noise']:.1f}",
-                f"{most['render']['psnr']:.1f}",
-                f"{before['map']['psnr']:.1f}",
-                f"{before['map']['ssim']:.3f}",
-            )
-        )
-    head = "cell | rendering unedited, dB | noise of the judge, dB | map unedited, dB | its SSIM"
-    return table(head, lines)
+_RATIOS = {key: f"{{ratio[{key}]:.2f}}" for key in COSTS}
+_CHANGES = {
+    "rendering, dB": "{change[psnr]:+.2f}",
+    "map, dB": "{change[map_psnr]:+.2f}",
+    "map SSIM": "{change[map_ssim]:+.3f}",
+    "sun off, degrees": lambda row: number(row["sun"]),
+}
+COLUMNS = {
+    "halving": {"time at most": "{share:g}", "best setting": "{setting}"} | _RATIOS | _CHANGES,
+    "presets": {
+        "cell": "{cell}",
+        "preset": "{setting}",
+        "s": "{time:.1f}",
+        "s again": "{again:.1f}",
+        "GB": lambda row: f"{row['memory'] / 1e9:.2f}",
+        "rendering, dB": "{psnr:.1f}",
+        "map, dB": "{map_psnr:.1f}",
+        "map SSIM": "{map_ssim:.3f}",
+        "sun off, degrees": lambda row: number(row["sun"]),
+    },
+    "settings": {"setting": "{setting}", "cells": "{cells}"}
+    | _RATIOS
+    | _CHANGES
+    | {"noise of the loss, %": lambda row: number(row["noise"] and 100 * row["noise"], ".2g")},
+    "cells": {
+        "cell": "{cell}",
+        "rendering unedited, dB": "{unedited[render][psnr_without_noise]:.1f}",
+        "noise of the judge, dB": "{ceiling[render][psnr]:.1f}",
+        "map unedited, dB": "{unedited[map][psnr]:.1f}",
+        "its SSIM": "{unedited[map][ssim]:.3f}",
+    },
+}

@@ -13,15 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit import inputs
+from envedit import config, inputs
 from envedit.core import latlong
-from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance, tonemap
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.scene import scene
-
-from .plan import ANGLE, SCENES, Cell, Setting, job_of
 
 WIDTH, FILM = 512, 128
 """Texels and pixels across, of every map and rendering that is judged."""
@@ -30,62 +27,54 @@ SEED, TRUE_SEED = 5_000_011, 6_000_011
 """Apart from those of targets and results in the runs."""
 SUNNY = 1000.0
 """Peak radiance from which on a map has a sun whose place can be told."""
-_VERSION = 1  # raise when the same map would be judged otherwise
 
 
 class Judge:
-    """Judge maps; ``judge(cell, folder)``.
+    """Judge maps that were to be turned as ``settings`` say, in their scene.
 
     Parameters
     ----------
-    out : Path
-        Folder of all jobs, where bounds are kept.
+    settings : Config
+        Map, scene and turn.
     spp, true_spp : int
-        Samples a pixel of renderings that are judged, and of references.
+        Samples a pixel of renderings that are judged, and of the reference.
     width, film : int
         Texels and pixels across.
+
+    Attributes
+    ----------
+    original, true : ndarray (H, W, 3)
+        The map before the edit, and the true one.
+    target : ndarray (2, h, w, 3)
+        Two independent renderings under the true map.
     """
 
-    def __init__(
-        self, out: Path, spp: int = SPP, true_spp: int = TRUE_SPP, width: int = WIDTH, film: int = FILM
-    ):
-        self.out, self.spp, self.true_spp, self.width, self.film = Path(out), spp, true_spp, width, film
-        self._of = [_VERSION, spp, true_spp, width, film, ANGLE]
-        self._cells, self._scenes = {}, {}
+    def __init__(self, settings: config.Config, spp=SPP, true_spp=TRUE_SPP, width=WIDTH, film=FILM):
+        self.spp, self.width = spp, width
+        self._scene = scene.load(settings.scene.file, film, film, settings.scene.parameters)
+        self._rows = inputs.active_rows("upper", width // 2).slice
+        source = images.load_envmap(settings.input.envmap)[0]
+        self.original = self._sized(source)
+        self.true = self._sized(latlong.rotate(source, settings.target.degrees))
+        self.target = self._halves(self.true, true_spp, TRUE_SEED)
 
-    def __call__(self, cell: Cell, folder: Path) -> dict:
-        """Judge what a run left, once; see :meth:`compare` for the numbers of ``full`` map and rendering.
+    def __call__(self, folder: Path) -> dict:
+        """Judge what a run left.
 
         Returns
         -------
         dict
-            ``render``, ``map``, ``sun_degrees`` as :meth:`compare`; ``working``: metrics of ``edited.exr``
-            itself, resized, against the true map; ``own``: what the run said of its rendering;
-            ``loss_noise`` as :func:`loss_noise`; ``timing``: seconds by part; ``notes``.
+            ``render``, ``map``, ``sun_degrees`` as :meth:`compare`, of the map at the resolution of its file;
+            ``loss_noise`` as :func:`loss_noise`; ``timing``: seconds by part.
         """
-        kept = folder / "judged.json"
-        if found := self._kept(kept):
-            return found
         full = folder / "edited_full.exr"
-        working = self._sized(images.read(str(folder / "edited.exr"))[0])
-        edited = self._sized(images.read(str(full))[0]) if full.exists() else working
-        own = json.loads((folder / "metrics.json").read_text())
+        edited = images.read(str(full if full.exists() else folder / "edited.exr"))[0]
         with open(folder / "history.csv", newline="") as file:
             losses = [float(row["loss"]) for row in csv.DictReader(file) if row.get("loss")]
-        found = {"of": self._of, "full": full.exists(), **self.compare(cell, edited)}
-        found |= {
-            "working": metrics.compare(working[self._rows()], self.true(cell)[0][self._rows()]),
-            "own": own["render"]["psnr"],
-            "loss_noise": loss_noise(losses),
-            "iterations": own["iterations"],
-            "timing": own["timing"],
-            "transport": own["transport"],
-            "notes": own["choices"],
-        }
-        _write(kept, found)
-        return found
+        timing = json.loads((folder / "metrics.json").read_text())["timing"]
+        return self.compare(self._sized(edited)) | {"loss_noise": loss_noise(losses), "timing": timing}
 
-    def compare(self, cell: Cell, edited: np.ndarray) -> dict:
+    def compare(self, edited: np.ndarray) -> dict:
         """Render a map (H, W, 3) of the judge's size and compare it with the true one.
 
         Returns
@@ -95,79 +84,37 @@ class Judge:
             ``psnr_without_noise``, see :func:`without_noise`; ``map``: psnr, ssim, mse of the upper half;
             ``sun_degrees``: angle between the brightest texels, None where the true map has no sun.
         """
-        true, wanted = self.true(cell)
-        halves = self._halves(cell, edited, self.spp, SEED)
-        rows, place = self._rows(), latlong.directions(*true.shape[:2])
-        peaks = [place[metrics.peak_position(m[rows])] for m in (edited, true)]
-        sunny = luminance(true[rows]).max() > SUNNY
+        halves, rows = self._halves(edited, self.spp, SEED), self._rows
+        place = latlong.directions(*self.true.shape[:2])
+        peaks = [place[metrics.peak_position(m[rows])] for m in (edited, self.true)]
+        sunny = luminance(self.true[rows]).max() > SUNNY
         # From the chord: an angle near 0 has no digits left in its cosine.
         angle = 2 * np.degrees(np.arcsin(min(np.linalg.norm(peaks[0] - peaks[1]) / 2, 1.0)))
-        render = metrics.compare(halves.mean(axis=0), wanted.mean(axis=0))
-        render["psnr_without_noise"] = without_noise(halves, wanted)
+        render = metrics.compare(halves.mean(axis=0), self.target.mean(axis=0))
+        render["psnr_without_noise"] = without_noise(halves, self.target)
         return {
             "render": render,
-            "map": metrics.compare(edited[rows], true[rows]),
+            "map": metrics.compare(edited[rows], self.true[rows]),
             "sun_degrees": float(angle) if sunny else None,
         }
 
-    def bounds(self, cell: Cell) -> dict:
+    def bounds(self) -> dict:
         """Judge the map as it was before the edit, and the true map: the floor, and the most noise allows.
 
         Returns
         -------
         dict
-            ``unedited`` and ``ceiling``, as :meth:`compare`; kept on disk.
+            ``unedited`` and ``ceiling``, as :meth:`compare`.
         """
-        kept = self.out / f"bounds-{job_of(cell, Setting('bounds', '', {})).key}.json"
-        if found := self._kept(kept):
-            return found
-        original = self._sized(images.load_envmap(str(cell.file))[0])
-        true = self.true(cell)[0]
-        found = {
-            "of": self._of,
-            "unedited": self.compare(cell, original),
-            "ceiling": self.compare(cell, true),
-        }
-        _write(kept, found)
-        return found
-
-    def _kept(self, path):
-        """Read what was judged before, if it was judged in the same way."""
-        try:
-            found = json.loads(path.read_text())
-            return found if found["of"] == self._of else None
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-
-    def true(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-        """Return the true map (H, W, 3) and two independent renderings under it, (2, h, w, 3)."""
-        if cell not in self._cells:
-            source = images.load_envmap(str(cell.file))[0]
-            true = self._sized(latlong.rotate(source, ANGLE))
-            self._cells[cell] = true, self._halves(cell, true, self.true_spp, TRUE_SEED)
-        return self._cells[cell]
+        return {"unedited": self.compare(self.original), "ceiling": self.compare(self.true)}
 
     def _sized(self, envmap):
         return latlong.resize(envmap, self.width // 2, self.width)
 
-    def _rows(self):
-        return inputs.active_rows("upper", self.width // 2).slice
-
-    def _halves(self, cell, envmap, spp, seed):
+    def _halves(self, envmap, spp, seed):
         """Render twice with half of the samples each, (2, h, w, 3) float64."""
-        if cell.scene not in self._scenes:
-            given = SCENES[cell.scene]
-            self._scenes[cell.scene] = scene.load(
-                given["file"], self.film, self.film, given.get("parameters", {})
-            )
-        lit = self._scenes[cell.scene]
-        return np.stack(
-            [lit.render(envmap, spp=max(spp // 2, 1), seed=seed + i) for i in range(2)], dtype=np.float64
-        )
-
-
-def _write(path, found):
-    write_atomically(path, (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+        pictures = [self._scene.render(envmap, spp=max(spp // 2, 1), seed=seed + i) for i in range(2)]
+        return np.stack(pictures, dtype=np.float64)
 
 
 def without_noise(halves: np.ndarray, wanted: np.ndarray) -> float:

@@ -1,13 +1,16 @@
 """Damaged files of every kind end well; and the harness sees each way in which they could end badly."""
 
-import json
+import argparse
 import struct
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.fuzz import documents, drive, headers, mutate, pictures, run
+from envedit.config import Config
+from experiments.fuzz import documents, drive, experiment, headers, kinds, mutate, pictures
+from experiments.harness import table
 from tests.oracles.tiers import slow_but
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
@@ -36,18 +39,18 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
         "toml",
     ),
 )
-def test_damaged_files_are_read_or_refused(what, cases):
-    tally = drive.fuzz(what, range(cases))
-    assert not tally.faults
-    assert tally.counts["read"] + tally.counts["refused"] == cases
+def test_damaged_files_are_read_or_refused(what, cases, tmp_path):
+    found = drive.piece(Config(), tmp_path, what, 0, cases)
+    counts, errors = found["counts"], found["errors"]
+    assert not found["faults"] and not list(tmp_path.iterdir())
+    assert counts["read"] + counts["refused"] == cases
     # Not all of the damage is found at the door, and not all of it is harmless.
     if what == "entry":  # a damaged one is made anew
-        assert tally.counts["read"] == cases
+        assert counts["read"] == cases
         return
-    assert tally.counts["read"] > 0 and tally.counts["refused"] > cases / 4
-    assert set(tally.kinds) <= {"InputError", "ConfigError"} and bool(tally.kinds["ConfigError"]) <= (
-        what in ("toml", "scene")
-    )
+    assert counts["read"] > 0 and counts["refused"] > cases / 4
+    assert set(errors) <= {"InputError", "ConfigError"}
+    assert bool(errors["ConfigError"]) <= (what in ("toml", "scene"))
 
 
 @pytest.mark.slow
@@ -70,7 +73,7 @@ def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
     assert declared >= 12 * shape[0] * shape[1]
     small = {"ours.exr": "exr", "flat.hdr": "hdr", "rgb8.png": "painted"}[name]
     with drive.Worker("hdr") as process:
-        for warm, raw in drive.seeds(small):
+        for warm, raw in kinds.seeds(small):
             if warm == name:
                 (tmp_path / f"small-{name}").write_bytes(raw)
                 process.read(tmp_path / f"small-{name}", 0, len(raw), limited=False)
@@ -82,7 +85,7 @@ def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
 @linux
 @pytest.mark.parametrize("field", ["dataWindow", "displayWindow", "both"])
 def test_an_image_two_billion_texels_wide_takes_no_memory(tmp_path, field):
-    raw = bytearray(dict(drive.seeds("exr"))["ours.exr"])
+    raw = bytearray(dict(kinds.seeds("exr"))["ours.exr"])
     for name in ("dataWindow", "displayWindow"):
         if field in (name, "both"):
             at = raw.index(name.encode() + b"\0box2i\0") + len(name) + 11
@@ -177,49 +180,51 @@ def test_failing_cases_are_kept_and_counted(tmp_path, monkeypatch):
         "        import os\n        os.abort()\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    tally = drive.fuzz("hdr", range(4), keep=tmp_path / "kept", reader="bad:read")
-    assert [(i, o) for i, o, _ in tally.faults] == [(1, "traceback"), (2, "crashed")]
-    assert dict(tally.counts) == {"read": 2, "traceback": 1, "crashed": 1}
-    kept = sorted(path.name for path in (tmp_path / "kept").iterdir())
-    name, data = drive.case("hdr", drive.seeds("hdr"), 0, 2)
-    assert len(kept) == 4 and f"hdr-0-2-crashed-{name}" in kept
-    assert (tmp_path / "kept" / f"hdr-0-2-crashed-{name}").read_bytes() == data
+    (kept := tmp_path / "kept").mkdir()
+    found = drive.piece(Config(), kept, "hdr", 0, 4, reader="bad:read")
+    assert [(i, o) for i, o, _ in found["faults"]] == [(1, "traceback"), (2, "crashed")]
+    assert dict(found["counts"]) == {"read": 2, "traceback": 1, "crashed": 1}
+    name, data = kinds.case("hdr", kinds.seeds("hdr"), 0, 2)
+    assert len(list(kept.iterdir())) == 4
+    assert (kept / f"2-crashed-{name}").read_bytes() == data
+    assert "SIGABRT" in (kept / f"2-crashed-{name}.txt").read_text()
 
 
 def test_a_case_is_the_same_file_every_time():
     for what in ("hdr", "toml", "weights"):
-        whole = drive.seeds(what)
+        whole = kinds.seeds(what)
         one, again = (
-            [drive.case(what, whole, 0, i) for i in order] for order in (range(30), range(29, -1, -1))
+            [kinds.case(what, whole, 0, i) for i in order] for order in (range(30), range(29, -1, -1))
         )
         assert one == again[::-1]
-        other = [drive.case(what, whole, 1, i) for i in range(30)]
+        other = [kinds.case(what, whole, 1, i) for i in range(30)]
         assert sum(a == b for a, b in zip(one, other, strict=True)) < 3
         assert sum(data == dict(whole)[name] for name, data in one) < 6  # nearly all are damaged
 
 
-def test_pieces_of_a_run_add_up(tmp_path):
-    tally = drive.Tally()
-    for index, outcome in enumerate(("read", "refused", "hung")):
-        tally.add(index, {"outcome": outcome, "kind": "InputError", "peak": 3 << 20}, 1 << 20)
-    for first in (0, 3, 3):  # the last takes the place of the one before
-        sums = run.recorded(tmp_path / "sub" / "record.json", {"exr": (range(first, first + 3), 0, tally)})
-    assert sums["exr"].counts == {"read": 2, "refused": 2, "hung": 2} and len(sums["exr"].faults) == 2
-    row = [cell.strip() for cell in run.table(sums).splitlines()[2].split("|")]
-    assert row[1:7] == ["exr", "6", "2", "2 InputError", "0", "2"] and row[-2] == "2.0 MiB"
-    file = tmp_path / "sub" / "record.json"
-    assert json.loads(file.read_text())
-    for cases, seed, twice in [((0, 6), 0, True), ((2, 4), 0, True), ((5, 9), 0, True), ((3, 6), 0, False),
-                               ((6, 9), 0, False), ((0, 6), 1, False)]:  # fmt: skip
-        assert bool(run.counted_twice(file, "exr", range(*cases), seed)) == twice
-    assert "holds cases 3 to 5 of exr" in run.counted_twice(file, "exr", range(5, 9), 0)
-    assert not run.counted_twice(file, "hdr", range(6), 0)
-    with pytest.raises(SystemExit):
-        run.main(["--record", str(file), "--what", "exr", "--cases", "5"])
+def test_pieces_of_a_kind_add_up_and_faults_are_named():
+    common = {"what": "exr", "errors": {"InputError": 2}, "folder": Path("kept")}
+    hung = common | {"counts": {"refused": 2, "hung": 1}, "beyond": 3 << 20, "faults": [[7, "hung", "5 s"]]}
+    whole = common | {"counts": {"read": 1, "refused": 2}, "beyond": 1 << 20, "faults": []}
+    rows = [hung, whole, whole | {"what": "hdr"}]
+    exr, hdr = experiment.combine(rows)
+    assert exr["counts"] == {"read": 1, "refused": 4, "hung": 1} and exr["beyond"] == 3 << 20
+    lines = table(experiment.EXPERIMENT, rows).splitlines()
+    row = [cell.strip() for cell in lines[2].split("|")]
+    assert row[1:7] == ["exr", "6", "1", "4 InputError", "0", "1"] and row[-2] == "3.0 MiB"
+    assert hdr["counts"].total() == 3 and len(lines) == 4
+    assert experiment.failures(rows) == ["exr 7: hung: 5 s (kept in kept)"]
+
+
+def test_the_pieces_of_a_kind_are_all_its_files():
+    asked = experiment.cases(argparse.Namespace(count=6000, heap_check=""))
+    names = [case.name for case in asked if case.about["what"] == "hdr"]
+    assert names == ["hdr 0-2499", "hdr 2500-4999", "hdr 5000-5999"]
+    assert len(asked) == 3 * len(kinds.KINDS)
 
 
 def test_headers_are_understood_apart_from_the_readers():
-    files = dict(drive.seeds("exr")) | dict(drive.seeds("hdr")) | dict(drive.seeds("painted"))
+    files = dict(kinds.seeds("exr")) | dict(kinds.seeds("hdr")) | dict(kinds.seeds("painted"))
     texels = 16 * 32
     for name, data in files.items():
         found = headers.declared(data)

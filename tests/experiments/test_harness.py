@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,8 @@ def test_results_of_another_configuration_or_version_are_not_reused(run, monkeyp
     run("run", "--only", "seed-3")
     assert "| 3 | 6.0 |" in run("table")[1].out
     assert "no case is done" in run("table", "--set", "fit.epochs=7")[1].out
+    code, said = run("sheet", "--set", "fit.epochs=7")
+    assert code == 3 and "no case is done" in said.err
     assert "no case is done" in run("table", version="of the command")[1].out
     monkeypatch.setattr("envedit.sweep.jobs.program", lambda: "another")
     assert "no case is done" in run("table")[1].out
@@ -100,9 +103,10 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
         alone=True,
     )
     assert harness.main(made, ["run", "--out", str(tmp_path), "--set", "seed=9"]) == 1
+    assert harness.main(made, ["sheet", "--out", str(tmp_path), "--set", "seed=9"]) == 2
     said = capsys.readouterr()
     assert said.out == "x:\n\n| seed | n |\n| --- | --- |\n| 9 | 0 |\n| 9 | 1 |\n"
-    assert said.err.endswith("FAILED: n is 1\n")
+    assert said.err.endswith("FAILED: n is 1\ncalls: there is no sheet of calls; give run or table\n")
     folder = calling().job(["seed=9"]).folder(tmp_path)
     assert json.loads((folder / "result.json").read_text())["odd"] is None
     keys = {calling(n).job().key for n in (2, 3)} | {calling(tables={"seed": 6}).job().key}
@@ -128,13 +132,6 @@ def test_an_override_beats_the_case_and_a_target_file_its_turn():
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
 
 
-def test_a_folder_belongs_to_what_was_asked_and_to_a_version(tmp_path, monkeypatch):
-    folders = [harness.own_folder(tmp_path, *asked) for asked in ((), ("a",), ("a", "b"))]
-    assert len(set(folders)) == 3 and all(folder.is_dir() for folder in folders)
-    monkeypatch.setattr(sweep, "program", lambda: "another")
-    assert harness.own_folder(tmp_path) not in folders
-
-
 def test_numbers_tables_and_montages():
     assert [number(v) for v in (None, float("nan"), 1.25, 0)] == ["-", "-", "1.2", "0.0"]
     assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
@@ -145,28 +142,65 @@ def test_numbers_tables_and_montages():
     assert (made[4 + gap : 8 + gap, :1] == 255).all() and not made[4 + gap :, 1:].any()
 
 
-def test_every_experiment_makes_its_cases(tmp_path, monkeypatch, capsys):
+MAPS = [
+    "aristea_wreck", "autumn_field", "evening_road_01", "kloofendal_48d_partly_cloudy", "kloppenheim_06",
+    "mud_road", "overcast_soil", "rustig_koppie", "snow_field", "sunflowers", "syferfontein_18d_clear",
+    "wasteland_clouds",
+]  # fmt: skip
+COUNTS = {
+    "ceiling": 166,
+    "engine": 45,
+    "engine.cost_of_checks": 5,
+    "fuzz": 44,
+    "interiors": 5,
+    "interruption": 8,
+    "layers": 96,
+    "layers.gain": 72,
+    "layers.large_map": 1,
+    "layers.old_sun": 12,
+    "levels": 24,
+    "natural": 680,
+    "paint.figure10": 7,
+    "paint.rates": 2,
+    "paint.soak": 1,
+    "painted_edits": 18,
+    "painted_edits.full_resolution": 2,
+    "paper": 540,
+    "solver.columns": 2,
+    "solver.edits": 9,
+    "solver.growth": 5,
+    "solver.trace": 1,
+    "three_spheres": 24,
+    "tradeoff": 7,
+    "views": 36,
+}
+"""Cases of every experiment over these maps."""
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
     for kind in ("puresky", "hdri"):
         (tmp_path / kind).mkdir()
-    for name in (
-        "kloofendal_48d_partly_cloudy", "autumn_field", "wasteland_clouds", "overcast_soil", "sunflowers"
-    ):  # fmt: skip
+    for name in MAPS:
         (tmp_path / "puresky" / f"{name}_puresky_1k.hdr").write_text(name)
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
-    counts = {
-        "interiors": 5,
-        "layers": 40,
-        "levels": 24,
-        "natural": 330,
-        "painted_edits": 18,
-        "views": 18,
-    }
-    for name, count in counts.items():
-        asked = [name, "run", "--dry-run", "--out", str(tmp_path / "out" / name)]
-        assert command.main(asked) == 0
-        assert capsys.readouterr().out.endswith(f"{count} jobs: {count} missing\n")
+
+
+@pytest.mark.parametrize("name", command.modules())
+def test_every_experiment_makes_its_cases(name, data, tmp_path, capsys):
+    asked = [*name.split(), "run", "--dry-run", "--out", str(tmp_path / "out")]
+    if name == "paper":
+        asked.append("table3")
+    assert command.main(asked) == 0
+    assert capsys.readouterr().out.endswith(f"\n{COUNTS[name]} jobs: {COUNTS[name]} missing\n")
+
+
+def test_experiments_are_listed_and_an_unknown_one_is_named(capsys):
+    assert command.main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert [line.split()[0] for line in lines] == list(command.modules()) == list(COUNTS)
     assert command.main(["layer"]) == 2
-    assert "expected one of interiors, layers" in capsys.readouterr().err
+    assert re.search("got layer, expected one of .*interiors, interruption, layers", capsys.readouterr().err)
 
 
 def test_the_same_options_everywhere():

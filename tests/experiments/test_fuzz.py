@@ -190,6 +190,18 @@ def test_failing_cases_are_kept_and_counted(tmp_path, monkeypatch):
     assert "SIGABRT" in (kept / f"2-crashed-{name}.txt").read_text()
 
 
+@linux
+def test_a_whole_file_that_is_not_read_is_a_fault(tmp_path, monkeypatch):
+    (tmp_path / "bad.py").write_text(
+        f"def read(path, index):\n    if index == {drive.WHOLE} and path.name == 'new.hdr':\n"
+        "        raise KeyError('a')\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    found = drive.piece(Config(), tmp_path, "hdr", 0, 2, reader="bad:read")
+    assert [(name, outcome) for name, outcome, _ in found["faults"]] == [("new.hdr", "traceback")]
+    assert dict(found["counts"]) == {"read": 2}
+
+
 def test_a_case_is_the_same_file_every_time():
     for what in ("hdr", "toml", "weights"):
         whole = kinds.seeds(what)

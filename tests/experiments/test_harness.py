@@ -113,6 +113,17 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
     assert len(keys) == 3
 
 
+def test_rows_may_be_combined(tmp_path):
+    made = Experiment(
+        "sums",
+        "Add up.",
+        lambda given: [],
+        columns={"kind": "{kind}", "sum": "{n}"},
+        combine=lambda rows: [{"kind": "both", "n": sum(row["n"] for row in rows)}],
+    )
+    assert harness.table(made, [{"n": 1}, {"n": 2}]).endswith("| both | 3 |")
+
+
 def test_user_errors_are_one_line(run, tmp_path):
     code, said = run("run", "--only", "nothing")
     assert code == 2 and said.err == "twice: --only nothing: no case of twice is left; give other options\n"

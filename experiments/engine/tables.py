@@ -6,11 +6,6 @@ import statistics
 from experiments.harness import markdown, number
 
 
-def table(head: str, rows) -> str:
-    """Return a Markdown table; ``head`` has its columns separated by |."""
-    return markdown([cell.strip() for cell in head.split("|")], ([str(cell) for cell in row] for row in rows))
-
-
 def si(value: float | None, unit: str = "") -> str:
     """Write a number with three digits and a prefix: 0.0123 s is 12.3 ms."""
     if not value or not math.isfinite(value):

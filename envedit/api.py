@@ -320,6 +320,8 @@ def _of_arrays(settings: config.Config, given: Mapping[str, np.ndarray]) -> conf
     if "target" in given or "target_map" in given:
         table = settings.target
         kept = {key: getattr(table, key) for key in table.given & {"tonemap", "paint", "hold", "spp"}}
-        kind = "image" if "target" in given else "envmap"
+        kind = "envmap"
+        if "target" in given:
+            kind = "rendering" if table.kind == "rendering" else "image"
         settings = replace(settings, target=config.Target(kind=kind, file=images.ARRAY, **kept))
     return settings

@@ -15,6 +15,7 @@ from envedit.core.errors import ConfigError
 TURN_DEGREES = 60.0
 """Turn of the target's map where neither a map nor a turn is given."""
 _PAINTED = {"target.kind": ("image", "strokes")}
+_PICTURES = "rendering", "image"
 _SUNSKY = {"input.envmap": ("sunsky", "auto")}
 
 
@@ -93,13 +94,14 @@ class Target(Table):
 
     kind: str = key(
         "envmap",
-        Choice("envmap", "image", "strokes", "none"),
-        'given by: another map, a painted image, or strokes; "none": only [lights], exposure, white balance',
+        Choice("envmap", "rendering", "image", "strokes", "none"),
+        "given by: another map, a picture of the scene under other light, a painted image, or strokes; "
+        '"none": only [lights], exposure, white balance',
     )
     file: str | tuple[str, ...] = key(
         "",
         OneOrMore(String()),
-        "kind envmap: the other map, which is not turned; kind image: the painted rendering, or a list",
+        "kind envmap: the other map, which is not turned; kinds rendering and image: the picture, or a list",
     )
     rotate_degrees: float | str = key(
         "auto",
@@ -119,7 +121,10 @@ class Target(Table):
         "view that each file, or mask, belongs to: index or id; []: the first, the second, ...",
     )
     tonemap: str = key(
-        "gamma", Choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted", when=_PAINTED
+        "gamma",
+        Choice(*TONEMAPS),
+        "tonemap under which the picture, or a stroke, is painted; without it a rendering's PNG or JPEG is sRGB",
+        when={"target.kind": ("rendering", "image", "strokes")},
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
     paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
@@ -157,7 +162,7 @@ class Target(Table):
     def views(self) -> tuple[int | str, ...]:
         """The view of each painted file, or of each mask."""
         given = self.view if isinstance(self.view, tuple) else (self.view,)
-        count = len(self.files) if self.kind == "image" else len(self.masks)
+        count = len(self.files) if self.kind in _PICTURES else len(self.masks)
         return given or tuple(range(count))
 
     def _check_together(self) -> None:
@@ -165,20 +170,21 @@ class Target(Table):
             raise ConfigError('target.file: got a list, expected one map, as target.kind is "envmap"')
         if self.view != () and self.kind == "strokes":
             raise ConfigError("target.view: got one, expected none: each stroke has a view of its own")
-        named = len(self.files) if self.kind == "image" else len(self.masks)
+        named = len(self.files) if self.kind in _PICTURES else len(self.masks)
         if self.view != () and len(self.views) != named:
             raise ConfigError(f"target.view: got {len(self.views)} views, expected {named}, one a file")
         if len({*self.views}) != len(self.views):
             raise ConfigError("target.view: got a view twice, expected each once")
-        if self.kind == "image" and self.mask and len(self.masks) != named:
+        if self.kind in _PICTURES and self.mask and len(self.masks) != named:
             raise ConfigError(f"target.mask: got {len(self.masks)} masks, expected {named}, one a file")
         if self.kind == "envmap" and self.file and self.rotate_degrees not in ("auto", 0):
             raise ConfigError(
                 "target.file and target.rotate_degrees: got both, expected one: the other map, or the input "
                 'turned; remove one, or set rotate_degrees = "auto"'
             )
-        if self.kind == "image" and not self.file:
-            raise ConfigError('target.file: got "", expected the painted image, as target.kind is "image"')
+        if self.kind in _PICTURES and not self.file:
+            what = "painted image" if self.kind == "image" else "picture of the scene"
+            raise ConfigError(f'target.file: got "", expected the {what}, as target.kind is "{self.kind}"')
         if self.kind == "strokes" and not self.strokes:
             raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
         if self.kind == "none" and (self.file or self.mask):

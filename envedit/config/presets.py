@@ -125,7 +125,7 @@ def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
     asked = overlaid(chosen, given)
     if asked.get("representation", {}).get("kind", "layers") != "layers":
         chosen = overlaid(chosen, MANY_PARAMETERS[preset])
-    if asked.get("target", {}).get("kind", "envmap") not in ("envmap", "none"):
+    if asked.get("target", {}).get("kind", "envmap") in ("image", "strokes"):
         chosen = overlaid(chosen, PAINTED[preset])
     return chosen
 

@@ -28,6 +28,13 @@ LEAST_REST = 1e-4
 def best(
     problem: Problem, point: Point, normal: Normal, light: int | None = None
 ) -> tuple[dict, float] | None:
+    """As :func:`several`, the best one; None."""
+    return next(iter(several(problem, point, normal, light, 1)), None)
+
+
+def several(
+    problem: Problem, point: Point, normal: Normal, light: int | None = None, most: int = 1, apart: float = 1.0
+) -> list[tuple[dict, float]]:
     """Light a spare light where F falls most; ``light`` if given, or else the first that is dark.
 
     Candidates are the cells of the block transport, then texels around the best one, through exact columns.
@@ -44,24 +51,35 @@ def best(
     spare = range(layers.lights.own, layers.lights.count)
     dark = [i for i in spare if i not in problem.added(point.state)] if light is None else [light]
     if not dark:
-        return None
+        return []
     try:
         model = _Model(problem, normal)
     except np.linalg.LinAlgError:
-        return None
+        return []
     i, flux = dark[0], np.float64(layers.lights.flux[dark[0]])
     scale = flux.max()
     if not scale > 0:
-        return None
+        return []
     flux = flux / scale  # of any strength, in single precision
     _, directions = problem.blocks.sky
     if not len(directions):  # so few rows are edited that they fill no cell by half
-        return None
+        return []
     strength, fall = model.of_cells(flux)
-    found = int(np.argmax(fall))
-    if not fall[found] > 0:
-        return None
-    direction, strength, fall = directions[found], strength[found], fall[found]
+    result = []
+    left = np.ones(len(fall), bool)
+    for _ in range(most):
+        at = int(np.argmax(np.where(left, fall, 0)))
+        if not (left[at] and fall[at] > 0):
+            break
+        left &= directions @ directions[at] < apart
+        one = _refined(problem, point, model, i, flux, scale, directions[at], strength[at], fall[at])
+        if one is not None:
+            result.append(one)
+    return result
+
+
+def _refined(problem, point, model, i, flux, scale, direction, strength, fall):
+    layers, transport = problem.layers, problem.transport
     height, width = problem.envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
     row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
@@ -102,7 +120,14 @@ class _Model:
         if parts.lights:
             mixed.append(sum(blocks.seen([b * f for b, f in zip(parts.lights, flux, strict=True)])))
         pull = sum(blocks.seen(list((parts.pulled * flux).T[..., None])))[0]
-        return self._best(np.concatenate(mixed), pull, blocks.power(parts.squared * flux**2).sum(axis=0))
+        power = blocks.power(parts.squared * flux**2).sum(axis=0)
+        stated = self.normal.stated
+        seen = np.stack(blocks.seen([b[:, None] * f for b, f in zip(stated.blocks.T, flux, strict=True)]))[:, 0]
+        return self._best(*self._with_stated(seen, np.concatenate(mixed), pull, power))
+
+    def _with_stated(self, seen, mixed, pull, power):
+        stated = self.normal.stated
+        return mixed + stated.by_unknowns.T @ seen, pull + stated.value @ seen, power + np.square(seen).sum(axis=0)
 
     def of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
@@ -123,7 +148,9 @@ class _Model:
             seen = seen + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
             pull = pull + mine @ (slope * robust * residual)
             power = power + np.einsum("np,np->n", mine, weighted)
-        return self._best(np.concatenate([*mixed, seen]), pull, power)
+        share = np.broadcast_to(normal.stated.share, normal.slope.shape)
+        stated = np.stack([pictures[..., c] @ share[..., c].ravel() for c in range(3)])
+        return self._best(*self._with_stated(stated, np.concatenate([*mixed, seen]), pull, power))
 
     def _best(self, mixed, pull, power):
         half = forward(self._lower, mixed)

@@ -36,10 +36,12 @@ from envedit.solve import (
     hold,
     map_problem,
     prior,
+    search,
     transport_error,
 )
 from envedit.targets.target import Target
 
+N, HOLD, MEAN = 10.0, 0.3, 1.0
 CHECKED_SPP = 64
 """Samples a pixel of renderings by which start and solution are compared."""
 TRIAL_STEPS, NEWTON_TRIAL = 30, 6
@@ -177,6 +179,11 @@ class Job:
 
     def best(self, starts: list[tuple[Params, list[str]]], crop: np.ndarray) -> tuple[Params, list[str]]:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
+        if not self._rendered and self.newton:
+            problem = self._problem()
+            found = search.search(problem, problem.state(starts[0][0]), self._sigma)
+            self.begun = found.run
+            return problem.found(found.run.state), [f"explanation: {found.name}"]
         if len(starts) == 1:
             return starts[0]
         begun: list[gauss_newton.Run | None] = []
@@ -286,6 +293,8 @@ class Job:
         target = self.target.aim, self.target.weight
         more: dict[str, Any] = {"saturates": self._rendered, "robust": self._rendered}
         chosen = prior.Prior() if self._rendered else prior.PAINTED
+        if not self._rendered:
+            more |= {"independent": N * (1 + HOLD), "rest": 1 - self.target.coverage, "rest_statements": N * MEAN * float(1 - self.target.coverage.mean())}
         return map_problem.Problem(*asked, *target, chosen, **more, blocks=self._blocks)
 
     @functools.cached_property

@@ -20,7 +20,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK
 from envedit.solve import added_light
 from envedit.solve.derivatives import ANGLE, WIDE
-from envedit.solve.map_problem import INDEPENDENT, SIGMA, Point, Posterior, Problem
+from envedit.solve.map_problem import SIGMA, Point, Posterior, Problem
 
 ITERATIONS, LITTLE = 16, 2e-3
 """Most steps where no light is added or moved, and the relative decrease of F below which no further step is
@@ -250,7 +250,7 @@ def _without(state, k):
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
     noise = problem.noise(point.residual, sigma)
-    return problem.loss(point, run.start, noise) + 6 * INDEPENDENT * float(np.log(noise))
+    return problem.loss(point, run.start, noise) + 6 * problem.statements * float(np.log(noise))
 
 
 class _Search:

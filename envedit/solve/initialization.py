@@ -211,6 +211,8 @@ def _searched(layers, params, transport, target, original, only_own=False):
         # Of several lights one may have changed, and the search have moved others to make up for it.
         still = (params, ["all lights initialised at their places in the map"])
         return [still, searched] if several else [searched]
+    if only_own:
+        return [(params, [])]
     return painted_starts(replace(problem, initial=target.initial), params, target.coverage)
 
 

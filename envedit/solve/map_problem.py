@@ -31,7 +31,7 @@ from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.derivatives import Derivatives
-from envedit.solve.normal_equations import Blocks, Normal, solved
+from envedit.solve.normal_equations import Blocks, Normal, Stated, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import Point, Unknowns, in_numpy
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
@@ -107,21 +107,27 @@ class Problem(Unknowns):
         saturates: bool = False,
         robust: bool = True,
         blocks: BlockJacobian | None = None,
+        independent: float = INDEPENDENT,
+        rest: np.ndarray | None = None,
+        rest_statements: float = 0.0,
     ):
         super().__init__(layers, saturates)
-        self.robust = robust
+        self.robust, self.independent = robust, independent
+        self.rest, self.rest_statements = rest, rest_statements if rest is not None else 0.0
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
         self.prior = prior or Prior()
+        self.picture = picture
         self.target = display_curve.to_display(tensor(picture)).numpy()
         shape = picture.shape[:2]
         self.weight = _on_average_one(weight, shape)
-        self.area = max(1.0, shape[0] * shape[1] / INDEPENDENT)
+        self.area = shape[0] * shape[1] / min(independent, shape[0] * shape[1])
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks)
-        self._precisions = self.prior.gain_precisions(self.sizes, self.ground)
+        self._precisions = self.prior.gain_precisions(layers.gain, self.ground)
 
     def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:
         """Take another target, with its weights; returns a point with its residual from that target."""
+        self.picture = picture
         self.target = display_curve.to_display(tensor(picture)).numpy()
         self.weight = _on_average_one(weight, picture.shape[:2])
         shown = display_curve.to_display(tensor(point.rendering)).numpy()
@@ -152,17 +158,17 @@ class Problem(Unknowns):
         number. At least ``least``.
         """
         size = _sizes(residual)
-        if self._huber(size, least) <= 3 * INDEPENDENT:
+        if self.misfit(residual, least) <= 3 * self.statements:
             return least
         if not self.robust:
-            return float(np.sqrt((self.weight * size**2).sum() / (self.area * INDEPENDENT)))
+            return float(least * np.sqrt(self.misfit(residual, least) / (3 * self.statements)))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         order = np.argsort(size, axis=None)
         r, w = (v.ravel()[order].astype(np.float64) for v in (size, self.weight))
         a = np.cumsum(np.append(0, w * r * r))
         b, c = (np.append(np.cumsum(part[::-1])[::-1], 0) for part in (w * r, w))
-        d = self.area * INDEPENDENT
+        d = self.area * self.independent
         sigma = (b + np.sqrt(b * b + (d + c) * a)) / (d + c)
         inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
         return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
@@ -173,7 +179,7 @@ class Problem(Unknowns):
 
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
-        total = (self._precisions * (AXES @ state["gain"].T) ** 2).sum()
+        total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
         for i in self.lit(state):
             change = self._flux_change(state, start, i)
@@ -192,7 +198,17 @@ class Problem(Unknowns):
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
         """Return the first part of F."""
-        return self._huber(_sizes(residual), sigma)
+        return self._huber(_sizes(residual), sigma) + float((self.stated(residual) ** 2).sum()) / sigma**2
+
+    @property
+    def statements(self):
+        return self.independent + self.rest_statements
+
+    def stated(self, picture):
+        """Mean over what was not painted, times the root of how often it counts, (3,)."""
+        if not self.rest_statements:
+            return np.zeros(3)
+        return np.sqrt(self.rest_statements) * (picture * self.rest).sum(axis=(0, 1)) / self.rest.sum()
 
     def _huber(self, size, sigma):
         loss = size**2
@@ -215,6 +231,8 @@ class Problem(Unknowns):
         if self.robust:
             robust = robust * np.minimum(1, sigma / np.maximum(size, 1e-12))
         slope = display_curve.slope(point.rendering)
+        share = self.share() / sigma
+        mean = self.stated(point.residual) / sigma
         blocks, linear = self.blocks, self.derivatives.at(point)
         pictures, profile = linear.pictures, linear.profile
         unknowns = 3 * n + len(pictures)
@@ -223,13 +241,16 @@ class Problem(Unknowns):
         pulled = blocks.summed(slope * profile * robust * point.residual)
         pulled_back = np.zeros((n, 3)), 0.0
         if descent:
-            pulled_back = self._pulled_back(point, slope * robust * point.residual)
+            pulled_back = self._pulled_back(point, slope * (robust * point.residual + share * mean))
         seen, lit = np.zeros((len(pictures), n * 3)), []
+        by_mean = np.zeros((3, unknowns))
+        mean_blocks = blocks.summed(slope * profile * share)
         for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
             gradient[part] = pulled_back[0][:, c]
+            by_mean[c, part] = mean_blocks[:, c] @ j
             if len(pictures):
                 weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
                 in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
@@ -240,15 +261,24 @@ class Problem(Unknowns):
             flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), -1)
             hessian[rest, rest] = flat @ flat.T
             gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
+            by_mean[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
+            gradient[rest] += mean @ by_mean[:, rest]
             if self.saturates:
                 gradient[-1] = pulled_back[1]
             hessian[rest, : 3 * n], hessian[: 3 * n, rest] = seen, seen.T
+        hessian += by_mean.T @ by_mean
         precision, back = self._precision(linear.named), self._from_prior(state, start, linear.named)
         hessian += precision
         gradient = gradient + precision @ back if descent else np.zeros(unknowns)
         pixels = robust, slope, point.residual, profile, pictures
         parts = Blocks(linear.jacobian, squared, pulled, lit)
-        return Normal(hessian, gradient, precision, linear.named, parts, *pixels)
+        stated = Stated(by_mean, mean, share * slope, mean_blocks)
+        return Normal(hessian, gradient, precision, linear.named, parts, *pixels, stated)
+
+    def share(self):
+        if not self.rest_statements:
+            return np.zeros((*self.target.shape[:2], 1))
+        return np.sqrt(self.rest_statements) * self.rest / self.rest.sum()
 
     def _pulled_back(self, point, picture):
         """Return the derivatives of the sum of a picture times T E.
@@ -271,10 +301,9 @@ class Problem(Unknowns):
         """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
         n = self.nodes
         precision = np.zeros((3 * n + len(unknowns),) * 2)
-        node = np.arange(n)
         for a, axis in enumerate(AXES):
             for c, d in np.ndindex(3, 3):
-                precision[c * n + node, d * n + node] += axis[c] * axis[d] * self._precisions[a]
+                precision[c * n : c * n + n, d * n : d * n + n] += axis[c] * axis[d] * self._precisions[a]
         for k, (name, i, axis) in enumerate(unknowns, 3 * n):
             if name == "flux":
                 precision[k, k - axis : k - axis + 3] = self.prior.flux_precision[axis]
@@ -347,7 +376,7 @@ class Problem(Unknowns):
     def posterior(self, normal: Normal) -> Posterior:
         """Return what the normal equations at the solution say of the log luminance gain."""
         n = self.nodes
-        prior = np.diag(1 / (3 * self._precisions[0]))
+        prior = np.linalg.inv(3 * self._precisions[0])
         mean = np.zeros((len(normal.hessian), n))
         for c in range(3):
             mean[c * n + np.arange(n), np.arange(n)] = 1 / 3

@@ -31,6 +31,16 @@ class Blocks:
 
 
 @dataclass(frozen=True)
+class Stated:
+    """Mean of the rest: derivatives (3, unknowns), value (3,), per pixel (h, w, 3) and per block."""
+
+    by_unknowns: np.ndarray
+    value: np.ndarray
+    share: np.ndarray
+    blocks: np.ndarray
+
+
+@dataclass(frozen=True)
 class Normal:
     """Hessian (m, m) and gradient (m,) of F / 2.
 
@@ -49,6 +59,7 @@ class Normal:
     residual: np.ndarray
     profile: np.ndarray
     pictures: np.ndarray
+    stated: Stated | None = None
 
     @property
     def determined(self) -> float:

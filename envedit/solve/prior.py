@@ -11,6 +11,16 @@ AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Luminance, blue-amber and green-magenta, as unit vectors of log RGB."""
 
 
+SKIES = (np.sqrt(3) * 0.69, np.sqrt(3) * 0.244, 1.2), (0.37, 0.145, 2.1), (0.078, 0.015, 1.3)
+
+
+def field_covariance(cosine, whole, gradient, power, degrees=32):
+    """whole^2 + sum over degrees l of (2 l + 1) (gradient l^-power)^2 P_l."""
+    l = np.arange(1, degrees + 1)
+    series = (2 * l + 1) * (gradient * l**-power) ** 2
+    return np.polynomial.legendre.legval(cosine, np.concatenate([[whole**2], series]))
+
+
 @dataclass(frozen=True)
 class Prior:
     """How far a sky changes: standard deviations, the same for every scene and map.
@@ -48,14 +58,33 @@ class Prior:
     added_size: float = 1.0
     saturation: float = 1.0
 
-    def gain_precisions(self, sizes: Sequence[tuple[int, int]], ground: bool = False) -> np.ndarray:
-        """Return 1 / variance of every node's log gain along luminance, chroma and tint: (3, n).
+    freedom: float | None = None
+
+    def gain_precisions(self, gain, ground: bool = False) -> np.ndarray:
+        """Return the inverse covariance of the nodes' log gain along luminance, chroma and tint: (3, n, n).
 
         ``ground``: the last is the factor of ground, which changes as a coarse node of the sky.
         """
-        fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
-        fall = np.append(fall, 1.0) if ground else fall
-        return np.stack([(sd * fall) ** -2.0 for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)])
+        sizes = gain.sizes
+        if self.freedom is None:
+            fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
+            fall = np.append(fall, 1.0) if ground else fall
+            return np.stack(
+                [np.diag((sd * fall) ** -2.0) for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)]
+            )
+        d = gain.directions(len(sizes) - 1)
+        cosine = np.clip(d @ d.T, -1, 1)
+        count = sum(rows * columns for rows, columns in sizes)
+        found = np.zeros((3, count + ground, count + ground))
+        first = count - len(d)
+        for one, (whole, gradient, power) in zip(found, SKIES, strict=True):
+            covariance = field_covariance(cosine, whole, max(self.freedom, 0.01) * gradient, power)
+            covariance += 1e-6 * np.eye(len(d)) * whole**2
+            one[first:count, first:count] = np.linalg.inv(covariance)
+            one[np.arange(first), np.arange(first)] = 1e6
+            if ground:
+                one[count, count] = 1 / whole**2
+        return found
 
     @property
     def flux_precision(self) -> np.ndarray:
@@ -64,7 +93,7 @@ class Prior:
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-PAINTED = Prior(chroma=Prior.chroma / 3, tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3)
+PAINTED = Prior(freedom=0.25, chroma=Prior.chroma / 3, tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3)
 """Of painted targets: paint that asks for another brightness is no reason for another colour of the sky.
 
 In colour a third of what a rendered target may change, and of a light as much as of the sky.

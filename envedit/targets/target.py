@@ -23,7 +23,13 @@ from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.targets import initial_rendering, painted_image, strokes
+from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
+
+
+FOUND_ANEW = (
+    " (its noise is not that of the initial rendering: it is solved as a rendering under other light; "
+    "if it was painted, give a mask)"
+)
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,8 @@ def make(
     hidden = None if alpha is None else alpha == 0
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap, other), hidden)
+    if chosen.kind == "rendering":
+        return _seen(_of_rendering(scene, chosen, picture, mask), hidden)
     shape = scene.height, scene.width
     initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
@@ -140,6 +148,12 @@ def make(
     else:
         found = _painted_strokes(scene, initial, chosen)
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
+    if chosen.kind == "image" and mask is None and not chosen.masks:
+        anew = rendered_anew.is_rendered_anew(
+            found.picture, initial, found.coverage, lambda: _again(scene, envmap, settings), scene.rows
+        )
+        if anew:
+            return _seen(_of_rendering(scene, chosen, picture, mask, FOUND_ANEW), hidden)
     picture, warnings = found.picture, tuple(found.warnings)
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
         # Squares and sums of what is more would leave single precision; on a display it is as white.
@@ -156,6 +170,41 @@ def make(
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
     return _seen(Target(picture, weight, None, source, warnings, initial, coverage, asked), hidden)
+
+
+def _again(scene, envmap, settings):
+    """Render the map again as :func:`.initial_rendering.initial` does, with other samples."""
+    seed = Seeds.of(settings.seed).judged
+    return rendered(scene, envmap, settings.target.spp, seed, settings.renderer.cache)[0]
+
+
+def _of_rendering(scene, chosen, picture, mask, how=""):
+    """Take a picture of the scene under other light; ``how``: why it is taken for one."""
+    shape = scene.height, scene.width
+    if picture is not None:
+        everywhere = np.ones(shape) if mask is None else mask
+        found = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
+        source, asked = "a picture of the scene, given as an array", (picture, *filter(None.__ne__, [mask]))
+    else:
+        declared = chosen.tonemap if "tonemap" in chosen.given else "srgb"
+        files = zip(chosen.files, chosen.masks or ("",) * len(chosen.files), strict=True)
+        by_view = _by_view(scene, chosen.views, files)
+
+        def of_view(k, before):
+            file, mask = by_view[k]
+            return painted_image.read(file, before.shape[:2], declared, None, mask)
+
+        found = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
+        source = f"a picture of the scene: {', '.join(chosen.files)}"
+        asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
+    weight = np.where(found.excluded[..., None], 0, found.coverage).astype(np.float32)
+    if not weight.any():
+        raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
+    weight = None if (weight == 1).all() else weight
+    picture = np.minimum(found.picture, np.float32(BRIGHTEST))
+    known = rendered_anew.noise(picture, scene.rows)
+    source += f"{how}, noise of its display values {float(np.median(known)):.2g}"
+    return Target(picture, weight, None, source, tuple(found.warnings), asked=asked, noise=known)
 
 
 def _by_view(scene, views, given):

@@ -19,7 +19,7 @@ from envedit.core.seeds import Seeds
 from envedit.representations.layers.gain import CYCLES
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.targets import initial_rendering
+from envedit.targets import initial_rendering, rendered_anew
 from envedit.targets.target import Target, first_hold, pixel_weight
 
 PIXELS = 128 * 128
@@ -87,10 +87,14 @@ def worked_on(
     chosen = settings.target
     hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0
     if target.coverage is None or target.initial is None or target.weight is None:
-        assert target.envmap is not None, "what was not painted was rendered"
-        asked = chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
-        picture, _, noise = rendered(small, target.envmap, *asked)
         weight = None
+        if target.envmap is None:  # a picture of the scene
+            picture = at_size(target.picture, lit, small)
+            noise = rendered_anew.noise(picture, small.rows)
+        else:
+            picture, _, noise = rendered(
+                small, target.envmap, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
+            )
         if target.weight is not None:
             weight = np.where(hidden[..., None], 0, at_size(target.weight, lit, small)).astype("f4")
         return replace(target, picture=picture, noise=noise, weight=weight)

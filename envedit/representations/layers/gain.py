@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import latlong
 from envedit.core.arrays import tensor
 
 MOST = 12.0
@@ -105,6 +106,7 @@ class GridGain:
     """
 
     def __init__(self, cycles: int, share: float, top: bool = True):
+        self._share, self._top = share, top
         self.poles = [row for row, there in ((0, top), (-1, top and share == 1)) if there]
         """Rows of nodes that lie at a pole: the first of each counts for all."""
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
@@ -123,6 +125,15 @@ class GridGain:
     def scales(self) -> dict:
         """Return what a unit of each parameter is: a number, or an array (rows, columns, 3)."""
         return {f"gain.{i}": unit for i, unit in enumerate(self._units)}
+
+    def directions(self, level: int) -> np.ndarray:
+        """Return the directions of a grid's nodes, (rows * columns, 3)."""
+        rows, columns = self.sizes[level]
+        low, high = (0.0, np.pi * self._share) if self._top else (np.pi * (1 - self._share), np.pi)
+        theta = low + (high - low) * np.arange(rows) / (rows - 1)
+        phi = 2 * np.pi * np.arange(columns) / columns
+        theta, phi = np.meshgrid(theta, phi, indexing="ij")
+        return latlong.on_sphere(theta.ravel(), phi.ravel())
 
     def hats(self, level: int, shape: tuple[int, int]) -> list[tuple[np.ndarray, np.ndarray]]:
         """List the nodes around every texel of an image (rows, W), nine at most: (index of the node, weight).

@@ -1,0 +1,86 @@
+"""A picture of the scene under other light, made by a renderer: how it is told from paint, and its noise.
+
+Who paints on a rendering keeps its Monte Carlo noise, also where a filter goes over all of it. A picture that
+was rendered anew has noise of its own. With A the rendering that could have been painted on, B another one of
+the same map with other samples, and h a high-pass filter, the sums over pixels of |h(picture) - h(A)|^2 and
+|h(picture) - h(B)|^2 are then equally large but for chance, as A and B can be exchanged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core.types import Views
+from envedit.losses.display_curve import to_display
+
+CHANGED = 0.9
+"""Share of the pixels that differ from the initial rendering from which on a picture may be rendered anew."""
+DEVIATIONS = 5.0
+"""Standard deviations by which the picture must be nearer to A than to B to be painted on A: chance does it
+once in three million pictures."""
+_IMMERKAER = np.outer([1, -2, 1], [1, -2, 1]) / 6
+"""The filter of Immerkaer (1996), which takes out what is linear in rows or columns; of white noise it leaves
+the standard deviation."""
+
+
+def is_rendered_anew(
+    picture: np.ndarray,
+    painted_on: np.ndarray,
+    coverage: np.ndarray,
+    another: Callable[[], np.ndarray],
+    views: Views = (slice(None),),
+) -> bool:
+    """Tell whether a picture was rendered under other light, and not painted.
+
+    Parameters
+    ----------
+    picture, painted_on : ndarray (h, w, 3)
+        The picture, and the rendering A that may have been painted on, linear radiance.
+    coverage : ndarray (h, w, 1)
+        Where the two differ.
+    another : callable
+        Returns B, the rendering of the same map with other samples; called only where it is needed.
+    views : sequence of slice
+        Rows of each view.
+    """
+    lit = (painted_on > 0).any(axis=2)
+    if not lit.any() or (coverage[lit] > 0).mean() < CHANGED:
+        return False
+    filtered = [high_pass(image, views) for image in (picture, painted_on, another())]
+    nearer = (np.square(filtered[0] - filtered[2]) - np.square(filtered[0] - filtered[1])).mean(axis=2)
+    blocks = _block_means(nearer)
+    error = blocks.std() / np.sqrt(len(blocks))
+    return bool(error > 0 and blocks.mean() < DEVIATIONS * error)
+
+
+def noise(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
+    """Estimate the standard error of a picture's display values from the picture itself: (h, w).
+
+    One number for the whole picture, the median absolute value of :func:`high_pass` over 0.6745: edges and
+    texture are the smaller part of it.
+    """
+    size = float(np.median(np.abs(high_pass(picture, views)))) / 0.6745
+    return np.full(picture.shape[:2], size)
+
+
+def high_pass(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
+    """Return display values (h, w, 3) without what is smooth in them, view by view."""
+    shown = to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))).numpy().astype(np.float64)
+    parts = []
+    for rows in views:
+        padded = np.pad(shown[rows], ((1, 1), (1, 1), (0, 0)), mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(0, 1))
+        parts.append(np.einsum("hwcij,ij->hwc", windows, _IMMERKAER))
+    return np.concatenate(parts)
+
+
+def _block_means(values, size=8):
+    """Return the means of blocks of pixels, whose errors are independent: (blocks,)."""
+    rows = np.arange(0, values.shape[0], size)
+    columns = np.arange(0, values.shape[1], size)
+    sums = np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+    counts = np.add.reduceat(np.add.reduceat(np.ones_like(values), rows, axis=0), columns, axis=1)
+    return (sums / counts).ravel()

@@ -11,6 +11,7 @@ from envedit.config.tables import EDITED, LAYERS, Table, key
 from envedit.config.validators import Boolean, Choice, Integer, Number, OneOrMore, OrAuto, String, show
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
+from envedit.core.primaries import SPACES
 
 TURN_DEGREES = 60.0
 """Turn of the target's map where neither a map nor a turn is given."""
@@ -56,7 +57,16 @@ class Input(Table):
     lights: tuple[dict, ...] = key(
         (), LightList(), "lights moved, changed or added by hand, before turn and edit"
     )
-    repair: bool = key(False, Boolean(), "replace NaN and Inf by their neighbours, and do not refuse the map")
+    colour_space: str = key(
+        "auto",
+        Choice("auto", *SPACES),
+        'colour space of the map\'s linear values; "auto": as its file says, Rec. 709 where it says nothing',
+    )
+    repair: bool = key(
+        False,
+        Boolean(),
+        "replace NaN by its neighbours and +Inf by the brightest light, and do not refuse the map",
+    )
 
     def _check_together(self) -> None:
         if not self.envmap:

@@ -14,7 +14,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.targets import initial_rendering, painted_image
-from tests.oracles.builders import exr
+from tests.oracles.builders import chunk, exr, turned, with_chunk, with_segment
 
 SIZE = (60, 83)  # no multiple of a JPEG's blocks
 RECTANGLE = (slice(13, 37), slice(21, 50))
@@ -56,30 +56,6 @@ def jpeg(path, pixels, quality=95):
 
 def floats(path, picture, dtype=np.float32, **more):
     return exr(path, **{c: picture[..., i].astype(dtype) for i, c in enumerate("RGB")}, **more)
-
-
-def chunk(kind, data):
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def with_chunk(path, kind, data):
-    """Put a chunk before the pixels of a PNG."""
-    raw = path.read_bytes()
-    at = raw.index(b"IDAT") - 4
-    path.write_bytes(raw[:at] + chunk(kind, data) + raw[at:])
-    return path
-
-
-def with_segment(path, marker, data):
-    raw = path.read_bytes()
-    path.write_bytes(raw[:2] + bytes([255, marker]) + struct.pack(">H", len(data) + 2) + data + raw[2:])
-    return path
-
-
-def turned(orientation):
-    """Return EXIF data that says so."""
-    entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
-    return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 
 
 def told(result):
@@ -469,17 +445,19 @@ def test_interlaced(tmp_path):
     np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
 
 
-def test_turned_pictures_are_refused(initial, tmp_path):
+def test_turned_pictures_are_turned_upright(initial, tmp_path):
     wanted = codes(brushed(initial)[0])
-    file = with_chunk(png(tmp_path / "p.png", wanted), b"eXIf", turned(6))
-    refused(["p.png", "EXIF orientation 6", "upright"], file, SIZE, "gamma", initial)
-    file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE1, b"Exif\0\0" + turned(3))
-    refused(["p.jpg", "EXIF orientation 3"], file, SIZE, "gamma", initial)
-    file = with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + turned(1))
-    assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
-    for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff"):
+    covered = painted_image.read(png(tmp_path / "w.png", wanted), SIZE, "gamma", initial).coverage
+    file = with_chunk(png(tmp_path / "p.png", np.rot90(wanted)), b"eXIf", turned(6))
+    found = painted_image.read(file, SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.coverage, covered)
+    assert "p.png: turned upright, as its EXIF orientation 6 says" in told(found)
+    half = np.ascontiguousarray(wanted[::-1, ::-1])
+    file = with_segment(jpeg(tmp_path / "p.jpg", half), 0xE1, b"Exif\0\0" + turned(3))
+    assert 0.5 < painted_image.read(file, SIZE, "gamma", initial).coverage.sum() / covered.sum() < 1.5
+    for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff", turned(0), turned(9)):
         with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + damage)
-        assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
+        assert painted_image.read(tmp_path / "q.jpg", SIZE, "gamma", initial).coverage.any()
 
 
 @pytest.mark.parametrize(

@@ -255,6 +255,11 @@ def _of_array(values: np.ndarray, name: str, space: str) -> tuple[np.ndarray, di
     size = image.shape[1], image.shape[0]
     info: Info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
     info["marks"] = {}
+    if values.dtype in (np.uint8, np.uint16):
+        info["warnings"].append(
+            f"an array of {values.dtype} is taken as linear radiance: codes of a picture have to be "
+            f"divided by {np.iinfo(values.dtype).max}, and their curve undone, before"
+        )
     return marks.honour(image, info, space), info
 
 

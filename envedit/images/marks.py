@@ -59,7 +59,7 @@ def honour(pixels: np.ndarray, info: Info, space: str = AUTO) -> np.ndarray:
     gamma = marks.get("gamma", 0)
     if b"sRGB" not in profile or b"inear" in profile:
         warnings.append(
-            "its colour profile is not sRGB: values are read as sRGB, light and hues may be off; "
+            "its colour profile is not sRGB, but values are used as if it were: light and hues may be off; "
             "convert it to sRGB, or save it as linear OpenEXR"
         )
     elif "profile" not in marks and gamma > 0 and abs(gamma - _SRGB_GAMMA) > _GAMMA_TOLERANCE:

@@ -26,7 +26,7 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     if "xyze" in header.get("FORMAT", ""):
         raise InputError(f"{name}: holds XYZ colours (32-bit_rle_xyze); save it as RGB (32-bit_rle_rgbe)")
     for key in {"EXPOSURE", "COLORCORR", "GAMMA"} & header.keys():
-        if _numbers(header[key]) not in ([1], [1, 1, 1]):
+        if header[key] and set(_numbers(header[key])) != {1}:
             info["marks"][key] = header[key]
     chromaticities = _numbers(header.get("PRIMARIES", ""))
     if len(chromaticities) == 8 and any(chromaticities):  # zeros: none are known

@@ -133,6 +133,6 @@ def _chromaticities(marks, info, space):
     if spaces:
         info["warnings"].append(
             f"its colour space '{shown(spaces[0])}' says nothing: read as linear Rec. 709; "
-            "[input] colour_space can say what it is"
+            "of the map to edit, [input] colour_space can say what it is"
         )
     return None

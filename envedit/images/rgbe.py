@@ -67,7 +67,7 @@ def _product(first, second):
     """Multiply the numbers of two lines of a key, as programs add a line for each of their changes."""
     factors = _numbers(first), _numbers(second)
     if not factors[0] or len(factors[0]) != len(factors[1]):
-        return f"{first}, {second}"
+        return f"{first}, {second}"[:60]
     return " ".join(f"{a * b:g}" for a, b in zip(factors[0], factors[1], strict=True))
 
 

@@ -253,7 +253,7 @@ def _export_initial(settings, arguments):
         _tell(arguments, "warning", line)
     for line in notes:
         _say(arguments, line)
-    declared = settings.target.tonemap
+    declared = settings.target.display_tonemap
     if under not in ("linear", declared):
         _say(
             arguments,

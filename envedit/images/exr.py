@@ -163,8 +163,10 @@ def _choose_channels(name, headers, info):
         if colour:
             names = [layers[colour[0]][c] for c in "RGB"]
             if len(colour) > 1:
-                chosen = shown(colour[0]) or "R, G, B"
-                info["warnings"].append(f"{len(colour)} colour layers: '{chosen}' was read")
+                named = [f"'{shown(layer, 30) or 'R, G, B'}'" for layer in colour[:8]]
+                info["warnings"].append(
+                    f"{len(colour)} colour layers ({', '.join(named)}): {named[0]} was read"
+                )
         else:
             grey = [v["Y"] for v in layers.values() if "Y" in v and not {"RY", "BY", "X", "Z"} & v.keys()]
             if not grey:

@@ -37,7 +37,7 @@ def test_exr_mixed_types_layers_and_parts(tmp_path, rng):
     layers = {f"View.Combined.{c}": p[c] for c in "RGB"} | other | {"Z": p["R"]}
     found, info = images.read(exr(tmp_path / "l.exr", **layers))
     np.testing.assert_array_equal(found, stacked(p))
-    assert info["warnings"] == ["2 colour layers: 'View.Combined' was read"]
+    assert info["warnings"] == ["2 colour layers ('View.Combined', 'aov'): 'View.Combined' was read"]
 
     part = OpenEXR.Part(dict(SCANLINE), {"Z": p["R"]}, "depth")
     colour = OpenEXR.Part(dict(SCANLINE), dict(p), "colour")

@@ -456,6 +456,18 @@ def test_an_empty_layer_is_refused(initial, tmp_path):
     refused(["p.png", "nothing of it is painted"], file, SIZE, "gamma")
 
 
+def test_layers_of_an_exr_are_named(initial, tmp_path):
+    """As Krita saves them: paint on another layer than the first is not seen."""
+    layers = {f"Background.{c}": initial[..., i].copy() for i, c in enumerate("RGB")}
+    layers |= {f"Paint Layer 1.{c}": layer(initial)[..., i].astype("f4") for i, c in enumerate("RGBA")}
+    file = exr(tmp_path / "p.exr", **layers)
+    says = "2 colour layers ('Background', 'Paint Layer 1'): 'Background' was read"
+    refused(["nothing of it is painted", says], file, SIZE, "gamma", initial)
+    layers["Background.R"][RECTANGLE] = 0.5
+    found = painted_image.read(exr(tmp_path / "q.exr", **layers), SIZE, "gamma", initial)
+    assert says in told(found)
+
+
 # ---- grey, palettes, marks ---------------------------------------------------------------------------------
 
 

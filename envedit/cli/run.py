@@ -361,7 +361,9 @@ def _verdict(measured):
         return f"{first.rpartition(' ')[0]} -> {last}{what}"
 
     painted = measured["painted"]
-    if painted and painted["towards"] is not None:
+    if painted and painted["towards"] is None:
+        line = "the painted change is below the noise of the renderings"
+    elif painted:
         line = f"{100 * painted['towards']:.0f} % of the painted change reached"
         if painted["reachable"] is not None:
             line += f" ({100 * painted['reachable']:.0f} % feasible)"

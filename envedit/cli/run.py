@@ -362,7 +362,7 @@ def _verdict(measured):
 
     painted = measured["painted"]
     if painted and painted["towards"] is None:
-        line = "the painted change is below the noise of the renderings"
+        line = "share of the painted change reached: unknown"
     elif painted:
         line = f"{100 * painted['towards']:.0f} % of the painted change reached"
         if painted["reachable"] is not None:

@@ -134,7 +134,8 @@ def read(
     if before is not None:
         painted &= differs(values, before, info, top, spread)
         if not mask:
-            _check_painted(file, painted, before, info, said, top, warnings)
+            other = {key: value for key, value in said.items() if value != str(exported.get(key))}
+            _check_painted(file, painted, before, info, other, top, warnings)
     coverage = alpha * (read_mask(mask, shape)[..., 0] if mask else painted)
     if not coverage.any():
         facts = f" ({'; '.join(info['warnings'])})" if info["warnings"] else ""
@@ -314,7 +315,7 @@ def _laid_over(values, alpha, before, premultiplied):
     return (values if premultiplied else alpha * values) + (1 - alpha) * before
 
 
-def _check_painted(file, painted, before, info, said, top, warnings):
+def _check_painted(file, painted, before, info, other, top, warnings):
     """Warn where paint is recognised badly: in a JPEG, and where nearly all would be paint."""
     if info["format"] == "jpeg":
         warnings.append(f"{file}: paint is found but roughly in a JPEG, faint paint not at all: save a PNG")
@@ -323,7 +324,7 @@ def _check_painted(file, painted, before, info, said, top, warnings):
     if share < NEARLY_ALL:
         return
     line = f"{file}: {100 * share:.0f} % of the pixels differ from the initial rendering"
-    made = f" (it was made with {', '.join(f'{k} {v}' for k, v in said.items())})" if said else ""
+    made = f" (it was made with {', '.join(f'{k} {v}' for k, v in other.items())})" if other else ""
     warnings.append(
         f"{line}: unless all of it was painted, it is of another rendering{made}; "
         "export that again with --export-initial, or give a mask"

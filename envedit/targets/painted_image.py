@@ -22,6 +22,8 @@ from envedit.targets import initial_rendering
 from envedit.targets.paint_detection import differs
 
 NEARLY_ALL = 0.9
+MOST_RESIZED = 16
+"""Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
 NOTHING: Mapping[str, object] = MappingProxyType({})
 
 
@@ -98,17 +100,16 @@ def read(
     pixels, info = images.read_stored(file)
     file = info["path"]
     said = initial_rendering.stated_origin(file, info, exported)
-    _check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
     warnings = [f"{file}: {line}" for line in info["warnings"]]
+    spread = _spread_of_resampling(file, pixels.shape, shape, warnings)
+    _check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
 
     # ---- Values, alpha and clipped pixels, at the size of the rendering
     values, alpha, top = _planes(file, pixels, warnings)
     clipped = np.zeros(alpha.shape, bool)
     if not info["hdr"]:
         clipped = (values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)).any(axis=2) & (alpha > 0)
-    spread = 0
-    if alpha.shape != tuple(shape[:2]):
-        spread = _spread_of_resampling(file, alpha.shape, shape, warnings)
+    if spread:
         values, alpha, clipped = _resampled(values, alpha, clipped, shape, info["hdr"])
 
     # ---- The tonemap, and the rendering under it
@@ -237,14 +238,18 @@ def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
 
 
 def _spread_of_resampling(file, size, shape, warnings):
-    """Check a picture of another size; returns over how many pixels resampling mixes the rendering's.
+    """Check a picture's size; returns over how many pixels resampling mixes the rendering's, 0 without.
 
     Editors resample with filters of at most three lobes, each as wide as the larger of the two pixels.
     """
-    (rows, columns), (height, width) = size, shape[:2]
+    (rows, columns), (height, width) = size[:2], shape[:2]
+    if (rows, columns) == (height, width):
+        return 0
     sizes = f"{file}: is {columns}x{rows} pixels, the rendering is {width}x{height}: "
     if abs(columns * height - rows * width) > max(height, width):
         raise InputError(sizes + "another aspect; paint on the picture that --export-initial writes")
+    if max(columns, width) > MOST_RESIZED * min(columns, width):
+        raise InputError(f"{sizes}more than {MOST_RESIZED} times apart; save it at the size of the export")
     warnings.append(f"{sizes}resampled; faint or thin paint is not found: better keep the size of the export")
     return int(np.ceil(3 * max(1, height / rows, width / columns)))
 

@@ -555,6 +555,8 @@ def test_cmyk_is_refused(initial, tmp_path):
 def test_another_size(initial, tmp_path):
     file = png(tmp_path / "p.png", codes(initial)[:40])
     refused(["is 83x40 pixels", "83x60", "aspect", "--export-initial"], file, SIZE, "gamma", initial)
+    file = png(tmp_path / "p.png", codes(initial)[:1, :1])
+    refused(["is 1x1 pixels", "83x60", "more than 16 times"], file, SIZE, "gamma", initial)
 
 
 @pytest.mark.parametrize("factor", [2, 1.5, 0.5])

@@ -129,7 +129,11 @@ class Target(Table):
         "view that each file, or mask, belongs to: index or id; []: the first, the second, ...",
     )
     tonemap: str = key(
-        "gamma", Choice(*TONEMAPS), "tonemap under which the image, or a stroke, is painted", when=_PAINTED
+        "auto",
+        Choice("auto", *TONEMAPS),
+        "tonemap under which a PNG is exported, and the image or a stroke is painted; auto: gamma, or of a "
+        "PNG reinhard where gamma clips 0.1 % of its pixels; an image is read as it says or shows itself",
+        when=_PAINTED,
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
     paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
@@ -152,6 +156,11 @@ class Target(Table):
     def degrees(self) -> float:
         """Turn of the input that is the target's map, where :attr:`file` names no other."""
         return TURN_DEGREES if isinstance(self.rotate_degrees, str) else self.rotate_degrees
+
+    @property
+    def display_tonemap(self) -> str:
+        """Tonemap of strokes, and of a picture that gamma does not clip."""
+        return "gamma" if self.tonemap == "auto" else self.tonemap
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -134,7 +134,7 @@ def make(
         found = painted_image.given(picture, shape, initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
     elif chosen.kind == "image":
-        found = _painted_files(scene, initial, chosen)
+        found = _painted_files(scene, initial, settings)
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
         source = f"painted: {', '.join(chosen.files)}"
     else:
@@ -166,14 +166,16 @@ def _by_view(scene, views, given):
     return dict(zip(numbers, given, strict=True))
 
 
-def _painted_files(scene, initial, chosen):
+def _painted_files(scene, initial, settings):
     """Read what was painted on views, each from its file."""
+    chosen, name = settings.target, initial_rendering.png_tonemap(initial, settings)
     masks = chosen.masks or ("",) * len(chosen.files)
     painted = _by_view(scene, chosen.views, zip(chosen.files, masks, strict=True))
 
     def of_view(k, before):
         file, mask = painted[k]
-        return painted_image.read(file, before.shape[:2], chosen.tonemap, before, mask)
+        exported = initial_rendering.origin(settings, before.shape, name)
+        return painted_image.read(file, before.shape[:2], chosen.tonemap, before, mask, exported)
 
     return _of_views(scene, initial, painted, of_view)
 
@@ -187,7 +189,7 @@ def _painted_strokes(scene, initial, chosen):
 
     def of_view(k, before):
         own = [i for i, number in enumerate(numbers) if number == k]
-        made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.tonemap)
+        made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.display_tonemap)
         warnings.extend(_renumbered(line, own) for line in made.warnings)
         return painted_image.Painted(made.picture, made.coverage, np.zeros(before.shape[:2], bool), ())
 

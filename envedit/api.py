@@ -97,6 +97,7 @@ def edit(
         raise ConfigError("target, target_map: got both, expected one: a picture, or a map to render under")
     chosen, found = _settings(settings)
     given = {name: _array(name, value) for name, value in arrays.items() if value is not None}
+    codes = [_said_of_codes(name, arrays[name]) for name in given if name != "mask"]
     mi.set_variant(chosen.variant)
     with contextlib.ExitStack() as stack:
         lit = None
@@ -110,7 +111,9 @@ def edit(
             chosen = _of_scene(chosen, lit)
         arguments = (given.get(name) for name in ("envmap", "target_map", "target", "mask"))
         memory = inputs.Given(lit, *arguments)
-        return run(_of_arrays(chosen, given), base=base or found, watch=watch, memory=memory)
+        result = run(_of_arrays(chosen, given), base=base or found, watch=watch, memory=memory)
+    result.warnings[:0] = filter(None, codes)
+    return result
 
 
 def fit(
@@ -311,6 +314,15 @@ def _array(name: str, value: ArrayLike) -> np.ndarray:
         raise InputError(f"{name}: got {show(value)}, expected an array of numbers")
     with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is refused as such
         return found.astype(np.float32)
+
+
+def _said_of_codes(name: str, value: ArrayLike | None) -> str:
+    """Return a warning of an array that may hold codes of a picture, not radiance; "" for others."""
+    found = np.asarray(value)
+    if found.dtype not in (np.uint8, np.uint16) or not (found > 1).any():
+        return ""
+    what = f"{name}: got {found.dtype} up to {found.max()}, taken as linear radiance as it is"
+    return f"{what}; if it holds codes of a picture, undo their display curve first"
 
 
 def _of_arrays(settings: config.Config, given: Mapping[str, np.ndarray]) -> config.Config:

@@ -113,11 +113,11 @@ class InputMap:
         colours = primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))
         return float((colours < -_ROUNDING * np.abs(colours).max(axis=2, keepdims=True)).any(axis=2).mean())
 
-    def at_file_size(self, repair: bool) -> InputMap:
+    def at_file_size(self, settings: config.Input) -> InputMap:
         """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
-        return _read(self.source if self.array is None else self.array, None, repair, self.scale)
+        return _read(self.source if self.array is None else self.array, None, settings, self.scale)
 
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
@@ -209,13 +209,13 @@ def read_map(
     """
     scale = 1.0 if lit is None else lit.own.scale
     if array is not None:
-        return by_hand(settings, _read(array, width, settings.repair, scale))
+        return by_hand(settings, _read(array, width, settings, scale))
     source = source_of(settings, lit)
     if source == SUNSKY:
         width = width or settings.width
         sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
         return by_hand(settings, InputMap(source, sky, scale, (width, width // 2), []))
-    return by_hand(settings, _read(source, width, settings.repair, scale))
+    return by_hand(settings, _read(source, width, settings, scale))
 
 
 def by_hand(settings: config.Input, given: InputMap) -> InputMap:
@@ -236,8 +236,10 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
     return replace(given, stored=turned, warnings=warnings, placed=placed)
 
 
-def _read(source, width, repair, scale):
-    stored, info = images.load_envmap(source, width, repair, convert=False, name="envmap")
+def _read(source, width, settings, scale):
+    stored, info = images.load_envmap(
+        source, width, settings.repair, convert=False, name="envmap", space=settings.colour_space
+    )
     about = scale, info["size"], list(info["warnings"]), info["chromaticities"]
     array = source if isinstance(source, np.ndarray) else None
     found = InputMap(source if array is None else images.ARRAY, stored, *about, array=array)
@@ -283,7 +285,7 @@ def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = Non
         said.insert(0, f"map: the scene's own, {source}")
     if given is not None and given.chromaticities is not None:
         space = primaries.name_of(given.chromaticities)
-        said.append(f"map in {space}: edited in Rec. 709 (Bradford adaptation), written in {space}")
+        said.append(f"map in {space}: edited in Rec. 709, written in {space}")
     if own.scale != 1:
         whose = "it" if source == str(own.file) else "the map (which is not the scene's own)"
         said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}")

@@ -182,7 +182,7 @@ def run(
     with clock("judge_s"), in_file_units(), keeping(edited):
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
-        final, judged, _ = lit.sampled(edited, spp, seed)
+        final, judged, noise = lit.sampled(edited, spp, seed)
         initial = target.initial
         if initial is None:  # the same samples: what differs is the map
             initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
@@ -202,7 +202,9 @@ def run(
     maps = {"initial": original, "target": target.envmap, "edited": edited}
     with in_file_units(), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit)
+        measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit, noise)
+    if measured["painted"] and measured["painted"]["towards"] is None:
+        notes.append("the painted change is below the noise of the renderings: no share of it is measured")
     rate = "; lower optimizer.lr" if job.raised_rate else ""
     pair = [measured[name] for name in ("render", "initial")]
     measured["worse"] = target.coverage is None and metrics.worse(*pair)
@@ -332,7 +334,7 @@ def _perceptual(settings):
     return dists, lpips
 
 
-def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
+def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=None):
     """Compare renderings and maps: the part of the metrics that says how good the result is."""
     tonemap = settings.output.tonemap
     before, target, after = (renders[name] for name in ("initial", "target", "edited"))
@@ -347,9 +349,9 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
         "painted": None,
     }
     if len(lit.views) > 1:
-        measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap)
+        measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap, noise)
     if coverage is not None:
-        measured["painted"] = metrics.painted(after, target, before, coverage, tonemap, seen)
+        measured["painted"] = metrics.painted(after, target, before, coverage, tonemap, seen, noise)
         measured["painted"]["reachable"] = None if within is None else within.share
     if maps["target"] is not None:
         original, true, edited = (maps[name][rows.slice] for name in ("initial", "target", "edited"))
@@ -359,7 +361,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit):
     return measured
 
 
-def _of_views(views, renders, coverage, lpips, seen, tonemap):
+def _of_views(views, renders, coverage, lpips, seen, tonemap, noise):
     """Compare the renderings of each view."""
     found = []
     for view in views:
@@ -370,8 +372,9 @@ def _of_views(views, renders, coverage, lpips, seen, tonemap):
         of_view |= {"render": metrics.compare(after, target, *some)}
         of_view |= {"initial": metrics.compare(before, target, *some), "painted": None}
         if coverage is not None:
-            painted = coverage[view.rows], tonemap, counts
-            of_view["painted"] = metrics.painted(after, target, before, *painted)
+            error = None if noise is None else noise[view.rows]
+            cover = coverage[view.rows]
+            of_view["painted"] = metrics.painted(after, target, before, cover, tonemap, counts, error)
         found.append(of_view)
     return found
 

@@ -253,7 +253,7 @@ def _export_initial(settings, arguments):
         _tell(arguments, "warning", line)
     for line in notes:
         _say(arguments, line)
-    declared = settings.target.tonemap
+    declared = settings.target.display_tonemap
     if under not in ("linear", declared):
         _say(
             arguments,
@@ -361,7 +361,9 @@ def _verdict(measured):
         return f"{first.rpartition(' ')[0]} -> {last}{what}"
 
     painted = measured["painted"]
-    if painted and painted["towards"] is not None:
+    if painted and painted["towards"] is None:
+        line = "share of the painted change reached: unknown"
+    elif painted:
         line = f"{100 * painted['towards']:.0f} % of the painted change reached"
         if painted["reachable"] is not None:
             line += f" ({100 * painted['reachable']:.0f} % feasible)"

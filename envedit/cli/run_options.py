@@ -79,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
         "--export-initial",
         metavar="FILE",
         help="only write the initial rendering, to paint on: linear .exr, or 16-bit .png under "
-        "[target] tonemap, or under reinhard where that would clip",
+        "[target] tonemap; and FILE.envedit.json, which says what it was made with",
     )
     instead.add_argument(
         "--dry-run",

@@ -11,6 +11,7 @@ from envedit.config.tables import EDITED, LAYERS, Table, key
 from envedit.config.validators import Boolean, Choice, Integer, Number, OneOrMore, OrAuto, String, show
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
+from envedit.core.primaries import SPACES
 
 TURN_DEGREES = 60.0
 """Turn of the target's map where neither a map nor a turn is given."""
@@ -57,7 +58,16 @@ class Input(Table):
     lights: tuple[dict, ...] = key(
         (), LightList(), "lights moved, changed or added by hand, before turn and edit"
     )
-    repair: bool = key(False, Boolean(), "replace NaN and Inf by their neighbours, and do not refuse the map")
+    colour_space: str = key(
+        "auto",
+        Choice("auto", *SPACES),
+        'colour space of the map\'s linear values; "auto": as its file says, Rec. 709 where it says nothing',
+    )
+    repair: bool = key(
+        False,
+        Boolean(),
+        "replace NaN by its neighbours and +Inf by the brightest light, and do not refuse the map",
+    )
 
     def _check_together(self) -> None:
         if not self.envmap:
@@ -121,9 +131,11 @@ class Target(Table):
         "view that each file, or mask, belongs to: index or id; []: the first, the second, ...",
     )
     tonemap: str = key(
-        "gamma",
-        Choice(*TONEMAPS),
-        "tonemap under which the picture, or a stroke, is painted; without it a rendering's PNG or JPEG is sRGB",
+        "auto",
+        Choice("auto", *TONEMAPS),
+        "tonemap under which a PNG is exported, and the image or a stroke is painted; auto: gamma, or of a "
+        "PNG reinhard where gamma clips 0.1 % of its pixels; an image is read as it says or shows itself, and a "
+        "rendering that says nothing as sRGB",
         when={"target.kind": ("rendering", "image", "strokes")},
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
@@ -147,6 +159,11 @@ class Target(Table):
     def degrees(self) -> float:
         """Turn of the input that is the target's map, where :attr:`file` names no other."""
         return TURN_DEGREES if isinstance(self.rotate_degrees, str) else self.rotate_degrees
+
+    @property
+    def display_tonemap(self) -> str:
+        """Tonemap of strokes, and of a picture that gamma does not clip."""
+        return "gamma" if self.tonemap == "auto" else self.tonemap
 
     @property
     def files(self) -> tuple[str, ...]:

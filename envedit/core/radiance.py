@@ -129,11 +129,13 @@ def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest:
             raise InputError(f"{what}: {texels.sum()} texels are {how}, {where}: {cure}")
 
 
-def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
-    """Replace every non-finite texel by the mean of its finite neighbours.
+def repair(image: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Replace infinite radiance by the brightest, and every other non-finite texel by its neighbours.
 
-    The eight neighbours, columns periodic; holes are filled from their rim inwards. A texel with one bad
-    channel is replaced whole, as its other channels are no more to be trusted.
+    A sun that the program before could not hold has overflowed to +Inf: such channels become the largest
+    finite value of the image, or :data:`HALF_MAX` if that is more. A texel with NaN or -Inf in a channel
+    becomes the mean of its eight neighbours, columns periodic, as its other channels are no more to be
+    trusted; holes are filled from their rim inwards.
 
     Parameters
     ----------
@@ -144,8 +146,10 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
     -------
     image : array (H, W, 3) float32
         The same where it was finite.
-    count : int
-        Texels replaced.
+    overflowed : array of bool (H, W)
+        Texels that were infinite.
+    replaced : array of bool (H, W)
+        Texels that were replaced by their neighbours.
 
     Raises
     ------
@@ -155,12 +159,14 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
     with np.errstate(over="ignore"):
         image = np.array(image, np.float32)
     height, width = image.shape[:2]
-    good = ~any_channel(~np.isfinite(image))
-    count = int(good.size - good.sum())
-    if count == 0:
-        return image, 0
-    if count == good.size:
+    finite = np.isfinite(image)
+    if not (~any_channel(~finite)).any():
+        count = height * width
         raise InputError(f"all {count} texels of the image are NaN or infinite: nothing to repair from")
+    replaced = any_channel(np.isnan(image) | np.isneginf(image))
+    overflowed = any_channel(np.isposinf(image)) & ~replaced
+    image[np.isposinf(image)] = max(HALF_MAX, float(image[finite].max()))
+    good = ~replaced
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     row, column = np.nonzero(~good)
     while len(row):
@@ -179,4 +185,4 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, int]:
         beside = [np.clip(row + i, 0, height - 1) * width + (column + j) % width for i, j in steps]
         texel = np.unique(np.concatenate(beside))
         row, column = np.divmod(texel[~good.ravel()[texel]], width)
-    return image, count
+    return image, overflowed, replaced

@@ -59,7 +59,7 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
 
 def _by_hand(settings: config.Input, given: inputs.InputMap) -> inputs.InputMap:
     """Read a map at its file's size, and place and turn its lights as it was done at working size."""
-    full = given.at_file_size(settings.repair)
+    full = given.at_file_size(settings)
     if given.placed is not None:
         own = given.placed
         before, rows = own.envmap, Rows.of(len(own.envmap))

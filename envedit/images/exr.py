@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 
-from envedit.core import primaries
 from envedit.core.errors import InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import Info
@@ -115,7 +114,7 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     if stored and len(planes) in (1, 3) and windows[index] != display:
         planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
     image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
-    _describe(name, header, info)
+    _describe(header, info)
     return _to_display(image, (left, top), display, name, info)
 
 
@@ -145,50 +144,60 @@ def _window(box):
 
 
 def _choose_channels(name, headers, info):
-    """Return the first part with colour and its channel names, three or (luminance) one."""
-    seen = []
+    """Return the part of the picture and its channel names, three or (luminance) one."""
+    seen, colour, grey = [], [], []  # of the latter: part, name of the layer, channels
     for index, header in enumerate(headers):
         if "deep" in str(header.get("type", "")).lower():
             seen.append("deep data")
             continue
-        channels = {c.name: c for c in header["channels"]}
-        seen.extend(channels)
         layers: dict[str, dict[str, str]] = {}
-        for full in channels:
-            layer, _, short = full.rpartition(".")
-            layers.setdefault(layer, {})[short.upper()] = full
-        # Unnamed channels first, then a layer that calls itself the picture, then the order of the file.
-        colour = [k for k, v in layers.items() if {"R", "G", "B"} <= v.keys()]
-        colour.sort(key=lambda k: (k != "", not re.search("combined|beauty|rgba", k.lower())))
-        if colour:
-            names = [layers[colour[0]][c] for c in "RGB"]
-            if len(colour) > 1:
-                chosen = shown(colour[0]) or "R, G, B"
-                info["warnings"].append(f"{len(colour)} colour layers: '{chosen}' was read")
-        else:
-            grey = [v["Y"] for v in layers.values() if "Y" in v and not {"RY", "BY", "X", "Z"} & v.keys()]
-            if not grey:
-                continue
-            names = grey[:1]
-            info["warnings"].append(f"only luminance ('{shown(names[0])}'): read as grey")
-        if any(channels[c].xSampling != 1 or channels[c].ySampling != 1 for c in names):
-            raise InputError(f"{name}: subsampled channels are not supported; save R, G, B in full")
-        return index, names
-    found = ", ".join(shown(channel, 30) for channel in seen[:12])
-    raise InputError(f"{name}: no R, G, B channels (found: {found}); save it as RGB")
+        for channel in header["channels"]:
+            seen.append(channel.name)
+            layer, _, short = channel.name.rpartition(".")
+            layers.setdefault(layer, {})[short.upper()] = channel.name
+        # Unnamed channels of a part go first; the part's own name is that of all of them.
+        for layer, channels in sorted(layers.items(), key=lambda item: item[0] != ""):
+            part = str(header.get("name", "")) if len(headers) > 1 else ""
+            label = layer if part in layer else ".".join(filter(None, (part, layer)))
+            if {"R", "G", "B"} <= channels.keys():
+                colour.append((index, label, [channels[c] for c in "RGB"]))
+            elif "Y" in channels and not {"RY", "BY", "X", "Z"} & channels.keys():
+                grey.append((index, channels["Y"], [channels["Y"]]))
+    if not colour + grey:
+        found = ", ".join(shown(channel, 30) for channel in seen[:12])
+        raise InputError(f"{name}: no R, G, B channels (found: {found}); save it as RGB")
+
+    # ---- unnamed channels, then a layer or part that calls itself the picture, then the order of the file
+    index, label, names = min(colour, key=lambda c: _rank(c[1])) if colour else grey[0]
+    if not colour:
+        info["warnings"].append(f"only luminance ('{shown(label)}'): read as grey")
+    elif len(colour) > 1:
+        labels = [shown(c[1], 40) or "R, G, B" for c in colour]
+        others = ", ".join(labels[:6]) + (", ..." if len(labels) > 6 else "")
+        info["warnings"].append(
+            f"{len(colour)} colour layers ({others}): '{shown(label) or 'R, G, B'}' was read"
+        )
+    if any(c.xSampling != 1 or c.ySampling != 1 for c in headers[index]["channels"] if c.name in names):
+        raise InputError(f"{name}: subsampled channels are not supported; save R, G, B in full")
+    return index, names
 
 
-def _describe(name, header, info):
-    """Take over the header's plain attributes and colour space; warn of a projection we would misread."""
+def _rank(label):
+    """Order layers: unnamed channels, names that end in a word for the picture, or hold one, others."""
+    if not label:
+        return 0
+    found = re.search("(combined|beauty|rgba)(.?)", label.lower())
+    return 3 if found is None else 2 if found[2] else 1
+
+
+def _describe(header, info):
+    """Take over the header's plain attributes and marks."""
     info["metadata"] = {k: v for k, v in header.items() if isinstance(v, str | int | float)}
-    given = header.get("chromaticities")
-    said = [v for k in _SPACE_NAMES if isinstance(v := header.get(k), str) and v]
-    if given is not None:
-        info["chromaticities"] = primaries.known(given, name)
-    elif said:
-        info["chromaticities"] = primaries.named(said[0], name)
-    if "CUBE" in str(header.get("envmap", "")):
-        info["warnings"].append("it is marked as a cube map: read as if it were lat-long")
+    marks = info["marks"]
+    if header.get("chromaticities") is not None:
+        marks["chromaticities"] = header["chromaticities"]
+    marks["spaces"] = [v for k in _SPACE_NAMES if isinstance(v := header.get(k), str) and v]
+    marks["cube"] = "CUBE" in str(header.get("envmap", ""))
 
 
 def _to_display(image, corner, display, name, info):
@@ -197,6 +206,7 @@ def _to_display(image, corner, display, name, info):
     if corner == (left, top) and image.shape[:2] == (height, width):
         return image
     check_declared(name, width, height)
+    info["data_size"] = image.shape[1], image.shape[0]
     info["warnings"].append(
         f"data window {image.shape[1]} x {image.shape[0]} at {corner[0]}, {corner[1]} differs from the "
         f"display window {width} x {height} at {left}, {top}: cropped, or filled with black"

@@ -17,10 +17,10 @@ import numpy as np
 
 from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import replacing, write_atomically
-from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError
+from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import ArrayLike, FilePath, Info
-from envedit.images import exr, ldr, rgbe
+from envedit.images import exr, ldr, marks, rgbe
 from envedit.images.headers import MAX_SIDE, damaged, head_of
 
 FORMATS = (
@@ -43,9 +43,10 @@ __all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_hdr", "writ
 def read(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as linear radiance.
 
-    The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; layers; the
-    first part with colour; luminance-only files become grey), Radiance HDR, and PNG or JPEG, whose sRGB curve
-    is undone. Alpha is left out. Values are as stored: they may be negative or not finite, see
+    The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; of layers
+    and parts that with the picture; luminance-only files become grey), Radiance HDR, and PNG or JPEG, whose
+    sRGB curve is undone. Marks of the file are honoured (:mod:`.marks`); what is transparent in a PNG is
+    dark. Values are as stored: they may be negative or not finite, see
     :func:`envedit.core.radiance.health`.
 
     Parameters
@@ -59,8 +60,8 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
         Linear radiance.
     info : dict
         ``path`` (str), ``format`` ("exr", "hdr", "png" or "jpeg"), ``size`` (width, height), ``hdr`` (False
-        for 8- and 16-bit pictures), ``metadata`` (dict of str, int and float), ``chromaticities`` (of the
-        file's colours; None: Rec. 709) and ``warnings`` (list of str).
+        for 8- and 16-bit pictures, which have ``bits``), ``metadata`` (dict of str, int and float),
+        ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str).
 
     Raises
     ------
@@ -69,7 +70,7 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
         side or 2^27 in all.
     """
     image, info = _decode(path, stored=False)
-    return _in_rec709(image, info), info
+    return marks.in_rec709(image, info), info
 
 
 def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
@@ -93,41 +94,24 @@ def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     Raises
     ------
     InputError
-        As :func:`read`, and if the picture is marked to be turned (EXIF orientation).
+        As :func:`read`.
     """
     pixels, info = _decode(path, stored=True)
-    if (orientation := info.pop("orientation", 1)) not in (0, 1):
-        raise InputError(
-            f"{info['path']}: is marked as turned (EXIF orientation {orientation}), which is not undone: "
-            "save it upright, without that mark"
-        )
-    profile = info.pop("profile", b"sRGB").replace(b"\0", b"")  # its name may be UTF-16
-    if b"sRGB" not in profile or b"inear" in profile:
-        info["warnings"].append(
-            "its colour profile is not sRGB: values are used as they are, hues may be off"
-        )
-    return _in_rec709(pixels, info), info
+    return marks.in_rec709(pixels, info), info
 
 
-def _in_rec709(pixels, info):
-    """Convert the colours of (H, W, C) to Rec. 709, where the file has others."""
-    if info["chromaticities"] is None or pixels.shape[2] < 3:
-        return pixels
-    info["warnings"].append(f"converted from {primaries.name_of(info['chromaticities'])} to Rec. 709")
-    matrix = primaries.to_rec709(info["chromaticities"])
-    return np.concatenate([primaries.converted(pixels[..., :3], matrix), pixels[..., 3:]], axis=2)
-
-
-def _decode(path, stored):
+def _decode(path, stored, space=marks.AUTO):
     name = os.fsdecode(path)
     head = head_of(name)
     info: Info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
-    info["chromaticities"] = None
+    info["marks"] = {}
     for kind, magic, reader in FORMATS:
         if head.startswith(magic):
             info["format"] = kind
             try:
-                image = reader(name, head, info, stored)
+                image = marks.honour(reader(name, head, info, stored), info, space)
+                if not stored and not info["hdr"]:
+                    image = marks.light(image, info)
             except MemoryError:
                 raise InputError(f"{name}: not enough memory to read this image; make it smaller") from None
             except EnveditError:
@@ -148,21 +132,24 @@ def load_envmap(
     repair: bool = False,
     convert: bool = True,
     name: str = ARRAY,
+    space: str = marks.AUTO,
 ) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
     Parameters
     ----------
     path : path-like or ndarray (H, 2 H, 3)
-        An image of 2:1, or its linear radiance.
+        An image of 2:1, or its linear radiance; one that a texel's rounding made odd is resampled.
     width : int, optional
         Working width in texels, even and at least 6; the height is half of it. Without, the file's own size.
     repair : bool
-        Replace NaN and infinite texels instead of refusing them.
+        Mend NaN and infinite texels (:func:`.radiance.repair`) instead of refusing them.
     convert : bool
         To Rec. 709; otherwise colours are those of the file, ``info["chromaticities"]``.
     name : str
         What errors call an array.
+    space : str
+        Colour space of the values, a name of :data:`.primaries.SPACES`; "auto": as the file says.
 
     Returns
     -------
@@ -175,40 +162,52 @@ def load_envmap(
     Raises
     ------
     InputError
-        If the file cannot be read, is not 2:1, is smaller than 6 x 3, or holds texels that are not finite.
+        If the file cannot be read, is not 2:1 to a texel, is smaller than 6 x 3, or holds texels that are not
+        finite.
     ConfigError
         If ``width`` is odd or less than 6.
     """
     if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
         raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
     if isinstance(path, np.ndarray):
-        image, info = _of_array(path, name)
+        image, info = _of_array(path, name, space)
     else:
-        image, info = read(path) if convert else _decode(path, stored=False)
+        image, info = _decode(path, stored=False, space=space)
+    if convert:
+        image = marks.in_rec709(image, info)
     name, warnings = info["path"], info["warnings"]
     rows, columns = image.shape[:2]
-    if columns != 2 * rows:
-        raise InputError(f"{name}: a lat-long map is 2:1, this is {columns} x {rows}; crop or resize it")
+    if abs(columns - 2 * rows) > 1:
+        raise InputError(f"{name}: a lat-long map is 2:1, this is {columns} x {rows}{_remedy(image, info)}")
     if rows < latlong.MIN_HEIGHT:
         raise InputError(f"{name}: {columns} x {rows} texels are too few for a map; use at least 6 x 3")
+    if columns != 2 * rows:
+        warnings.append(f"{columns} x {rows} texels are not 2:1: resampled to {2 * rows} x {rows}")
+        columns = 2 * rows
+        info["size"] = columns, rows
     found = info["health"] = radiance.health(image)
     info["repaired"], info["clipped"] = 0, found.negative
     if found.nan or found.inf:
-        row, column = min(p for p in (found.first_nan, found.first_inf) if p)
-        bad = int(radiance.any_channel(~np.isfinite(image)).sum())
-        where = f"{bad} texels are NaN or infinite, the first at row {row}, column {column}"
+        bad = radiance.any_channel(~np.isfinite(image))
+        info["repaired"] = int(bad.sum())
         if not repair:
+            where = f"{info['repaired']} texels are NaN or infinite, the first at {place_of(bad)}"
             raise InputError(f"{name}: {where}; repair the map, or ask for repair")
         try:
-            image, info["repaired"] = radiance.repair(image)
+            image, overflowed, replaced = radiance.repair(image)
         except InputError as e:
             raise InputError(f"{name}: {e}") from None
-        warnings.append(f"{where}: replaced from their neighbours")
+        if overflowed.any():
+            where = f"{overflowed.sum()} texels are infinite, the first at {place_of(overflowed)}"
+            warnings.append(f"{where}: taken for the brightest light, {image[overflowed].max():g}")
+        if replaced.any():
+            where = f"{replaced.sum()} texels are NaN or -Inf, the first at {place_of(replaced)}"
+            warnings.append(f"{where}: replaced from their neighbours")
     if found.first_negative:
         row, column = found.first_negative
+        where = f"the first at row {row}, column {column}"
         warnings.append(
-            f"{found.negative} texels are negative (down to {found.minimum:.3g}), the first at row {row}, "
-            f"column {column}: set to 0"
+            f"{found.negative} texels are negative (down to {found.minimum:.3g}), {where}: set to 0"
         )
     image = np.maximum(image, 0)  # also turns -0.0 into 0
     if found.first_saturated:
@@ -219,14 +218,34 @@ def load_envmap(
         )
     if not image.any():
         warnings.append("the map is black: it lights nothing")
-    if width is not None:
-        if width > columns:
-            warnings.append(f"enlarged from {columns} to {width} texels across: no detail is added")
-        image = latlong.resize(image, width // 2, width)
+    if width is not None and width > columns:
+        warnings.append(f"enlarged from {columns} to {width} texels across: no detail is added")
+    across = width or columns
+    if image.shape[1] != across:
+        image = latlong.resize(image, across // 2, across)
     return image, info
 
 
-def _of_array(values: np.ndarray, name: str) -> tuple[np.ndarray, dict]:
+_SHAPES = {
+    1 / 6: "a cube map in a column", 6: "a cube map in a row", 3 / 4: "a cube map as a vertical cross",
+    4 / 3: "a cube map as a horizontal cross", 1: "a mirror ball, an angular map or a fisheye",
+}  # fmt: skip
+"""What else maps are, by width over height."""
+
+
+def _remedy(image, info):
+    """Say, from its size, what an image is that is not 2:1, and what to do."""
+    rows, columns = image.shape[:2]
+    if "data_size" in info:
+        width, height = info["data_size"]
+        return f", its display window, and its data window {width} x {height}; save the two alike, 2:1"
+    if columns == 4 * rows:
+        return ", the shape of half a sphere; add the rows of the other half"
+    kind = _SHAPES.get(columns / rows)
+    return f", the shape of {kind}; convert it to lat-long" if kind else "; crop or resize it"
+
+
+def _of_array(values: np.ndarray, name: str, space: str) -> tuple[np.ndarray, dict]:
     """Take a map from an array as :func:`read` takes one from a file."""
     if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fiu":
         what = f"shape {values.shape} of {values.dtype}"
@@ -235,7 +254,13 @@ def _of_array(values: np.ndarray, name: str) -> tuple[np.ndarray, dict]:
         image = np.array(values, np.float32)
     size = image.shape[1], image.shape[0]
     info: Info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
-    return image, info | {"chromaticities": None}
+    info["marks"] = {}
+    if values.dtype in (np.uint8, np.uint16):
+        info["warnings"].append(
+            f"an array of {values.dtype} is taken as linear radiance: codes of a picture have to be "
+            f"divided by {np.iinfo(values.dtype).max}, and their curve undone, before"
+        )
+    return marks.honour(image, info, space), info
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -385,10 +410,9 @@ def _checked(name, image):
         image = image.astype(np.float32)
     bad = radiance.any_channel(~np.isfinite(image))
     if bad.any():
-        row, column = (int(i) for i in np.argwhere(bad)[0])
+        values = ", ".join(f"{v:g}" for v in image[bad][0])
         raise NumericalError(
-            f"{name}: not written: {bad.sum()} texels are not finite, the first at row {row}, "
-            f"column {column} ({', '.join(f'{v:g}' for v in image[row, column])})"
+            f"{name}: not written: {bad.sum()} texels are not finite, the first at {place_of(bad)} ({values})"
         )
     return image
 

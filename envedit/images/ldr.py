@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from envedit.core.color import srgb_to_linear
 from envedit.core.errors import InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import Info
@@ -18,33 +17,24 @@ from envedit.images.headers import check_declared, damaged
 
 def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`."""
-    declared(name, head, info if stored else {})
+    if info["format"] == "png":
+        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
+    else:
+        size = _jpeg_header(name, info)
+    check_declared(name, size[0], size[1])
     image = _bitmap(name)
     if image.dtype not in (np.uint8, np.uint16):
         raise damaged(name, f"unexpected samples of type {image.dtype}")
     info["hdr"] = False
-    if stored:
-        if info["format"] == "png":
-            _png_marks(name, info)
-        return image
-    depth = 8 * image.dtype.itemsize
-    info["warnings"].append(f"a {depth}-bit {info['format'].upper()} is not HDR: light above 1 is missing")
-    image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
-    values = srgb_to_linear(np.arange(2**depth) / (2**depth - 1)).astype(np.float32)
-    return values[image]
-
-
-def declared(name: str, head: bytes, info: Info | None = None) -> None:
-    """Check the size that a file declares; marks of a JPEG file are noted in ``info``."""
-    if head.startswith(b"\x89PNG"):
-        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
-    else:
-        size = _jpeg_header(name, {} if info is None else info)
-    check_declared(name, *size)
+    info["bits"] = 8 * image.dtype.itemsize
+    if info["format"] == "png":
+        _png_marks(name, info)
+    return image
 
 
 def _jpeg_header(name, info):
     """Return (width, height), and note the quality and the marks of a JPEG file."""
+    marks = info["marks"]
     size, mean = None, 0.0
     with open(name, "rb") as file:
         file.seek(2)
@@ -70,9 +60,9 @@ def _jpeg_header(name, info):
                     raise damaged(name, "a quantisation table breaks off")
                 mean = float(np.frombuffer(data[1 : 1 + 64 * wide], f">u{wide}").mean())
             elif marker[1] == 0xE1 and data[:6] == b"Exif\0\0":
-                info["orientation"] = _orientation(data[6:])
+                marks["orientation"] = _orientation(data[6:])
             elif marker[1] == 0xE2 and data[:12] == b"ICC_PROFILE\0":
-                info["profile"] = info.get("profile", b"") + data[14:]
+                marks["profile"] = marks.get("profile", b"") + data[14:]
     if size is None:
         raise damaged(name, "no JPEG frame header")
     scale = mean / _JPEG_MEAN
@@ -86,20 +76,27 @@ _JPEG_MEAN = 3688 / 64
 
 
 def _png_marks(name, info):
-    """Note texts, orientation and colour profile of a PNG that has been decoded."""
+    """Note texts, orientation, curve and colour profile of a PNG that has been decoded."""
+    marks = info["marks"]
     with open(name, "rb") as file:
         file.seek(8)
         while len(start := file.read(8)) == 8 and start[4:] != b"IEND":
             length, kind = int.from_bytes(start[:4], "big"), start[4:]
-            if kind not in (b"eXIf", b"iCCP", b"tEXt", b"iTXt", b"zTXt"):
+            if kind not in (b"eXIf", b"iCCP", b"sRGB", b"cICP", b"gAMA", b"tEXt", b"iTXt", b"zTXt"):
                 file.seek(length + 4, os.SEEK_CUR)
                 continue
             data = file.read(length + 4)[:length]
             key, _, rest = data.partition(b"\0")
             if kind == b"eXIf":
-                info["orientation"] = _orientation(data)
+                marks["orientation"] = _orientation(data)
             elif kind == b"iCCP":
-                info["profile"] = _inflated(rest[1:])
+                marks["profile"] = _inflated(rest[1:])
+            elif kind == b"sRGB":
+                marks.setdefault("profile", b"sRGB")
+            elif kind == b"cICP":  # 1, 13: primaries of Rec. 709, curve of sRGB
+                marks["profile"] = b"sRGB" if data[:2] == b"\1\r" else kind
+            elif kind == b"gAMA":
+                marks["gamma"] = int.from_bytes(data, "big") / 100_000
             elif kind == b"iTXt":
                 text = rest[2:].split(b"\0", 2)[-1]
                 text = _inflated(text) if rest[:1] == b"\1" else text

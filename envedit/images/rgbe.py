@@ -8,7 +8,7 @@ import numpy as np
 
 from envedit.core.errors import InputError
 from envedit.core.types import Info
-from envedit.images.headers import check_declared, damaged, shown
+from envedit.images.headers import check_declared, damaged
 
 
 def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
@@ -25,17 +25,24 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     header = info["metadata"] = _radiance_header(head[: end.start()].decode("latin-1"))
     if "xyze" in header.get("FORMAT", ""):
         raise InputError(f"{name}: holds XYZ colours (32-bit_rle_xyze); save it as RGB (32-bit_rle_rgbe)")
-    for key in {"EXPOSURE", "COLORCORR"} & header.keys():
-        if not _all_ones(header[key]):
-            value = shown(header[key])
-            info["warnings"].append(f"{key}={value} in its header is not undone: values are as stored")
+    for key in {"EXPOSURE", "COLORCORR", "GAMMA"} & header.keys():
+        if header[key] and set(_numbers(header[key])) != {1}:
+            info["marks"][key] = header[key]
+    chromaticities = _numbers(header.get("PRIMARIES", ""))
+    if len(chromaticities) == 8 and any(chromaticities):  # zeros: none are known
+        info["marks"]["chromaticities"] = chromaticities
     with open(name, "rb") as file:
         file.seek(end.end())
         # No encoding takes more than 1 + 1/127 bytes for one.
         data = file.read(height * (4 + 4 * width + 4 * (width // 64 + 2)))
+    rgbe = None
     if data[:2] == b"\x02\x02" and int.from_bytes(data[2:4], "big") == width:
-        rgbe = _radiance_runs(name, data, height, width)
-    else:
+        try:
+            rgbe = _radiance_runs(name, data, height, width)
+        except InputError:
+            if len(data) != 4 * height * width:  # of flat pixels, the first may look like a run's begin
+                raise
+    if rgbe is None:
         rgbe = _radiance_pixels(name, data, height, width)
     # Ward's format: (R, G, B) 2^(E - 136), and E = 0 is black.
     scale = np.ldexp(np.float32(1), rgbe[..., 3].astype(np.int32) - 136)
@@ -45,19 +52,31 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
 
 def _radiance_header(text):
     """Return the ``KEY=value`` lines of a header. By hand: a pattern takes the square of a line's length."""
-    header = {}
+    header: dict[str, str] = {}
     for line in text.split("\n"):
         key, equals, value = line.partition("=")
-        if equals and re.fullmatch(r"\w+", key.rstrip(" ")):
-            header[key.rstrip(" ")] = value.strip()
+        key, value = key.rstrip(" "), value.strip()
+        if equals and re.fullmatch(r"\w+", key):
+            if key in ("EXPOSURE", "COLORCORR") and key in header:
+                value = _product(header[key], value)
+            header[key] = value
     return header
 
 
-def _all_ones(text):
+def _product(first, second):
+    """Multiply the numbers of two lines of a key, as programs add a line for each of their changes."""
+    factors = _numbers(first), _numbers(second)
+    if not factors[0] or len(factors[0]) != len(factors[1]):
+        return f"{first}, {second}"[:60]
+    return " ".join(f"{a * b:g}" for a, b in zip(factors[0], factors[1], strict=True))
+
+
+def _numbers(text):
+    """Return the numbers of a line; none if a word of it is no number."""
     try:
-        return all(float(number) == 1 for number in text.split())
+        return [float(number) for number in text.split()]
     except ValueError:
-        return False
+        return []
 
 
 def _radiance_runs(name, data, height, width):

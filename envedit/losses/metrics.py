@@ -218,6 +218,7 @@ def painted(
     coverage: np.ndarray,
     tonemap: str = "gamma",
     seen: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
 ) -> dict:
     """Measure how far a painted picture was followed, and how still the rest was held.
 
@@ -233,11 +234,16 @@ def painted(
         Of the display values.
     seen : ndarray of bool (h, w), optional
         Pixels that count; all by default.
+    noise : ndarray (h, w), optional
+        Standard error of the result's display values under "gamma"; that of the initial rendering, which is
+        in the target as well, is taken to be the same.
 
     Returns
     -------
     dict
-        ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None where nothing was asked;
+        ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None where nothing was asked, or
+        less than noise leaves of it where it is followed exactly: the mean of |x - y| is 2 / sqrt(pi) times
+        the noise of each;
         ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
 
     Raises
@@ -252,8 +258,13 @@ def painted(
     cover = counts * np.broadcast_to(coverage, d.shape).astype(np.float64)
     left = np.broadcast_to(counts - cover, d.shape)
     asked, rest = float((cover * np.abs(before - t)).sum()), float(left.sum())
+    measured = asked > 0
+    if noise is not None:
+        change = np.abs(apply_tonemap(initial, "gamma") - apply_tonemap(target, "gamma"))
+        by_noise = 2 / np.sqrt(np.pi) * float((cover * noise[..., None]).sum())
+        measured &= float((cover * change).sum()) > by_noise
     return {
-        "towards": 1 - float((cover * np.abs(d - t)).sum()) / asked if asked > 0 else None,
+        "towards": 1 - float((cover * np.abs(d - t)).sum()) / asked if measured else None,
         "elsewhere": float((left * np.abs(d - before)).sum()) / rest if rest > 0 else None,
     }
 

@@ -311,10 +311,12 @@ def _verdict(metrics):
     if towards is not None:
         parts[0] = f"<strong>{100 * towards:.0f} %</strong> of the painted change reached"
         parts += [f"mean change elsewhere {elsewhere:.3f}"] if elsewhere is not None else []
+    elif painted:
+        parts[0] = "The painted change is below the noise of the renderings"
     parts += [f"{total:.1f} s in total"] if total is not None else []
     line = f'<p class="verdict">{" · ".join(parts)}</p>'
     if towards is not None and towards < 0:
         line += '<p class="alarm">The edited rendering is further from the paint than the unedited one.</p>'
-    if towards is None and before and after and worse(after, before):
+    if not painted and before and after and worse(after, before):
         line += '<p class="alarm">The edited rendering is further from the target than the unedited one.</p>'
     return line

@@ -92,58 +92,63 @@ def _centred(start, state, k, names=("turn", "flux", "size")):
 
 
 def moves(problem, best, sigma):
-    """List the states that a light more, one less, or one elsewhere may lead to."""
+    """List the states that a light more, one less, or one elsewhere may lead to: the few most promising.
+
+    Promising is what lowers the misfit, all else as it is, so far that the evidence may rise by it: with the
+    noise at its most likely value, -2 log likelihood is the number of values times the misfit's logarithm.
+    """
     found = []
     state, start = best.run.state, best.run.start
-    own = problem.layers.lights.own
+    lights = problem.layers.lights
+    now = problem.misfit(best.point.residual, 1.0)
+
+    def promising(name, changed, centre, misfit, cost=0.0):
+        gain = 3 * problem.statements * np.log(now / max(misfit, 1e-30)) - cost
+        if DEBUG:
+            print(f"    {name}: {gain:.1f}")
+        if gain > STRONG:
+            found.append((gain, name, changed, centre))
+
     for k in problem.lit(state):
         dark = _copy(state)
         dark["flux"][k] = DARK
-        for i, (direction, strength) in enumerate(places(problem, dark, k, sigma, problem.direction(state, k))):
+        for direction, strength, misfit in places(problem, dark, k, sigma, problem.direction(state, k)):
             moved = _copy(state)
-            moved["turn"][k] = rotation_vector(problem.layers.lights.centres[k], direction)
-            if k >= own:
-                moved["flux"][k] = strength
-            else:
-                moved["flux"][k] = np.clip(strength, -1, 1)
-            names = ("turn", "flux", "size") if k >= own else ("turn",)
-            found.append((f"light {k} moved to place {i}", moved, _centred(start, moved, k, names)))
-        if k >= own:
-            found.append((f"light {k} out", dark, start))
-            for j in problem.lit(state):
-                if j < own:
-                    merged = _copy(dark)
-                    merged["turn"][j] = rotation_vector(problem.layers.lights.centres[j], problem.direction(state, k))
-                    merged["flux"][j] = np.clip(state["flux"][j], -1, 1)
-                    found.append((f"light {j} takes the place of {k}", merged, _centred(start, merged, j, ("turn",))))
-    spare = [k for k in range(own, problem.layers.lights.count) if k not in problem.added(state)]
-    if spare:
-        k = spare[0]
-        for i, (direction, strength) in enumerate(places(problem, state, k, sigma)):
+            moved["turn"][k] = rotation_vector(lights.centres[k], direction)
+            moved["flux"][k] = strength
+            names = ("turn",) if k < lights.own else ("turn", "flux", "size")
+            promising(f"light {k} moved", moved, _centred(start, moved, k, names), misfit)
+        if k >= lights.own:
+            without = problem.evaluate(dark, resolve=False)
+            promising(f"light {k} out", dark, start, problem.misfit(without.residual, 1.0), -LIGHT - STRONG - 1)
+    spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
+    for k in spare[:1]:
+        for direction, strength, misfit in places(problem, state, k, sigma):
             more = _copy(state)
-            more["turn"][k] = rotation_vector(problem.layers.lights.centres[k], direction)
+            more["turn"][k] = rotation_vector(lights.centres[k], direction)
             more["flux"][k], more["size"][k] = strength, 0.0
-            found.append((f"light added at place {i}", more, _centred(start, more, k)))
-    return found
+            promising("light added", more, _centred(start, more, k), misfit, LIGHT)
+    found.sort(key=lambda one: -one[0])
+    return [one[1:] for one in found[:FEW]]
 
 
 SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
 
 
 def places(problem, state, k, sigma, besides=None):
-    """Where light k would lower the misfit most: (direction, log flux), the best first, distinct."""
-    lights, transport, blocks = problem.layers.lights, problem.transport, problem.blocks
+    """Where light k would lower the misfit most: (direction, log flux, misfit), the best first, distinct."""
+    lights, blocks = problem.layers.lights, problem.blocks
     point = problem.evaluate(state, resolve=False)
     if point.residual is None:
         return []
     flux = lights.flux[k]
     _, directions = blocks.sky
     count = np.maximum(np.bincount(blocks.block_of, minlength=blocks.count), 1)[:, None]
-    mean = [blocks.summed(one) / count for one in (point.rendering, problem.picture)]
-    weight = blocks.summed(problem.weight)
+    before, target = (blocks.summed(one) / count for one in (point.rendering, problem.picture))
+    weight = blocks.summed(problem.weight) / problem.area
     rest = blocks.summed(problem.share())
     pictures = np.stack([m.numpy() * np.float32(f) for m, f in zip(blocks._lit, flux, strict=True)], axis=2)
-    strength, misfit = _best_strength(pictures.transpose(1, 0, 2), mean[0], mean[1], weight / problem.area, rest, k < lights.own)
+    strength, misfit = _best_strength(pictures.transpose(1, 0, 2), before, target, weight, rest, k < lights.own)
     if besides is not None:
         misfit = np.where(directions @ besides > APART, np.inf, misfit)
     result = []
@@ -153,10 +158,7 @@ def places(problem, state, k, sigma, besides=None):
             break
         misfit = np.where(directions @ directions[at] > APART, np.inf, misfit)
         result.append(_refined(problem, point, flux, directions[at], strength[at], k < lights.own))
-    result.sort(key=lambda one: one[2])
-    if DEBUG:
-        print("    places", [(np.round(np.degrees([np.arctan2(d[0], -d[2]), np.arcsin(d[1])])), round(float(f), 2), float(m)) for d, f, m in result])
-    return [(direction, np.full(3, np.log(factor))) for direction, factor, _ in result]
+    return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in result]
 
 
 FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from envedit import config
+from envedit.core.atomic_files import write_atomically
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
-from envedit.core.types import FilePath
+from envedit.core.types import FilePath, Info, Shape
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
@@ -20,6 +23,15 @@ ENDINGS = (".exr", ".png")
 """What the initial rendering can be exported as; a JPEG would not keep it."""
 CLIPPED = 0.001
 """Share of the pixels that may be clipped in an exported PNG before another tonemap is used."""
+NEIGHBOUR = ".envedit.json"
+"""Ending of the file beside an exported picture that says what the picture's own metadata says."""
+KEYS = {
+    "width": "scene.width", "height": "scene.height", "map_width": "input.width", "spp": "target.spp",
+    "seed": "seed",
+}  # fmt: skip
+"""What must be the same where a picture is exported and where it is read, and the key that sets it."""
+_MOST_BYTES = 1 << 16  # of a neighbour that is read
+_PREFIX = "envedit."  # of a fact in the picture's metadata
 
 
 def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
@@ -50,15 +62,21 @@ def check_export(file: FilePath) -> None:
 
 
 def export_tonemap(file: FilePath, picture: np.ndarray, settings: config.Config) -> str:
-    """Return the tonemap of an exported picture (h, w, 3): "linear" for OpenEXR, or that of the PNG.
+    """Return the tonemap of an exported picture (h, w, 3): "linear" for OpenEXR, or :func:`png_tonemap`."""
+    linear = Path(os.fsdecode(file)).suffix.lower() == ".exr"
+    return "linear" if linear else png_tonemap(picture, settings)
 
-    That is [target] tonemap where it clips less than :data:`CLIPPED` of the pixels, which have no information
-    when they come back, and otherwise "reinhard", which clips nothing below a radiance of 10^4.
+
+def png_tonemap(picture: np.ndarray, settings: config.Config) -> str:
+    """Return the tonemap of a PNG of a rendering (h, w, 3): [target] tonemap where it names one.
+
+    With "auto" it is "gamma" where that clips less than :data:`CLIPPED` of the pixels, which have no
+    information when they come back, and otherwise "reinhard", which clips nothing below a radiance of 10^4.
     """
-    if Path(os.fsdecode(file)).suffix.lower() == ".exr":
-        return "linear"
-    clipped = _clipped(tonemap(picture, settings.target.tonemap))
-    return "reinhard" if clipped >= CLIPPED else settings.target.tonemap
+    chosen = settings.target
+    if chosen.tonemap != "auto" or _clipped(tonemap(picture, chosen.display_tonemap)) < CLIPPED:
+        return chosen.display_tonemap
+    return "reinhard"
 
 
 def _clipped(shown):
@@ -71,7 +89,8 @@ def export(
 ) -> list[str]:
     """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG.
 
-    The file says which tonemap it is under, and what it was rendered from.
+    The file says which tonemap it is under, and what it was rendered from. As editors drop that, a file
+    beside it, with :data:`NEIGHBOUR` after its name, says it too.
 
     Parameters
     ----------
@@ -97,18 +116,14 @@ def export(
     check_export(file)
     linear = Path(os.fsdecode(file)).suffix.lower() == ".exr"
     name = name or export_tonemap(file, picture, settings)
-    facts = {
-        "envedit.tonemap": name,
-        "envedit.scene": Path(settings.scene.file).name,
-        "envedit.envmap": Path(settings.input.envmap).name,
-        "envedit.seed": settings.seed,
-        "envedit.spp": settings.target.spp,
-    }
+    facts = origin(settings, picture.shape, name)
+    marks = {f"{_PREFIX}{key}": value for key, value in facts.items()}
+    write_atomically(f"{os.fsdecode(file)}{NEIGHBOUR}", json.dumps(facts, indent=1).encode())
     if linear:
-        images.write_exr(file, picture, facts, panorama=False)
+        images.write_exr(file, picture, marks, panorama=False)
         return []
     shown = tonemap(picture, name)
-    images.write_png(file, shown, 16, facts)
+    images.write_png(file, shown, 16, marks)
     share = _clipped(shown)
     if share < CLIPPED:
         return []
@@ -116,3 +131,97 @@ def export(
         f"{file}: {100 * share:.3g} % of the pixels are clipped under the '{name}' tonemap, and cannot be "
         "painted on: export an .exr"
     ]
+
+
+# ----------------------------------------------------------------------------------------------------------
+# What a picture was exported with
+
+
+def origin(settings: config.Config, shape: Shape, name: str) -> Info:
+    """Return what an exported picture says of itself.
+
+    Parameters
+    ----------
+    settings : config.Config
+        What it is made from.
+    shape : tuple
+        (h, w, ...) of the picture.
+    name : str
+        Its tonemap.
+    """
+    return {
+        "tonemap": name,
+        "scene": Path(settings.scene.file).name,
+        "envmap": Path(settings.input.envmap).name,
+        "width": shape[1],
+        "height": shape[0],
+        "map_width": settings.input.width,
+        "spp": settings.target.spp,
+        "seed": settings.seed,
+    }
+
+
+def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) -> dict[str, str]:
+    """Return what a painted picture was exported with, as its metadata or a file beside it says.
+
+    The file beside it is the one with its name, where it was saved over the export; otherwise, of those in
+    its folder that are of the same scene, one that agrees with this run, or else the first.
+
+    Parameters
+    ----------
+    file : path-like
+        The picture.
+    info : dict
+        Of :func:`envedit.images.images.read_stored`.
+    expected : mapping
+        What an export of this run says (:func:`origin`).
+
+    Returns
+    -------
+    dict
+        As :func:`origin`, values as text; empty where nothing is said.
+
+    Raises
+    ------
+    InputError
+        If a value of :data:`KEYS` is not that of this run: the rendering is not the one that was painted on.
+    """
+    file = Path(os.fsdecode(file))
+    said = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}
+    neighbour = None
+    if not said:
+        said, neighbour = _beside(file, expected)
+        if neighbour is not None and (info["hdr"] or neighbour.name.lower().endswith(f".exr{NEIGHBOUR}")):
+            said.pop("tonemap", None)  # of another format
+    if keys := _differing(said, expected):
+        stated = ", ".join(f"{KEYS[key]} {said[key][:20]!a}".replace("'", "") for key in keys)
+        own = ", ".join(str(expected[key]) for key in keys)
+        source = "was" if neighbour is None else f"{neighbour.name} says that it was"
+        remedy = "give these to this run, or export it again"
+        remedy += "" if neighbour is None else f"; if it is no such picture, remove {neighbour.name}"
+        raise InputError(f"{file}: {source} exported with {stated}, where this run has {own}: {remedy}")
+    return said
+
+
+def _differing(said, expected):
+    """Return the keys of :data:`KEYS` whose values differ."""
+    return [key for key in KEYS if key in said and said[key] != str(expected.get(key, said[key]))]
+
+
+def _beside(file, expected):
+    """Return what a file beside a picture says of its export, and the file; {} and None without one."""
+    own = file.with_name(f"{file.name}{NEIGHBOUR}")
+    found = {}
+    for path in filter(os.path.isfile, (own, *sorted(file.parent.glob(f"*{NEIGHBOUR}")))):
+        try:
+            with open(path, "rb") as stream:
+                facts = json.loads(stream.read(_MOST_BYTES))
+        except (OSError, ValueError, RecursionError):  # no JSON, or none of ours
+            continue
+        if isinstance(facts, dict) and (path == own or facts.get("scene") == expected.get("scene")):
+            found[path] = {str(key): str(value) for key, value in facts.items()}
+    if not found:
+        return {}, None
+    agreeing = [path for path, facts in found.items() if not _differing(facts, expected)]
+    chosen = own if own in found else (agreeing or list(found))[0]
+    return found[chosen], chosen

@@ -13,11 +13,13 @@ CODE_TOLERANCE = {255: 1.5, 65535: 32.0}
 """In steps: an editor may cut where we round, or compute with 15 bits; 32 are an eighth of an 8-bit step."""
 JPEG_FLOOR = 3.0
 """In steps of 255, for encoders that do not round as ours does; see :func:`_painted_jpeg`."""
+OVERSHOOT = 0.125
+"""Of the local range: resampling a step rings by up to 0.07 of it (bicubic), or 0.12 (Lanczos of 3 lobes)."""
 JPEG_SHARE = 1 / 3
 """A difference below this share of the largest within two pixels is colour that bled across an edge."""
 
 
-def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int) -> np.ndarray:
+def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int, spread: int = 0) -> np.ndarray:
     """Return where (h, w) a picture was painted.
 
     Parameters
@@ -29,7 +31,16 @@ def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int) -> np.
         Of :func:`envedit.images.images.read_stored`.
     top : int
         Largest code of the file, 255 or 65535; not used for float files.
+    spread : int
+        Over how many pixels resampling has mixed the values: one within the range that ``before`` has so
+        near, or beyond it by :data:`OVERSHOOT`, is not painted.
     """
+    if spread:
+        planes = np.moveaxis(before, 2, 0)
+        low = -np.stack([_largest(-plane, spread) for plane in planes], axis=2)
+        high = np.stack([_largest(plane, spread) for plane in planes], axis=2)
+        beyond = OVERSHOOT * (high - low)
+        before = np.clip(values, low - beyond, high + beyond)
     if info["hdr"]:
         room = FLOAT_TOLERANCE[info["format"]] * before.max(axis=2, keepdims=True) + 1e-7
         same = (np.abs(values - before) <= room) | (np.minimum(values, before) >= 65504)
@@ -70,7 +81,7 @@ def _compressed(codes, quality):
 def _largest(values, reach=2):
     """Return the largest value (h, w) within ``reach`` pixels in rows and columns."""
     for _ in range(2):
-        padded = np.pad(values, ((reach, reach), (0, 0)))
+        padded = np.pad(values, ((reach, reach), (0, 0)), "edge")
         values = padded[reach : reach + len(values)].T
         for start in range(2 * reach + 1):
             values = np.maximum(values, padded[start : start + values.shape[1]].T)

@@ -7,17 +7,24 @@ format.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
 from envedit.core.errors import InputError, place_of
+from envedit.core.resampling import fit
 from envedit.core.types import FilePath, Shape
 from envedit.images import images
+from envedit.targets import initial_rendering
 from envedit.targets.paint_detection import differs
 
 NEARLY_ALL = 0.9
+MOST_RESIZED = 16
+"""Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
+NOTHING: Mapping[str, object] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -47,12 +54,19 @@ class Painted:
 
 
 def read(
-    file: FilePath, shape: Shape, tonemap_name: str, initial: np.ndarray | None = None, mask: FilePath = ""
+    file: FilePath,
+    shape: Shape,
+    tonemap_name: str,
+    initial: np.ndarray | None = None,
+    mask: FilePath = "",
+    exported: Mapping[str, object] = NOTHING,
 ) -> Painted:
     """Read a painted picture.
 
-    - Float files are linear radiance. Others are undone by the tonemap that they were painted under; the one
-      that the file names goes before ``tonemap_name``.
+    - Float files are linear radiance. Others are undone by the tonemap that they were painted under:
+      ``tonemap_name``, where one is declared; else the one that the file names, or that of the export, unless
+      the unpainted pixels are those of the rendering under another.
+    - A picture of another size and the rendering's aspect is resampled.
     - Where a PNG or JPEG is white in a channel, the value is a lower bound: such pixels are
       excluded, but for those that were neither painted nor clipped before. Black is no such limit: there is
       nothing below it.
@@ -66,36 +80,50 @@ def read(
     shape : tuple
         (h, w) of the rendering.
     tonemap_name : str
-        Declared tonemap, one of ``color.TONEMAPS``.
+        Declared tonemap, one of ``color.TONEMAPS``, or "auto".
     initial : ndarray (h, w, 3), optional
         Linear radiance of what was painted on. Without it every pixel counts as painted.
     mask : path-like, optional
         White where it was painted, in place of comparing; see :func:`read_mask`.
+    exported : mapping, optional
+        What an export of ``initial`` as a PNG says of itself (:func:`.initial_rendering.origin`): what the
+        file says is compared with it, and its tonemap is that of a file which says nothing.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is of another size, holds values that are not finite, is grey where the
-        rendering is not, or shows nothing painted.
+        If the file cannot be read, was exported from another rendering or under another tonemap than the
+        declared one, is of another aspect, holds values that are not finite, is grey where the rendering is
+        not, or shows nothing painted.
     """
+    # ---- The file, and what it says of itself
     pixels, info = images.read_stored(file)
     file = info["path"]
-    _check_size(file, pixels.shape, shape)
-    _check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
+    said = initial_rendering.stated_origin(file, info, exported)
     warnings = [f"{file}: {line}" for line in info["warnings"]]
-    name = _tonemap_of(file, info, tonemap_name, warnings)
+    spread = _spread_of_resampling(file, pixels.shape, shape, warnings)
+    _check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
+
+    # ---- Values, alpha and clipped pixels, at the size of the rendering
     values, alpha, top = _planes(file, pixels, warnings)
+    clipped = np.zeros(alpha.shape, bool)
+    if not info["hdr"]:
+        clipped = (values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)).any(axis=2) & (alpha > 0)
+    if spread:
+        values, alpha, clipped = _resampled(values, alpha, clipped, shape, info["hdr"])
+
+    # ---- The tonemap, and the rendering under it
     before = None
+    name = _tonemap_of(file, info, said, tonemap_name, exported, warnings)
     if initial is not None:
         if not info["hdr"] and "envedit.tonemap" not in info["metadata"]:
-            name = _recognised(file, values, alpha, initial, name, warnings)
+            seen = (alpha > 0) & ~clipped & (initial > 0).any(axis=2)
+            name = _recognised(file, values, seen, initial, name, tonemap_name, warnings)
         if pixels.shape[2] < 3 and not mask and _coloured(initial, name):
             raise InputError(f"{file}: is grey, the rendering is in colour: save it as RGB, or give a mask")
         before = np.asarray(initial, np.float64) if info["hdr"] else tonemap(np.float64(initial), name)
 
-    clipped = np.zeros(shape[:2], bool)
-    if not info["hdr"]:
-        clipped = (values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)).any(axis=2) & (alpha > 0)
+    # ---- What was painted, and what of it has information
     if (alpha < 1).any():
         values = _laid_over(values, alpha[..., None], before, info["hdr"])
         over = "laid over the initial rendering" if before is not None else "taken as it is"
@@ -105,12 +133,16 @@ def read(
         )
     painted = alpha > 0
     if before is not None:
-        painted &= differs(values, before, info, top)
+        painted &= differs(values, before, info, top, spread)
         if not mask:
-            _check_painted(file, painted, before, info, top, warnings)
+            other = {key: value for key, value in said.items() if value != str(exported.get(key))}
+            _check_painted(file, painted, before, info, other, top, warnings)
     coverage = alpha * (read_mask(mask, shape)[..., 0] if mask else painted)
     if not coverage.any():
-        raise InputError(f"{file}: nothing of it is painted; paint on it, or give a mask that is white there")
+        facts = f" ({'; '.join(info['warnings'])})" if info["warnings"] else ""
+        raise InputError(
+            f"{file}: nothing of it is painted{facts}; paint on it, or give a mask that is white there"
+        )
     excluded = clipped | (alpha == 0)
     if before is not None:
         excluded = clipped & ((coverage > 0) | (before >= 1 - 0.5 / top).any(axis=2))
@@ -125,6 +157,7 @@ def read(
             "count, paint below white, or on an .exr"
         )
 
+    # ---- The picture, in linear radiance
     picture = values if info["hdr"] else inverse_tonemap(values, name)
     if initial is not None:  # to the last bit, not as the file has rounded it
         picture = np.where((painted & (coverage > 0))[..., None], picture, initial)
@@ -204,14 +237,32 @@ def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
     return weight.astype(np.float32)
 
 
-def _check_size(file, size, shape):
+def _spread_of_resampling(file, size, shape, warnings):
+    """Check a picture's size; returns over how many pixels resampling mixes the rendering's, 0 without.
+
+    Editors resample with filters of at most three lobes, each as wide as the larger of the two pixels.
+    """
     (rows, columns), (height, width) = size[:2], shape[:2]
     if (rows, columns) == (height, width):
-        return
+        return 0
     sizes = f"{file}: is {columns}x{rows} pixels, the rendering is {width}x{height}: "
     if abs(columns * height - rows * width) > max(height, width):
         raise InputError(sizes + "another aspect; paint on the picture that --export-initial writes")
-    raise InputError(sizes + "export it at that size, or set [scene] width and height to the picture's")
+    if max(columns, width) > MOST_RESIZED * min(columns, width):
+        raise InputError(f"{sizes}more than {MOST_RESIZED} times apart; save it at the size of the export")
+    warnings.append(f"{sizes}resampled; faint or thin paint is not found: better keep the size of the export")
+    return int(np.ceil(3 * max(1, height / rows, width / columns)))
+
+
+def _resampled(values, alpha, clipped, shape, premultiplied):
+    """Return values, alpha and clipped pixels at another size; colour is averaged by its alpha."""
+    weight = alpha[..., None]
+    new_alpha = fit(weight, *shape[:2]).astype(np.float64)
+    new = fit(values if premultiplied else values * weight, *shape[:2]).astype(np.float64)
+    if not premultiplied:
+        new = new / np.where(new_alpha > 0, new_alpha, 1)
+    new_alpha = np.where(new_alpha > 1 - 1e-6, 1, new_alpha)  # a sum of weights, in single precision
+    return new, new_alpha[..., 0], fit(clipped[..., None], *shape[:2])[..., 0] > 0
 
 
 def _check_finite(file, pixels, advice):
@@ -219,20 +270,23 @@ def _check_finite(file, pixels, advice):
         raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
 
 
-def _tonemap_of(file, info, declared, warnings):
-    """Return the tonemap of the file's values; what it says about itself goes before the configuration."""
-    said = str(info["metadata"].get("envedit.tonemap", "") or declared)
+def _tonemap_of(file, info, said, declared, exported, warnings):
+    """Return the tonemap of the file's values: the declared one, that of its name, or the export's."""
+    unnamed = str(exported.get("tonemap", "gamma")) if declared == "auto" else declared
+    name = said.get("tonemap") or unnamed
     if info["hdr"]:
-        if "envedit.tonemap" in info["metadata"] and said != "linear":
-            warnings.append(f"{file}: says that it is under {said[:40]!a}; it is read as linear radiance")
-        return declared
-    if said not in TONEMAPS:
-        warnings.append(
-            f"{file}: says that it is under {said[:40]!a}, which is unknown: '{declared}' is used"
+        if "tonemap" in said and name != "linear":
+            warnings.append(f"{file}: says that it is under {name[:40]!a}; it is read as linear radiance")
+        return unnamed
+    if name not in TONEMAPS:
+        warnings.append(f"{file}: says that it is under {name[:40]!a}, which is unknown: '{unnamed}' is used")
+        return unnamed
+    if declared not in ("auto", name):
+        raise InputError(
+            f"{file}: was exported under '{name}', where target.tonemap is '{declared}': "
+            f'set that to "{name}" or "auto"'
         )
-    else:
-        return said
-    return declared
+    return name
 
 
 def _planes(file, pixels, warnings):
@@ -266,7 +320,7 @@ def _laid_over(values, alpha, before, premultiplied):
     return (values if premultiplied else alpha * values) + (1 - alpha) * before
 
 
-def _check_painted(file, painted, before, info, top, warnings):
+def _check_painted(file, painted, before, info, other, top, warnings):
     """Warn where paint is recognised badly: in a JPEG, and where nearly all would be paint."""
     if info["format"] == "jpeg":
         warnings.append(f"{file}: paint is found but roughly in a JPEG, faint paint not at all: save a PNG")
@@ -275,33 +329,33 @@ def _check_painted(file, painted, before, info, top, warnings):
     if share < NEARLY_ALL:
         return
     line = f"{file}: {100 * share:.0f} % of the pixels differ from the initial rendering"
-    facts = {k[8:]: v for k, v in info["metadata"].items() if k.startswith("envedit.")}
-    made = f" (it was made with {', '.join(f'{k} {v}' for k, v in facts.items())})" if facts else ""
+    made = f" (it was made with {', '.join(f'{k} {v}' for k, v in other.items())})" if other else ""
     warnings.append(
         f"{line}: unless all of it was painted, it is of another rendering{made}; "
         "export that again with --export-initial, or give a mask"
     )
 
 
-def _recognised(file, values, alpha, initial, declared, warnings):
+def _recognised(file, values, seen, initial, name, declared, warnings):
     """Return the tonemap under which a picture that names none is the initial rendering, but for its paint.
 
-    That is the declared one, unless the median difference over the pixels is more than four times as large as
-    under another, which it equals to three steps of 8 bits: editors drop the name when they save. Pixels that
-    are black in the rendering are so under every tonemap, and do not count.
+    That is ``name``, unless the median difference over the pixels ``seen`` is more than four times as large
+    as under another, which it equals to three steps of 8 bits: editors drop the name when they save. A
+    declared one holds in any case. Pixels that are clipped in the picture, or black in the rendering, are so
+    under every tonemap, and do not count.
     """
-    where = (alpha > 0) & (initial > 0).any(axis=2)
-    if not where.any():
-        return declared
-    error = {name: _median_error(values, initial, name, where) for name in TONEMAPS}
+    if not seen.any():
+        return name
+    difference = {one: np.abs(values - tonemap(np.float64(initial), one)).max(axis=2) for one in TONEMAPS}
+    error = {one: float(np.median(off[seen])) for one, off in difference.items()}
     best = min(error, key=error.__getitem__)
-    if error[best] > 3 / 255 or 4 * error[best] >= error[declared]:
-        if error[declared] > 3 / 255:
-            warnings.append(f"{file}: names no tonemap: read under '{declared}', that of [target] tonemap")
-        return declared
-    warnings.append(f"{file}: is the initial rendering under '{best}', and read so, not '{declared}'")
-    return best
-
-
-def _median_error(values, initial, name, where):
-    return float(np.median(np.abs(values - tonemap(np.float64(initial), name)).max(axis=2)[where]))
+    if error[best] > 3 / 255 or 4 * error[best] >= error[name]:
+        if error[name] > 3 / 255 and declared == "auto":
+            warnings.append(f"{file}: names no tonemap: read under '{name}', that of an export")
+        return name
+    line = f"{file}: is the initial rendering under '{best}', and read "
+    if declared == "auto":
+        warnings.append(f"{line}so, not under '{name}'")
+        return best
+    warnings.append(f"{line}under '{name}', as target.tonemap declares")
+    return name

@@ -142,7 +142,7 @@ def make(
         found = painted_image.given(picture, shape, initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
     elif chosen.kind == "image":
-        found = _painted_files(scene, initial, chosen)
+        found = _painted_files(scene, initial, settings)
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
         source = f"painted: {', '.join(chosen.files)}"
     else:
@@ -186,13 +186,13 @@ def _of_rendering(scene, chosen, picture, mask, how=""):
         found = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
         source, asked = "a picture of the scene, given as an array", (picture, *filter(None.__ne__, [mask]))
     else:
-        declared = chosen.tonemap if "tonemap" in chosen.given else "srgb"
+        unnamed = {"tonemap": "srgb"}
         files = zip(chosen.files, chosen.masks or ("",) * len(chosen.files), strict=True)
         by_view = _by_view(scene, chosen.views, files)
 
         def of_view(k, before):
             file, mask = by_view[k]
-            return painted_image.read(file, before.shape[:2], declared, None, mask)
+            return painted_image.read(file, before.shape[:2], chosen.tonemap, None, mask, unnamed)
 
         found = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
         source = f"a picture of the scene: {', '.join(chosen.files)}"
@@ -215,14 +215,16 @@ def _by_view(scene, views, given):
     return dict(zip(numbers, given, strict=True))
 
 
-def _painted_files(scene, initial, chosen):
+def _painted_files(scene, initial, settings):
     """Read what was painted on views, each from its file."""
+    chosen, name = settings.target, initial_rendering.png_tonemap(initial, settings)
     masks = chosen.masks or ("",) * len(chosen.files)
     painted = _by_view(scene, chosen.views, zip(chosen.files, masks, strict=True))
 
     def of_view(k, before):
         file, mask = painted[k]
-        return painted_image.read(file, before.shape[:2], chosen.tonemap, before, mask)
+        exported = initial_rendering.origin(settings, before.shape, name)
+        return painted_image.read(file, before.shape[:2], chosen.tonemap, before, mask, exported)
 
     return _of_views(scene, initial, painted, of_view)
 
@@ -236,7 +238,7 @@ def _painted_strokes(scene, initial, chosen):
 
     def of_view(k, before):
         own = [i for i, number in enumerate(numbers) if number == k]
-        made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.tonemap)
+        made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.display_tonemap)
         warnings.extend(_renumbered(line, own) for line in made.warnings)
         return painted_image.Painted(made.picture, made.coverage, np.zeros(before.shape[:2], bool), ())
 

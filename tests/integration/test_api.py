@@ -186,6 +186,14 @@ def test_what_cannot_be_used_is_refused_by_name(given, kind, parts):
     assert all(part in str(info.value) for part in parts), str(info.value)
 
 
+def test_codes_of_a_picture_as_radiance_are_warned_of():
+    adjusted = TINY | {"target": {"kind": "none"}, "scene": {"width": 8}}
+    codes = np.full((8, 16, 3), 200, np.uint8)
+    said = envedit.edit(adjusted, envmap=codes).warnings
+    assert said[0].startswith("envmap: got uint8 up to 200, taken as linear radiance as it is")
+    assert not any("uint8" in line for line in envedit.edit(adjusted, envmap=codes / 255).warnings)
+
+
 @pytest.mark.parametrize(
     ("make", "text"),
     [

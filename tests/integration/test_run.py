@@ -722,7 +722,8 @@ def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsy
         assert call(path, "--quiet", "--export-initial", tmp_path / name) == 0
     assert capsys.readouterr().out == ""
     after = content(tmp_path)
-    assert after.keys() - before.keys() == {"a.exr", "b.png", "c.exr"}
+    made = {"a.exr", "b.png", "c.exr"}
+    assert after.keys() - before.keys() == made | {f"{name}.envedit.json" for name in made}
     assert all(after[key] == before[key] for key in before)
     assert after["a.exr"] == after["c.exr"]  # the same picture again
     assert pixels(tmp_path / "a.exr").shape == (18, 24, 3)
@@ -740,7 +741,8 @@ def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     out, err = capsys.readouterr()
     assert "1 strokes on the initial rendering" in out and "dry_run.png" in out
     after = content(tmp_path)
-    assert after.keys() - before.keys() == {"initial.exr", "c_out/dry_run.png", "c_out/dry_run.exr"}
+    made = {"initial.exr", "initial.exr.envedit.json", "c_out/dry_run.png", "c_out/dry_run.exr"}
+    assert after.keys() - before.keys() == made
     painted = pixels(tmp_path / "c_out" / "dry_run.exr") - pixels(tmp_path / "initial.exr")
     np.testing.assert_allclose(painted[:, :12], 0.25, rtol=1e-5)
     assert not painted[:, 12:].any()

@@ -1,5 +1,8 @@
 """Small files, pictures and scenes that several tests share, and losses in plain numpy."""
 
+import struct
+import zlib
+
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -32,6 +35,30 @@ def grey(value, height=8, width=16):
 
 def read_png(path):
     return np.array(mi.Bitmap(str(path)))
+
+
+def chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def with_chunk(path, kind, data):
+    """Put a chunk before the pixels of a PNG."""
+    raw = path.read_bytes()
+    at = raw.index(b"IDAT") - 4
+    path.write_bytes(raw[:at] + chunk(kind, data) + raw[at:])
+    return path
+
+
+def with_segment(path, marker, data):
+    raw = path.read_bytes()
+    path.write_bytes(raw[:2] + bytes([255, marker]) + struct.pack(">H", len(data) + 2) + data + raw[2:])
+    return path
+
+
+def turned(orientation):
+    """Return EXIF data that says so."""
+    entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
+    return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 
 
 # ---- losses ------------------------------------------------------------------------------------------------

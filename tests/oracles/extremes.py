@@ -80,7 +80,8 @@ def _declare():
         cells[name, "read"] = refused(
             InputError,
             f"1 texels are NaN or infinite, {AT}; repair the map",
-            "`[input] repair = true` takes the mean of its neighbours instead.",
+            "`[input] repair = true` takes the mean of its neighbours instead, "
+            "or the brightest light for +Inf.",
         )
         cells[name, "normalise"] = seen(
             "range", "The range is not finite; every representation refuses the map before."

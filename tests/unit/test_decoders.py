@@ -5,16 +5,19 @@ import struct
 import subprocess
 import sys
 import time
+import zlib
 
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
 
+from envedit.core import primaries
+from envedit.core.color import srgb_to_linear
 from envedit.core.errors import InputError
 from envedit.images import exr as exr_module
 from envedit.images import images
-from tests.oracles.builders import SCANLINE, exr, planes, stacked
+from tests.oracles.builders import SCANLINE, exr, planes, stacked, turned, with_chunk
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint32])
@@ -37,12 +40,41 @@ def test_exr_mixed_types_layers_and_parts(tmp_path, rng):
     layers = {f"View.Combined.{c}": p[c] for c in "RGB"} | other | {"Z": p["R"]}
     found, info = images.read(exr(tmp_path / "l.exr", **layers))
     np.testing.assert_array_equal(found, stacked(p))
-    assert info["warnings"] == ["2 colour layers: 'View.Combined' was read"]
+    assert info["warnings"] == ["2 colour layers (View.Combined, aov): 'View.Combined' was read"]
 
     part = OpenEXR.Part(dict(SCANLINE), {"Z": p["R"]}, "depth")
     colour = OpenEXR.Part(dict(SCANLINE), dict(p), "colour")
     OpenEXR.File([part, colour]).write(str(tmp_path / "p.exr"))
     np.testing.assert_array_equal(images.read(tmp_path / "p.exr")[0], stacked(p))
+
+
+@pytest.mark.parametrize(
+    ("parts", "channels", "label"),
+    [
+        (("ViewLayer.AO", "ViewLayer.Combined"), ("", ""), "ViewLayer.Combined"),
+        (("ViewLayer.Combined_Key", "ViewLayer.Combined"), ("", ""), "ViewLayer.Combined"),
+        (("one", "two"), ("diffuse.", "beauty."), "two.beauty"),
+        (("View.AO", "View.Combined"), ("View.AO.", "View.Combined."), "View.Combined"),
+    ],
+)
+def test_the_part_of_the_picture_is_read(parts, channels, label, tmp_path, rng):
+    """It is named so, by part or layer; every layer with colour is told."""
+    p = planes(rng)
+    written = [
+        OpenEXR.Part(dict(SCANLINE), {prefix + c: values[c] for c in "RGB"}, part)
+        for part, prefix, values in zip(parts, channels, (planes(rng), p), strict=True)
+    ]
+    OpenEXR.File(written).write(str(tmp_path / "p.exr"))
+    found, info = images.read(tmp_path / "p.exr")
+    np.testing.assert_array_equal(found, stacked(p))
+    assert info["warnings"][0].startswith(f"2 colour layers ({parts[0]}")
+    assert info["warnings"][0].endswith(f"{label}): '{label}' was read")
+
+
+def test_layers_without_a_name_for_the_picture_are_told(tmp_path, rng):
+    layers = {f"{layer}.{c}": v for layer in ("Background", "Paint") for c, v in planes(rng).items()}
+    _, info = images.read_stored(exr(tmp_path / "k.exr", **layers))
+    assert info["warnings"] == ["2 colour layers (Background, Paint): 'Background' was read"]
 
 
 def test_exr_of_many_channels_is_refused_before_it_is_decoded(tmp_path, rng, monkeypatch):
@@ -126,6 +158,37 @@ def test_radiance_header(tmp_path, rng):
     assert not images.read(rgbe_file(tmp_path / "e.hdr", q, header="EXPOSURE=1.000\n"))[1]["warnings"]
 
 
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        ("EXPOSURE=2\nEXPOSURE=4.0\n", "EXPOSURE=8 in its header is not undone"),
+        ("EXPOSURE=2\nEXPOSURE=0.5\n", None),
+        ("EXPOSURE=2\nEXPOSURE=x\n", "EXPOSURE=2, x in its header"),
+        ("COLORCORR=1 2 1\nCOLORCORR=1 2 0.5\n", "COLORCORR=1 4 0.5 in its header"),
+        ("GAMMA=2.2\n", "GAMMA=2.2 in its header is not undone"),
+        ("GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n", None),  # what some programs write into every file
+        ("PRIMARIES=0.64 0.33 0.30 0.60 0.15 0.06 0.3127 0.3290\n", None),
+        ("PRIMARIES=.713 .293 .165 .830 .128 .044 .32168 .33767\n", "converted from ACEScg to Rec. 709"),
+    ],
+)
+def test_radiance_marks(header, told, tmp_path, rng):
+    q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8).tobytes()
+    expected, _ = images.read(rgbe_file(tmp_path / "p.hdr", q))
+    found, info = images.read(rgbe_file(tmp_path / "e.hdr", q, header=header))
+    assert [told in line for line in info["warnings"]] == [True] if told else not info["warnings"]
+    if "PRIMARIES=.713" in header:
+        expected = primaries.converted(expected, primaries.to_rec709(primaries.ACES_AP1))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_flat_pixels_whose_first_looks_like_a_run(tmp_path, rng):
+    q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8)
+    expected, _ = images.read(rgbe_file(tmp_path / "a.hdr", q.tobytes()))
+    q[0, 0] = 2, 2, 0, 8  # 8 texels follow, by channels
+    found, _ = images.read(rgbe_file(tmp_path / "b.hdr", q.tobytes()))
+    np.testing.assert_array_equal(found.reshape(-1, 3)[1:], expected.reshape(-1, 3)[1:])
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_png_is_decoded_and_flagged(tmp_path, rng, dtype, channels):
@@ -136,9 +199,71 @@ def test_png_is_decoded_and_flagged(tmp_path, rng, dtype, channels):
     found, info = images.read(tmp_path / "a.png")
     s = np.repeat(q, 3, 2) / top if channels == 1 else q[..., :3] / top
     expected = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    if channels == 4:  # what is transparent gives no light
+        expected *= q[..., 3:] / top
+        assert f"{(q[..., 3] < top).sum()} texels are transparent" in info["warnings"][1]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert found.dtype == np.float32 and found.shape == (4, 8, 3)
     assert info["hdr"] is False and "not HDR" in info["warnings"][0]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_maps_are_turned_upright(orientation, tmp_path, rng):
+    """As the EXIF standard has it: on which sides the stored first row and first column are seen."""
+    upright = rng.integers(0, 256, (4, 8, 3)).astype(np.uint8)
+    stored = {
+        1: upright, 2: upright[:, ::-1], 3: upright[::-1, ::-1], 4: upright[::-1],
+        5: upright.swapaxes(0, 1), 6: np.rot90(upright), 7: np.rot90(upright, 2).swapaxes(0, 1),
+        8: np.rot90(upright, -1),
+    }[orientation]  # fmt: skip
+    mi.Bitmap(upright).write(str(tmp_path / "u.png"))
+    mi.Bitmap(np.ascontiguousarray(stored)).write(str(tmp_path / "a.png"))
+    with_chunk(tmp_path / "a.png", b"eXIf", turned(orientation))
+    found, info = images.load_envmap(tmp_path / "a.png")
+    np.testing.assert_array_equal(found, images.load_envmap(tmp_path / "u.png")[0])
+    told = f"turned upright, as its EXIF orientation {orientation} says"
+    assert (told in info["warnings"]) is (orientation > 1)
+    assert info["size"] == (8, 4)
+
+
+@pytest.mark.parametrize("gamma", [100_000, 55_556, 45_455, 45_000, 0])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_curve_that_a_png_says(gamma, dtype, tmp_path, rng):
+    """gAMA is honoured, in maps and pictures, unless it stands for sRGB or another mark goes before it."""
+    top = np.iinfo(dtype).max
+    q = rng.integers(0, top + 1, (4, 8, 4)).astype(dtype)
+    q[..., 3] = top
+    bitmap = mi.Bitmap(q)
+    bitmap.set_srgb_gamma(False)  # no mark of its own
+    bitmap.write(str(tmp_path / "a.png"))
+    path = with_chunk(tmp_path / "a.png", b"gAMA", struct.pack(">I", gamma))
+    odd = gamma > 50_000
+    codes = q[..., :3] / top
+    light = codes ** (100_000 / gamma) if odd else srgb_to_linear(codes)
+    found, info = images.read(path)
+    np.testing.assert_allclose(found, light, atol=3e-5)
+    assert ("(gAMA): converted to sRGB" in info["warnings"][0]) is odd
+    stored, info = images.read_stored(path)
+    values = stored / np.iinfo(stored.dtype).max
+    np.testing.assert_allclose(srgb_to_linear(values[..., :3]), light, atol=3e-5)
+    assert len(info["warnings"]) == odd and (values[..., 3] == 1).all()
+    _, info = images.read(with_chunk(path, b"sRGB", b"\0"))
+    assert "gAMA" not in info["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "odd"),
+    [
+        (b"iCCP", b"ICC\0\0" + zlib.compress(b"GIMP built-in Linear sRGB"), True),
+        (b"iCCP", b"ICC\0\0" + zlib.compress(b"sRGB IEC61966-2.1"), False),
+        (b"cICP", b"\x09\x10\0\1", True),  # Rec. 2020, PQ
+        (b"cICP", b"\1\r\0\1", False),
+    ],
+)
+def test_a_profile_that_is_not_srgb_is_told_of_maps(kind, data, odd, tmp_path):
+    mi.Bitmap(np.full((4, 8, 3), 188, np.uint8)).write(str(tmp_path / "a.png"))
+    _, info = images.load_envmap(with_chunk(tmp_path / "a.png", kind, data))
+    assert ("its colour profile is not sRGB" in info["warnings"][0]) is odd
 
 
 def test_jpeg(tmp_path):

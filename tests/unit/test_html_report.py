@@ -137,6 +137,8 @@ def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
     assert "further from" not in page.text  # the whole picture may well be
     worse = write(tmp_path / "w.html", metrics={"painted": painted | {"towards": -0.2}})
     assert "further from the paint" in worse.text
+    faint = write(tmp_path / "f.html", metrics=psnr | {"painted": painted | {"towards": None}})
+    assert "painted change is below the noise" in faint.text and "further from" not in faint.text
 
 
 def test_report_of_a_known_map_and_a_failed_edit(tmp_path):

@@ -61,17 +61,31 @@ def test_load_envmap(tmp_path, rng):
         images.load_envmap(path, width=8)
     found, info = images.load_envmap(path, width=8, repair=True)
     assert np.isfinite(found).all() and (found >= 0).all() and info["repaired"] == 2
-    assert any("replaced from their neighbours" in w for w in info["warnings"])
+    assert "1 texels are infinite, the first at row 5, column 2: taken for the brightest light, 65504" in (
+        info["warnings"]
+    )
+    assert "1 texels are NaN or -Inf, the first at row 5, column 6: replaced from their neighbours" in (
+        info["warnings"]
+    )
+    np.testing.assert_allclose(images.load_envmap(path, repair=True)[0][5, 2, 0], 65504)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float64])
+def test_codes_given_as_an_array_are_told(dtype):
+    found, info = images.load_envmap(np.full((4, 8, 3), 200, dtype))
+    assert (found == 200).all()
+    told = f"an array of {np.dtype(dtype)} is taken as linear radiance" in "".join(info["warnings"])
+    assert told is (dtype in (np.uint8, np.uint16))
 
 
 def test_load_envmap_refusals(tmp_path):
     def grey(height, width, value=1.0):
         return exr(tmp_path / "g.exr", **{c: np.full((height, width), value, np.float32) for c in "RGB"})
 
-    for height, width in ((8, 8), (1, 1), (5, 11)):
+    for height, width in ((8, 8), (5, 12), (5, 8)):
         with pytest.raises(InputError, match=rf"g.exr: a lat-long map is 2:1, this is {width} x {height}"):
             images.load_envmap(grey(height, width))
-    for height, width in ((1, 2), (2, 4)):
+    for height, width in ((1, 1), (1, 2), (2, 4), (2, 5)):
         with pytest.raises(InputError, match=rf"g.exr: {width} x {height} texels are too few"):
             images.load_envmap(grey(height, width))
     for width in (0, 1, 5, 7, -8, 10**6):
@@ -81,6 +95,45 @@ def test_load_envmap_refusals(tmp_path):
         images.load_envmap(grey(4, 8, np.nan), repair=True)
     found, info = images.load_envmap(grey(4, 8, 0.0), width=16)
     assert not found.any() and "black" in info["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "what"),
+    [
+        (192, 32, "the shape of a cube map in a column; convert it to lat-long"),
+        (32, 192, "the shape of a cube map in a row; convert it to lat-long"),
+        (64, 48, "the shape of a cube map as a vertical cross; convert it to lat-long"),
+        (48, 64, "the shape of a cube map as a horizontal cross; convert it to lat-long"),
+        (16, 16, "the shape of a mirror ball, an angular map or a fisheye; convert it to lat-long"),
+        (16, 64, "the shape of half a sphere; add the rows of the other half"),
+        (17, 64, "crop or resize it"),
+    ],
+)
+def test_what_is_not_lat_long_is_named(height, width, what, tmp_path):
+    path = exr(tmp_path / "a.exr", **{c: np.ones((height, width), np.float32) for c in "RGB"})
+    with pytest.raises(InputError, match=rf"a.exr: .* is 2:1, this is {width} x {height}[,;] {what}$"):
+        images.load_envmap(path)
+
+
+def test_a_display_window_of_another_shape_is_named(tmp_path, rng):
+    header = {"dataWindow": ((0, 0), (15, 7)), "displayWindow": ((0, 0), (31, 17))}
+    path = exr(tmp_path / "a.exr", header, **planes(rng, size=(8, 16)))
+    with pytest.raises(InputError, match=r"this is 32 x 18, its display window, and its data window 16 x 8"):
+        images.load_envmap(path)
+
+
+@pytest.mark.parametrize(("height", "width"), [(103, 205), (103, 207), (33, 65)])
+@pytest.mark.parametrize("working", [None, 64])
+def test_a_texel_of_rounding_is_resampled(height, width, working, rng):
+    """A map of 2:1 that was made smaller has an odd width where its height was rounded; its flux is kept."""
+    sky = rng.random((height, width, 3)).astype(np.float32)
+    sky[height // 3, width // 2] = 50 * height
+    found, info = images.load_envmap(sky, working)
+    across = working or 2 * height
+    assert found.shape == (across // 2, across, 3) and info["size"] == (2 * height, height)
+    assert f"{width} x {height} texels are not 2:1: resampled to {2 * height} x {height}" in info["warnings"]
+    flux = [i.sum(1, dtype=np.float64).T @ latlong.solid_angles(*i.shape[:2]) for i in (sky, found)]
+    np.testing.assert_allclose(flux[0], flux[1], rtol=0.02)
 
 
 # ---- writing -----------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from envedit.core.color import inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.losses import metrics
 from tests.oracles.plain import IDENTICAL
@@ -183,6 +184,26 @@ def test_painted_tells_how_far_the_paint_was_followed_and_how_still_the_rest_was
     assert found["elsewhere"] == pytest.approx((0.5 * 0.24 + 0.11) / 3.5)
     assert metrics.painted(wanted, wanted, initial, coverage)["towards"] == 1
     assert metrics.painted(initial, wanted, initial, coverage) == {"towards": 0, "elsewhere": 0}
+
+
+def test_paint_below_the_noise_is_unknown(rng):
+    """A result that follows the paint exactly, with other samples, seems to have gone the other way."""
+    initial = np.full((64, 64, 3), 0.3)
+    noise = np.full((64, 64), 0.01)
+    coverage = np.zeros((64, 64, 1))
+    coverage[:32] = 1
+
+    def noisy(image):
+        return inverse_tonemap(tonemap(image) + noise[..., None] * rng.standard_normal(image.shape))
+
+    before, other = noisy(initial), noisy(initial)
+    for change, measured in ((0.005, False), (0.05, True)):
+        wanted = inverse_tonemap(tonemap(before) + change * coverage)
+        edited = inverse_tonemap(tonemap(other) + change * coverage)
+        blind = metrics.painted(edited, wanted, before, coverage)["towards"]
+        found = metrics.painted(edited, wanted, before, coverage, noise=noise)["towards"]
+        assert blind == pytest.approx(1 - 2 / np.sqrt(np.pi) * 0.01 / change, abs=0.05)
+        assert found == (blind if measured else None)
 
 
 def test_painted_without_a_question_is_unknown():

@@ -14,7 +14,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.targets import initial_rendering, painted_image
-from tests.oracles.builders import exr
+from tests.oracles.builders import chunk, exr, turned, with_chunk, with_segment
 
 SIZE = (60, 83)  # no multiple of a JPEG's blocks
 RECTANGLE = (slice(13, 37), slice(21, 50))
@@ -56,30 +56,6 @@ def jpeg(path, pixels, quality=95):
 
 def floats(path, picture, dtype=np.float32, **more):
     return exr(path, **{c: picture[..., i].astype(dtype) for i, c in enumerate("RGB")}, **more)
-
-
-def chunk(kind, data):
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def with_chunk(path, kind, data):
-    """Put a chunk before the pixels of a PNG."""
-    raw = path.read_bytes()
-    at = raw.index(b"IDAT") - 4
-    path.write_bytes(raw[:at] + chunk(kind, data) + raw[at:])
-    return path
-
-
-def with_segment(path, marker, data):
-    raw = path.read_bytes()
-    path.write_bytes(raw[:2] + bytes([255, marker]) + struct.pack(">H", len(data) + 2) + data + raw[2:])
-    return path
-
-
-def turned(orientation):
-    """Return EXIF data that says so."""
-    entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
-    return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 
 
 def told(result):
@@ -273,10 +249,13 @@ def test_the_tonemap_that_the_file_names_is_used(kind, text, initial, tmp_path):
     file = png(tmp_path / "p.png", codes(wanted, "log", 65535))
     with_chunk(file, b"tEXt", "Author\0Jürgen".encode("latin-1"))  # as many an editor writes
     with_chunk(file, kind, b"envedit.tonemap\0" + text)
-    found = painted_image.read(file, SIZE, "gamma", initial)
-    np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
-    np.testing.assert_allclose(found.picture, wanted, rtol=2e-3)
-    assert not told(found)
+    for declared in ("auto", "log"):
+        found = painted_image.read(file, SIZE, declared, initial)
+        np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
+        np.testing.assert_allclose(found.picture, wanted, rtol=2e-3)
+        assert not told(found)
+    says = ["p.png: was exported under 'log', where target.tonemap is 'gamma'", '"log" or "auto"']
+    refused(says, file, SIZE, "gamma", initial)
 
 
 @pytest.mark.parametrize("said", [b"filmic", b"", b"\xff\0\xff"])
@@ -296,12 +275,44 @@ def test_another_tonemap_is_recognised_by_what_was_not_painted(name, initial, tm
     """An editor drops the name of the tonemap, and 8 bits of 16."""
     wanted, where = brushed(initial)
     file = png(tmp_path / "p.png", codes(wanted, name))
-    for declared in TONEMAPS:
-        found = painted_image.read(file, SIZE, declared, initial)
+    for exported in TONEMAPS:
+        found = painted_image.read(file, SIZE, "auto", initial, exported={"tonemap": exported})
         np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
         error = tonemap(found.picture[where], name) - tonemap(wanted[where], name)
         assert np.abs(error).max() <= 0.5 / 255 + 1e-6
-        assert (f"is the initial rendering under '{name}'" in told(found)) is (name != declared)
+        assert (f"is the initial rendering under '{name}', and read so" in told(found)) is (name != exported)
+
+
+@pytest.mark.parametrize("name", TONEMAPS)
+def test_a_declared_tonemap_holds(name, initial, tmp_path):
+    """And what another would make of the unpainted pixels is told."""
+    file = png(tmp_path / "p.png", codes(brushed(initial)[0]))
+    found = painted_image.read(file, SIZE, name, initial)
+    error = tonemap(found.picture, name) - codes(brushed(initial)[0]) / 255
+    assert np.abs(error)[RECTANGLE].max() <= 1e-6
+    assert (f"and read under '{name}', as target.tonemap declares" in told(found)) is (name != "gamma")
+
+
+def test_clipped_pixels_say_nothing_of_a_tonemap(initial, tmp_path):
+    """A bright rendering under Reinhard, made brighter: what is white now would be white under gamma."""
+    initial = 30 * initial
+    wanted = np.clip(1.25 * tonemap(initial, "reinhard"), 0, 1)
+    file = png(tmp_path / "p.png", np.rint(wanted * 255).astype(np.uint8))
+    assert (wanted == 1).mean() > 0.5
+    found = painted_image.read(file, SIZE, "auto", initial, exported={"tonemap": "reinhard"})
+    counted = (found.coverage[..., 0] > 0) & ~found.excluded
+    assert counted.any() and (found.picture[counted].sum(axis=1) > initial[counted].sum(axis=1)).all()
+
+
+def test_a_layer_alone_is_read_under_the_tonemap_of_an_export(initial, tmp_path):
+    """An editor has dropped its name, and nothing of the rendering shows."""
+    lit = config.Config()
+    exported = initial_rendering.origin(lit, SIZE, initial_rendering.png_tonemap(30 * initial, lit))
+    assert exported["tonemap"] == "reinhard"
+    file = png(tmp_path / "p.png", np.rint(layer(initial) * 255).astype(np.uint8))
+    found = painted_image.read(file, SIZE, "auto", 30 * initial, exported=exported)
+    paint = tonemap(found.picture[20, 30], "reinhard")
+    np.testing.assert_allclose(paint, [0.2, 0.3, 0.4], atol=0.5 / 255)
 
 
 @pytest.mark.parametrize("declared", TONEMAPS)
@@ -421,6 +432,18 @@ def test_an_empty_layer_is_refused(initial, tmp_path):
     refused(["p.png", "nothing of it is painted"], file, SIZE, "gamma")
 
 
+def test_layers_of_an_exr_are_named(initial, tmp_path):
+    """As Krita saves them: paint on another layer than the first is not seen."""
+    layers = {f"Background.{c}": initial[..., i].copy() for i, c in enumerate("RGB")}
+    layers |= {f"Paint Layer 1.{c}": layer(initial)[..., i].astype("f4") for i, c in enumerate("RGBA")}
+    file = exr(tmp_path / "p.exr", **layers)
+    says = "2 colour layers (Background, Paint Layer 1): 'Background' was read"
+    refused(["nothing of it is painted", says], file, SIZE, "gamma", initial)
+    layers["Background.R"][RECTANGLE] = 0.5
+    found = painted_image.read(exr(tmp_path / "q.exr", **layers), SIZE, "gamma", initial)
+    assert says in told(found)
+
+
 # ---- grey, palettes, marks ---------------------------------------------------------------------------------
 
 
@@ -469,17 +492,19 @@ def test_interlaced(tmp_path):
     np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
 
 
-def test_turned_pictures_are_refused(initial, tmp_path):
+def test_turned_pictures_are_turned_upright(initial, tmp_path):
     wanted = codes(brushed(initial)[0])
-    file = with_chunk(png(tmp_path / "p.png", wanted), b"eXIf", turned(6))
-    refused(["p.png", "EXIF orientation 6", "upright"], file, SIZE, "gamma", initial)
-    file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE1, b"Exif\0\0" + turned(3))
-    refused(["p.jpg", "EXIF orientation 3"], file, SIZE, "gamma", initial)
-    file = with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + turned(1))
-    assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
-    for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff"):
+    covered = painted_image.read(png(tmp_path / "w.png", wanted), SIZE, "gamma", initial).coverage
+    file = with_chunk(png(tmp_path / "p.png", np.rot90(wanted)), b"eXIf", turned(6))
+    found = painted_image.read(file, SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.coverage, covered)
+    assert "p.png: turned upright, as its EXIF orientation 6 says" in told(found)
+    half = np.ascontiguousarray(wanted[::-1, ::-1])
+    file = with_segment(jpeg(tmp_path / "p.jpg", half), 0xE1, b"Exif\0\0" + turned(3))
+    assert 0.5 < painted_image.read(file, SIZE, "gamma", initial).coverage.sum() / covered.sum() < 1.5
+    for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff", turned(0), turned(9)):
         with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + damage)
-        assert painted_image.read(file, SIZE, "gamma", initial).coverage.any()
+        assert painted_image.read(tmp_path / "q.jpg", SIZE, "gamma", initial).coverage.any()
 
 
 @pytest.mark.parametrize(
@@ -506,10 +531,41 @@ def test_cmyk_is_refused(initial, tmp_path):
 
 
 def test_another_size(initial, tmp_path):
-    file = png(tmp_path / "p.png", codes(np.repeat(np.repeat(initial, 2, 0), 2, 1)))
-    refused(["p.png: is 166x120 pixels, the rendering is 83x60", "[scene] width"], file, SIZE, "gamma")
     file = png(tmp_path / "p.png", codes(initial)[:40])
     refused(["is 83x40 pixels", "83x60", "aspect", "--export-initial"], file, SIZE, "gamma", initial)
+    file = png(tmp_path / "p.png", codes(initial)[:1, :1])
+    refused(["is 1x1 pixels", "83x60", "more than 16 times"], file, SIZE, "gamma", initial)
+
+
+@pytest.mark.parametrize("factor", [2, 1.5, 0.5])
+@pytest.mark.parametrize("method", ["NEAREST", "BILINEAR", "BICUBIC", "LANCZOS"])
+def test_a_resized_picture_is_resampled(method, factor, initial, tmp_path):
+    pillow = pytest.importorskip("PIL.Image")
+    initial = initial.clip(0.05, 0.8)
+    wanted, where = brushed(initial)
+    size = round(factor * SIZE[1]), round(factor * SIZE[0])
+    image = pillow.fromarray(codes(wanted)).resize(size, getattr(pillow, method))
+    image.save(tmp_path / "p.png")
+    found = painted_image.read(tmp_path / "p.png", SIZE, "gamma", initial)
+    inside = np.zeros(SIZE, bool)
+    inside[17:33, 25:46] = True
+    around = np.ones(SIZE, bool)
+    around[5:45, 13:58] = False  # beside strong paint filters ring
+    assert (found.coverage[inside] == 1).all() and not found.coverage[around].any()
+    assert found.picture[around].tobytes() == initial[around].tobytes()
+    assert np.abs(tonemap(found.picture[inside]) - tonemap(wanted[inside])).mean() < 0.01
+    assert f"is {size[0]}x{size[1]} pixels, the rendering is 83x60: resampled" in told(found)
+
+
+def test_a_resized_layer_keeps_its_colour(initial, tmp_path):
+    pixels = np.rint(layer(initial) * 255).astype(np.uint8)
+    file = png(tmp_path / "p.png", pixels.repeat(2, 0).repeat(2, 1))
+    found = painted_image.read(file, SIZE, "gamma", initial)
+    np.testing.assert_allclose(found.coverage[..., 0], pixels[..., 3] / 255, atol=1e-6)
+    np.testing.assert_allclose(tonemap(found.picture[20, 30]), [0.2, 0.3, 0.4], atol=0.5 / 255)
+    linear = floats(tmp_path / "p.exr", np.repeat(np.repeat(brushed(initial)[0], 2, 0), 2, 1))
+    found = painted_image.read(linear, SIZE, "gamma", initial)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -595,16 +651,17 @@ def settings(**target):
 @pytest.mark.parametrize("name", TONEMAPS)
 def test_exported_and_painted_on(ending, name, initial, tmp_path):
     file = tmp_path / f"paint{ending}"
-    told_now = initial_rendering.export(file, initial, settings(tonemap=name))
+    asked = settings(**{"tonemap": name} if name in ("log", "reinhard") else {})  # the others clip highlights
+    told_now = initial_rendering.export(file, initial, asked)
     pixels, info = images.read_stored(file)
     stored = info["metadata"]
     assert {k: str(stored[f"envedit.{k}"]) for k in ("scene", "envmap", "seed")} == {
         "scene": "sphere", "envmap": "auto", "seed": "3"
     }  # fmt: skip
-    used = name if name in ("log", "reinhard") else "reinhard"  # the others clip highlights
+    used = name if name in ("log", "reinhard") else "reinhard"
     assert stored["envedit.tonemap"] == ("linear" if ending == ".exr" else used)
     assert not told_now
-    refused(["nothing of it is painted"], file, SIZE, name, initial)
+    refused(["nothing of it is painted"], file, SIZE, "auto", initial)
     if ending == ".exr":
         np.testing.assert_array_equal(pixels, initial)
         assert "envmap" not in OpenEXR.File(str(file), header_only=True).header()
@@ -615,8 +672,72 @@ def test_exported_and_painted_on(ending, name, initial, tmp_path):
         assert (pixels < 65535).all()
         pixels[RECTANGLE] //= 2
         png(file, pixels)
-    found = painted_image.read(file, SIZE, name, initial)
+    found = painted_image.read(file, SIZE, "auto", initial)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
+
+
+def test_a_declared_tonemap_is_that_of_the_export(initial, tmp_path):
+    warnings = initial_rendering.export(tmp_path / "a.png", initial, settings(tonemap="gamma"))
+    assert "% of the pixels are clipped under the 'gamma' tonemap" in warnings[0]
+    assert images.read_stored(tmp_path / "a.png")[1]["metadata"]["envedit.tonemap"] == "gamma"
+
+
+def exported(made=None, **of_run):
+    """Return what exports of a run say of themselves, and its settings."""
+    settings = config.Config(**of_run)
+    return initial_rendering.origin(settings, (*SIZE, 3), made or "gamma"), settings
+
+
+@pytest.mark.parametrize("drops", ["nothing", "texts", "texts and name", "texts, name and size"])
+@pytest.mark.parametrize(
+    ("given", "key"),
+    [({"input": {"width": 128}}, "input.width 256"), ({"target": {"spp": 64}}, "target.spp auto"),
+     ({"seed": 4}, "seed 0")],
+)  # fmt: skip
+def test_a_picture_of_another_rendering_is_refused(drops, given, key, initial, tmp_path):
+    made = config.Config()
+    file = tmp_path / "paint_me.png"
+    initial_rendering.export(file, initial, made)
+    wanted = brushed(initial)[0]
+    if drops == "nothing":
+        texts = images.read_stored(file)[1]["metadata"].items()
+        kept = {key: text for key, text in texts if key.startswith("envedit.")}
+        images.write_png(file, tonemap(wanted, "reinhard"), 16, kept)
+    else:
+        file = file if drops == "texts" else tmp_path / "painted.png"
+        pixels = codes(wanted, "reinhard")
+        png(file, pixels.repeat(2, 0).repeat(2, 1) if "size" in drops else pixels)
+    same, _ = exported("reinhard")
+    found = painted_image.read(file, SIZE, "auto", initial, exported=same)
+    assert (found.coverage[..., 0] > 0)[RECTANGLE].all() and "under" not in told(found)
+    other, _ = exported("reinhard", **given)
+    says = [f"{file}: ", f"exported with {key}, where this run has", "export it again"]
+    says += [] if drops == "nothing" else ["paint_me.png.envedit.json"]
+    refused(says, file, SIZE, "auto", initial, exported=other)
+
+
+def test_a_picture_exported_at_another_size_is_refused(initial, tmp_path):
+    file = tmp_path / "p.png"
+    initial_rendering.export(file, initial.repeat(2, 0).repeat(2, 1), config.Config())
+    here, _ = exported()
+    says = ["exported with scene.width 166, scene.height 120, where this run has 83, 60"]
+    refused(says, file, SIZE, "auto", initial, exported=here)
+
+
+def test_a_neighbour_of_another_scene_says_nothing(initial, tmp_path):
+    initial_rendering.export(tmp_path / "a.png", initial, config.Config(scene={"file": "statue"}, seed=9))
+    (tmp_path / "b.png.envedit.json").write_bytes(b"\xff{")
+    (tmp_path / "c.png.envedit.json").write_bytes(b"[1]")
+    (tmp_path / "d.png.envedit.json").write_bytes(b"[" * 65536)
+    file = png(tmp_path / "p.png", codes(brushed(initial)[0]))
+    here, _ = exported()
+    found = painted_image.read(file, SIZE, "auto", initial, exported=here)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
+    # Of several of the same scene, one that agrees with this run counts.
+    initial_rendering.export(tmp_path / "e.png", initial, config.Config(seed=8), "gamma")
+    refused(["e.png.envedit.json", "seed 8"], file, SIZE, "auto", initial, exported=here)
+    initial_rendering.export(tmp_path / "f.png", initial, config.Config(), "gamma")
+    assert painted_image.read(file, SIZE, "auto", initial, exported=here).coverage.any()
 
 
 def test_texts_of_a_png_are_as_another_program_reads_them(tmp_path, rng):

@@ -1,12 +1,13 @@
 """Colour spaces: matrices against published ones, and files that have other primaries than Rec. 709."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import OpenEXR
 import pytest
 
-from envedit import inputs
+from envedit import config, inputs
 from envedit.core import primaries
 from envedit.core.errors import InputError
 from envedit.core.primaries import ACES_AP0, ACES_AP1, P3_D65, REC709, REC2020
@@ -35,7 +36,7 @@ def test_acescg_to_rec709_is_the_published_matrix():
     expected = [[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]]
     np.testing.assert_allclose(primaries.to_rec709(ACES_AP1), expected, atol=2e-5)
     np.testing.assert_allclose(primaries.to_rec709(REC709), np.eye(3), atol=1e-12)
-    for space in primaries.SPACES.values():
+    for space in (ACES_AP0, ACES_AP1, REC2020, P3_D65):
         np.testing.assert_allclose(primaries.to_rec709(space) @ np.ones(3), 1, atol=1e-9)
 
 
@@ -58,6 +59,48 @@ def test_a_space_that_is_given_by_name(key, tmp_path, rng):
     assert info["chromaticities"] is None and not info["warnings"]
     with pytest.raises(InputError, match="c.exr: colour space 'ARRI LogC' is not known: save it as linear"):
         images.read(exr(tmp_path / "c.exr", {key: "ARRI LogC"}, **p))
+
+
+def test_xyz_is_not_adapted(tmp_path):
+    """Grey of Rec. 709 has the X, Y, Z of D65 (IEC 61966-2-1): with 1/3, 1/3 as white it stays grey."""
+    header = {"chromaticities": (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)}
+    xyz = {c: np.full((4, 8), 0.5 * v, np.float32) for c, v in zip("RGB", (0.9505, 1, 1.0890), strict=True)}
+    found, info = images.read(exr(tmp_path / "a.exr", header, **xyz))
+    np.testing.assert_allclose(found, 0.5, atol=2e-4)
+    assert info["warnings"] == ["converted from CIE XYZ to Rec. 709"]
+
+
+@pytest.mark.parametrize("key", ["colorInteropID", "oiio:ColorSpace"])
+@pytest.mark.parametrize("name", ["unknown", "Raw", "Utility - Raw"])
+def test_a_name_that_says_nothing_is_none(key, name, tmp_path, rng):
+    p = planes(rng)
+    found, info = images.read(exr(tmp_path / "a.exr", {key: name}, **p))
+    np.testing.assert_array_equal(found, stacked(p))
+    assert info["chromaticities"] is None
+    assert f"its colour space '{name}' says nothing: read as linear Rec. 709" in info["warnings"][0]
+    other = {"colorInteropID": "unknown", "oiio:ColorSpace": "ACEScg"}
+    assert images.read(exr(tmp_path / "b.exr", other, **p))[1]["chromaticities"] == ACES_AP1
+    same = exr(tmp_path / "c.exr", {key: "Utility - Linear - sRGB"}, **p)
+    assert not images.read(same)[1]["warnings"]
+
+
+@pytest.mark.parametrize(
+    "header",
+    [{}, {"oiio:ColorSpace": "ARRI LogC"}, {"chromaticities": REC2020}, {"chromaticities": (0.3,) * 8}],
+)
+def test_a_key_goes_before_what_the_file_says(header, tmp_path, rng):
+    """The map is converted from, and written in, the space that [input] colour_space names."""
+    p = planes(rng)
+    settings = config.Input(envmap=str(exr(tmp_path / "a.exr", header, **p)), colour_space="ACEScg", width=8)
+    given = inputs.read_map(settings, None)
+    np.testing.assert_array_equal(given.stored, stacked(p))
+    expected = np.maximum(stacked(p) @ primaries.to_rec709(ACES_AP1).T, 0)
+    np.testing.assert_allclose(given.radiance, expected, rtol=1e-4, atol=1e-3)
+    assert given.at_file_size(settings).chromaticities == given.chromaticities == ACES_AP1
+    array = inputs.read_map(settings, None, array=stacked(p))
+    np.testing.assert_array_equal(array.radiance, given.radiance)
+    plain = inputs.read_map(replace(settings, colour_space="Rec. 709"), None)
+    assert plain.chromaticities is None and (plain.radiance == stacked(p)).all()
 
 
 @pytest.mark.parametrize(

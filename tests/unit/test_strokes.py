@@ -530,7 +530,7 @@ def test_the_edits_that_come_ready_paint_something(name, rng):
     assert config.target.kind == "strokes" and config.input.envmap == "auto" and config.preset == "standard"
     assert cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="b.toml") == config
     picture = (0.2 + 0.1 * rng.random((128, 128, 3))).astype(np.float32)
-    found = strokes.paint(picture, config.target.strokes, config.target.tonemap)
+    found = strokes.paint(picture, config.target.strokes, config.target.display_tonemap)
     assert not found.warnings
     change = np.abs(tonemap(found.picture) - tonemap(picture)).max(axis=2)
     assert found.coverage.mean() > 0.003 and (found.coverage.mean() == 1) == (name == "warmer")

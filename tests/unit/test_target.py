@@ -1,11 +1,14 @@
 """Targets: rendered under a known map, painted as a picture, or painted by strokes."""
 
+import dataclasses
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit import config
 from envedit.core import latlong
+from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
@@ -141,6 +144,25 @@ def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):
     np.testing.assert_array_equal(from_array.picture, from_file.picture)
     np.testing.assert_array_equal(from_array.weight, from_file.weight)
     assert from_array.coverage.sum() == 3 * 6
+
+
+def test_a_painted_picture_is_read_as_it_was_exported(ball, seen, tmp_path):
+    """Under Reinhard, as gamma would clip, though no file says so; another map width is refused."""
+    envmap, initial = 40 * seen[0], 40 * seen[1]
+    file, exported = tmp_path / "paint.png", asking(kind="image", file=str(tmp_path / "paint.png"))
+    initial_rendering.export(file, initial, exported)
+    display, _ = images.read_stored(file)
+    display[3:9, 4:12] = display[3:9, 4:12] * 0.5
+    png(file, display)
+    narrow = dataclasses.replace(exported, input=config.Input(width=32))
+    with pytest.raises(InputError, match="exported with input.width 256, where this run has 32"):
+        target.make(narrow, ball, envmap)
+    (tmp_path / "paint.png.envedit.json").unlink()
+    for settings in (exported, narrow):
+        made = target.make(settings, ball, envmap)
+        shown = tonemap(made.picture, "reinhard")[3:9, 4:12] * 65535
+        np.testing.assert_allclose(shown, display[3:9, 4:12], atol=1)
+        assert made.coverage.sum() == 6 * 8 and made.warnings == ()
 
 
 def test_mask_of_an_array_overrides_what_is_seen(ball, seen):

@@ -182,7 +182,7 @@ class Session:
         """Paint the strokes and aim the solution at them."""
         chosen, self.reach, self.searched = self.project.settings.target, None, False
         self.hold = first_hold(chosen)
-        painted = self._after(list(self.document.strokes), chosen.tonemap)
+        painted = self._after(list(self.document.strokes), chosen.display_tonemap)
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
         self.solving = bool(coverage is not None and coverage.any())
         if not self.solving:

@@ -331,7 +331,7 @@ def _of_arrays(settings: config.Config, given: Mapping[str, np.ndarray]) -> conf
         settings = replace(settings, input=replace(settings.input, envmap=images.ARRAY))
     if "target" in given or "target_map" in given:
         table = settings.target
-        kept = {key: getattr(table, key) for key in table.given & {"tonemap", "paint", "hold", "spp"}}
+        kept = {key: getattr(table, key) for key in table.given & {"tonemap", "paint", "rest", "hold", "spp"}}
         kind = "envmap"
         if "target" in given:
             kind = "rendering" if table.kind == "rendering" else "image"

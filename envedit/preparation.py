@@ -25,7 +25,7 @@ from envedit.representations.layers.lights import SPARE
 from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.scene.renderings import rendered
-from envedit.solve import initialization, map_problem, turning
+from envedit.solve import initialization, likelihood, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
@@ -161,7 +161,7 @@ class Preparation:
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
             loss, other = _loss(turned), _loss(still)
-        chosen = still if other < loss - 6 * map_problem.INDEPENDENT * np.log1p(PREFERRED) else turned
+        chosen = still if other < loss - 6 * likelihood.INDEPENDENT * np.log1p(PREFERRED) else turned
         chosen.notes.append(
             f"Akaike criterion (lower is better): {loss:.5g} with the sky turned, {other:.5g} without"
         )
@@ -299,8 +299,16 @@ class Preparation:
             if not search:
                 return params, recordings.notes
             self.watch.stage("searching for lights")
-            asked = job.representation, params, recordings, job.target, job.original
-            ready = initialization.find(*asked, only_own=job.newton)
+            if job.target.coverage is not None:
+                params, found = initialization.explained(
+                    self.settings, job.representation, params, recordings, job.target, job.original
+                )
+                job.begun = found.run if job.newton else None
+                said = f"of what was painted: {found.name} (-2 log evidence {found.score:.1f})"
+                return params, [*recordings.notes, said]
+            ready = initialization.find(
+                job.representation, params, recordings, job.target, job.original, only_own=job.newton
+            )
             job.target = ready.target
             if smooth is not None:
                 # What ground is lit by from elsewhere makes up for what coarse grids cannot show.

@@ -134,17 +134,24 @@ class Target(Table):
         "auto",
         Choice("auto", *TONEMAPS),
         "tonemap under which a PNG is exported, and the image or a stroke is painted; auto: gamma, or of a "
-        "PNG reinhard where gamma clips 0.1 % of its pixels; an image is read as it says or shows itself, and a "
-        "rendering that says nothing as sRGB",
+        "PNG reinhard where gamma clips 0.1 % of its pixels; an image is read as it says or shows itself, "
+        "a rendering that says nothing as sRGB",
         when={"target.kind": ("rendering", "image", "strokes")},
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
     paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
+    rest: str = key(
+        "follow",
+        Choice("follow", "keep"),
+        "what the pixels do that were not painted: follow the light that the paint asks for (shading, "
+        "highlights, shadows), with the same mean; or keep their values",
+        when=_PAINTED,
+    )
     hold: float | str = key(
         "auto",
         OrAuto(Number(0)),
-        "weight of all pixels that were not painted; auto: 1, and with Gauss-Newton steps as much more as "
-        "keeps the mean change of their display values below 0.02",
+        "weight of all pixels that were not painted; auto: 0.3 where they follow; where they keep their values "
+        "1, and with Gauss-Newton steps as much more as keeps their mean change of display values below 0.02",
         when=_PAINTED,
     )
     spp: int | str = key(

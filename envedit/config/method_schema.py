@@ -165,6 +165,19 @@ class Optimizer(Table):
 
 
 @dataclass(frozen=True)
+class Solve(Table):
+    """How far the map may go."""
+
+    freedom: float = key(
+        0.25,
+        Number(0, 1),
+        "of a painted target: how far the sky may change beside its lights, in units of how photographed skies "
+        "differ; 0: lights, and one factor for the whole sky",
+        when=LAYERS | {"target.kind": ("image", "strokes")},
+    )
+
+
+@dataclass(frozen=True)
 class Renderer(Table):
     """How the rendering is computed while editing."""
 

@@ -18,7 +18,7 @@ from typing import Any
 from envedit.config import presets
 from envedit.config.input_schema import Input, Scene, Target
 from envedit.config.key_validators import Kelvin
-from envedit.config.method_schema import Fit, Loss, Optimizer, Perceptual, Renderer, Representation
+from envedit.config.method_schema import Fit, Loss, Optimizer, Perceptual, Renderer, Representation, Solve
 from envedit.config.tables import ADAM_STEPS, EDITED, SIREN, Table, key, table_key
 from envedit.config.validators import Boolean, Choice, Integer, Number, OrAuto, String
 from envedit.core.color import TONEMAPS
@@ -95,6 +95,7 @@ class Config(Table):
     fit: Fit = table_key(Fit, SIREN | EDITED)
     loss: Loss = table_key(Loss, ADAM_STEPS | EDITED)
     perceptual: Perceptual = table_key(Perceptual)
+    solve: Solve = table_key(Solve, EDITED)
     optimizer: Optimizer = table_key(Optimizer, EDITED)
     renderer: Renderer = table_key(Renderer)
     output: Output = table_key(Output)

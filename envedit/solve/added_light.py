@@ -28,13 +28,6 @@ LEAST_REST = 1e-4
 def best(
     problem: Problem, point: Point, normal: Normal, light: int | None = None
 ) -> tuple[dict, float] | None:
-    """As :func:`several`, the best one; None."""
-    return next(iter(several(problem, point, normal, light, 1)), None)
-
-
-def several(
-    problem: Problem, point: Point, normal: Normal, light: int | None = None, most: int = 1, apart: float = 1.0
-) -> list[tuple[dict, float]]:
     """Light a spare light where F falls most; ``light`` if given, or else the first that is dark.
 
     Candidates are the cells of the block transport, then texels around the best one, through exact columns.
@@ -51,35 +44,24 @@ def several(
     spare = range(layers.lights.own, layers.lights.count)
     dark = [i for i in spare if i not in problem.added(point.state)] if light is None else [light]
     if not dark:
-        return []
+        return None
     try:
         model = _Model(problem, normal)
     except np.linalg.LinAlgError:
-        return []
+        return None
     i, flux = dark[0], np.float64(layers.lights.flux[dark[0]])
     scale = flux.max()
     if not scale > 0:
-        return []
+        return None
     flux = flux / scale  # of any strength, in single precision
     _, directions = problem.blocks.sky
     if not len(directions):  # so few rows are edited that they fill no cell by half
-        return []
+        return None
     strength, fall = model.of_cells(flux)
-    result = []
-    left = np.ones(len(fall), bool)
-    for _ in range(most):
-        at = int(np.argmax(np.where(left, fall, 0)))
-        if not (left[at] and fall[at] > 0):
-            break
-        left &= directions @ directions[at] < apart
-        one = _refined(problem, point, model, i, flux, scale, directions[at], strength[at], fall[at])
-        if one is not None:
-            result.append(one)
-    return result
-
-
-def _refined(problem, point, model, i, flux, scale, direction, strength, fall):
-    layers, transport = problem.layers, problem.transport
+    found = int(np.argmax(fall))
+    if not fall[found] > 0:
+        return None
+    direction, strength, fall = directions[found], strength[found], fall[found]
     height, width = problem.envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
     row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
@@ -121,13 +103,9 @@ class _Model:
             mixed.append(sum(blocks.seen([b * f for b, f in zip(parts.lights, flux, strict=True)])))
         pull = sum(blocks.seen(list((parts.pulled * flux).T[..., None])))[0]
         power = blocks.power(parts.squared * flux**2).sum(axis=0)
-        stated = self.normal.stated
-        seen = np.stack(blocks.seen([b[:, None] * f for b, f in zip(stated.blocks.T, flux, strict=True)]))[:, 0]
-        return self._best(*self._with_stated(seen, np.concatenate(mixed), pull, power))
-
-    def _with_stated(self, seen, mixed, pull, power):
-        stated = self.normal.stated
-        return mixed + stated.by_unknowns.T @ seen, pull + stated.value @ seen, power + np.square(seen).sum(axis=0)
+        by_blocks = self.normal.mean_of_rest.by_blocks.T
+        mean = blocks.seen([b[:, None] * f for b, f in zip(by_blocks, flux, strict=True)])
+        return self._best(np.concatenate(mixed), pull, power, np.concatenate(mean))
 
     def of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
@@ -148,11 +126,16 @@ class _Model:
             seen = seen + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
             pull = pull + mine @ (slope * robust * residual)
             power = power + np.einsum("np,np->n", mine, weighted)
-        share = np.broadcast_to(normal.stated.share, normal.slope.shape)
-        stated = np.stack([pictures[..., c] @ share[..., c].ravel() for c in range(3)])
-        return self._best(*self._with_stated(stated, np.concatenate([*mixed, seen]), pull, power))
+        by_pixels = normal.mean_of_rest.by_pixels.reshape(-1, 3)
+        mean = np.stack([pictures[..., c] @ by_pixels[:, c] for c in range(3)])
+        return self._best(np.concatenate([*mixed, seen]), pull, power, mean)
 
-    def _best(self, mixed, pull, power):
+    def _best(self, mixed, pull, power, mean):
+        """Return strengths and falls; ``mean`` (3, n) is what the pictures do to the mean of the rest."""
+        rest = self.normal.mean_of_rest
+        mixed = mixed + rest.jacobian.T @ mean
+        pull = pull + rest.residual @ mean
+        power = power + np.square(mean).sum(axis=0)
         half = forward(self._lower, mixed)
         along = half.T @ self._gradient - pull
         rest = power - np.square(half).sum(axis=0)

@@ -34,14 +34,13 @@ from envedit.solve import (
     checkpoint,
     gauss_newton,
     hold,
-    map_problem,
-    prior,
-    search,
+    likelihood,
+    task,
     transport_error,
 )
+from envedit.solve.map_problem import Posterior
 from envedit.targets.target import Target
 
-N, HOLD, MEAN = 10.0, 0.3, 1.0
 CHECKED_SPP = 64
 """Samples a pixel of renderings by which start and solution are compared."""
 TRIAL_STEPS, NEWTON_TRIAL = 30, 6
@@ -49,7 +48,7 @@ TRIAL_STEPS, NEWTON_TRIAL = 30, 6
 TRIAL_GAIN, LIKELIER = 0.05, gauss_newton.WORTH
 """By which share of the loss it must be better with Adam, and by how much lower with Gauss-Newton: twice the
 logarithm of the places that a light could have had, some 20,000."""
-CLEARLY = 6 * map_problem.INDEPENDENT * np.log(1.1)
+CLEARLY = 6 * likelihood.INDEPENDENT * np.log(1.1)
 """By how much lower with Gauss-Newton for a rendered target, where lights that are moved may stand in for one
 another: as for a residual 10 % smaller."""
 RISEN = 2.0
@@ -118,7 +117,7 @@ class Job:
         Receives progress.
     dists : distances.Dists, optional
         As for :class:`.adam_loop.Objective`.
-    posterior : map_problem.Posterior, optional
+    posterior : Posterior, optional
         How well the target determines the sky, where :meth:`optimise` knows it.
     note : str
         What the solver has to say.
@@ -137,7 +136,7 @@ class Job:
     folder: Path | None
     watch: Watch
     dists: distances.Dists | None = None
-    posterior: map_problem.Posterior | None = None
+    posterior: Posterior | None = None
     note: str = ""
     begun: gauss_newton.Run | None = None
 
@@ -179,11 +178,6 @@ class Job:
 
     def best(self, starts: list[tuple[Params, list[str]]], crop: np.ndarray) -> tuple[Params, list[str]]:
         """Return the start, (parameters, notes), that gets farthest in a few steps."""
-        if not self._rendered and self.newton:
-            problem = self._problem()
-            found = search.search(problem, problem.state(starts[0][0]), self._sigma)
-            self.begun = found.run
-            return problem.found(found.run.state), [f"explanation: {found.name}"]
         if len(starts) == 1:
             return starts[0]
         begun: list[gauss_newton.Run | None] = []
@@ -289,13 +283,10 @@ class Job:
         return adam.params, state
 
     def _problem(self):
-        asked = self.representation, self.renderer.transport, self.original
-        target = self.target.aim, self.target.weight
-        more: dict[str, Any] = {"saturates": self._rendered, "robust": self._rendered}
-        chosen = prior.Prior() if self._rendered else prior.PAINTED
-        if not self._rendered:
-            more |= {"independent": N * (1 + HOLD), "rest": 1 - self.target.coverage, "rest_statements": N * MEAN * float(1 - self.target.coverage.mean())}
-        return map_problem.Problem(*asked, *target, chosen, **more, blocks=self._blocks)
+        transport = self.renderer.transport
+        return task.problem(
+            self.settings, self.target, self.representation, transport, self.original, self._blocks
+        )
 
     @functools.cached_property
     def _blocks(self):
@@ -305,9 +296,7 @@ class Job:
 
     @property
     def _sigma(self):
-        """Standard error of display values: what was measured of the target, but not below the usual."""
-        noise = self.target.noise
-        return map_problem.SIGMA if noise is None else max(map_problem.SIGMA, float(np.median(noise)))
+        return task.sigma(self.target)
 
     def _solve(self, params, resume):
         """Make Gauss-Newton steps from the start, or from the checkpoint."""

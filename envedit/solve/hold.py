@@ -69,6 +69,6 @@ def further(
     rendering, aim, *pixels
         As for ``change``.
     """
-    if chosen.hold != "auto" or not chosen.paint:
+    if chosen.hold != "auto" or chosen.rest == "follow" or not chosen.paint:
         return None
     return raised(weight, change(rendering, aim, *pixels))

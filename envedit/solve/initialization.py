@@ -18,7 +18,7 @@ from envedit.core.types import Progress
 from envedit.representations.layers.gain import CYCLES, Octave
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
-from envedit.solve import gain_bandwidth, light_search, painted_change, pixel_confidence
+from envedit.solve import gain_bandwidth, light_search, pixel_confidence, search, task
 from envedit.targets.target import Target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
@@ -203,39 +203,32 @@ def _trusted(envmap, recordings, target):
 
 
 def _searched(layers, params, transport, target, original, only_own=False):
-    """List the starts of the searches, (parameters, notes)."""
+    """List the starts of the search for lights, (parameters, notes)."""
     problem = light_search.SearchProblem(layers, transport, target.picture, target.weight, original)
-    if target.coverage is None:
-        searched = light_search.start(problem, params, only_own)
-        several = only_own and len(layers.separation.lights) > 1 and searched[0]["turn"].numpy().any()
-        # Of several lights one may have changed, and the search have moved others to make up for it.
-        still = (params, ["all lights initialised at their places in the map"])
-        return [still, searched] if several else [searched]
-    if only_own:
-        return [(params, [])]
-    return painted_starts(replace(problem, initial=target.initial), params, target.coverage)
+    searched = light_search.start(problem, params, only_own)
+    several = only_own and len(layers.separation.lights) > 1 and searched[0]["turn"].numpy().any()
+    # Of several lights one may have changed, and the search have moved others to make up for it.
+    still = (params, ["all lights initialised at their places in the map"])
+    return [still, searched] if several else [searched]
 
 
-def painted_starts(
-    problem: light_search.SearchProblem, params: dict, coverage: np.ndarray
-) -> list[tuple[dict, list[str]]]:
-    """List where the edit of a painted picture may start, (parameters, notes), no two alike.
+def explained(
+    settings: config.Config,
+    layers: Layers,
+    params: dict,
+    recordings: Recordings,
+    target: Target,
+    original: np.ndarray,
+) -> tuple[dict, search.Explanation]:
+    """Find the likeliest explanation of a painted picture; returns its parameters and itself.
 
     Parameters
     ----------
-    problem, params
-        As for :func:`.painted_change.start`.
-    coverage : ndarray (h, w, 1)
-        How much each pixel was painted.
+    settings : config.Config
+        Of the run.
+    layers, params, recordings, target, original
+        As for :func:`find`.
     """
-    daring = (False, True) if (coverage < 1).any() else (False,)
-    found = [painted_change.start(problem, params, bold) for bold in daring]
-    if problem.layers.separation.lights:
-        found.append(painted_change.softened(problem.layers, params))
-    return [one for i, one in enumerate(found) if not any(_same(one, other) for other in found[:i])]
-
-
-def _same(one, other):
-    """Say whether two starts place the lights alike, in turn and flux, to a thousandth of their units."""
-    (a, _), (b, _) = one, other
-    return all(np.allclose(a[name].numpy(), b[name].numpy(), 0, 1e-3) for name in ("turn", "flux"))
+    problem = task.problem(settings, target, layers, recordings.transport, original)
+    found = search.search(problem, problem.state(params), task.sigma(target))
+    return problem.found(found.run.state), found

@@ -4,15 +4,11 @@ Unknowns x: the log gain g of every node, and of every light that is lit its log
 direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and
 E(x) the map that the layers compose, minimised is
 
-    F(x) = 3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  x' K x
+    F(x) = misfit of the residual  +  x' K x
 
-r_p is the root mean square over the channels of d(T E(x))_p - d(t)_p.
-
-* rho_s is Huber's loss: quadratic up to s, linear beyond. Pixels that no light can explain (caustics, shadow
-  edges) therefore have limited weight; residuals of painted pictures count by their squares.
-* A is the number of pixels whose errors go together, a share of the picture (:data:`INDEPENDENT`).
-* K is the inverse covariance of a sky's change (:class:`Prior`): luminance, blue-amber and green-magenta each
-  with their standard deviation, smaller by half for every finer grid; of lights flux, size and direction.
+* The misfit is that of ``likelihood.py``: how unlikely the residual of display values d(T E(x)) - d(t) is.
+* K is the inverse covariance of a sky's change (:class:`Prior`): of the gain along luminance, blue-amber and
+  green-magenta; of lights flux, size and direction.
 
 The residual is exact, through T; so is the gradient by gain and saturation. Other derivatives are those of
 ``derivatives.py``.
@@ -31,15 +27,14 @@ from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.derivatives import Derivatives
-from envedit.solve.normal_equations import Blocks, Normal, Stated, solved
+from envedit.solve.likelihood import Likelihood, on_average_one
+from envedit.solve.normal_equations import Blocks, MeanOfRest, Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import Point, Unknowns, in_numpy
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
-INDEPENDENT = 256
-"""Residuals of a picture that count as independent, per channel: neighbouring pixels err together."""
 LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
 """Largest step of an unknown: beyond it the linear model does not hold."""
 SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
@@ -83,15 +78,12 @@ class Problem(Unknowns):
         The original.
     picture : ndarray (h, w, 3)
         The target, linear radiance.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts beside the others.
+    likelihood : Likelihood, optional
+        Of its residuals; by default that of a rendering all of whose pixels count the same.
     prior : Prior
         How far a sky changes.
     saturates : bool
         The saturation of its colours is an unknown.
-    robust : bool
-        Pixels that no light can explain have limited weight (Huber); else every residual counts by its
-        square, as where the picture was painted: a large residual is the requested change there.
     blocks : BlockJacobian, optional
         Of another problem of these layers and this transport; made where None.
     """
@@ -102,34 +94,27 @@ class Problem(Unknowns):
         transport: LightTransport,
         envmap: np.ndarray,
         picture: np.ndarray,
-        weight: np.ndarray | None = None,
-        prior: Prior = None,
+        likelihood: Likelihood | None = None,
+        prior: Prior | None = None,
         saturates: bool = False,
-        robust: bool = True,
         blocks: BlockJacobian | None = None,
-        independent: float = INDEPENDENT,
-        rest: np.ndarray | None = None,
-        rest_statements: float = 0.0,
     ):
         super().__init__(layers, saturates)
-        self.robust, self.independent = robust, independent
-        self.rest, self.rest_statements = rest, rest_statements if rest is not None else 0.0
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
         self.prior = prior or Prior()
-        self.picture = picture
-        self.target = display_curve.to_display(tensor(picture)).numpy()
-        shape = picture.shape[:2]
-        self.weight = _on_average_one(weight, shape)
-        self.area = shape[0] * shape[1] / min(independent, shape[0] * shape[1])
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks)
         self._precisions = self.prior.gain_precisions(layers.gain, self.ground)
+        self._aim(picture, likelihood)
 
-    def aimed_at(self, picture: np.ndarray, weight: np.ndarray | None, point: Point) -> Point:
-        """Take another target, with its weights; returns a point with its residual from that target."""
+    def _aim(self, picture, likelihood):
         self.picture = picture
         self.target = display_curve.to_display(tensor(picture)).numpy()
-        self.weight = _on_average_one(weight, picture.shape[:2])
+        self.likelihood = likelihood or Likelihood(on_average_one(None, picture.shape[:2]))
+
+    def aimed_at(self, picture: np.ndarray, likelihood: Likelihood | None, point: Point) -> Point:
+        """Take another target, with its likelihood; returns a point with its residual from that target."""
+        self._aim(picture, likelihood)
         shown = display_curve.to_display(tensor(point.rendering)).numpy()
         return replace(point, residual=np.float64(shown) - self.target)
 
@@ -152,26 +137,8 @@ class Problem(Unknowns):
         return Point(state, edited, sky, rendering.numpy(), np.float64(shown) - self.target)
 
     def noise(self, residual: np.ndarray, least: float) -> float:
-        """Return the standard error under which the misfit is what independent residuals of it have.
-
-        An M-estimate of scale with Huber's loss (not his proposal 2): the first part of F is then their
-        number. At least ``least``.
-        """
-        size = _sizes(residual)
-        if self.misfit(residual, least) <= 3 * self.statements:
-            return least
-        if not self.robust:
-            return float(least * np.sqrt(self.misfit(residual, least) / (3 * self.statements)))
-        # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
-        # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
-        order = np.argsort(size, axis=None)
-        r, w = (v.ravel()[order].astype(np.float64) for v in (size, self.weight))
-        a = np.cumsum(np.append(0, w * r * r))
-        b, c = (np.append(np.cumsum(part[::-1])[::-1], 0) for part in (w * r, w))
-        d = self.area * self.independent
-        sigma = (b + np.sqrt(b * b + (d + c) * a)) / (d + c)
-        inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
-        return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
+        """Return the most likely standard error (:meth:`.Likelihood.noise`)."""
+        return self.likelihood.noise(residual, least)
 
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""
@@ -198,23 +165,7 @@ class Problem(Unknowns):
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
         """Return the first part of F."""
-        return self._huber(_sizes(residual), sigma) + float((self.stated(residual) ** 2).sum()) / sigma**2
-
-    @property
-    def statements(self):
-        return self.independent + self.rest_statements
-
-    def stated(self, picture):
-        """Mean over what was not painted, times the root of how often it counts, (3,)."""
-        if not self.rest_statements:
-            return np.zeros(3)
-        return np.sqrt(self.rest_statements) * (picture * self.rest).sum(axis=(0, 1)) / self.rest.sum()
-
-    def _huber(self, size, sigma):
-        loss = size**2
-        if self.robust:
-            loss = np.where(size <= sigma, loss, sigma * (2 * size - sigma))
-        return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
+        return self.likelihood.misfit(residual, sigma)
 
     # ---- normal equations ----------------------------------------------------------------------------------
 
@@ -226,13 +177,10 @@ class Problem(Unknowns):
         and the gradient is 0.
         """
         state, n = point.state, self.nodes
-        size = _sizes(point.residual)
-        robust = self.weight / (self.area * sigma**2)
-        if self.robust:
-            robust = robust * np.minimum(1, sigma / np.maximum(size, 1e-12))
+        robust = self.likelihood.weights(point.residual, sigma)
+        share = self.likelihood.share / sigma * np.ones_like(robust)
+        mean = self.likelihood.mean(point.residual) / sigma
         slope = display_curve.slope(point.rendering)
-        share = self.share() / sigma
-        mean = self.stated(point.residual) / sigma
         blocks, linear = self.blocks, self.derivatives.at(point)
         pictures, profile = linear.pictures, linear.profile
         unknowns = 3 * n + len(pictures)
@@ -244,13 +192,13 @@ class Problem(Unknowns):
             pulled_back = self._pulled_back(point, slope * (robust * point.residual + share * mean))
         seen, lit = np.zeros((len(pictures), n * 3)), []
         by_mean = np.zeros((3, unknowns))
-        mean_blocks = blocks.summed(slope * profile * share)
+        mean_by_blocks = blocks.summed(slope * profile * share)
         for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
             gradient[part] = pulled_back[0][:, c]
-            by_mean[c, part] = mean_blocks[:, c] @ j
+            by_mean[c, part] = mean_by_blocks[:, c] @ j
             if len(pictures):
                 weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
                 in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
@@ -272,13 +220,8 @@ class Problem(Unknowns):
         gradient = gradient + precision @ back if descent else np.zeros(unknowns)
         pixels = robust, slope, point.residual, profile, pictures
         parts = Blocks(linear.jacobian, squared, pulled, lit)
-        stated = Stated(by_mean, mean, share * slope, mean_blocks)
-        return Normal(hessian, gradient, precision, linear.named, parts, *pixels, stated)
-
-    def share(self):
-        if not self.rest_statements:
-            return np.zeros((*self.target.shape[:2], 1))
-        return np.sqrt(self.rest_statements) * self.rest / self.rest.sum()
+        mean_of_rest = MeanOfRest(by_mean, mean, share * slope, mean_by_blocks)
+        return Normal(hessian, gradient, precision, linear.named, parts, *pixels, mean_of_rest)
 
     def _pulled_back(self, point, picture):
         """Return the derivatives of the sum of a picture times T E.
@@ -390,15 +333,3 @@ class Problem(Unknowns):
         whole[:, self.rows] = spread
         return Posterior(*whole)
 
-
-def _on_average_one(weight, shape):
-    """Return weights (h, w, 1) whose mean is 1: where few pixels count, they are the whole picture."""
-    if weight is None:
-        return np.ones((*shape, 1), np.float32)
-    mean = float(np.mean(weight, dtype=np.float64))
-    return np.float32(weight) if abs(mean - 1) < 1e-6 else np.float32(weight / max(mean, 1e-30))
-
-
-def _sizes(residual):
-    """Root mean square over the channels of every pixel, (h, w, 1)."""
-    return np.sqrt((residual**2).mean(axis=2, keepdims=True))

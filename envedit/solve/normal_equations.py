@@ -31,13 +31,25 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class Stated:
-    """Mean of the rest: derivatives (3, unknowns), value (3,), per pixel (h, w, 3) and per block."""
+class MeanOfRest:
+    """The mean of what was not painted, q / sigma of ``likelihood.py``, as one more residual of each channel.
 
-    by_unknowns: np.ndarray
-    value: np.ndarray
-    share: np.ndarray
-    blocks: np.ndarray
+    Attributes
+    ----------
+    jacobian : ndarray (3, m)
+        Its derivatives by the unknowns.
+    residual : ndarray (3,)
+        Its value.
+    by_pixels : ndarray (h, w, 3)
+        Its derivatives by the radiance of pixels.
+    by_blocks : ndarray (blocks, 3)
+        These times the profile, summed over blocks.
+    """
+
+    jacobian: np.ndarray
+    residual: np.ndarray
+    by_pixels: np.ndarray
+    by_blocks: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ class Normal:
     residual: np.ndarray
     profile: np.ndarray
     pictures: np.ndarray
-    stated: Stated | None = None
+    mean_of_rest: MeanOfRest
 
     @property
     def determined(self) -> float:

@@ -2,30 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from envedit.representations.layers.gain import GridGain
 
 AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Luminance, blue-amber and green-magenta, as unit vectors of log RGB."""
 
 
-SKIES = (np.sqrt(3) * 0.69, np.sqrt(3) * 0.244, 1.2), (0.37, 0.145, 2.1), (0.078, 0.015, 1.3)
+@dataclass(frozen=True)
+class SkyDifference:
+    """How much the log radiance of photographed skies differs, along one of :data:`AXES`.
+
+    The difference of two skies is a field with the covariance
+
+        C(angle) = whole^2 + sum over degrees l >= 1 of (2 l + 1) (gradient l^-falloff)^2 P_l(cos angle),
+
+    as ``python -m experiments natural.skies`` measures it: a factor for the whole sky, two gradients, and
+    little else.
+    """
+
+    whole: float
+    gradient: float
+    falloff: float
+
+    def covariance(self, cosine: np.ndarray, freedom: float) -> np.ndarray:
+        """Return C at angles given by their cosines; all but the factor of the whole sky times freedom^2."""
+        degree = np.arange(1, DEGREES + 1)
+        series = (2 * degree + 1) * (freedom * self.gradient * degree**-self.falloff) ** 2
+        return np.polynomial.legendre.legval(cosine, np.append(self.whole**2, series))
 
 
-def field_covariance(cosine, whole, gradient, power, degrees=32):
-    """whole^2 + sum over degrees l of (2 l + 1) (gradient l^-power)^2 P_l."""
-    l = np.arange(1, degrees + 1)
-    series = (2 * l + 1) * (gradient * l**-power) ** 2
-    return np.polynomial.legendre.legval(cosine, np.concatenate([[whole**2], series]))
+DEGREES = 32
+"""Highest degree of the fields: beyond the gain's finest grid, which has 12 cycles around the horizon."""
+PHOTOGRAPHED = (
+    SkyDifference(np.sqrt(3) * 0.69, np.sqrt(3) * 0.244, 1.2),
+    SkyDifference(0.37, 0.145, 2.1),
+    SkyDifference(0.078, 0.015, 1.3),
+)
+"""Along luminance, blue-amber and green-magenta; nine maps (``experiments/natural``)."""
+LEAST_FREEDOM = 0.01
+"""Freedom that 0 stands for: a gain that is the same everywhere, to a hundredth of how skies differ."""
+FIXED = 1e6
+"""Precision of grids that do not take part: their nodes stay at 0."""
+NUGGET = 1e-6
+"""Share of the variance at a node that is its own, so that nodes at one place can be told apart."""
 
 
 @dataclass(frozen=True)
 class Prior:
     """How far a sky changes: standard deviations, the same for every scene and map.
 
-    Those of a rendered target, which may be of quite another sky; :data:`PAINTED` are those of a painted one.
+    Those of a rendered target, which may be of quite another sky; :func:`of_paint` has those of a painted one.
 
     Attributes
     ----------
@@ -46,6 +76,9 @@ class Prior:
         Of a light's log size: of the map's own, and of a light that is added, which may be haze or a sun.
     saturation : float
         Of the log saturation of the sky's colours.
+    freedom : float or None
+        How far the gain may go, in units of how photographed skies differ (:data:`PHOTOGRAPHED`); None: as
+        ``luminance``, ``chroma`` and ``tint`` say, node by node.
     """
 
     luminance: float = 1.0
@@ -57,33 +90,36 @@ class Prior:
     size: float = 0.3
     added_size: float = 1.0
     saturation: float = 1.0
-
     freedom: float | None = None
 
-    def gain_precisions(self, gain, ground: bool = False) -> np.ndarray:
+    def gain_precisions(self, gain: GridGain, ground: bool = False) -> np.ndarray:
         """Return the inverse covariance of the nodes' log gain along luminance, chroma and tint: (3, n, n).
 
-        ``ground``: the last is the factor of ground, which changes as a coarse node of the sky.
+        With :attr:`freedom` the nodes of the finest grid differ as photographed skies do, times freedom, and
+        coarser grids, which it contains, stay at 0; without, every node has its own standard deviation.
+
+        Parameters
+        ----------
+        gain : GridGain
+            Whose nodes these are.
+        ground : bool
+            The last node is the factor of ground, which changes as a coarse node of the sky.
         """
-        sizes = gain.sizes
+        coarse = [rows * columns for rows, columns in gain.sizes]
         if self.freedom is None:
-            fall = np.concatenate([np.full(rows * columns, 0.5**i) for i, (rows, columns) in enumerate(sizes)])
-            fall = np.append(fall, 1.0) if ground else fall
-            return np.stack(
-                [np.diag((sd * fall) ** -2.0) for sd in (np.sqrt(3) * self.luminance, self.chroma, self.tint)]
-            )
-        d = gain.directions(len(sizes) - 1)
-        cosine = np.clip(d @ d.T, -1, 1)
-        count = sum(rows * columns for rows, columns in sizes)
-        found = np.zeros((3, count + ground, count + ground))
-        first = count - len(d)
-        for one, (whole, gradient, power) in zip(found, SKIES, strict=True):
-            covariance = field_covariance(cosine, whole, max(self.freedom, 0.01) * gradient, power)
-            covariance += 1e-6 * np.eye(len(d)) * whole**2
-            one[first:count, first:count] = np.linalg.inv(covariance)
-            one[np.arange(first), np.arange(first)] = 1e6
-            if ground:
-                one[count, count] = 1 / whole**2
+            fall = np.concatenate([np.full(count, 0.5**i) for i, count in enumerate(coarse)] + [[1.0] * ground])
+            deviations = np.sqrt(3) * self.luminance, self.chroma, self.tint
+            return np.stack([np.diag((deviation * fall) ** -2.0) for deviation in deviations])
+        directions = gain.directions(len(gain.sizes) - 1)
+        cosine = np.clip(directions @ directions.T, -1, 1)
+        first, last = sum(coarse[:-1]), sum(coarse)
+        found = np.zeros((3, last + ground, last + ground))
+        for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
+            covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM))
+            covariance[np.diag_indices_from(covariance)] *= 1 + NUGGET
+            precision[first:last, first:last] = np.linalg.inv(covariance)
+            precision[np.arange(first), np.arange(first)] = FIXED
+            precision[last:, last:] = skies.whole**-2.0
         return found
 
     @property
@@ -93,8 +129,10 @@ class Prior:
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-PAINTED = Prior(freedom=0.25, chroma=Prior.chroma / 3, tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3)
-"""Of painted targets: paint that asks for another brightness is no reason for another colour of the sky.
+def of_paint(freedom: float) -> Prior:
+    """Return the prior of painted targets.
 
-In colour a third of what a rendered target may change, and of a light as much as of the sky.
-"""
+    Paint that asks for another brightness is no reason for another colour of a light: a third of what a
+    rendered target may change.
+    """
+    return Prior(tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3, freedom=freedom)

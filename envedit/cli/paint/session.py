@@ -26,7 +26,6 @@ from envedit.cli.paint.project import Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.errors import NumericalError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
@@ -37,10 +36,8 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
-from envedit.solve import feasibility, gauss_newton, hold, initialization, map_problem
-from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
-from envedit.solve.light_search import SearchProblem
-from envedit.solve.prior import PAINTED
+from envedit.solve import feasibility, gauss_newton, hold, map_problem, prior, search
+from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes, working_size
 from envedit.targets.target import first_hold, pixel_weight
 
@@ -154,7 +151,8 @@ class Session:
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         asked = layers, self.transport, self.origin, self.base
-        self.problem = map_problem.Problem(*asked, prior=PAINTED, robust=False)
+        freedom = self.project.settings.solve.freedom
+        self.problem = map_problem.Problem(*asked, prior=prior.of_paint(freedom))
         self.still = self.start = self.problem.state(params)
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)
@@ -198,7 +196,8 @@ class Session:
         """Aim the solution at the paint, with the present weight of what was not painted."""
         paint = self.project.settings.target.paint
         self.weight = pixel_weight(self.coverage, self._hidden, paint, self.hold)
-        self.point = self.problem.aimed_at(self.target, self.weight, self.point)
+        likelihood = Likelihood.of_paint(self.weight, self.coverage)
+        self.point = self.problem.aimed_at(self.target, likelihood, self.point)
         self.run, self._rendered = gauss_newton.Run(self.run.state, self.start), None
 
     def _held_more(self):
@@ -293,31 +292,16 @@ class Session:
         A light that jumps, or that is added, is where no small step leads.
         """
         self._tell_doing("looking for other lights")
-        layers, params = self.problem.layers, self.problem.params(self.still)
-        asked = SearchProblem(layers, self._watched, self.target, self.weight, self.origin, self.base)
-        starts = [start for start, _ in initialization.painted_starts(asked, params, self.coverage)]
-        best = gauss_newton.solve(self.problem, params, iterations=0, run=self.run, trial=True, sparing=False)
-        least, found = best.loss - LIKELIER, None
-        for start in [params, *starts]:
-            tried = self._tried(start)
-            if tried is not None and tried.loss < least:
-                least, found = tried.loss, tried.run
+        now = search.score(self.problem, self.run, self.point, map_problem.SIGMA)
+        found = search.search(self.problem, self.still, after_step=self._unless_newer)
         self.searched = True
-        if found is not None:
-            self.run, self.start = found, found.start
+        if found.score < now - search.STRONG:
+            self.run, self.start = found.run, found.run.start
             self._rendered = None
         self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns
         self._show("transport")
         self._tell_lights()
         self.tell_state()
-
-    def _tried(self, start):
-        """Return the solution after a few steps from a start; None where it cannot begin."""
-        steps: dict[str, Any] = {"iterations": NEWTON_TRIAL, "after_step": self._unless_newer}
-        try:
-            return gauss_newton.solve(self.problem, start, trial=True, sparing=False, **steps)
-        except NumericalError:
-            return None
 
     def _unless_newer(self, *_):
         if self.newer():

@@ -1,0 +1,58 @@
+"""The problem that a target poses: how likely its residuals are, and how far the map may change for it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envedit import config
+from envedit.representations.layers.layers import Layers
+from envedit.solve import prior
+from envedit.solve.block_jacobian import BlockJacobian
+from envedit.solve.likelihood import Likelihood, on_average_one
+from envedit.solve.map_problem import SIGMA, Problem
+from envedit.targets.target import Target
+from envedit.transport.light_transport import LightTransport
+
+
+def likelihood(target: Target) -> Likelihood:
+    """Return the likelihood of a target's residuals: of a rendering, or of paint where it has coverage."""
+    if target.coverage is None:
+        return Likelihood(on_average_one(target.weight, target.picture.shape[:2]))
+    return Likelihood.of_paint(target.weight, target.coverage)
+
+
+def problem(
+    settings: config.Config,
+    target: Target,
+    layers: Layers,
+    transport: LightTransport,
+    envmap: np.ndarray,
+    blocks: BlockJacobian | None = None,
+) -> Problem:
+    """Return what is minimised.
+
+    Parameters
+    ----------
+    settings : config.Config
+        Of the run: ``solve.freedom``.
+    target : Target
+        What the renderer is to make.
+    layers, transport, envmap, blocks
+        As for :class:`.Problem`.
+    """
+    painted = target.coverage is not None
+    return Problem(
+        layers,
+        transport,
+        envmap,
+        target.aim,
+        likelihood(target),
+        prior.of_paint(settings.solve.freedom) if painted else prior.Prior(),
+        saturates=not painted,
+        blocks=blocks,
+    )
+
+
+def sigma(target: Target) -> float:
+    """Return the standard error of display values: what was measured of the target, at least :data:`SIGMA`."""
+    return SIGMA if target.noise is None else max(SIGMA, float(np.median(target.noise)))

@@ -171,7 +171,7 @@ class Solve(Table):
     freedom: float = key(
         0.25,
         Number(0, 1),
-        "of a painted target: how far the sky may change beside its lights, in units of how photographed skies "
+        "painted targets: how far the sky may change beside its lights, in units of how photographed skies "
         "differ; 0: lights, and one factor for the whole sky",
         when=LAYERS | {"target.kind": ("image", "strokes")},
     )

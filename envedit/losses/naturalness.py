@@ -10,6 +10,17 @@ from envedit.losses.metrics import LOG_EPS, high_frequency_energy
 
 PERCENTILES, MARGIN = (1, 99), 0.1
 """Range of log chroma that a sky has, and by how much a texel may leave it."""
+CELL_ROWS, CELL_COLUMNS = 8, 32
+"""Cells of the upper half, 11 degrees wide, by which patches are measured."""
+COARSE_DEGREES = 60.0
+"""Scale from which on a change is no patch but another exposure, or a gradient over the whole sky."""
+CLIPPED = 0.01
+"""Share of the sky's brightest texels that are cut in cells: the sun moving is no patch."""
+SKIES_PATCHES = 0.53
+"""RMS of patches between two photographed skies (``python -m experiments natural.skies run``)."""
+MOST_WHITE, MOST_PATCHES = 0.05, 1.0
+"""From where on a user is warned of a painted edit: a twentieth of the sky more that is white, and as many
+patches as another sky has. Towards a rendering another sky can be meant."""
 
 
 def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = None) -> dict:
@@ -29,7 +40,9 @@ def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = 
         mean over channels) lies outside the 1st to 99th percentile of original and true map together, by
         more than 0.1, in any channel. ``seam``: mean |log luminance step| across the horizon over the
         original's. ``high_frequency``: energy of high frequencies (:func:`.high_frequency_energy`) over the
-        larger of the original's and the true map's. None where the denominator is 0.
+        larger of the original's and the true map's. ``white``: share of the upper half's solid angle that is
+        display white in all channels, less the original's. ``patches``: :func:`patches` of the edit, over
+        those between two photographed skies. None where the denominator is 0.
     """
     known = [original] if true is None else [original, true]
     sharp = max(high_frequency_energy(one) for one in known)
@@ -38,7 +51,62 @@ def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = 
         "colours_outside": colours_outside(edited, known),
         "seam": _step(edited) / step if step > 0 else None,
         "high_frequency": high_frequency_energy(edited) / sharp if sharp > 0 else None,
+        "white": white(edited) - white(original),
+        "patches": patches(edited, original) / SKIES_PATCHES,
     }
+
+
+def warning(measured: dict) -> str:
+    """Return a sentence on what is unnatural in a painted edit's :func:`natural`; "" where nothing is."""
+    found = []
+    if measured["white"] > MOST_WHITE:
+        found.append(f"{100 * measured['white']:.0f} % more of it is white")
+    if measured["patches"] > MOST_PATCHES:
+        found.append(f"its patches are {measured['patches']:.1f} times those between two photographed skies")
+    if not found:
+        return ""
+    return f"the sky has changed much: {' and '.join(found)}; lower solve.freedom, or paint less"
+
+
+def white(envmap: np.ndarray) -> float:
+    """Return the share of the upper half's solid angle whose radiance is at least 1 in all channels."""
+    half = max(1, envmap.shape[0] // 2)
+    omega = np.repeat(latlong.solid_angles(*envmap.shape[:2])[:half], envmap.shape[1])
+    bright = (envmap[:half] >= 1).all(axis=2).ravel()
+    return float((omega * bright).sum() / omega.sum())
+
+
+def patches(edited: np.ndarray, original: np.ndarray) -> float:
+    """Return the RMS of the log gain of the upper half at scales of 11 to 60 degrees.
+
+    The gain is that of mean luminance in cells, with the brightest :data:`CLIPPED` of each map cut; what is
+    smooth at :data:`COARSE_DEGREES` is taken off.
+    """
+    (before, directions, omega), (after, _, _) = cells(original), cells(edited)
+    gain = after - before
+    angle = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
+    kernel = np.exp(-0.5 * (angle / COARSE_DEGREES) ** 2) * omega
+    smooth = kernel @ gain / kernel.sum(axis=1)
+    return float(np.sqrt(omega @ (gain - smooth) ** 2 / omega.sum()))
+
+
+def cells(envmap: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return log luminance (n,), direction (n, 3) and solid angle (n,) of the upper half's cells."""
+    height, width, _ = envmap.shape
+    half = max(1, height // 2)
+    shown = luminance(envmap[:half])
+    shown = np.minimum(shown, np.quantile(shown, 1 - CLIPPED))
+    omega = np.repeat(latlong.solid_angles(height, width)[:half, None], width, axis=1)
+    row = np.arange(half) * min(CELL_ROWS, half) // half
+    column = np.arange(width) * min(CELL_COLUMNS, width) // width
+    cell = row[:, None] * CELL_COLUMNS + column
+    weight = np.bincount(cell.ravel(), omega.ravel())
+    light = np.bincount(cell.ravel(), (omega * shown).ravel())
+    directions = latlong.directions(height, width)[:half].reshape(-1, 3)
+    centre = np.stack([np.bincount(cell.ravel(), omega.ravel() * axis) for axis in directions.T], axis=1)
+    used = weight > 0
+    centre = centre[used] / np.linalg.norm(centre[used], axis=1, keepdims=True)
+    return np.log(light[used] / weight[used] + LOG_EPS), centre, weight[used]
 
 
 def colours_outside(edited: np.ndarray, known: list[np.ndarray]) -> float:

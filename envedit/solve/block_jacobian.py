@@ -101,7 +101,7 @@ class BlockJacobian:
         return [tensor(m[:, cells] / np.float32(size)) for m in self._matrix]
 
     def of_cells(self, flux: np.ndarray) -> np.ndarray:
-        """Return pictures in blocks of a light of some flux (3,) in each cell of :attr:`sky`: (n, blocks, 3)."""
+        """Return pictures in blocks of a flux (3,) in each cell of :attr:`sky`, (n, blocks, 3)."""
         columns = [m.numpy() * np.float32(f) for m, f in zip(self._lit, flux, strict=True)]
         return np.stack(columns, axis=2).transpose(1, 0, 2)
 

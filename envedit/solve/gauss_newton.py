@@ -250,7 +250,7 @@ def _without(state, k):
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
     noise = problem.noise(point.residual, sigma)
-    return problem.loss(point, run.start, noise) + 6 * problem.likelihood.values * float(np.log(noise))
+    return problem.loss(point, run.start, noise) + 6 * problem.likelihood.independent * float(np.log(noise))
 
 
 class _Search:

@@ -11,9 +11,8 @@ import numpy as np
 
 from envedit import config
 from envedit.core.color import tonemap
+from envedit.solve.likelihood import VISIBLE
 
-VISIBLE = 0.02
-"""Mean change of display values from which on a change of what was not painted counts as visible."""
 LEAST, MOST_AT_ONCE, MOST = 1.5, 16.0, 256.0
 """Least and largest factor by which the weight is raised at once; largest weight."""
 

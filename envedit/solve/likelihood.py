@@ -3,16 +3,17 @@
 With r_p the root mean square over the channels of a pixel's residual of display values, minus twice the
 logarithm of the likelihood is, but for a constant,
 
-    3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  |q|^2 / sigma^2  +  6 n log(sigma)
+    3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  6 n log(sigma)  +  |q|^2
 
-* A is the number of pixels whose errors go together, n = pixels / A + m the number of independent values of a
+* A is the number of pixels whose errors go together, n = pixels / A the number of independent values of a
   channel. A rendering has :data:`INDEPENDENT`. A stroke is no measurement of each pixel that it covers, but a
   few statements (:data:`STATEMENTS`) of somebody who cannot paint physics.
 * rho_s is Huber's loss for a rendering: quadratic up to s = sigma, linear beyond, so that pixels which no light
   can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts by its
   square: a large one is the change that is asked for.
-* q is m^(1/2) times the mean of r over what was not painted, (3,): the exposure and the colour of the rest as
-  a whole. It is a statement of its own, and the pattern of the rest another (the weights w).
+* What was not painted makes two statements. Its pattern (shading, highlights, shadows) has a small weight w and
+  may follow the paint. Its mean, which is its exposure and colour as a whole, stays to :data:`VISIBLE`: q is the
+  mean residual of each channel over that, (3,), times the root of the share of pixels that were not painted.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ INDEPENDENT = 256
 """Residuals of a rendering that count as independent, per channel: neighbouring pixels err together."""
 STATEMENTS = 3.0
 """Independent values, per channel, that all paint together states."""
+VISIBLE = 0.02
+"""Mean change of display values from which on a change of what was not painted counts as visible."""
 
 
 @dataclass(frozen=True)
@@ -40,40 +43,31 @@ class Likelihood:
     robust : bool
         Huber's loss in place of squares.
     rest : ndarray (h, w, 1) or None
-        Pixels whose mean is a statement of its own, as shares in [0, 1]; None: there is none.
-    mean_counts : float
-        For how many independent values this mean counts.
+        How much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none.
     """
 
     weight: np.ndarray
     independent: float = INDEPENDENT
     robust: bool = True
     rest: np.ndarray | None = None
-    mean_counts: float = 0.0
 
     @classmethod
     def of_paint(cls, weight: np.ndarray, coverage: np.ndarray) -> Likelihood:
-        """Return the likelihood of a painted picture.
-
-        Its paint counts for :data:`STATEMENTS`, its rest for as much more as it weighs beside the paint, and
-        the mean of the rest for :data:`STATEMENTS` times the share of pixels that are rest: where nearly all
-        is painted, nothing is said of an exposure that stays.
+        """Return the likelihood of a painted picture, whose rest counts for as much as it weighs beside paint.
 
         Parameters
         ----------
         weight, coverage : ndarray (h, w, 1)
             How much each pixel counts, and was painted.
         """
-        counted = weight > 0
-        painted = float((weight * coverage).sum(dtype=np.float64) / weight.sum(dtype=np.float64))
-        rest = (1 - coverage) * counted
-        share = float(rest.sum(dtype=np.float64) / counted.sum())
+        total = weight.sum(dtype=np.float64)
+        painted = float(weight[coverage > 0].sum(dtype=np.float64) / total)
+        rest = (1 - coverage) * (weight > 0)
         return cls(
             weight=on_average_one(weight, weight.shape[:2]),
             independent=STATEMENTS / painted if painted > 0 else STATEMENTS,
             robust=False,
-            rest=rest if share > 0 else None,
-            mean_counts=STATEMENTS * share,
+            rest=rest if rest.any() else None,
         )
 
     @property
@@ -82,29 +76,28 @@ class Likelihood:
         return max(1.0, self.weight.size / self.independent)
 
     @property
-    def values(self) -> float:
-        """Independent values of a channel, n."""
-        return self.independent + (0.0 if self.rest is None else self.mean_counts)
-
-    @property
-    def share(self) -> np.ndarray | float:
-        """What each pixel contributes to q, (h, w, 1); 0 where there is no such statement."""
+    def share(self) -> np.ndarray:
+        """What each pixel contributes to q, (h, w, 1)."""
         if self.rest is None:
-            return 0.0
-        return np.sqrt(self.mean_counts) * self.rest / self.rest.sum(dtype=np.float64)
+            return np.zeros_like(self.weight)
+        total = self.rest.sum(dtype=np.float64)
+        counted = np.count_nonzero(self.weight)
+        return (np.sqrt(total / counted) / (VISIBLE * total) * self.rest).astype(np.float32)
 
     def mean(self, residual: np.ndarray) -> np.ndarray:
         """Return q of a residual (h, w, 3): (3,)."""
         return (residual * self.share).sum(axis=(0, 1))
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
-        """Return the first two parts of the formula above."""
+        """Return the first and the last part of the formula above."""
+        return self._pixels(residual, sigma) + float(np.square(self.mean(residual)).sum())
+
+    def _pixels(self, residual, sigma):
         size = sizes(residual)
         loss = size**2
         if self.robust:
             loss = np.where(size <= sigma, loss, sigma * (2 * size - sigma))
-        mean = np.square(self.mean(residual)).sum()
-        return float((3 * (self.weight * loss).sum() / self.area + mean) / sigma**2)
+        return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
 
     def weights(self, residual: np.ndarray, sigma: float) -> np.ndarray:
         """Return the weights (h, w, 1) under which a sum of squares has the gradient of the first part."""
@@ -114,15 +107,16 @@ class Likelihood:
         return weight
 
     def noise(self, residual: np.ndarray, least: float) -> float:
-        """Return the standard error under which the misfit is what independent values of it have, 3 n.
+        """Return the standard error under which the first part is what independent values of it have, 3 n.
 
         The most likely one: for squares exactly, with Huber's loss as an M-estimate of scale (not his
         proposal 2). At least ``least``.
         """
-        if self.misfit(residual, least) <= 3 * self.values:
+        found = self._pixels(residual, least) / (3 * self.independent)
+        if found <= 1:
             return least
         if not self.robust:
-            return least * float(np.sqrt(self.misfit(residual, least) / (3 * self.values)))
+            return least * float(np.sqrt(found))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)
@@ -130,10 +124,15 @@ class Likelihood:
         r, w = (v.ravel()[order].astype(np.float64) for v in (size, self.weight))
         a = np.cumsum(np.append(0, w * r * r))
         b, c = (np.append(np.cumsum(part[::-1])[::-1], 0) for part in (w * r, w))
-        d = self.area * self.values
+        d = self.area * self.independent
         sigma = (b + np.sqrt(b * b + (d + c) * a)) / (d + c)
         inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
         return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
+
+    def at_best(self, residual: np.ndarray, least: float) -> float:
+        """Return the formula above at the most likely noise."""
+        sigma = self.noise(residual, least)
+        return self.misfit(residual, sigma) + 6 * self.independent * float(np.log(sigma))
 
 
 def on_average_one(weight: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:

@@ -178,8 +178,8 @@ class Problem(Unknowns):
         """
         state, n = point.state, self.nodes
         robust = self.likelihood.weights(point.residual, sigma)
-        share = self.likelihood.share / sigma * np.ones_like(robust)
-        mean = self.likelihood.mean(point.residual) / sigma
+        share = self.likelihood.share
+        mean = self.likelihood.mean(point.residual)
         slope = display_curve.slope(point.rendering)
         blocks, linear = self.blocks, self.derivatives.at(point)
         pictures, profile = linear.pictures, linear.profile
@@ -276,8 +276,10 @@ class Problem(Unknowns):
 
     def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
         """Return the state after a damped step; None if the step is not finite."""
-        damped = normal.hessian.copy()
-        damped[np.diag_indices_from(damped)] *= 1 + damping
+        # Of the prior all is damped: off the diagonal it has what makes nodes go together.
+        damped = normal.hessian + damping * normal.precision
+        diagonal = np.diag_indices_from(damped)
+        damped[diagonal] += damping * (normal.hessian - normal.precision)[diagonal]
         try:
             step = -solved(np.linalg.cholesky(damped), normal.gradient)
             if self.saturates:

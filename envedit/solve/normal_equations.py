@@ -32,7 +32,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class MeanOfRest:
-    """The mean of what was not painted, q / sigma of ``likelihood.py``, as one more residual of each channel.
+    """The mean of what was not painted, q of ``likelihood.py``, as one more residual of each channel.
 
     Attributes
     ----------

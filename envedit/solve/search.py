@@ -9,7 +9,7 @@ approximation (MacKay 1992),
 
 with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2. What an unknown
 gains in misfit it pays for by how far it is determined beyond its prior. The best explanation is kept if its
-number is lower by :data:`STRONG`, and the search goes on from there.
+number is lower by :data:`POSITIVE`, and the search goes on from there.
 """
 
 from __future__ import annotations
@@ -25,11 +25,13 @@ from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import gauss_newton
+from envedit.solve.likelihood import Likelihood
 from envedit.solve.map_problem import SIGMA, Problem
 from envedit.solve.unknowns import Point
 
-STRONG = 6.0
-"""By how much -2 log evidence must be lower for another explanation: strong evidence (Kass and Raftery 1995)."""
+POSITIVE = 2.0
+"""By how much -2 log evidence must be lower for another explanation: "positive" evidence by Kass and Raftery
+(1995), below which it is "not worth more than a bare mention"."""
 LIGHT = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 STEPS = 5
@@ -100,12 +102,12 @@ def search(
     best = _descended(problem, "lights left where they are", start, start, sigma)
     while best.point.residual is not None:
         found = []
-        for move in _moves(problem, best):
+        for move in _moves(problem, best, sigma):
             found.append(_descended(problem, move.name, move.state, move.centre, sigma))
             if after_step:
                 after_step()
         least = min(found, key=lambda one: one.score, default=best)
-        if not least.score < best.score - STRONG:
+        if not least.score < best.score - POSITIVE:
             break
         best = least
     return best
@@ -118,7 +120,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     noise = problem.noise(point.residual, sigma)
     normal = problem.normal(point, run.start, noise, descent=False)
     (_, known), (_, expected) = np.linalg.slogdet(normal.hessian), np.linalg.slogdet(normal.precision)
-    likelihood = problem.loss(point, run.start, noise) + 6 * problem.likelihood.values * np.log(noise)
+    likelihood = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
     found = float(likelihood + known - expected + LIGHT * len(problem.added(run.state)))
     return found if np.isfinite(found) else np.inf
 
@@ -135,24 +137,27 @@ def _descended(problem, name, state, centre, sigma):
 # ---- Moves ---------------------------------------------------------------------------------------------------
 
 
-def _moves(problem, best):
+def _moves(problem, best, sigma):
     """List the most promising moves from an explanation.
 
-    Promising is what lowers the misfit, all else as it is, so far that the evidence may rise by it: with the
-    noise at its most likely value, -2 log likelihood is 3 n times the logarithm of the misfit.
+    Lights come first: the sky's gain is as in the original. Promising is what raises the likelihood then, all
+    else as it is, so far that the evidence may rise by it.
     """
-    now = problem.misfit(best.point.residual, 1.0)
+    state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
+    now = _unlikeliness(problem, state, sigma)
     found = []
-    for name, state, centre, misfit, cost in _changes(problem, best):
-        gain = 3 * problem.likelihood.values * np.log(now / max(misfit, 1e-30)) - cost
-        if gain > STRONG:
-            found.append(_Move(name, state, centre, gain))
+    for name, changed, centre, unlikeliness, cost in _changes(problem, state, best.run.start, sigma):
+        gain = now - unlikeliness - cost
+        if gain > POSITIVE:
+            found.append(_Move(name, changed, centre, gain))
     return sorted(found, key=lambda move: -move.gain)[:CANDIDATES]
 
 
-def _changes(problem, best) -> Iterator[tuple[str, dict, dict, float, float]]:
-    """Yield what can be done to the lights: name, state, centre of the prior, misfit, cost of the light."""
-    state, start = best.run.state, best.run.start
+def _changes(problem, state, start, sigma) -> Iterator[tuple[str, dict, dict, float, float]]:
+    """Yield what can be done to the lights.
+
+    Its name, state, centre of the prior, -2 log likelihood, and what it costs to add the light.
+    """
     lights = problem.layers.lights
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
 
@@ -161,11 +166,11 @@ def _changes(problem, best) -> Iterator[tuple[str, dict, dict, float, float]]:
         dark = _changed(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
-        for direction, flux, misfit in _places(problem, dark, k, away):
+        for direction, flux, unlikeliness in _places(problem, dark, k, sigma, away):
             turn = rotation_vector(lights.centres[k], direction)
             moved = _changed(state, k, turn=turn, flux=flux)
             centre = _changed(start, k, turn=turn) if own else _changed(start, k, turn=turn, flux=flux)
-            yield f"light {k + 1} moved", moved, centre, misfit, 0.0
+            yield f"light {k + 1} moved", moved, centre, unlikeliness, 0.0
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
@@ -173,18 +178,18 @@ def _changes(problem, best) -> Iterator[tuple[str, dict, dict, float, float]]:
             size = np.log(SOFT_DEGREES / LOBE_DEGREES)
             soft = _changed(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = _changed(start, spare[0], turn=turn, flux=flux, size=size)
-            yield f"light {k + 1} softened", soft, centre, _misfit(problem, soft), 0.0
+            yield f"light {k + 1} softened", soft, centre, _unlikeliness(problem, soft, sigma), 0.0
         # ---- out, if it was added
         if not own:
-            yield f"light {k + 1} removed", dark, start, _misfit(problem, dark), -LIGHT
+            yield f"light {k + 1} removed", dark, start, _unlikeliness(problem, dark, sigma), -LIGHT
 
     # ---- one more
     for k in spare[:1]:
-        for direction, flux, misfit in _places(problem, state, k):
+        for direction, flux, unlikeliness in _places(problem, state, k, sigma):
             turn = rotation_vector(lights.centres[k], direction)
             more = _changed(state, k, turn=turn, flux=flux, size=0.0)
             centre = _changed(start, k, turn=turn, flux=flux, size=0.0)
-            yield "light added", more, centre, misfit, LIGHT
+            yield "light added", more, centre, unlikeliness, LIGHT
 
 
 def _changed(state, k, **values):
@@ -195,16 +200,16 @@ def _changed(state, k, **values):
     return state
 
 
-def _misfit(problem, state):
+def _unlikeliness(problem, state, sigma):
     point = problem.evaluate(state)
-    return np.inf if point.residual is None else problem.misfit(point.residual, 1.0)
+    return np.inf if point.residual is None else problem.likelihood.at_best(point.residual, sigma)
 
 
-# ---- Where a light lowers the misfit -------------------------------------------------------------------------
+# ---- Where a light raises the likelihood ---------------------------------------------------------------------
 
 
-def _places(problem, state, k, away=None):
-    """List where light ``k``, dark in a state, lowers the misfit most: direction, log flux (3,), misfit.
+def _places(problem, state, k, sigma, away=None):
+    """List where light ``k``, dark in a state, raises the likelihood most: direction, log flux (3,), -2 log.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
     the best ones through exact columns. Places differ by :data:`APART`, also from ``away``.
@@ -217,50 +222,50 @@ def _places(problem, state, k, away=None):
     own, flux = k < lights.own, lights.flux[k]
     pixels = np.maximum(np.bincount(blocks.block_of, minlength=blocks.count), 1)[:, None]
     seen = _Seen(
+        likelihood=likelihood,
+        sigma=sigma,
         before=blocks.summed(point.rendering) / pixels,
         target=blocks.summed(problem.picture) / pixels,
-        weight=blocks.summed(likelihood.weight)[:, 0] / likelihood.area,
-        share=blocks.summed(likelihood.share * np.ones_like(likelihood.weight))[:, 0],
+        weight=blocks.summed(likelihood.weight)[:, 0],
+        share=blocks.summed(likelihood.share)[:, 0],
     )
-    factors, misfit = seen.best(blocks.of_cells(flux), own)
+    factors, unlikeliness = seen.best(blocks.of_cells(flux), own)
     if away is not None:
-        misfit = np.where(directions @ away > APART, np.inf, misfit)
+        unlikeliness = np.where(directions @ away > APART, np.inf, unlikeliness)
     found = []
     for _ in range(CANDIDATES):
-        at = int(np.argmin(misfit))
-        if not np.isfinite(misfit[at]):
+        at = int(np.argmin(unlikeliness))
+        if not np.isfinite(unlikeliness[at]):
             break
-        misfit = np.where(directions @ directions[at] > APART, np.inf, misfit)
-        found.append(_refined(problem, point, flux, own, directions[at], factors[at], misfit[at]))
+        unlikeliness = np.where(directions @ directions[at] > APART, np.inf, unlikeliness)
+        found.append(_refined(problem, point, flux, own, directions[at], sigma))
     return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in found]
 
 
-def _refined(problem, point, flux, own, direction, factor, least):
-    """Look around a direction through exact columns; returns direction, factor of the flux, misfit."""
+def _refined(problem, point, flux, own, direction, sigma):
+    """Look around a direction through exact columns; returns direction, factor of the flux, -2 log likelihood."""
     transport, likelihood = problem.transport, problem.likelihood
     height, width = problem.envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
     seen = _Seen(
+        likelihood=likelihood,
+        sigma=sigma,
         before=point.rendering.reshape(-1, 3),
         target=problem.picture.reshape(-1, 3),
-        weight=likelihood.weight.ravel() / likelihood.area,
-        share=(likelihood.share * np.ones_like(likelihood.weight)).ravel(),
+        weight=likelihood.weight.ravel(),
+        share=likelihood.share.ravel(),
     )
     row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
     for spacing in SPACINGS:
-        if transport.capacity < 9:  # memory leaves no exact columns to refine
-            break
         steps = spacing * np.arange(-1, 2)
         first = problem.rows.start
         rows = np.unique(np.clip(row + steps, first, first + problem.layers.shape[0] - 1))
         texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
         unit = (flux / omega[texels // width][:, None]).astype(np.float32)
-        factors, misfit = seen.best(transport.probe(texels) * unit[:, None, :], own)
-        at = int(np.argmin(misfit))
-        factor, least = factors[at], misfit[at]
+        factors, unlikeliness = seen.best(transport.probe(texels) * unit[:, None, :], own)
+        at = int(np.argmin(unlikeliness))
         row, column = divmod(int(texels[at]), width)
-        direction = latlong.directions(height, width)[row, column]
-    return direction, factor, float(least)
+    return latlong.directions(height, width)[row, column], factors[at], float(unlikeliness[at])
 
 
 @dataclass(frozen=True)
@@ -271,25 +276,31 @@ class _Seen:
     likelihood.
     """
 
+    likelihood: Likelihood
+    sigma: float
     before: np.ndarray
     target: np.ndarray
     weight: np.ndarray
     share: np.ndarray
 
     def best(self, pictures, own):
-        """Return the factor by which each picture (k, n, 3) lowers the misfit most, and the misfit then."""
+        """Return the likeliest factor of the flux of each picture (k, n, 3), and -2 log likelihood then."""
         unit = np.ones(len(pictures))
         if not own:  # of any flux
             unit = self.before.mean() / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
         goal = _display(self.target)
+        count = 3 * self.likelihood.independent
         least, found = np.full(len(pictures), np.inf), np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
             more = pictures * np.float32(factor * unit)[:, None, None]
             off = _display(np.float32(self.before) + more) - goal
-            misfit = np.einsum("knc,knc,n->k", off, off, self.weight)
-            misfit += np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)
-            better = misfit < least
-            least, found = np.where(better, misfit, least), np.where(better, factor * unit, found)
+            squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
+            mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)
+            variance = np.maximum(squares / count, self.sigma**2)
+            unlikeliness = squares / variance + count * np.log(variance) + mean
+            better = unlikeliness < least
+            least = np.where(better, unlikeliness, least)
+            found = np.where(better, factor * unit, found)
         return found, least
 
 

@@ -9,8 +9,9 @@ import os
 import re
 import stat
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 from envedit.core.errors import EnveditError, InputError
 
@@ -76,7 +77,7 @@ def write_atomically(path: FilePath, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def opened(path: FilePath) -> BinaryIO:
+def opened(path: FilePath) -> BufferedReader:
     """Open a regular file for reading bytes; a pipe or a device would wait or never end.
 
     Raises

@@ -1,15 +1,17 @@
 """What page and server say to each other, and ``painted.toml``."""
 
 import json
+import os
 import struct
 
 import numpy as np
 import pytest
 
 from envedit import config
+from envedit.cli import paint
 from envedit.cli.paint import project, protocol, worker
 from envedit.cli.paint.session import Tell
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, InputError
 
 STROKE = {"type": "shadow", "points": [[0.1, 0.2], [0.3, 0.4]], "width": 0.1}
 
@@ -36,6 +38,8 @@ def message(**more):
         (message(document={"strokes": [{"type": "x"}]}), r"target.strokes\[0\].type"),
         (message(document={"strokes": [{**STROKE, "width": -1}]}), r"target.strokes\[0\].width"),
         (message(document={"strokes": [STROKE] * 501}), "expected at most 500"),
+        (message(document={"strokes": ["unread"] * 501}), "expected at most 500"),
+        (message(document={"strokes": [{**STROKE, "points": ["unread"] * 20_001}]}), "expected at most 500"),
         (message(document={"lights": [{"light": 9}]}), r"input.lights\[0\].light"),
         (message(document={"lights": [{"light": 1}, {"light": 1}]}), "more than once"),
         (message(document={"lights": [{"azimuth": 1}]}), "azimuth and elevation"),
@@ -90,6 +94,21 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     assert config.load(opened.folder / "painted.toml").target.kind == "none"
     other = project.opened(str(file), envmap="scene")
     assert other.folder == tmp_path / "edit_out-2", "another map's painting would be overwritten"
+
+
+def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):
+    file = tmp_path / "edit.toml"
+    file.write_text('[input]\nenvmap = "sunsky"\n')
+    opened = project.opened(str(file))
+    with opened.alone():
+        said = f"edit_out: process {os.getpid()} .* has this painting open"
+        with pytest.raises(InputError, match=said), project.opened(str(file)).alone():
+            pass
+        assert paint.main([str(file), "--no-browser", "--port", "0"]) == 3
+        assert "has this painting open: end that `envedit paint`" in capsys.readouterr().err
+    with opened.alone():
+        assert len(list(opened.folder.iterdir())) == 1
+    assert list(opened.folder.iterdir()) == []
 
 
 def test_what_paint_cannot_solve_is_refused(tmp_path):

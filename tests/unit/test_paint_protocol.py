@@ -2,14 +2,18 @@
 
 import json
 import os
+import resource
 import struct
+from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit import config
 from envedit.cli import paint
-from envedit.cli.paint import project, protocol, worker
+from envedit.cli.paint import project, protocol, session, worker
 from envedit.cli.paint.session import Tell
 from envedit.core.errors import ConfigError, InputError
 
@@ -116,6 +120,33 @@ def test_what_paint_cannot_solve_is_refused(tmp_path):
     file.write_text('preset = "paper"\n')
     with pytest.raises(ConfigError, match="expected layers and transport"):
         project.opened(str(file))
+
+
+def test_memory_is_given_back_when_nothing_is_left_to_do(monkeypatch):
+    given, resting = [], session.Session.__new__(session.Session)
+    monkeypatch.setattr(session, "give_back_memory", lambda: given.append(resting.phase))
+    states = (True, False, "done"), (False, True, "dragging")
+    for resting.resting, resting._dragged, resting.phase in states:
+        assert not resting.advance()
+    resting._worked = lambda: True
+    resting._dragged = False
+    assert resting.advance()
+    assert given == ["done"], "while a light is dragged the next frame needs the buffers"
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
+def test_what_is_given_back_leaves_the_process():
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    cycle = [dr.arange(mi.Float, 2**25)]
+    cycle.append(cycle)
+    dr.eval(cycle[0])
+    dr.sync_thread()
+    del cycle
+    kept = resident()
+    session.give_back_memory()
+    assert kept - resident() > 0.9 * 4 * 2**25
 
 
 def test_a_stroke_is_solved_for_while_it_is_drawn_however_fast_the_pointer_moves():

@@ -14,11 +14,15 @@ Longer than 400 lines: one class; edits, idle work and frames act on the same so
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from envedit import config, inputs, pipeline, renderers
@@ -69,6 +73,17 @@ class Tell:
 
     def say(self, message: dict) -> None:
         """Send a message."""
+
+
+def give_back_memory() -> None:
+    """Return to the system what Dr.Jit and the C library keep of freed buffers for the next ones.
+
+    Problems that were solved, which hold large arrays, are in reference cycles: they are collected first.
+    """
+    gc.collect()
+    dr.flush_malloc_cache()
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # glibc's alone
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Session:
@@ -270,8 +285,13 @@ class Session:
 
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
-        if self._dragged or self.resting:
-            return False
+        more = not self._dragged and not self.resting and self._worked()
+        if not more and self.phase == "done":
+            give_back_memory()
+        return more
+
+    def _worked(self):
+        """Do a piece of work; False where there is none left."""
         if not self.converged:
             self._step()
             return True

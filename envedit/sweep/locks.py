@@ -79,7 +79,7 @@ class Lock:
 def _holder(path, now):
     """Who holds a lock, in words; empty if its owner is dead or it is gone.
 
-    A time far in the future tells as little of a living owner as one far in the past.
+    A time far in the future is no sign of a living owner, as one far in the past is none.
     """
     try:
         age = abs(now - path.stat().st_mtime)

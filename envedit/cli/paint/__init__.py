@@ -37,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
         elif arguments.envmap:
             opened = project.opened("sphere", arguments.envmap, arguments.preset)
         if opened is not None:
-            with opened.alone():  # told here where another server has it; the worker holds it
+            with opened.alone():  # an error here if another server has it; the worker holds it
                 pass
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)

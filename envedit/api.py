@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from envedit import config, inputs
 from envedit.config.validators import show
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.radiance import require_unmasked
 from envedit.images import analytic_sky, images
 from envedit.pipeline import Watch, run
 from envedit.representations.siren import fit as siren
@@ -82,7 +83,7 @@ def edit(
         The configuration has an unknown key or an unusable value, which the message names, or arguments do
         not go together.
     InputError
-        A file or an array cannot be used: missing, of another shape, not finite.
+        A file or an array cannot be used: missing, of another shape, not finite, masked.
     EnveditError
         As :func:`envedit.pipeline.run`.
 
@@ -306,6 +307,7 @@ def _settings(given: object) -> tuple[config.Config, Path | None]:
 
 def _array(name: str, value: ArrayLike) -> np.ndarray:
     """Return an argument as float32, as which it is saved; shape and values are checked where it is used."""
+    require_unmasked(value, name)
     try:
         found = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths

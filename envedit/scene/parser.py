@@ -16,6 +16,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import atomic_files
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene_files
 
@@ -275,8 +276,7 @@ def hash_node(digest: hashlib._Hash, node: mi.parser.SceneNode) -> None:
         digest.update(f"{key}=".encode())
         if key == "filename":
             try:
-                with open(value, "rb") as file:
-                    digest.update(hashlib.file_digest(file, "sha256").digest())
+                digest.update(atomic_files.digest(value))
             except OSError as error:
                 raise InputError(f"{value}: cannot be read ({error.strerror})") from None
         else:

@@ -40,6 +40,7 @@ from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_text, supported
 
@@ -160,6 +161,7 @@ class Scene:
         NumericalError
             If a texel is not finite or is negative in float32; one such texel spoils every lit pixel.
         """
+        require_unmasked(image, "environment map")
         image = np.asarray(image)
         if image.ndim != 3 or image.shape[2] != 3 or not np.issubdtype(image.dtype, np.number):
             what = f"shape {image.shape} of {image.dtype}"

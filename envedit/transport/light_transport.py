@@ -34,7 +34,7 @@ from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError
-from envedit.core.radiance import require_radiance
+from envedit.core.radiance import require_radiance, require_unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
@@ -532,6 +532,7 @@ class LightTransport:
             Number of columns traced. Texels stay exact while there is room; then those that are not bright
             any more make room for those that are.
         """
+        require_unmasked(envmap, "light transport")
         envmap, exact = np.asarray(envmap), self._exact
         wanted = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
         tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1

@@ -7,12 +7,14 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 
 import numpy as np
 import pytest
 
+from envedit.cli.paint import protocol
 from envedit.cli.paint.protocol import Document
 from tests.oracles.painting import SMALL, asked, connected, heard, served, until
 
@@ -71,6 +73,30 @@ def test_no_other_file_is_served_or_written(server):
     put = {"method": "PUT", "data": b"#?RADIANCE", "headers": {"Origin": server.origins[0]}}
     assert asked(f"{server.url}map/a.hdr", **put)[0] == 409  # on the start page only
     assert set(os.listdir()) <= {"edit.toml", "edit_out", "secret.txt"}
+
+
+def test_an_address_without_its_slash_is_not_redirected(server):
+    for path in (f"/{server.token}", "/somebody/ws/", f"/{server.token}/main.js/"):
+        with socket.create_connection(("127.0.0.1", server.port), timeout=30) as plain:
+            plain.sendall(f"GET {path} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n".encode())
+            answer = plain.makefile("rb").read()
+        assert answer.startswith(b"HTTP/1.1 404") and b"evil.example" not in answer, path
+
+
+def test_while_a_message_is_read_others_are_served(server, monkeypatch):
+    read, asked_for, waited = protocol.read, threading.Event(), []
+
+    def slow(text, client=""):
+        waited.append(asked_for.wait(20))
+        return read(text, client)
+
+    monkeypatch.setattr(protocol, "read", slow)
+    with connected(server) as page:
+        page.send("{")
+        assert asked(server.url)[0] == 200
+        asked_for.set()
+        assert "expected JSON" in heard(page, "refused")["text"]
+    assert waited == [True], "the page was served only after the message had been read"
 
 
 def test_bad_messages_are_told_and_huge_ones_end_the_connection(server):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from envedit.cli import run
 from envedit.cli.paint.protocol import Document
 from envedit.core import array_cache, atomic_files
 from envedit.core.errors import ConfigError, InputError
+from envedit.sweep import locks
 
 NAME = "painted.toml"
 _RECENT = 12
@@ -87,6 +89,30 @@ class Project:
                 return str((self.base / value).absolute())
         return value
 
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[locks.Lock]:
+        """Make the folder, and let no other server paint in it meanwhile.
+
+        Raises
+        ------
+        InputError
+            It cannot be made, or another server has it.
+        """
+        self._make_folder()
+        with locks.Lock(self.folder) as lock:
+            if lock.holder:
+                raise InputError(
+                    f"{self.folder}: {lock.holder} has this painting open: end that `envedit paint`, or "
+                    "give a configuration of another [output] dir"
+                )
+            yield lock
+
+    def _make_folder(self):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
+
     def keep(self, document: Document) -> None:
         """Write ``painted.toml``, whole or not at all.
 
@@ -95,10 +121,7 @@ class Project:
         InputError
             It cannot be written.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
+        self._make_folder()
         atomic_files.write_atomically(self.folder / NAME, self.text(document).encode())
 
 

@@ -14,11 +14,15 @@ Longer than 400 lines: one class; edits, idle work and frames act on the same so
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from envedit import config, inputs, pipeline, renderers
@@ -26,7 +30,7 @@ from envedit.cli.paint.project import Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.errors import NumericalError
+from envedit.core.errors import ConfigError, NumericalError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
@@ -69,6 +73,17 @@ class Tell:
 
     def say(self, message: dict) -> None:
         """Send a message."""
+
+
+def give_back_memory() -> None:
+    """Return to the system what Dr.Jit and the C library keep of freed buffers for the next ones.
+
+    Problems that were solved, which hold large arrays, are in reference cycles: they are collected first.
+    """
+    gc.collect()
+    dr.flush_malloc_cache()
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # glibc's alone
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Session:
@@ -119,29 +134,56 @@ class Session:
         self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
-        self._aim(project.document)
+        self._aim(self._usable(project.document))
+
+    def _usable(self, document):
+        """Return a document without the strokes on views that the scene has not, each with a note."""
+        kept = []
+        for i, stroke in enumerate(document.strokes):
+            try:
+                self.lit.view(stroke.get("view", 0), f"target.strokes[{i}].view")
+            except ConfigError as error:
+                self.notes = [*self.notes, f"{error}: the stroke is left out"]
+            else:
+                kept.append(stroke)
+        return replace(document, strokes=tuple(kept))
 
     # ---- edits ---------------------------------------------------------------------------------------------
 
     def update(self, edit: Edit) -> None:
-        """Take a document: paint, move lights, and show what is known at once."""
+        """Take a document: paint, move lights, and show what is known at once.
+
+        One that cannot be painted or shown is refused: that before it stays, and pages get it back.
+        """
         began = time.perf_counter()
         before, self.document = self.document, edit.document
         moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
         self.phase, self._rendered, self.resting = edit.phase, None, False
         whose = {"steps": self.status["steps"], "number": edit.number, "client": edit.client}
         self.status = {"reachable": None, "iterations": 0, **whose}
-        if edit.phase == "dragging":
-            self._drag()
-        elif moved or self._dragged:
-            self._aim(edit.document)
-        else:
-            self._paint()
+        try:
+            if edit.phase == "dragging":
+                self._drag()
+            elif moved or self._dragged:
+                self._aim(edit.document)
+            else:
+                self._paint()
+            self._show("transport")
+        except Exception:
+            self.phase = "done"
+            self._aim(before)
+            self._show("transport")
+            self._tell_document("")
+            raise
+        self._tell_document(edit.client)
         if edit.phase == "done":
             self.project.keep(self.document)
-        self._show("transport")
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self.tell_state()
+
+    def _tell_document(self, client):
+        """Say what is painted, to all pages but the one that has painted it."""
+        self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
 
     def _aim(self, document):
         """Take lights and turn of a document for the map that is painted on."""
@@ -243,8 +285,13 @@ class Session:
 
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
-        if self._dragged or self.resting:
-            return False
+        more = not self._dragged and not self.resting and self._worked()
+        if not more and self.phase == "done":
+            give_back_memory()
+        return more
+
+    def _worked(self):
+        """Do a piece of work; False where there is none left."""
         if not self.converged:
             self._step()
             return True

@@ -146,7 +146,7 @@ const RECEIVED = {
     say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();
   },
-  document(message) { history.follow({ ...EMPTY, ...message.document }); refresh(); },
+  document(message) { history.follow({ ...EMPTY, ...message.document }, !message.client); refresh(); },
   lights(message) { lights.set(message); },
   status(message) {
     last = message;

@@ -164,6 +164,7 @@ def run(
             target = solved
     predicted = None
     if traced:
+        warnings += traced.warnings
         with in_file_units(), keeping(edited):
             predicted = traced.coarse_error(edited)
 

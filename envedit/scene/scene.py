@@ -7,7 +7,7 @@ that is not used cannot get in the way:
 - the environment emitter, whatever its kind, becomes an ``envmap`` with the same orientation whose texels
   are set by :meth:`Scene.set_envmap`;
 - the film gets the asked size and float32 RGB; its reconstruction filter stays the author's;
-- the integrator gives way to ``path``, with the path depth and ``hide_emitters`` that it asks for;
+- the integrator gives way to ``path``, with ``max_depth``, ``rr_depth`` and ``hide_emitters`` of its own;
 - a rough BSDF whose alpha is at most 1e-4, which Mitsuba would clamp, becomes its limit, the smooth one;
 - a shape with the properties ``fit_height`` (and ``fit_up``, one of x, y, z with or without a minus) is
   centred on the y axis, set on the plane y = 0 and scaled to that height, or to 1.5 times it in width.
@@ -93,6 +93,8 @@ class Scene:
         File and scale of the map that the scene itself names.
     max_depth : int
         Longest path in segments that the scene's integrator asks for, as Mitsuba counts them; -1: any.
+    rr_depth : int
+        Path length in segments from which on Russian roulette ends paths.
     hide_emitters : bool
         The camera sees neither the environment nor shapes that are lamps.
     notes : tuple of str
@@ -115,6 +117,7 @@ class Scene:
     views: tuple[View, ...]
     own: supported.OwnMap = supported.OwnMap(None, 1.0)
     max_depth: int = -1
+    rr_depth: int = supported.ROULETTE
     hide_emitters: bool = False
     notes: tuple[str, ...] = ()
     parameters: dict[str, str | float | bool] = field(default_factory=dict)
@@ -284,8 +287,8 @@ class Scene:
     def _traced(self, count, seed, i, max_depth):
         """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
-        asked = {"type": "path", "max_depth": max_depth, "hide_emitters": self.hide_emitters}
-        integrator = mi.load_dict(asked)
+        asked = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+        integrator = mi.load_dict({"type": "path", **asked})
         pictures = []
         for k in range(len(self.views)):
             pass_seed = int(np.random.SeedSequence([seed, i, k]).generate_state(1)[0])
@@ -393,7 +396,7 @@ def load(
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    rest = views, own, asked.max_depth, asked.hide_emitters, notes
+    rest = views, own, asked.max_depth, asked.rr_depth, asked.hide_emitters, notes
     given: dict[str, Any] = dict(parameters or {})
 
     def again(width: int, height: int) -> Scene:

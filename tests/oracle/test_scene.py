@@ -47,6 +47,19 @@ def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(
     np.testing.assert_allclose(ours[0, 0], seen, rtol=0.2)
 
 
+def test_russian_roulette_begins_where_the_scene_says(tmp_path, rng):
+    image = sky(rng)
+    for kind in ("path", "volpath"):
+        asked = f'<integrator type="{kind}"><integer name="rr_depth" value="1"/></integrator>'
+        loaded = scene.load(write_scene(tmp_path, asked, SENSOR, BALL, LIGHT))
+        ours = loaded.render(image, spp=16, seed=3)
+        seed = int(np.random.SeedSequence([3, 0, 0]).generate_state(1)[0])
+        for depth in (1, 5):
+            integrator = mi.load_dict({"type": "path", "rr_depth": depth})
+            theirs = film.render(loaded.mi, integrator, 16, seed)[..., :3].astype(np.float32)
+            assert np.array_equal(ours, theirs) == (depth == 1)
+
+
 def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     picture = loaded.render(np.ones((8, 16, 3)), spp=256)

@@ -51,6 +51,7 @@ QUIET_LEAST, QUIET_MOST = 256, 768
 """Samples a pixel between which a rendering of "auto" ends."""
 _QUIET_PASS = 64  # samples a pixel
 _ALPHA_SPP = 256
+_SAMPLED = 3e-4  # of the radiance of a pole's row, in the next row, which adds 0.2 % to the light
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -176,6 +177,9 @@ class Scene:
                 f"environment map: {bad} texels are not finite or are negative, "
                 f"the first at row {row}, column {column}: {image[row, column, channel]} in {'RGB'[channel]}"
             )
+        if not image[1:-1].any():  # Mitsuba's density has a factor sin(theta): it would sample nothing
+            image = image.copy()
+            image[[1, -2]] = np.maximum(image[[1, -2]], _SAMPLED * image[[0, -1]])
         self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
         self.params.update()
 

@@ -840,6 +840,20 @@ def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng, monkeypatch
     assert pipeline.run(settings).history
 
 
+@pytest.mark.parametrize("kind", ["light in the row of the pole", "below the least normal number"])
+def test_light_that_makes_no_picture_comes_back_bit_for_bit(kind, tmp_path):
+    picture = np.zeros((16, 32, 3), np.float32)
+    if "pole" in kind:
+        picture[0] = [100, 90, 80]
+    else:
+        picture[:] = 1e-40
+    itself = {"file": "map.exr", "spp": 256}
+    asked = {"input": {"rows": "all", "width": 32}, "target": itself, "renderer": {"spp": 256}}
+    found = pipeline.run(settings_of(tmp_path, picture, **asked))
+    assert found.envmap.tobytes() == picture.tobytes()
+    assert (found.renders["target"].max() > 0.01) == ("pole" in kind)
+
+
 def test_keys_that_gauss_newton_does_not_use_are_named(tmp_path, rng):
     asked = {"optimizer": {"iterations": 1, "lr": 0.1}, "loss": {"ssim": 0.5}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **asked))

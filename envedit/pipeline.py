@@ -36,6 +36,9 @@ from envedit.targets.working_size import at_size
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
+LEAST_GAIN = 0.05
+"""Share of the residual below which an edit has achieved nothing: 0.45 dB."""
+
 
 @dataclass
 class _Clock:
@@ -184,9 +187,9 @@ def run(
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, _ = lit.sampled(edited, spp, seed)
-        initial = target.initial
-        if initial is None:  # the same samples: what differs is the map
-            initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
+        # The same samples: what differs is the map.
+        unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
+        initial = unedited if target.initial is None else target.initial
         lights, core = _lights(original, edited, lit.to_world, edit.degrees)
 
     # ---- Notes
@@ -205,13 +208,23 @@ def run(
         stored = given.as_stored(edited, edit.degrees)
         measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit)
     rate = "; lower optimizer.lr" if job.raised_rate else ""
-    pair = [measured[name] for name in ("render", "initial")]
-    measured["worse"] = target.coverage is None and metrics.worse(*pair)
+    pair, where = [measured[name] for name in ("render", "initial")], ""
+    if target.coverage is not None:
+        painted, where = target.coverage[..., 0] > 0, " where painted"
+        tonemap = settings.output.tonemap
+        pair = [metrics.compare(one, target.picture, tonemap, None, painted) for one in (final, unedited)]
+    after, before = (metrics.score(one, pair, 2) for one in pair)
+    measured["worse"] = metrics.worse(*pair)
     if measured["worse"]:
-        after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
-            f"the result is farther from the target than the input: {after} now, {before} before; "
+            f"the result is farther from the target than the input{where}: {after} now, {before} before; "
             f"the edited map is kept anyway: look at it before you use it{rate}"
+        )
+    solving = job.settings.optimizer.iterations > 0 and not measured["worse"]
+    if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
+        warnings.append(
+            f"the edit achieved nothing in {state.step} steps: {after} from the target{where} now, {before} "
+            "before; check the target's exposure, and that the map lights what is to change"
         )
     if state.bad_steps:
         warnings.append(

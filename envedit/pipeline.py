@@ -190,7 +190,7 @@ def run(
         # The same samples: what differs is the map.
         unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         initial = unedited if target.initial is None else target.initial
-        lights, core = _lights(original, edited, lit.to_world, edit.degrees)
+        lights, core = _lights(settings, given, edited, lit.to_world, edit.degrees)
 
     # ---- Notes
     notes += [job.note] if job.note else []
@@ -288,7 +288,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
-        lights, core = _lights(original, edited, lit.to_world)
+        lights, core = _lights(settings, given, edited, lit.to_world)
     said = "no target: the result is compared with the initial rendering"
     notes = [
         *inputs.notes(settings.input, lit, given),
@@ -311,11 +311,16 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
     return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
 
 
-def _lights(original, edited, to_world, degrees=0.0):
-    """Match the lights of both maps, and return the edited one's alone as well."""
-    found = [separate(envmap) for envmap in (original, edited)]
-    before, after = (light_list.listed(one, to_world) for one in found)
-    return light_list.matched(before, after, degrees), np.minimum(found[1].core, edited).astype(np.float32)
+def _lights(settings, given, edited, to_world, degrees=0.0):
+    """Match the lights of the map as its file has it and as edited, and return the latter alone as well."""
+    original, by_hand = given.radiance, settings.input.rotate_degrees
+    first = last = separate(original if given.unmoved is None else given.unmoved)
+    if given.unmoved is not None:
+        last = light_list.kept(first, separate(original), given.unmoved, original, by_hand)
+    last = light_list.kept(last, separate(edited), original, edited, degrees)
+    before, after = (light_list.listed(one, to_world) for one in (first, last))
+    core = np.minimum(last.core, edited).astype(np.float32)
+    return light_list.matched(before, after, by_hand + degrees), core
 
 
 @contextlib.contextmanager

@@ -25,7 +25,6 @@ from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
-from envedit.representations.layers.separation import separate
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
@@ -190,7 +189,8 @@ def run(
         # The same samples: what differs is the map.
         unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         initial = unedited if target.initial is None else target.initial
-        lights, core = _lights(settings, given, edited, lit.to_world, edit.degrees)
+        by_hand = settings.input.rotate_degrees
+        lights, core = light_list.of_edit(given, edited, lit.to_world, by_hand, edit.degrees)
 
     # ---- Notes
     notes += [job.note] if job.note else []
@@ -288,7 +288,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
-        lights, core = _lights(settings, given, edited, lit.to_world)
+        lights, core = light_list.of_edit(given, edited, lit.to_world, settings.input.rotate_degrees)
     said = "no target: the result is compared with the initial rendering"
     notes = [
         *inputs.notes(settings.input, lit, given),
@@ -309,18 +309,6 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
     more |= {"settings": settings}
     return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
-
-
-def _lights(settings, given, edited, to_world, degrees=0.0):
-    """Match the lights of the map as its file has it and as edited, and return the latter alone as well."""
-    original, by_hand = given.radiance, settings.input.rotate_degrees
-    first = last = separate(original if given.unmoved is None else given.unmoved)
-    if given.unmoved is not None:
-        last = light_list.kept(first, separate(original), given.unmoved, original, by_hand)
-    last = light_list.kept(last, separate(edited), original, edited, degrees)
-    before, after = (light_list.listed(one, to_world) for one in (first, last))
-    core = np.minimum(last.core, edited).astype(np.float32)
-    return light_list.matched(before, after, by_hand + degrees), core
 
 
 @contextlib.contextmanager

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from envedit.core import latlong
-from envedit.representations.layers.separation import Light, Separation
+from envedit.inputs import InputMap
+from envedit.representations.layers.separation import Light, Separation, separate
 
 FARTHEST = math.pi + 1
 """Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
@@ -39,6 +40,37 @@ def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """
     lights = np.minimum(core, envmap).astype(np.float32)
     return np.where(lights > 0, envmap - lights, envmap).astype(np.float32), lights
+
+
+def of_edit(
+    given: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: float, degrees: float = 0.0
+) -> tuple[dict[str, list[dict]], np.ndarray]:
+    """Match the lights of a map as its file has it and as edited.
+
+    Parameters
+    ----------
+    given : inputs.InputMap
+        The map.
+    edited : ndarray (H, W, 3)
+        The edited map, linear radiance that reaches the scene.
+    to_world : ndarray (3, 3)
+        As of :func:`listed`.
+    by_hand, degrees : float
+        By how much the map was turned when it was read, and by the edit.
+
+    Returns
+    -------
+    lights : dict
+        Of :func:`matched`.
+    core : ndarray (H, W, 3) float32
+        The lights of the edited map alone.
+    """
+    first = last = separate(given.radiance if given.unmoved is None else given.unmoved)
+    if given.unmoved is not None:
+        last = kept(first, separate(given.radiance), given.unmoved, given.radiance, by_hand)
+    last = kept(last, separate(edited), given.radiance, edited, degrees)
+    before, after = (listed(one, to_world) for one in (first, last))
+    return matched(before, after, by_hand + degrees), np.minimum(last.core, edited).astype(np.float32)
 
 
 def listed(found: Separation, to_world: np.ndarray) -> list[dict]:

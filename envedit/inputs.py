@@ -74,6 +74,8 @@ class InputMap:
         The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed.
     array : ndarray (H, W, 3), optional
         The whole map, where it came as an array and not from a file.
+    unmoved : ndarray (H, W, 3), optional
+        The :attr:`radiance` as the file has it, where lights were placed or the map was turned by hand.
     """
 
     source: str
@@ -84,6 +86,7 @@ class InputMap:
     chromaticities: Chromaticities | None = None
     placed: PlacedLights | None = None
     array: np.ndarray | None = None
+    unmoved: np.ndarray | None = None
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -233,7 +236,7 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
             warnings.append(f"input.lights: got light = {named}, but {had}; the {entries} ignored")
         found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
     turned = latlong.rotate(found.stored, settings.rotate_degrees)
-    return replace(given, stored=turned, warnings=warnings, placed=placed)
+    return replace(given, stored=turned, warnings=warnings, placed=placed, unmoved=given.radiance)
 
 
 def _read(source, width, settings, scale):

@@ -25,7 +25,6 @@ from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
-from envedit.representations.layers.separation import separate
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
@@ -35,6 +34,9 @@ from envedit.targets.target import make as make_target
 from envedit.targets.working_size import at_size
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
+
+LEAST_GAIN = 0.05
+"""Share of the residual below which an edit has achieved nothing: 0.45 dB."""
 
 
 @dataclass
@@ -164,6 +166,7 @@ def run(
             target = solved
     predicted = None
     if traced:
+        warnings += traced.warnings
         with in_file_units(), keeping(edited):
             predicted = traced.coarse_error(edited)
 
@@ -183,10 +186,11 @@ def run(
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, noise = lit.sampled(edited, spp, seed)
-        initial = target.initial
-        if initial is None:  # the same samples: what differs is the map
-            initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
-        lights, core = _lights(original, edited, lit.to_world, edit.degrees)
+        # The same samples: what differs is the map.
+        unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
+        initial = unedited if target.initial is None else target.initial
+        by_hand = settings.input.rotate_degrees
+        lights, core = light_list.of_edit(given, edited, lit.to_world, by_hand, edit.degrees)
 
     # ---- Notes
     notes += [job.note] if job.note else []
@@ -206,13 +210,23 @@ def run(
     if measured["painted"] and measured["painted"]["towards"] is None:
         notes.append("the painted change is below the noise of the renderings: no share of it is measured")
     rate = "; lower optimizer.lr" if job.raised_rate else ""
-    pair = [measured[name] for name in ("render", "initial")]
-    measured["worse"] = target.coverage is None and metrics.worse(*pair)
+    pair, where = [measured[name] for name in ("render", "initial")], ""
+    if target.coverage is not None:
+        painted, where = target.coverage[..., 0] > 0, " where painted"
+        tonemap = settings.output.tonemap
+        pair = [metrics.compare(one, target.picture, tonemap, None, painted) for one in (final, unedited)]
+    after, before = (metrics.score(one, pair, 2) for one in pair)
+    measured["worse"] = metrics.worse(*pair)
     if measured["worse"]:
-        after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
-            f"the result is farther from the target than the input: {after} now, {before} before; "
+            f"the result is farther from the target than the input{where}: {after} now, {before} before; "
             f"the edited map is kept anyway: look at it before you use it{rate}"
+        )
+    solving = job.settings.optimizer.iterations > 0 and not measured["worse"]
+    if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
+        warnings.append(
+            f"the edit achieved nothing in {state.step} steps: {after} from the target{where} now, {before} "
+            "before; check the target's exposure, and that the map lights what is to change"
         )
     if state.bad_steps:
         warnings.append(
@@ -276,7 +290,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
         measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
         stored = given.as_stored(edited)
-        lights, core = _lights(original, edited, lit.to_world)
+        lights, core = light_list.of_edit(given, edited, lit.to_world, settings.input.rotate_degrees)
     said = "no target: the result is compared with the initial rendering"
     notes = [
         *inputs.notes(settings.input, lit, given),
@@ -297,13 +311,6 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
     more |= {"settings": settings}
     return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
-
-
-def _lights(original, edited, to_world, degrees=0.0):
-    """Match the lights of both maps, and return the edited one's alone as well."""
-    found = [separate(envmap) for envmap in (original, edited)]
-    before, after = (light_list.listed(one, to_world) for one in found)
-    return light_list.matched(before, after, degrees), np.minimum(found[1].core, edited).astype(np.float32)
 
 
 @contextlib.contextmanager

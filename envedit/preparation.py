@@ -133,7 +133,8 @@ class Preparation:
         """Prepare the edit; the sky is turned where that explains the target better."""
         turn, settings = self._turn(target), self.settings
         idle = replace(self, settings=replace(settings, optimizer=replace(settings.optimizer, iterations=0)))
-        noise = self._noise(target, turn)
+        known = self._noise(target, turn)
+        noise = known or 0.0
         worth = (
             turn is not None
             and turn.degrees != 0
@@ -144,7 +145,7 @@ class Preparation:
             )
         )
         if not worth:
-            if noise > 0 and self._still(turn, target) <= TO_NOISE * noise:
+            if known is not None and self._still(turn, target) <= TO_NOISE * noise:
                 said = "nothing changed: the map already renders to the target within noise"
                 said += f" (display residual of the stored transport {noise:.4f})"
                 return idle._prepared(target, 0.0, [said], search=False, ask=False)
@@ -180,20 +181,20 @@ class Preparation:
             return turning.find(transport, *seen, thorough=asked is True)
 
     def _noise(self, target, turn):
-        """Return the residual of T against Mitsuba's rendering of the map; 0 where an edit is made anyway.
+        """Return the residual of T against Mitsuba's rendering of the map; None where an edit is made anyway.
 
         That is where the target is painted, where nothing is left as it is (a network is no exact copy), and
         where neither the map nor its turn come near the target.
         """
         transport = self.renderer.transport
         if self.settings.representation.kind != "layers" or transport is None or target.coverage is not None:
-            return 0.0
+            return None
         with self.clock("start_s"):
             cache, seed = self.settings.renderer.cache, Seeds.of(self.settings.seed).turn_check
             shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
             near = turning.apart(shown, target.picture, target.weight) < 2 * TO_NOISE * NOISIEST
             if not near and (turn is None or turn.error > DOUBTFUL * NOISIEST):
-                return 0.0
+                return None
             found = turning.residual(transport, self.original, shown, target.weight)
         return found if found <= NOISIEST else QUIET
 

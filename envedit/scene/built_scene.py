@@ -22,7 +22,7 @@ from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene as scenes
 from envedit.scene.scene import Scene
-from envedit.scene.supported import OwnMap
+from envedit.scene.supported import ROULETTE, OwnMap
 
 _CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 # Names of classes, of which an integrator written in Python has another in Python than in C++.
@@ -126,11 +126,11 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     params[f"{stem}scale"] = 1.0
     params.update()
     width, views = scenes.views_of(given, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
-    depth, hide, notes = _integrator(given)
+    asked = _integrator(given)
     unique = UNKNOWN + uuid.uuid4().hex
     own = OwnMap(None, scale)
     rows = views[-1].rows.stop
-    return Scene(given, None, width, rows, key, to_world, unique, params, views, own, depth, hide, notes)
+    return Scene(given, None, width, rows, key, to_world, unique, params, views, own, *asked)
 
 
 def own_map(given: Any) -> np.ndarray:
@@ -171,8 +171,8 @@ def _rotation(transform: Any) -> np.ndarray:
     return found
 
 
-def _integrator(scene: Any) -> tuple[int, bool, tuple[str, ...]]:
-    """Return path depth, whether emitters are hidden, and notes, as :func:`.supported.take_integrator`."""
+def _integrator(scene: Any) -> tuple[int, int, bool, tuple[str, ...]]:
+    """Return max_depth, rr_depth, hide_emitters and notes, as :func:`.supported.take_integrator`."""
     given, media = scene.integrator(), any(shape.is_medium_transition() for shape in scene.shapes())
     names = {given.class_name(), type(given).__name__} if given is not None else {"PathIntegrator"}
     hide, notes = bool(getattr(given, "hide_emitters", False)), []
@@ -181,11 +181,12 @@ def _integrator(scene: Any) -> tuple[int, bool, tuple[str, ...]]:
     if media:
         notes.append("the scene's medium is not rendered, as its integrator has no media")
     if names & _DIRECT:
-        return 2, hide, tuple(notes)
+        return 2, ROULETTE, hide, tuple(notes)
     if not names & (_PATHS | _VOLUMES):
         kind = given.class_name()
         notes.append(f"integrator {kind} is not used: rendered by path, with paths of any length")
-        return -1, hide, tuple(notes)
-    found = re.search(r"max_depth = (\d+)", str(given))
-    depth = int(found[1]) if found else int(getattr(given, "max_depth", _ANY_DEPTH))
-    return (-1 if depth >= _ANY_DEPTH else depth), hide, tuple(notes)
+        return -1, ROULETTE, hide, tuple(notes)
+    printed = dict(re.findall(r"(\w+_depth) = (\d+)", str(given)))
+    depth = int(printed.get("max_depth", _ANY_DEPTH))
+    roulette = int(printed.get("rr_depth", getattr(given, "rr_depth", ROULETTE)))
+    return (-1 if depth >= _ANY_DEPTH else depth), roulette, hide, tuple(notes)

@@ -7,7 +7,7 @@ that is not used cannot get in the way:
 - the environment emitter, whatever its kind, becomes an ``envmap`` with the same orientation whose texels
   are set by :meth:`Scene.set_envmap`;
 - the film gets the asked size and float32 RGB; its reconstruction filter stays the author's;
-- the integrator gives way to ``path``, with the path depth and ``hide_emitters`` that it asks for;
+- the integrator gives way to ``path``, with ``max_depth``, ``rr_depth`` and ``hide_emitters`` of its own;
 - a rough BSDF whose alpha is at most 1e-4, which Mitsuba would clamp, becomes its limit, the smooth one;
 - a shape with the properties ``fit_height`` (and ``fit_up``, one of x, y, z with or without a minus) is
   centred on the y axis, set on the plane y = 0 and scaled to that height, or to 1.5 times it in width.
@@ -52,6 +52,7 @@ QUIET_LEAST, QUIET_MOST = 256, 768
 """Samples a pixel between which a rendering of "auto" ends."""
 _QUIET_PASS = 64  # samples a pixel
 _ALPHA_SPP = 256
+_SAMPLED = 3e-4  # of the radiance of a pole's row, in the next row, which adds 0.2 % to the light
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -94,6 +95,8 @@ class Scene:
         File and scale of the map that the scene itself names.
     max_depth : int
         Longest path in segments that the scene's integrator asks for, as Mitsuba counts them; -1: any.
+    rr_depth : int
+        Path length in segments from which on Russian roulette ends paths.
     hide_emitters : bool
         The camera sees neither the environment nor shapes that are lamps.
     notes : tuple of str
@@ -116,6 +119,7 @@ class Scene:
     views: tuple[View, ...]
     own: supported.OwnMap = supported.OwnMap(None, 1.0)
     max_depth: int = -1
+    rr_depth: int = supported.ROULETTE
     hide_emitters: bool = False
     notes: tuple[str, ...] = ()
     parameters: dict[str, str | float | bool] = field(default_factory=dict)
@@ -175,6 +179,9 @@ class Scene:
                 f"environment map: {bad} texels are not finite or are negative, "
                 f"the first at row {row}, column {column}: {image[row, column, channel]} in {'RGB'[channel]}"
             )
+        if not image[1:-1].any():  # Mitsuba's density has a factor sin(theta): it would sample nothing
+            image = image.copy()
+            image[[1, -2]] = np.maximum(image[[1, -2]], _SAMPLED * image[[0, -1]])
         self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
         self.params.update()
 
@@ -286,8 +293,8 @@ class Scene:
     def _traced(self, count, seed, i, max_depth):
         """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
-        asked = {"type": "path", "max_depth": max_depth, "hide_emitters": self.hide_emitters}
-        integrator = mi.load_dict(asked)
+        asked = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+        integrator = mi.load_dict({"type": "path", **asked})
         pictures = []
         for k in range(len(self.views)):
             pass_seed = int(np.random.SeedSequence([seed, i, k]).generate_state(1)[0])
@@ -395,7 +402,7 @@ def load(
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    rest = views, own, asked.max_depth, asked.hide_emitters, notes
+    rest = views, own, asked.max_depth, asked.rr_depth, asked.hide_emitters, notes
     given: dict[str, Any] = dict(parameters or {})
 
     def again(width: int, height: int) -> Scene:

@@ -29,6 +29,8 @@ VOLUMES = ("volpath", "volpathmis", "prbvolpath")
 """Integrators that would follow light through media."""
 WRAPPERS = ("aov", "moment", "stokes")
 """Integrators that render by another one inside."""
+ROULETTE = 5
+"""Path length from which on Mitsuba ends paths by Russian roulette, where the integrator names none."""
 
 _ROUNDING = 1e-3  # of a rotation's columns that a file gives with few digits
 
@@ -96,6 +98,8 @@ class Integrator:
     ----------
     max_depth : int
         Longest path in segments, as Mitsuba counts; -1: any.
+    rr_depth : int
+        Path length in segments from which on Russian roulette ends paths.
     hide_emitters : bool
         The camera does not see the environment, nor shapes that are lamps.
     notes : tuple of str
@@ -103,6 +107,7 @@ class Integrator:
     """
 
     max_depth: int
+    rr_depth: int
     hide_emitters: bool
     notes: tuple[str, ...]
 
@@ -113,8 +118,8 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     Raises
     ------
     InputError
-        The scene has a participating medium and an integrator that would render it, or ``max_depth`` gives
-        no picture.
+        The scene has a participating medium and an integrator that would render it, or ``max_depth`` or
+        ``rr_depth`` is out of range.
     """
     for n in state.nodes:  # of a dict, the parser does not know the type of a plugin written in Python
         if n.type == mi.ObjectType.Unknown and n.props.plugin_name() in PATHS + DIRECT + VOLUMES:
@@ -126,27 +131,30 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
         if not inside:
             break
         node = inside[0]
-    name, depth, hide, notes = "path", -1, False, []
+    name, depth, roulette, hide, notes = "path", -1, ROULETTE, False, []
     if node is not None:
         props, name = node.props, node.props.plugin_name()
         hide = props.get("hide_emitters", False) is True
         if name in DIRECT:
             depth = 2
         elif name in PATHS + VOLUMES:
-            depth = props.get("max_depth", -1)
+            depth, roulette = props.get("max_depth", -1), props.get("rr_depth", ROULETTE)
         else:
             notes.append(f"integrator {name} is not used: rendered by path, with paths of any length")
-        if isinstance(depth, bool) or not isinstance(depth, int) or depth < -1 or not depth:
-            raise InputError(
-                f"{place_of(state, node, where)}: max_depth is {depth}, expected -1 or a whole number above 0"
-            )
+        for key, value, expected in (("max_depth", depth, "-1 or "), ("rr_depth", roulette, "")):
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if not whole or not (value > 0 or expected and value == -1):
+                expected += "a whole number above 0"
+                raise InputError(f"{place_of(state, node, where)}: {key} is {value}, expected {expected}")
     _check_media(state, where, name, notes)
     for n in nodes:
         identity = n.props.id()
         n.props = mi.Properties("path")
         n.props.set_id(identity)
         n.props["max_depth"], n.props["hide_emitters"] = depth, hide
-    return Integrator(depth, hide, tuple(notes))
+        if roulette != ROULETTE:
+            n.props["rr_depth"] = roulette
+    return Integrator(depth, roulette, hide, tuple(notes))
 
 
 def ensure_integrator(state: mi.parser.ParserState) -> None:

@@ -129,14 +129,16 @@ def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
 
 
 @pytest.mark.parametrize("integrator", [
-    {"type": "path"}, {"type": "path", "max_depth": 6}, {"type": "direct"}, {"type": "prb", "max_depth": 4},
+    {"type": "path", "rr_depth": 9}, {"type": "path", "max_depth": 6}, {"type": "direct"},
+    {"type": "prb", "max_depth": 4, "rr_depth": 3},
     {"type": "prb", "max_depth": -1}, {"type": "direct_projective"}, {"type": "volpath", "max_depth": 3},
     {"type": "depth"}, {"type": "ptracer", "max_depth": 5},
 ])  # fmt: skip
 def test_a_built_scene_s_integrator_asks_for_the_same_as_a_dict_s(integrator):
     made = ball(np.ones((4, 8, 3), np.float32)) | {"integrator": integrator}
     built, parsed = (envedit.load_scene(scene) for scene in (mi.load_dict(made), made))
-    assert (built.max_depth, built.hide_emitters) == (parsed.max_depth, parsed.hide_emitters)
+    for name in ("max_depth", "rr_depth", "hide_emitters"):
+        assert getattr(built, name) == getattr(parsed, name)
     assert len(built.notes) == len(parsed.notes)
 
 

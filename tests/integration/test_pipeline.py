@@ -808,6 +808,18 @@ def test_a_turned_sky_is_turned_back_to_the_bit(kind, tmp_path, rng):
     assert found.maps["initial"].tobytes() == picture.tobytes()
 
 
+def test_lights_before_are_those_of_the_file(tmp_path, rng):
+    """Not as they were placed and turned by hand, which is part of how far they have moved."""
+    moved = {"light": 1, "azimuth": 200.0, "elevation": 40.0}
+    for by_hand, azimuth in (({"rotate_degrees": 90.0}, 360 * 9.5 / 32 - 90), ({"lights": [moved]}, 200)):
+        settings, _ = turned_world(tmp_path, rng, target={"kind": "none"}, input=by_hand)
+        found = pipeline.run(settings)
+        (before,), (after,) = (found.lights[name] for name in ("before", "after"))
+        assert before["azimuth"] == pytest.approx(360 * 9.5 / 32, abs=1) and not before["removed"]
+        assert after["azimuth"] == pytest.approx(azimuth % 360, abs=3) and after["moved_degrees"] > 20
+        assert any("light 1 at azimuth 107, elevation 42 moved by" in line for line in found.notes)
+
+
 def test_a_sky_that_must_not_turn_does_not(tmp_path, rng):
     settings, _ = turned_world(tmp_path, rng, representation={"turn": False}, optimizer={"iterations": 3})
     found = pipeline.run(settings)
@@ -838,6 +850,20 @@ def test_what_is_there_already_comes_back_bit_for_bit(tmp_path, rng, monkeypatch
     brighter = {"file": "brighter.exr", "rotate_degrees": 0.0, "spp": 256}
     settings, _ = turned_world(tmp_path, rng, target=brighter, **asked)
     assert pipeline.run(settings).history
+
+
+@pytest.mark.parametrize("kind", ["light in the row of the pole", "below the least normal number"])
+def test_light_that_makes_no_picture_comes_back_bit_for_bit(kind, tmp_path):
+    picture = np.zeros((16, 32, 3), np.float32)
+    if "pole" in kind:
+        picture[0] = [100, 90, 80]
+    else:
+        picture[:] = 1e-40
+    itself = {"file": "map.exr", "spp": 256}
+    asked = {"input": {"rows": "all", "width": 32}, "target": itself, "renderer": {"spp": 256}}
+    found = pipeline.run(settings_of(tmp_path, picture, **asked))
+    assert found.envmap.tobytes() == picture.tobytes()
+    assert (found.renders["target"].max() > 0.01) == ("pole" in kind)
 
 
 def test_keys_that_gauss_newton_does_not_use_are_named(tmp_path, rng):

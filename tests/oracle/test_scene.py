@@ -47,6 +47,30 @@ def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(
     np.testing.assert_allclose(ours[0, 0], seen, rtol=0.2)
 
 
+def test_russian_roulette_begins_where_the_scene_says(tmp_path, rng):
+    image = sky(rng)
+    for kind in ("path", "volpath"):
+        asked = f'<integrator type="{kind}"><integer name="rr_depth" value="1"/></integrator>'
+        loaded = scene.load(write_scene(tmp_path, asked, SENSOR, BALL, LIGHT))
+        ours = loaded.render(image, spp=16, seed=3)
+        seed = int(np.random.SeedSequence([3, 0, 0]).generate_state(1)[0])
+        for depth in (1, 5):
+            integrator = mi.load_dict({"type": "path", "rr_depth": depth})
+            theirs = film.render(loaded.mi, integrator, 16, seed)[..., :3].astype(np.float32)
+            assert np.array_equal(ours, theirs) == (depth == 1)
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_light_in_the_row_of_a_pole_alone_is_seen(row, tmp_path):
+    """As in the sum with another map, as rendering is linear."""
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    pole = np.zeros((16, 32, 3), np.float32)
+    pole[row] = 100
+    even = np.full_like(pole, 0.1)
+    alone, both, faint = (loaded.render(image, spp=4096).mean() for image in (pole, pole + even, even))
+    assert alone > 0.01 and alone == pytest.approx(both - faint, rel=0.02)
+
+
 def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     picture = loaded.render(np.ones((8, 16, 3)), spp=256)

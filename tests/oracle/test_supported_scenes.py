@@ -148,8 +148,9 @@ def test_plugins_that_are_replaced_or_refused(tmp_path):
         lit, _, notes = users_scenes.loaded(users_scenes.write(tmp_path, parts))
         assert lit.max_depth == expected.get(name, 4)
         assert any("depth is not used" in note for note in notes) == (name == "depth")
-    zero = '<integrator type="path"><integer name="max_depth" value="0"/></integrator>'
-    assert "max_depth is 0, expected -1 or" in said(zero, SENSOR, BALL, light())
+    for key, expected in (("max_depth", "-1 or a whole"), ("rr_depth", "a whole")):
+        zero = f'<integrator type="path"><integer name="{key}" value="0"/></integrator>'
+        assert f"{key} is 0, expected {expected} number above 0" in said(zero, SENSOR, BALL, light())
 
 
 @pytest.mark.parametrize("scale", ["0", "-2", "nan", "1e-60"])

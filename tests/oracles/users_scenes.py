@@ -160,7 +160,9 @@ PLUGINS = {
     },
     "film": {"hdrfilm": "size and pixel format are set, crop and filter kept", "specfilm": REFUSED},
     "integrator": {
-        **dict.fromkeys(("path", "ptracer"), "paths of its `max_depth`; `hide_emitters` is taken"),
+        **dict.fromkeys(
+            ("path", "ptracer"), "paths of its `max_depth`; `rr_depth` and `hide_emitters` are taken"
+        ),
         "direct": "paths of two segments; `hide_emitters` is taken",
         **dict.fromkeys(("volpath", "volpathmis"), "as `path`; with a medium in the scene refused"),
         **dict.fromkeys(("aov", "moment", "stokes"), "the integrator inside it counts"),

@@ -55,6 +55,29 @@ def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
     assert pixels(here / "again" / "edited.exr").tobytes() == before.tobytes()
 
 
+@pytest.mark.parametrize("named", ["own map", "texture", "include"])
+def test_what_the_scene_names_is_not_moved_out_of_the_folder_of_results(named, here, capsys):
+    """Two of the files that a run leaves are what this scene reads."""
+    (here / "out").mkdir()
+    file = here / "out" / {"own map": "edited.exr", "texture": "preview.png", "include": "edited.xml"}[named]
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="$folder/preview.png"/>'
+    ball = BALL.replace('<rgb name="reflectance" value="0.2, 0.4, 0.6"/>', f"{image}</texture>")
+    if named == "own map":
+        parts = '<default name="folder" value="out"/>', SENSOR, BALL, light(name="$folder/edited.exr")
+        images.write_exr(file, sky(np.random.default_rng(1)) + 0.1)
+    elif named == "texture":
+        parts = '<default name="folder" value="gone"/>', SENSOR, ball, light()
+        images.write_png(file, np.ones((4, 4, 3)))
+    else:
+        parts = SENSOR, '<include filename="out/edited.xml"/>', light()
+        write_scene(here / "out", BALL, name="edited.xml")
+    write_scene(here, PATH, *parts, name="own.xml")
+    before, values = file.read_bytes(), ["--set", "scene.parameters.folder=out"] if named == "texture" else []
+    assert call("own.xml", "--out", "out", *values, *small(), "--quiet") == 3
+    assert f"{file}: this input lies where its own results would go" in capsys.readouterr().err
+    assert file.read_bytes() == before and [path.name for path in (here / "out").iterdir()] == [file.name]
+
+
 def test_a_shipped_scene_by_its_name_and_another_map(here):
     assert call("matte", "--envmap", "other.exr", "--rotate", "90", *small(), "--quiet") == 0
     ran = config.load(here / "matte_out" / "config.toml")

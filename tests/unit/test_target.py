@@ -1,11 +1,14 @@
 """Targets: rendered under a known map, painted as a picture, or painted by strokes."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit import config
 from envedit.core import latlong
+from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
@@ -93,6 +96,17 @@ def test_a_missing_map_is_refused(ball, tmp_path, rng):
 def test_black_map_makes_a_black_target(ball):
     made = target.make(asking(rotate_degrees=60), ball, np.zeros((8, 16, 3), np.float32))
     assert not made.picture.any()
+
+
+def test_a_target_that_is_largely_white_is_warned_of(ball, rng):
+    """More than a tenth of the pixels of this film see the sky beside the ball."""
+    for factor, curve, warned in ((1, "gamma", False), (100, "gamma", True), (100, "reinhard", False)):
+        settings = asking(rotate_degrees=60)
+        settings = replace(settings, output=replace(settings.output, tonemap=curve))
+        made = target.make(settings, ball, factor * (sky(rng) + 0.2) / 4)
+        assert bool(made.warnings) == warned
+        white = (tonemap(made.picture, curve) >= 1).all(axis=2).mean()
+        assert not warned or f"target: {100 * white:.3g} % of its pixels are white" in made.warnings[0]
 
 
 def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):

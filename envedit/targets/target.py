@@ -236,7 +236,7 @@ def _seen(target, hidden, curve):
     share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
     if share > MOST_WHITE:
         said = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
-        said += "PSNR, SSIM and pictures show no difference: lower scene.scale, or choose another output.tonemap"
+        said += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
         target = replace(target, warnings=(*target.warnings, said))
     if hidden is None or not hidden.any():
         return target

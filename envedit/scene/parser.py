@@ -52,6 +52,8 @@ def called(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any
                        f"Parsing of XML file {where} failed: ", f'Parsing of XML file "{where}" failed: ',
                        'At dictionary node "root": '):  # fmt: skip
             text = text.replace(prefix, "")
+        hint = r"\g<0>; give it: --set scene.parameters.\1=VALUE"
+        text = re.sub(r"undefined parameter: \$(\w+)", hint, text)
         raise InputError(f"{where}: {text if len(text) <= 300 else text[:297] + '...'}") from None
 
 

@@ -268,6 +268,15 @@ def test_text_where_a_number_belongs_is_told():
         scene.load("sphere", parameters={"roughness": "smooth"})
 
 
+def test_a_default_after_its_use_is_told_with_what_to_give(tmp_path):
+    """Mitsuba takes a default where it stands, for what follows."""
+    sized = BALL.replace("<bsdf", '<float name="radius" value="$size"/><bsdf')
+    path = write_scene(tmp_path, SENSOR, sized, '<default name="size" value="1"/>', LIGHT)
+    with pytest.raises(InputError, match=r"parameter: \$size; give it: --set scene.parameters.size=VALUE"):
+        scene.load(path)
+    scene.load(path, parameters={"size": 0.5})
+
+
 def test_names_are_found_in_included_files(tmp_path):
     sized = BALL.replace("<bsdf", '<float name="radius" value="$size"/><bsdf')
     write_scene(tmp_path, '<default name="size" value="1"/>', sized, name="ball.xml")

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs, pipeline
+from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.scene import scene
@@ -25,7 +26,8 @@ _ROOT = re.compile(rb"\A(\xef\xbb\xbf)?\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*<scene\b"
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of XML files, at any depth")
+    text = "of XML files, at any depth (default: the shipped scenes)"
+    parser.add_argument("folder", nargs="?", type=Path, default=shipped.folder(), metavar="FOLDER", help=text)
 
 
 def cases(given):

@@ -244,8 +244,8 @@ def set_sampler(state: mi.parser.ParserState, sensor: int, plugin: str) -> None:
 def find_file(
     state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str, folders: Iterable[Path]
 ) -> None:
-    """Make the name of a node's file absolute; the environment's own is already gone and need not exist."""
-    if "filename" not in node.props:
+    """Make the name of a node's file absolute; an environment map is replaced and need not exist."""
+    if "filename" not in node.props or node.props.plugin_name() == "envmap":
         return
     if not isinstance(name := node.props["filename"], str):
         raise InputError(f"{place_of(state, node, where)}: filename is {name}, expected a text")

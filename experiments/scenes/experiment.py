@@ -18,10 +18,10 @@ from experiments.harness import Experiment, calling, number
 
 WIDTH, MAP = 64, 128
 """Pixels and texels across."""
-SPP = 512
-"""Samples a pixel of the two renderings that are compared."""
-NEAR = 0.005
-"""Difference of the means up to which a rendering counts as Mitsuba's."""
+RENDERINGS, SPP = 8, 64
+"""Renderings by either program, and samples a pixel of each: what they differ by is the noise."""
+NEAR, SIGMA = 0.005, 3.0
+"""A rendering counts as Mitsuba's if the means differ by at most the first, or that many standard errors."""
 _ROOT = re.compile(rb"\A(\xef\xbb\xbf)?\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*<scene\b", re.DOTALL)
 
 
@@ -55,7 +55,7 @@ def tried(settings: config.Config, folder: Path) -> dict:
     A scene without an environment emitter, or that is made for any map, is lit by the analytic sky, in
     Mitsuba as well.
     """
-    found = {"refused": "", "light": "its own", "plain": "", "ratio": None, "psnr": None, "map": None}
+    found = {"refused": "", "light": "its own", "plain": "", "ratio": None, "noise": None, "psnr": None, "map": None}
     try:
         lit = inputs.load_scene(settings.scene)
         if lit.own.added:
@@ -71,8 +71,10 @@ def tried(settings: config.Config, folder: Path) -> dict:
     except (EnveditError, RuntimeError) as error:
         found["plain"] = str(error).splitlines()[-1]
     else:
-        rendering = lit.render(given.radiance, SPP, settings.seed)
-        found["ratio"] = float(rendering.mean(dtype=np.float64) / expected.mean(dtype=np.float64))
+        ours = [lit.render(given.radiance, SPP, k).mean(dtype=np.float64) for k in range(RENDERINGS)]
+        found["ratio"] = float(np.mean(ours) / np.mean(expected))
+        spread = [np.std(means, ddof=1) / np.mean(means) for means in (ours, expected)]
+        found["noise"] = float(np.hypot(*spread) / RENDERINGS**0.5)
     try:
         edit = pipeline.run(settings)
     except EnveditError as error:
@@ -81,8 +83,8 @@ def tried(settings: config.Config, folder: Path) -> dict:
     return found | {"map": edit.metrics["envmap"]["psnr"], "unedited": edit.metrics["initial_envmap"]["psnr"]}
 
 
-def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, folder: Path) -> np.ndarray:
-    """Render the user's file by ``mi.render``, on a film of our size; RGB, (h, w, 3).
+def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, folder: Path) -> list[float]:
+    """Render the user's file by ``mi.render``, on a film of our size; the mean of each rendering.
 
     Without a light of its own, the file that a run would leave.
     """
@@ -99,16 +101,17 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
         for key, value in sizes.items():
             params[f"{film}{key}"] = value
         params.update()
-        return np.array(mi.render(whole, sensor=0, spp=SPP, seed=5))[..., :3]
+        pictures = (mi.render(whole, sensor=0, spp=SPP, seed=100 + k) for k in range(RENDERINGS))
+        return [float(np.array(picture)[..., :3].mean(dtype=np.float64)) for picture in pictures]
 
 
 def summary(rows: list[dict]) -> str:
     loaded = [row for row in rows if not row["refused"]]
     compared = [row for row in loaded if row["ratio"] is not None]
-    near = sum(abs(row["ratio"] - 1) <= NEAR for row in compared)
+    near = sum(abs(row["ratio"] - 1) <= max(NEAR, SIGMA * row["noise"]) for row in compared)
     better = sum(row["psnr"] >= row["initial"] for row in loaded)
     text = f"{len(loaded)} of {len(rows)} scenes are edited; {near} of {len(compared)} initial renderings "
-    text += f"have Mitsuba's mean to {100 * NEAR:g} %; {better} of {len(loaded)} edited renderings are no "
+    text += f"have Mitsuba's mean to {100 * NEAR:g} % or their noise; {better} of {len(loaded)} edited renderings are no "
     text += "farther from the target, under the turned map, than the initial one."
     reasons = Counter(re.sub(r"^.*?: ", "", row["refused"].splitlines()[0]) for row in rows if row["refused"])
     return "\n".join([text, *(f"- refused, {count}: {why}" for why, count in reasons.most_common())])
@@ -126,7 +129,9 @@ EXPERIMENT = Experiment(
         "scene": "{scene}",
         "refused": lambda m: cell(m["refused"]),
         "light": "{light}",
-        "mean over Mitsuba's": lambda m: cell(m["plain"]) if m["plain"] else number(m["ratio"], ".4f"),
+        "mean over Mitsuba's, with standard error": lambda m: (
+            cell(m["plain"]) if m["plain"] else f"{number(m['ratio'], '.4f')} ± {number(m['noise'], '.4f')}"
+        ),
         "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m.get('initial'))})",
         "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m.get('unedited'))})",
     },

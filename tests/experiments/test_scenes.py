@@ -50,12 +50,13 @@ def test_a_scene_is_compared_with_mitsuba_or_refused(parts, lit_by, refused, tmp
 
 def test_scenes_are_counted():
     rows = [
-        {"refused": "", "ratio": 1.001, "psnr": 40.0, "initial": 20.0},
-        {"refused": "", "ratio": 1.02, "psnr": 19.0, "initial": 20.0},
+        {"refused": "", "ratio": 1.001, "noise": 0.0, "psnr": 40.0, "initial": 20.0},
+        {"refused": "", "ratio": 1.02, "noise": 0.001, "psnr": 19.0, "initial": 20.0},
+        {"refused": "", "ratio": 1.02, "noise": 0.01, "psnr": 19.0, "initial": 20.0},
         {"refused": "", "ratio": None, "psnr": 30.0, "initial": 30.0},
         {"refused": "a.xml (line 3): no film\nmore", "ratio": None},
         {"refused": "b.xml (line 9): no film", "ratio": None},
     ]
     text = experiment.summary(rows)
-    assert "3 of 5 scenes are edited; 1 of 2 initial" in text and "2 of 3 edited renderings" in text
+    assert "4 of 6 scenes are edited; 2 of 3 initial" in text and "2 of 4 edited renderings" in text
     assert "- refused, 2: no film" in text

@@ -55,7 +55,8 @@ def tried(settings: config.Config, folder: Path) -> dict:
     A scene without an environment emitter, or that is made for any map, is lit by the analytic sky, in
     Mitsuba as well.
     """
-    found = {"refused": "", "light": "its own", "plain": "", "ratio": None, "noise": None, "psnr": None, "map": None}
+    found = {"refused": "", "light": "its own", "plain": ""}
+    found |= dict.fromkeys(("ratio", "noise", "psnr", "initial", "map", "unedited"))
     try:
         lit = inputs.load_scene(settings.scene)
         if lit.own.added:
@@ -111,8 +112,8 @@ def summary(rows: list[dict]) -> str:
     near = sum(abs(row["ratio"] - 1) <= max(NEAR, SIGMA * row["noise"]) for row in compared)
     better = sum(row["psnr"] >= row["initial"] for row in loaded)
     text = f"{len(loaded)} of {len(rows)} scenes are edited; {near} of {len(compared)} initial renderings "
-    text += f"have Mitsuba's mean to {100 * NEAR:g} % or their noise; {better} of {len(loaded)} edited renderings are no "
-    text += "farther from the target, under the turned map, than the initial one."
+    text += f"have Mitsuba's mean to {100 * NEAR:g} % or their noise; {better} of {len(loaded)} edited "
+    text += "renderings are no farther from the target, under the turned map, than the initial one."
     reasons = Counter(re.sub(r"^.*?: ", "", row["refused"].splitlines()[0]) for row in rows if row["refused"])
     return "\n".join([text, *(f"- refused, {count}: {why}" for why, count in reasons.most_common())])
 
@@ -132,8 +133,8 @@ EXPERIMENT = Experiment(
         "mean over Mitsuba's, with standard error": lambda m: (
             cell(m["plain"]) if m["plain"] else f"{number(m['ratio'], '.4f')} ± {number(m['noise'], '.4f')}"
         ),
-        "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m.get('initial'))})",
-        "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m.get('unedited'))})",
+        "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['initial'])})",
+        "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m['unedited'])})",
     },
     summary=summary,
     options=options,

@@ -13,7 +13,7 @@ from envedit import config, inputs, pipeline
 from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
-from envedit.scene import scene
+from envedit.scene import parser, scene
 from experiments.harness import Experiment, calling, number
 
 WIDTH, MAP = 64, 128
@@ -56,6 +56,7 @@ def tried(settings: config.Config, folder: Path) -> dict:
     Mitsuba as well.
     """
     found = {"refused": "", "light": "its own", "plain": ""}
+    file = settings.scene.file
     found |= dict.fromkeys(("ratio", "noise", "psnr", "initial", "map", "unedited"))
     try:
         lit = inputs.load_scene(settings.scene)
@@ -65,12 +66,11 @@ def tried(settings: config.Config, folder: Path) -> dict:
             found["light"] = "analytic sky"
         given = inputs.read_map(settings.input, lit, settings.input.width)
     except EnveditError as error:
-        where = settings.scene.file
-        return found | {"refused": str(error).replace(where, Path(where).name)}
+        return found | {"refused": str(error).replace(file, Path(file).name)}
     try:
         expected = plain(lit, settings, given, folder)
     except (EnveditError, RuntimeError) as error:
-        found["plain"] = str(error).splitlines()[-1]
+        found["plain"] = f"Mitsuba: {str(error).replace(file, Path(file).name)}"
     else:
         ours = [lit.render(given.radiance, SPP, k).mean(dtype=np.float64) for k in range(RENDERINGS)]
         found["ratio"] = float(np.mean(ours) / np.mean(expected))
@@ -95,7 +95,7 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
         mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
         Path(file).write_text(scene.relit(settings.scene.file, "sky.exr", dict(settings.scene.parameters)))
     with quiet_libraries():
-        whole = mi.load_file(file, **filled)
+        whole = parser.called(Path(file).name, mi.load_file, file, **filled)
         params, ours = mi.traverse(whole), lit.mi.sensors()[0].film()
         sizes = {"size": ours.size(), "crop_size": ours.crop_size(), "crop_offset": ours.crop_offset()}
         film = next(key for key, _ in params if key.endswith("film.size")).removesuffix("size")
@@ -131,7 +131,7 @@ EXPERIMENT = Experiment(
         "refused": lambda m: cell(m["refused"]),
         "light": "{light}",
         "mean over Mitsuba's, with standard error": lambda m: (
-            cell(m["plain"]) if m["plain"] else f"{number(m['ratio'], '.4f')} ± {number(m['noise'], '.4f')}"
+            cell(m["plain"]) if m["ratio"] is None else f"{m['ratio']:.4f} ± {m['noise']:.4f}"
         ),
         "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['initial'])})",
         "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m['unedited'])})",

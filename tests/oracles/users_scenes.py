@@ -240,13 +240,13 @@ that are refused or replaced are tried one by one, the others are Mitsuba's own 
 - **Variants.** Everything runs in `llvm_ad_rgb`; `cuda_ad_rgb` can be chosen, and nothing was run with it
   yet. Spectra are converted to RGB when a scene is loaded, as Mitsuba does. Spectral and polarised rendering
   are not supported: polarising materials act on unpolarised light, which is said.
-- **Measured** ([experiments/scenes](../experiments/scenes/README.md)): `python -m experiments scenes run FOLDER`
-  loads, renders and edits every Mitsuba scene of a folder, such as a clone of
+- **Measured** ([experiments/scenes](../experiments/scenes/README.md)): `python -m experiments scenes run
+  FOLDER` loads, renders and edits every Mitsuba scene of a folder, such as a clone of
   [mitsuba-data](https://github.com/mitsuba-renderer/mitsuba-data). Of the six shipped scenes five are edited,
   and `mesh` is refused without a mesh; all five initial renderings have Mitsuba's mean to 0.5 % or to their
   noise, and all five edited renderings are nearer the target. Of mitsuba-data, `matpreview` and
-  `principled_blend_creation` were tried: both are edited, the first is as Mitsuba renders it, the second is in
-  names that Mitsuba 3.9 itself refuses.
+  `principled_blend_creation` were tried: both are edited; the first is as Mitsuba renders it, the second has
+  names of plugins that Mitsuba 3.9 itself refuses.
 - **Refused by name:** a `to_world` of the map that mirrors or shears, and what the tables say. All that is
   refused of a scene is said at once.
 """

@@ -207,7 +207,7 @@ def load_scene(
     ConfigError
         A parameter, a sensor or the size cannot be used.
     InputError
-        A file is missing or damaged, or the scene is not lit by exactly one environment emitter.
+        A file is missing or damaged, or the scene has something that is not supported.
     """
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
@@ -275,7 +275,8 @@ def _lit(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
     """Load a scene in any form."""
     size = settings.width, settings.height
     scene = dict(scene) if isinstance(scene, Mapping) else scene
-    return built_scene.load(scene, *size, settings.parameters, base, settings.sensors)
+    up, scale = settings.up, settings.scale
+    return built_scene.load(scene, *size, settings.parameters, base, settings.sensors, up, scale)
 
 
 def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
@@ -286,8 +287,8 @@ def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
         if lit.digest.startswith(built_scene.UNKNOWN):
             settings = replace(settings, renderer=replace(settings.renderer, cache=False))
         return replace(settings, scene=config.Scene(file=GIVEN, **given))
-    kept = {"sensors": settings.scene.sensors} if len(lit.views) == 1 else {"sensors": "all"}
-    given |= {"parameters": lit.parameters} | kept
+    given["sensors"] = settings.scene.sensors if len(lit.views) == 1 else "all"
+    given |= {"parameters": lit.parameters, "up": settings.scene.up, "scale": settings.scene.scale}
     return replace(settings, scene=config.Scene(file=str(lit.path), **given))
 
 

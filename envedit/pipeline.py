@@ -120,6 +120,9 @@ def run(
         given = inputs.read_map(settings.input, lit, settings.input.width, memory.envmap)
         original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
+        if lit.own.added:
+            part = 100 * inputs.share(lit, original, Seeds.of(settings.seed).judged)
+            said.append(f"the map gives {part:.3g} % of the picture's light; scene.scale changes that")
         height, width, _ = original.shape
         rows = inputs.active_rows(settings.input.rows, height)
         if settings.target.kind == "none":

@@ -149,8 +149,8 @@ def _edit(settings, arguments, folder, allowed, start):
     from envedit.report import output_folder
 
     spare = [] if arguments.config is None else [arguments.config]
-    asked = output_folder.names(folder), output_folder.inputs_of(settings), arguments.resume, spare
-    output_folder.prepare_folder(folder, *asked)
+    read = output_folder.inputs_of(settings, arguments.base)
+    output_folder.prepare_folder(folder, output_folder.names(folder), read, arguments.resume, spare)
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
         _check_same(settings, folder)
         _say(arguments, f"{folder}: this run is complete, there is nothing to resume")

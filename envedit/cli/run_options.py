@@ -40,7 +40,8 @@ def parser() -> argparse.ArgumentParser:
     quick.add_argument(
         "--envmap",
         metavar="MAP",
-        help="map to edit: a file, scene or sunsky (default: the scene's own; without one, an analytic sky)",
+        help="map to edit: a file, scene or sunsky (default: the scene's own light; of a shipped scene, an "
+        "analytic sky)",
     )
     target = quick.add_mutually_exclusive_group()
     target.add_argument("--paint", metavar="PICTURE", help="target: the rendering, painted over")

@@ -12,6 +12,7 @@ import os
 import re
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,8 @@ def load(
     parameters: Mapping[str, Any] | None = None,
     base: Path | None = None,
     sensors: str | Sequence[int | str] = (0,),
+    up: str = "auto",
+    scale: float | str = "auto",
 ) -> Scene:
     """Take a scene in any form.
 
@@ -54,8 +57,8 @@ def load(
     ----------
     given : path, str, dict, mitsuba.Scene or Scene
         A file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, or a built scene, for which
-        all but ``sensors`` is fixed.
-    width, height, parameters, base, sensors
+        all but ``sensors`` and ``scale`` is fixed.
+    width, height, parameters, base, sensors, up, scale
         As of :func:`.scene.load`.
 
     Raises
@@ -67,8 +70,9 @@ def load(
         return given
     if isinstance(given, str | os.PathLike | dict):
         filled = dict(parameters or {})
-        return scenes.load(given, width, height, filled, base, sensors=sensors)
-    return wrapped(given, sensors)
+        return scenes.load(given, width, height, filled, base, sensors=sensors, up=up, scale=scale)
+    found = wrapped(given, sensors)
+    return found if isinstance(scale, str) else replace(found, own=OwnMap(None, scale))
 
 
 def is_built(given: object) -> bool:

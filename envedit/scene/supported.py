@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError
-from envedit.scene.parser import place_of
+from envedit.scene.own_light import OwnLight
+from envedit.scene.parser import append, environment, place_of
 
 SENSORS = ("perspective", "thinlens", "orthographic")
 """Sensors whose rays make a picture; others are refused."""
@@ -31,63 +32,99 @@ WRAPPERS = ("aov", "moment", "stokes")
 """Integrators that render by another one inside."""
 ROULETTE = 5
 """Path length from which on Mitsuba ends paths by Russian roulette, where the integrator names none."""
+POLARISING = ("circular", "measured_polarized", "polarizer", "pplastic", "retarder")
+"""Materials that are there for polarised light."""
 
 _ROUNDING = 1e-3  # of a rotation's columns that a file gives with few digits
 
 
 @dataclass(frozen=True)
 class OwnMap:
-    """The map that a scene's environment emitter names.
+    """The light that a scene's environment emitter gives.
 
     Attributes
     ----------
     file : Path or None
-        Its file, which need not exist; None where the emitter is no ``envmap`` or names none.
+        The map's file, which need not exist; None where the emitter is no ``envmap`` or names none.
     scale : float
-        What the emitter multiplies any map by, above 0.
+        What any map is multiplied by, above 0.
     notes : tuple of str
         What the user should know.
+    light : OwnLight or None
+        The emitter, where it names no file.
+    missing : str
+        Why the scene has neither, as an error says it; "" of a scene that is made for any map.
+    added : bool
+        The scene has no environment emitter: the map is light beside its own.
     """
 
     file: Path | None
     scale: float
     notes: tuple[str, ...] = ()
+    light: OwnLight | None = None
+    missing: str = ""
+    added: bool = False
 
 
-def own_map(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -> OwnMap:
-    """Read the file and the ``scale`` of the scene's ``envmap`` emitter, before it is replaced.
+PLACEHOLDER = "placeholder"
+"""The id of a ``constant`` emitter that stands for any map and is no light of its own."""
+_GIVE_MAP = "or give a map to light it: --envmap FILE, or [input] envmap"
+
+
+def own_map(
+    state: mi.parser.ParserState, where: str, folders: Iterable[Path], scale: float | str = "auto"
+) -> OwnMap:
+    """Read what the scene's environment emitter gives, before it is replaced.
+
+    Parameters
+    ----------
+    scale : float or "auto"
+        In place of the emitter's.
 
     Raises
     ------
     InputError
-        ``scale`` is not a finite number above 0.
+        There are several, or ``scale`` is not a finite number above 0.
     """
-    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter and n.props.plugin_name() == "envmap"]
-    if len(nodes) != 1:
-        return OwnMap(None, 1.0)
-    props = nodes[0].props
-    scale: Any = props.get("scale", 1.0)
-    number = isinstance(scale, int | float) and not isinstance(scale, bool)
-    if not number or not math.isfinite(scale) or not 0 < float(np.float32(scale)) < math.inf:
-        raise InputError(
-            f"{place_of(state, nodes[0], where)}: scale of the environment map is {scale}, expected a number "
-            "above 0"
-        )
+    factor = 1.0 if isinstance(scale, str) else scale
+    index = environment(state, where)
+    if index is None:
+        emitter = '<emitter type="envmap"><string name="filename" value="FILE"/></emitter>'
+        missing = f"{where}: no environment emitter: add {emitter} inside <scene>, {_GIVE_MAP}"
+        note = "no environment emitter: the map lights the scene beside its own lamps"
+        return OwnMap(None, factor, (note,), missing=missing, added=True)
+    node, place = state.nodes[index], place_of(state, state.nodes[index], where)
+    props, plugin = node.props, node.props.plugin_name()
+    if plugin != "envmap":
+        if plugin == "constant" and props.id() == PLACEHOLDER:
+            return OwnMap(None, factor)
+        return OwnMap(None, factor, light=OwnLight.of(state, index, where))
+    own: Any = props.get("scale", 1.0)
+    number = isinstance(own, int | float) and not isinstance(own, bool)
+    if not number or not math.isfinite(own) or not 0 < float(np.float32(own)) < math.inf:
+        raise InputError(f"{place}: scale of the environment map is {own}, expected a number above 0")
     matrix = getattr(props.get("to_world", None), "matrix", None)
     size = 1.0
     if matrix is not None:
         size = float(np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0]))
-    notes: tuple[str, ...] = ()
+    notes = []
     if np.isfinite(size) and abs(size - 1) > _ROUNDING:
-        notes = (
+        notes.append(
             f"to_world of the environment map scales by {size:.4g}: taken as the rotation in it, while "
-            "Mitsuba would look up wrong elevations",
+            "Mitsuba would look up wrong elevations"
         )
+    if isinstance(scale, str):
+        factor = float(own)
+    elif scale != own:
+        notes.append(f"scale {scale:g} (scene.scale) takes the place of the emitter's, {own:g}")
+    if "bitmap" in props:
+        return OwnMap(None, factor, tuple(notes), OwnLight.of(state, index, where))
     name = props.get("filename", None)
     if not isinstance(name, str) or not name:
-        return OwnMap(None, float(scale), notes)
+        missing = f"{place}: the environment map names no file; name one, {_GIVE_MAP}"
+        return OwnMap(None, factor, tuple(notes), missing=missing)
     found = [folder / name for folder in folders if os.path.isfile(folder / name)]
-    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), float(scale), notes)
+    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), factor, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -125,13 +162,15 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
         if n.type == mi.ObjectType.Unknown and n.props.plugin_name() in PATHS + DIRECT + VOLUMES:
             n.type = mi.ObjectType.Integrator
     nodes = [n for n in state.nodes if n.type == mi.ObjectType.Integrator]
-    node = next(iter(nodes), None)
+    node, notes = next(iter(nodes), None), []
     while node is not None and node.props.plugin_name() in WRAPPERS:
+        if node.props.plugin_name() == "stokes":
+            notes.append("integrator stokes: rendered without polarisation")
         inside = [n for n in _references(state, node) if n.type == mi.ObjectType.Integrator]
         if not inside:
             break
         node = inside[0]
-    name, depth, roulette, hide, notes = "path", -1, ROULETTE, False, []
+    name, depth, roulette, hide = "path", -1, ROULETTE, False
     if node is not None:
         props, name = node.props, node.props.plugin_name()
         hide = props.get("hide_emitters", False) is True
@@ -157,6 +196,12 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     return Integrator(depth, roulette, hide, tuple(notes))
 
 
+def polarised(state: mi.parser.ParserState) -> tuple[str, ...]:
+    """Say which materials of the scene polarise light, which is not followed."""
+    names = sorted({n.props.plugin_name() for n in state.nodes if n.props.plugin_name() in POLARISING})
+    return (f"{', '.join(names)}: rendered without polarisation",) if names else ()
+
+
 def ensure_integrator(state: mi.parser.ParserState) -> None:
     """Give a scene without an integrator ``path``.
 
@@ -164,11 +209,7 @@ def ensure_integrator(state: mi.parser.ParserState) -> None:
     """
     if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
         return
-    root = next(n for n in state.nodes if n.type == mi.ObjectType.Scene)
-    root.props["integrator"] = mi.Properties.ResolvedReference(len(state.nodes))
-    node = mi.parser.SceneNode()
-    node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
-    state.nodes.append(node)
+    append(state, mi.ObjectType.Integrator, "path")
 
 
 def _check_media(state, where, integrator, notes):

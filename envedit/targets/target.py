@@ -17,6 +17,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
+from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.seeds import Seeds
@@ -24,6 +25,9 @@ from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, painted_image, strokes
+
+MOST_WHITE = 0.1
+"""Share of the target's pixels that may be white without a warning."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,7 @@ def make(
     chosen, alpha = settings.target, scene.alpha
     hidden = None if alpha is None else alpha == 0
     if picture is None and chosen.kind == "envmap":
-        return _seen(_rendered(settings, scene, envmap, other), hidden)
+        return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
     shape = scene.height, scene.width
     initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
@@ -155,7 +159,8 @@ def make(
     weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
-    return _seen(Target(picture, weight, None, source, warnings, initial, coverage, asked), hidden)
+    made = Target(picture, weight, None, source, warnings, initial, coverage, asked)
+    return _seen(made, hidden, settings.output.tonemap)
 
 
 def _by_view(scene, views, given):
@@ -223,8 +228,18 @@ def _of_views(scene, initial, painted, of_view):
     return painted_image.Painted(picture, coverage, excluded, said)
 
 
-def _seen(target, hidden):
-    """Take the pixels that see no surface, where the scene hides what lights it, out of the loss."""
+def _seen(target, hidden, curve):
+    """Take the pixels that see no surface, where the scene hides what lights it, out of the loss.
+
+    And warn of a target that is largely white on a display.
+    """
+    white = (tonemap(target.picture, curve) >= 1).all(axis=2)
+    counted = white if hidden is None else white & ~hidden
+    share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
+    if share > MOST_WHITE:
+        said = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
+        said += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
+        target = replace(target, warnings=(*target.warnings, said))
     if hidden is None or not hidden.any():
         return target
     weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from envedit import config
-from envedit.core.errors import ConfigError
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.resampling import fit
 from envedit.core.seeds import Seeds
@@ -44,7 +43,7 @@ def most_pixels(settings: config.Config) -> int | None:
 def smaller(settings: config.Config, lit: Scene) -> Scene:
     """Return the scene on a film of at most so many pixels as are asked for, all views together.
 
-    It is the scene itself where its film is hardly larger, or takes no other size.
+    It is the scene itself where its film is hardly larger, or somebody has built it.
     """
     most, pixels = most_pixels(settings), lit.width * lit.height
     if most is None or pixels <= MUCH * most:
@@ -54,15 +53,12 @@ def smaller(settings: config.Config, lit: Scene) -> Scene:
 
 
 def scaled(lit: Scene, factor: float) -> Scene | None:
-    """Return the scene on a film that is ``factor`` times as wide and high; None where it takes no other."""
+    """Return the scene on a film that is ``factor`` times as wide and high; None if it is built already."""
     if lit.again is None:
         return None
     heights = {rows.stop - rows.start for rows in lit.rows}
     height = max(1, round(factor * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
-    try:
-        return lit.again(max(4, round(factor * lit.width)), height)
-    except ConfigError:  # a cropped film
-        return None
+    return lit.again(max(4, round(factor * lit.width)), height)
 
 
 def worked_on(

@@ -1,6 +1,6 @@
 """Targets: rendered under a known map, painted as a picture, or painted by strokes."""
 
-import dataclasses
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -98,6 +98,17 @@ def test_black_map_makes_a_black_target(ball):
     assert not made.picture.any()
 
 
+def test_a_target_that_is_largely_white_is_warned_of(ball, rng):
+    """More than a tenth of the pixels of this film see the sky beside the ball."""
+    for factor, curve, warned in ((1, "gamma", False), (100, "gamma", True), (100, "reinhard", False)):
+        settings = asking(rotate_degrees=60)
+        settings = replace(settings, output=replace(settings.output, tonemap=curve))
+        made = target.make(settings, ball, factor * (sky(rng) + 0.2) / 4)
+        assert bool(made.warnings) == warned
+        white = (tonemap(made.picture, curve) >= 1).all(axis=2).mean()
+        assert not warned or f"target: {100 * white:.3g} % of its pixels are white" in made.warnings[0]
+
+
 def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
     values = np.zeros((*SIZE, 3), np.uint8)
     values[:6] = 255
@@ -154,7 +165,7 @@ def test_a_painted_picture_is_read_as_it_was_exported(ball, seen, tmp_path):
     display, _ = images.read_stored(file)
     display[3:9, 4:12] = display[3:9, 4:12] * 0.5
     png(file, display)
-    narrow = dataclasses.replace(exported, input=config.Input(width=32))
+    narrow = replace(exported, input=config.Input(width=32))
     with pytest.raises(InputError, match="exported with input.width 256, where this run has 32"):
         target.make(narrow, ball, envmap)
     (tmp_path / "paint.png.envedit.json").unlink()

@@ -527,8 +527,8 @@ class Session:
         project.keep(self.document)
         settings, folder = project.configured(self.document), project.folder
         with output_folder.alone(folder):
-            named = output_folder.names(folder), output_folder.inputs_of(settings)
-            output_folder.prepare_folder(folder, *named)
+            read = output_folder.inputs_of(settings, project.base)
+            output_folder.prepare_folder(folder, output_folder.names(folder), read)
             watch = pipeline.Watch(
                 lambda text: self.tell.say({"type": "saving", "text": text}),
                 lambda done, total, text: self._progress(done, total, text),

@@ -127,6 +127,12 @@ def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):
             found.append(heard(page, "picked")["azimuth"])
         turned = (found[1] - found[0] + 180) % 360 - 180
         assert abs(turned) > 10, found
+        page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.45, "light": 0, "number": 3}))
+        reflected = heard(page, "picked")
+        assert abs(reflected["azimuth"] - 180) < 5 and abs(reflected["elevation"] - 25) < 5, reflected
+        page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.9, "light": 0, "number": 4}))
+        floor = heard(page, "picked")
+        assert "not glossy" in floor["text"] and "azimuth" not in floor, floor
 
 
 def test_a_light_that_was_placed_is_told_with_the_number_of_its_edit(server):

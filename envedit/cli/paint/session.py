@@ -36,6 +36,7 @@ from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
+from envedit.scene import highlight
 from envedit.scene.scene import Scene
 from envedit.solve import feasibility, gauss_newton, hold, initialization, map_problem
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
@@ -429,25 +430,31 @@ class Session:
 
     def pick(self, asked: Pick) -> None:
         """Find which light a pixel is lit by most, or where one must go for its highlight to lie there."""
-        patch = np.zeros(self.base.shape, np.float32)
-        seen = patch[self.lit.rows[min(asked.view, len(self.lit.rows) - 1)]]
-        height, width = seen.shape[:2]
-        row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
-        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
-        seen = self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
+        view = min(asked.view, len(self.lit.rows) - 1)
         if asked.light < 0:
-            answer["light"] = self._lit_by(seen)
+            answer["light"] = self._lit_by(self._seen(view, asked.x, asked.y))
         else:
-            omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
-            toward = latlong.directions(*seen.shape)
-            best = _smooth(seen / np.maximum(omega, 1e-12))
-            best[self.rows.stop :] = 0
-            i = int(best.argmax())
-            azimuth, elevation = angles(toward.reshape(-1, 3)[i])
-            answer |= {"light": asked.light, "azimuth": (azimuth + self.document.rotate_degrees) % 360}
-            answer["elevation"] = elevation
+            answer["light"] = asked.light
+            try:
+                toward = highlight.direction(self.lit, view, asked.x, asked.y)
+                row, _ = latlong.texel_position(toward, *self.map.shape[:2])
+                if not self.rows.first <= round(float(row)) < self.rows.stop:
+                    raise highlight.NoHighlightError("the light would stand where [input] rows keeps the map")
+                azimuth, answer["elevation"] = angles(toward)
+                answer["azimuth"] = (azimuth + self.document.rotate_degrees) % 360
+            except highlight.NoHighlightError as reason:
+                answer["text"] = str(reason)
         self.tell.say(answer)
+
+    def _seen(self, view, x, y):
+        """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
+        patch = np.zeros(self.base.shape, np.float32)
+        seen = patch[self.lit.rows[view]]
+        height, width = seen.shape[:2]
+        row, column = min(int(y * height), height - 1), min(int(x * width), width - 1)
+        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
+        return self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
 
     def _lit_by(self, seen):
         """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
@@ -510,9 +517,3 @@ class _Watched:
         if callable(found) and self._newer():
             raise SupersededError
         return found
-
-
-def _smooth(image):
-    """Sum an image (H, W) over 3x3 texels, around the horizon."""
-    wide = np.pad(np.pad(image, ((1, 1), (0, 0)), mode="edge"), ((0, 0), (1, 1)), mode="wrap")
-    return np.lib.stride_tricks.sliding_window_view(wide, (3, 3)).sum(axis=(2, 3))

@@ -241,11 +241,13 @@ function pick(phase, x, y) {
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
-  if (message.azimuth === undefined) {
+  if (message.text) say(`Light not moved: ${message.text}`);
+  else if (message.azimuth === undefined) {
     picked = message.light;
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
     else lights.choose(picked);
   } else if (!ended || message.number === asked) {
+    say("");
     lights.moveTo(message.light, message.azimuth, message.elevation);
     if (ended) lights.commit();
   }

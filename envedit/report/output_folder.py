@@ -57,7 +57,8 @@ def names(folder: Path) -> tuple[str, ...]:
 def inputs_of(settings: config.Config) -> list[str]:
     """List the files that a configuration reads, which no result may replace."""
     target = settings.target
-    named = (settings.input.envmap, settings.scene.file, *target.files, *target.masks)
+    own = settings.input.envmap, settings.scene.file, settings.optimizer.start
+    named = (*own, *target.files, *target.masks)
     return [file for file in named if file]
 
 

@@ -13,7 +13,8 @@ from envedit.cli.paint.protocol import Document
 from envedit.core import array_cache, atomic_files
 from envedit.core.errors import ConfigError, InputError
 
-NAME = "painted.toml"
+NAME, SOLUTION = "painted.toml", "painted.npz"
+"""Files of a painting: what was painted, and the solution that was saved last."""
 _RECENT = 12
 
 
@@ -33,6 +34,8 @@ class Project:
         As it was left the last time.
     again : bool
         Whether ``painted.toml`` was there already.
+    start : str
+        File of the solution that was saved of the document, "" where it has changed since.
     """
 
     settings: config.Config
@@ -40,13 +43,14 @@ class Project:
     base: Path
     document: Document
     again: bool = False
+    start: str = ""
 
-    def configured(self, document: Document) -> config.Config:
-        """Return the configuration that makes the map of a document."""
-        return _resolved(self.text(document), self.folder)
+    def configured(self, document: Document, start: str = "") -> config.Config:
+        """Return the configuration that makes the map of a document; arguments as of :meth:`text`."""
+        return _resolved(self.text(document, start), self.folder)
 
-    def text(self, document: Document) -> str:
-        """Return ``painted.toml``: what was given, and what was painted."""
+    def text(self, document: Document, start: str = "") -> str:
+        """Return ``painted.toml``: what was given, what was painted, and the solution that goes on from."""
         settings = self.settings
         target = {"kind": "strokes", "strokes": document.strokes} if document.strokes else {"kind": "none"}
         kept = ("tonemap", "paint", "hold", "spp") if document.strokes else ("spp",)
@@ -62,6 +66,7 @@ class Project:
             given["scene"]["parameters"] = {key: self._found(value) for key, value in named.items()}
         own = {"rotate_degrees": document.rotate_degrees} if document.rotate_degrees else {}
         given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
+        given["optimizer"] = given["optimizer"] | ({"start": start} if start else {})
         moved = {"exposure": document.exposure, "white_balance": document.white_balance}
         given["output"] = given["output"] | {key: value for key, value in moved.items() if value}
         given["output"].pop("dir", None)
@@ -87,8 +92,8 @@ class Project:
                 return str((self.base / value).absolute())
         return value
 
-    def keep(self, document: Document) -> None:
-        """Write ``painted.toml``, whole or not at all.
+    def keep(self, document: Document, start: str = "") -> None:
+        """Write ``painted.toml``, whole or not at all; arguments as of :meth:`text`.
 
         Raises
         ------
@@ -99,7 +104,7 @@ class Project:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
-        atomic_files.write_atomically(self.folder / NAME, self.text(document).encode())
+        atomic_files.write_atomically(self.folder / NAME, self.text(document, start).encode())
 
 
 def _resolved(text, folder):
@@ -142,7 +147,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
     folder = file.absolute().parent if file and painted else Path(settings.output.dir)
     plain = _plain(settings, folder)
     if painted:
-        return Project(plain, folder, base, document, True)
+        return Project(plain, folder, base, document, True, settings.optimizer.start)
     return _continued(Project(plain, folder, base, document))
 
 
@@ -158,6 +163,7 @@ def _plain(settings, folder):
         input=_without(settings.input, "lights", "rotate_degrees"),
         output=_without(settings.output, "exposure", "white_balance", dir=str(folder)),
         target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees"),
+        optimizer=_without(settings.optimizer, "start"),
     )
 
 

@@ -6,8 +6,8 @@ new edit comes.
 
 While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
 target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit
-that is saved is the pipeline's, which paints on Mitsuba's rendering, tries several starts, and judges its
-result.
+that is saved is the pipeline's, which paints on Mitsuba's rendering, goes on from the solution here, and
+judges its result.
 
 Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
 """
@@ -17,16 +17,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from envedit import config, inputs, pipeline, renderers
-from envedit.cli.paint.project import Project
+from envedit.cli.paint.project import SOLUTION, Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.errors import NumericalError
+from envedit.core.color import tonemap
+from envedit.core.errors import InputError, NumericalError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
@@ -38,7 +40,7 @@ from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene import highlight
 from envedit.scene.scene import Scene
-from envedit.solve import feasibility, gauss_newton, hold, initialization, map_problem
+from envedit.solve import checkpoint, feasibility, gauss_newton, hold, initialization, map_problem
 from envedit.solve.edit_job import LIKELIER, NEWTON_TRIAL
 from envedit.solve.light_search import SearchProblem
 from envedit.solve.prior import PAINTED
@@ -86,7 +88,10 @@ class Session:
     """
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
-        self.project, self.tell, self.newer = project, tell, newer
+        self.project, self.tell = project, tell
+        self._saving = self.solving = False
+        self.newer = lambda: not self._saving and newer()
+        self._kept = project.document  # as painted.toml has it
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
         self._shown: np.ndarray | None = None  # the rendering by T that the pages show
@@ -111,7 +116,7 @@ class Session:
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
-        self._watched: Any = _Watched(self.transport, newer)  # a transport in all it does
+        self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
         self._quick = self.transport
         if self.transport.spp > QUICK_SPP:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
@@ -121,6 +126,8 @@ class Session:
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
         self._aim(project.document)
+        if project.start and self.solving:
+            self._go_on_from(project.start)
 
     # ---- edits ---------------------------------------------------------------------------------------------
 
@@ -138,8 +145,9 @@ class Session:
             self._aim(edit.document)
         else:
             self._paint()
-        if edit.phase == "done":
+        if edit.phase == "done" and self.document != self._kept:
             self.project.keep(self.document)
+            self._kept = self.document
         self._show("transport")
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self.tell_state()
@@ -193,6 +201,17 @@ class Session:
             self.target, self.weight, self.coverage = self.base, None, None
             return
         self.target, self.coverage = painted.picture, coverage
+        self._weigh()
+
+    def _go_on_from(self, file):
+        """Take the solution that was saved of this document."""
+        try:
+            self.run = checkpoint.load_solution(Path(file), self.still)
+        except InputError as error:
+            self.notes = [*self.notes, str(error)]
+            return
+        self.start, self.hold, self.searched = self.run.start, self.run.hold, True
+        self.point = self.problem.evaluate(self.run.state)
         self._weigh()
 
     def _weigh(self):
@@ -258,10 +277,7 @@ class Session:
                 self._recorded = True
                 self._quick.resolve(self.point.edited, limit=COLUMNS)
                 return True
-            if self.solving and not self.searched:
-                self._search()
-                return True
-            if self.solving and self._held_more():
+            if self._searched_further():
                 return True
             if self.solving and self.reach is None:
                 self._reach()
@@ -269,6 +285,13 @@ class Session:
             return self._render(PASSES)
         except SupersededError:
             return True
+
+    def _searched_further(self):
+        """Try other lights, or give more weight to what was not painted; False where neither is due."""
+        if self.solving and not self.searched:
+            self._search()
+            return True
+        return self.solving and self._held_more()
 
     @property
     def converged(self) -> bool:
@@ -331,10 +354,7 @@ class Session:
         done, total = self._rendered
         if done >= passes:
             return False
-        if self._sharp is None:
-            self._sharp = working_size.scaled(self.lit, SHARPER) or self.lit
-        seed = Seeds.of(self.project.settings.seed).pass_of_page(done)
-        total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
+        total = total + self._pass(done, self._adjusted(self._edited()))
         done += 1
         self._rendered = done, total
         if done in (1, 2, 4, 8, PASSES):
@@ -342,6 +362,12 @@ class Session:
             self.tell.frame("render", "mitsuba", total / done, self._sharp.rows)
             self.tell_state()
         return True
+
+    def _pass(self, i, shown):
+        """Return one pass of Mitsuba's rendering of a map, at the size that is shown when idle."""
+        if self._sharp is None:
+            self._sharp = working_size.scaled(self.lit, SHARPER) or self.lit
+        return self._sharp.render(shown, PASS, Seeds.of(self.project.settings.seed).pass_of_page(i))
 
     def _worked_on(self, lit):
         """Return the scene at the size that an edit is solved at; as it is, if strokes are in its pixels."""
@@ -482,10 +508,35 @@ class Session:
     # ---- results -------------------------------------------------------------------------------------------
 
     def save(self, import_s: float = 0.0) -> list[str]:
-        """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings."""
-        project = self.project
-        project.keep(self.document)
-        settings, folder = project.configured(self.document), project.folder
+        """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings.
+
+        The run goes on from the solution that is shown, which is solved to its end first.
+        """
+        self._saving = True
+        try:
+            return self._save(import_s)
+        finally:
+            self._saving = False
+
+    def _save(self, import_s):
+        project, folder = self.project, self.project.folder
+
+        # ---- The solution that is shown, to its end
+        if self._dragged:
+            self._aim(self.document)
+        shown = self._adjusted(self._edited())
+        while not self.converged or self._searched_further():
+            if not self.converged:
+                self._step()
+        start = SOLUTION if self.solving else ""
+        project.keep(self.document, start)
+        self._kept = self.document
+        if start:
+            solution = gauss_newton.Run(self.run.state, self.run.start, hold=self.hold)
+            checkpoint.save_solution(folder / SOLUTION, solution)
+
+        # ---- The run that goes on from it
+        settings = project.configured(self.document, start)
         with output_folder.alone(folder):
             named = output_folder.names(folder), output_folder.inputs_of(settings)
             output_folder.prepare_folder(folder, *named)
@@ -496,14 +547,34 @@ class Session:
             result = pipeline.run(settings, folder=folder, base=project.base, watch=watch)
             self.tell.say({"type": "saving", "text": "writing"})
             warnings = run_folder.write(settings, folder, result, import_s, project.base)
-        rows = tuple(view.rows for view in result.views)
-        self.tell.frame("render", "saved", result.renders["edited"], rows)
-        self.tell.frame("map", "saved", result.maps["edited"])
+
+        # ---- What was saved, no less sharp than what is shown, and how it differs
+        saved, rows = result.maps["edited"], tuple(view.rows for view in result.views)
+        rendering = result.renders["edited"]
+        passed = self._pass(0, saved)
+        if passed.shape[1] > rendering.shape[1]:
+            rest = (self._pass(i, saved) for i in range(1, PASSES))
+            rendering, rows = sum(rest, passed) / PASSES, self._sharp.rows
+        self.tell.frame("render", "saved", rendering, rows)
+        self.tell.frame("map", "saved", saved)
         self._shown = None
         self.resting = True  # what is shown is what was saved
         files = [name for name in output_folder.names(folder) if (folder / name).exists()]
-        self.tell.say({"type": "saved", "folder": folder.name, "files": files, "warnings": warnings})
+        notes = [self._differs(shown, saved), *(note for note in result.notes if "target.hold =" in note)]
+        told = {"folder": folder.name, "files": files, "warnings": warnings, "notes": notes}
+        self.tell.say({"type": "saved", **told})
         return warnings
+
+    def _differs(self, shown, saved):
+        """Say by how much the rendering of the map that was saved differs from the one that was shown."""
+        self.transport.resolve(saved, limit=COLUMNS)
+        before, after = (tonemap(self.transport.apply(tensor(one)).numpy()) for one in (shown, saved))
+        self.point = self.problem.evaluate(self.run.state)  # that has taken its columns
+        change = np.abs(after - before)
+        return (
+            f"the picture differs from the one shown before by {change.mean():.2g} of a display value on "
+            f"average, {change.max():.2g} at most"
+        )
 
 
 class _Watched:

@@ -165,8 +165,8 @@ const RECEIVED = {
   saved(message) {
     say("", true);
     $("progress").hidden = true;
-    const links = message.files.filter((name) => ["report.html", "edited.exr", "lights.json"].includes(name));
-    $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...message.warnings.map((line) => `${line}. `));
+    const links = message.files.filter((name) => ["report.html", "edited.exr", "edited_full.exr", "edited_full.hdr", "lights.json"].includes(name));
+    $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...[...message.notes, ...message.warnings].map((line) => `${line}. `));
   },
   refused(message) { say(message.text); },
   error(message) { $("progress").hidden = true; say(message.text); state("error", "Error"); },

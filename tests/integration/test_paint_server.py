@@ -1,5 +1,6 @@
 """``envedit paint`` without a browser: who is let in, what is refused, several pages, ends."""
 
+import itertools
 import json
 import os
 import signal
@@ -114,6 +115,23 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
         again.send(json.dumps({"type": "document", "number": 6, "document": {}}))
         heard(again, "status", lambda m: m.get("number") == 6)
     until(lambda: server.worker.session.document == Document())
+
+
+def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
+    stroke = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
+    told = []
+    with connected(server) as page:
+        page.send(json.dumps({"type": "document", "number": 20, "document": {"strokes": [stroke]}}))
+        while not told or told[-1] != "done":
+            told.append(heard(page, "status", lambda m: m.get("number") == 20)["state"])
+        with pytest.raises(TimeoutError):
+            while True:
+                received = page.recv(timeout=3)
+                told += [json.loads(received).get("state")] if isinstance(received, str) else []
+        states = [state for state, _ in itertools.groupby(filter(None, told))]
+        assert states == ["solving", "rendering", "done"]
+        page.send(json.dumps({"type": "document", "number": 21, "document": {}}))
+        heard(page, "status", lambda m: m.get("number") == 21)
 
 
 def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):

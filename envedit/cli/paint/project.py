@@ -67,7 +67,7 @@ class Project:
         own = {"rotate_degrees": document.rotate_degrees} if document.rotate_degrees else {}
         given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
         given["optimizer"] = given["optimizer"] | ({"start": start} if start else {})
-        moved = {"exposure": document.exposure, "white_balance": document.white_balance}
+        moved = {"exposure": document.exposure, "temperature": document.temperature}
         given["output"] = given["output"] | {key: value for key, value in moved.items() if value}
         given["output"].pop("dir", None)
         lines = [
@@ -141,7 +141,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
         lights=settings.input.lights,
         rotate_degrees=settings.input.rotate_degrees,
         exposure=settings.output.exposure,
-        white_balance=settings.output.white_balance,
+        temperature=settings.output.temperature,
     )
     painted = file is not None and file.name == NAME
     folder = file.absolute().parent if file and painted else Path(settings.output.dir)
@@ -161,7 +161,7 @@ def _plain(settings, folder):
     return replace(
         settings,
         input=_without(settings.input, "lights", "rotate_degrees"),
-        output=_without(settings.output, "exposure", "white_balance", dir=str(folder)),
+        output=_without(settings.output, "exposure", "temperature", dir=str(folder)),
         target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees"),
         optimizer=_without(settings.optimizer, "start"),
     )
@@ -201,7 +201,7 @@ def recent() -> list[dict]:
 def note(project: Project) -> None:
     """Note that a project was worked on; a cache that cannot be written is no error."""
     path = str(project.folder / NAME)
-    title = f"{Path(project.settings.scene.file).stem}, {Path(project.settings.input.envmap).stem}"
+    title = f"{run.scene_name(Path(project.settings.scene.file))}, {Path(project.settings.input.envmap).stem}"
     listed = [{"path": path, "title": title}, *(one for one in recent() if one["path"] != path)]
     with contextlib.suppress(OSError, AttributeError, InputError):
         file = _recent_file()

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from envedit import config, inputs, pipeline, renderers
+from envedit import inputs, pipeline, renderers
 from envedit.cli.paint.project import SOLUTION, Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.color import tonemap
+from envedit.core.color import luminance, tonemap
 from envedit.core.errors import InputError, NumericalError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
@@ -56,6 +56,8 @@ SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
+NOT_WHITE = 0.95
+"""Share of the pixels of the rendering that the page does not show white when it is opened."""
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
@@ -128,6 +130,12 @@ class Session:
         self._aim(project.document)
         if project.start and self.solving:
             self._go_on_from(project.start)
+
+    @property
+    def exposure(self) -> float:
+        """Stops that leave :data:`NOT_WHITE` of the pixels below white, in quarters; 0 if they are black."""
+        bright = float(np.quantile(luminance(self.before), NOT_WHITE))
+        return float(np.clip(np.round(-4 * np.log2(bright)) / 4, -8, 8)) if bright > 0 else 0.0
 
     # ---- edits ---------------------------------------------------------------------------------------------
 
@@ -294,6 +302,17 @@ class Session:
         return self.solving and self._held_more()
 
     @property
+    def state(self) -> str:
+        """What goes on: moving (of lights), solving or rendering; done: nothing is left to do."""
+        if self._dragged:
+            return "moving"
+        if self.resting:
+            return "done"
+        if self.phase != "done" or not self.converged or (self.solving and self.reach is None):
+            return "solving"
+        return "rendering" if self._rendered is None or self._rendered[0] < PASSES else "done"
+
+    @property
     def converged(self) -> bool:
         """Whether no further step is made towards what is painted."""
         return not self.solving or self.run.finished or len(self.run.history) >= gauss_newton.ITERATIONS
@@ -381,19 +400,24 @@ class Session:
         painted, known = self.coverage[..., 0], self.point.edited
         self.reach = feasibility.reachable(self._watched, *asked, painted, self.base, known)
         self.status["reachable"] = self.reach.share
-        self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
+        self._tell_unreachable()
         self.tell_state()
+
+    def _tell_unreachable(self):
+        """Show what of the paint is not feasible, once that is known."""
+        if self.reach is not None:
+            self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
 
     # ---- what is shown -------------------------------------------------------------------------------------
 
     def _edited(self):
-        """Return the map as it is edited (H, W, 3), before exposure and white balance."""
+        """Return the map as it is edited (H, W, 3), before exposure and colours."""
         return self._preview[0] if self._dragged else unseen_kept(self.origin, self.point.edited)
 
     def _adjusted(self, edited):
-        """Return a map as it is shown: with exposure and white balance; the map itself without."""
+        """Return a map as it is shown: with exposure and temperature; the map itself without."""
         document, settings = self.document, self.project.settings
-        output = config.Output(exposure=document.exposure, white_balance=document.white_balance)
+        output = replace(settings.output, exposure=document.exposure, temperature=document.temperature)
         return adjustments.adjust(edited, settings.lights, output, self.given.scale)[0]
 
     def _show(self, source):
@@ -416,6 +440,7 @@ class Session:
         """Show everything anew, to a page that has just come."""
         self.resting, self._shown = False, None
         self.tell.frame("before", "transport", self.before, self.lit.rows)
+        self._tell_unreachable()
         self._show("transport")
         self._rendered = None
         self._tell_lights()
@@ -436,12 +461,9 @@ class Session:
         self.tell.say({"type": "lights", "own": own, "found": found})
 
     def tell_state(self) -> None:
-        """Say whether there is a solution yet, and how good it is."""
-        busy = not self._dragged and not self.converged
+        """Say what goes on, and how good the solution is."""
         rendered = self._rendered[0] * PASS if self._rendered else 0
-        self.tell.say(
-            {"type": "status", "state": "solving" if busy else "done", "samples": rendered, **self.status}
-        )
+        self.tell.say({"type": "status", "state": self.state, "samples": rendered, **self.status})
 
     def _tell_doing(self, text):
         self.tell.say({"type": "doing", "text": text})

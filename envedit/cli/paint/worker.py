@@ -7,6 +7,7 @@ import threading
 import traceback
 from pathlib import Path
 
+from envedit.cli import run
 from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Open, Pick, Save
 from envedit.cli.paint.session import Session, SupersededError, Tell
@@ -117,11 +118,12 @@ class Worker(threading.Thread):
         self.session = Session(opened, self.tell, lambda: self.newer)
         self._painting += 1
         project.note(opened)
+        scene = run.scene_name(self.session.lit.path)
         self.tell.say(
             {
                 "type": "opened",
                 "painting": self._painting,
-                "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
+                "title": f"{scene}, {Path(opened.settings.input.envmap).name}",
                 "folder": opened.folder.name,
                 "views": [view.name for view in self.session.lit.views],
                 "again": opened.again,
@@ -129,6 +131,7 @@ class Worker(threading.Thread):
                 "width": self.session.lit.width,
                 "height": self.session.lit.height,
                 "notes": self.session.notes,
+                "exposure": self.session.exposure,
             }
         )
         self.session.again()

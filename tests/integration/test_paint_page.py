@@ -171,10 +171,14 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
         second = page.page.evaluate(ratio)
         assert first["width"] / first["height"] == pytest.approx(32 / 20, rel=0.02)
         assert second["width"] / second["height"] == pytest.approx(32 / 28, rel=0.02)
+        page.page.get_by_test_id("tool-light").click()
         page.page.get_by_test_id("shape-rectangle").click()
+        stops = float(page.page.get_by_test_id("exposure").input_value())
         page.drag(page.at("#overlay", 0.3, 0.3), page.at("#overlay", 0.7, 0.7))
         kept = tmp_path / "edit_out" / "painted.toml"
         until(lambda: kept.exists() and "view = 1" in kept.read_text())
+        (stroke,) = config.load(kept).target.strokes
+        assert stroke["amount"] == pytest.approx(0.6 / 2**stops, rel=1e-3), "not of what is shown as white"
         page.shot("views")
 
         assert not page.page.evaluate(UNNAMED)

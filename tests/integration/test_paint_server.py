@@ -123,7 +123,9 @@ def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
     with connected(server) as page:
         page.send(json.dumps({"type": "document", "number": 20, "document": {"strokes": [stroke]}}))
         while not told or told[-1] != "done":
-            told.append(heard(page, "status", lambda m: m.get("number") == 20)["state"])
+            status = heard(page, "status", lambda m: m.get("number") == 20)
+            told.append(status["state"])
+        assert status["hold"] > 1, "the weight of what was not painted is not told"
         with pytest.raises(TimeoutError):
             while True:
                 received = page.recv(timeout=3)

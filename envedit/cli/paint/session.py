@@ -236,7 +236,7 @@ class Session:
         more = hold.further(chosen, self.hold, *seen)
         if more is None:
             return False
-        self.hold = more
+        self.hold = self.status["hold"] = more
         self._weigh()
         return True
 

@@ -183,6 +183,7 @@ function told(message) {
   if (message.iterations) parts.push(`${message.iterations} iterations`);
   if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
   if (message.reachable != null) parts.push(`${Math.round(100 * message.reachable)} % of the paint is feasible`);
+  if (message.hold) parts.push(`target.hold = ${+message.hold.toPrecision(3)}`);
   if (message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
   return parts.join(" · ");
 }

@@ -118,7 +118,7 @@ class Preparation:
 
     def detailed(self, target: Target) -> bool:
         """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""
-        if self.settings.representation.kind != "layers":
+        if self.settings.representation.kind != "layers" or self._started_before:
             return False
         with self.clock("fit_s"):
             representation: Any = representations.make(
@@ -130,7 +130,14 @@ class Preparation:
         return bool(found and found.octaves)
 
     def edit(self, target: Target) -> Edit:
-        """Prepare the edit; the sky is turned where that explains the target better."""
+        """Prepare the edit; the sky is turned where that explains the target better.
+
+        One that goes on from a solution on disk is of the map and the layers as they are.
+        """
+        if self._started_before:
+            edit = self._prepared(target, 0.0, [], search=False, ask=False)
+            edit.job.go_on_from(self.settings.optimizer.start, edit.params)
+            return edit
         turn, settings = self._turn(target), self.settings
         idle = replace(self, settings=replace(settings, optimizer=replace(settings.optimizer, iterations=0)))
         known = self._noise(target, turn)
@@ -167,6 +174,13 @@ class Preparation:
             f"Akaike criterion (lower is better): {loss:.5g} with the sky turned, {other:.5g} without"
         )
         return chosen
+
+    @property
+    def _started_before(self):
+        """Whether a solution on disk is what Gauss-Newton steps go on from."""
+        chosen, stored = self.settings.optimizer, self.settings.renderer.kind == "transport"
+        layers = self.settings.representation.kind == "layers"
+        return bool(chosen.start) and chosen.kind != "adam" and layers and stored
 
     def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""

@@ -56,7 +56,8 @@ def parser() -> argparse.ArgumentParser:
         "--out",
         metavar="DIR",
         help="folder for the results (default: CONFIG_out beside the configuration; "
-        "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out)",
+        "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out, "
+        "for FOLDER/scene.xml FOLDER_scene_out)",
     )
     made.add_argument(
         "--preset",

@@ -60,7 +60,7 @@ def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[Fil
     ``base`` is as of :func:`.scene.load`. Mitsuba is imported when the last are asked for.
     """
     target, weights = settings.target, settings.perceptual
-    yield from filter(None, (settings.input.envmap, *target.files, *target.masks))
+    yield from filter(None, (settings.input.envmap, settings.optimizer.start, *target.files, *target.masks))
     yield from filter(None, (weights.vgg, weights.dists, weights.backbone, weights.heads))
     from envedit.scene import scene
 

@@ -85,7 +85,7 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     )
     light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3]}
     done = protocol.document(
-        {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "white_balance": 5000}
+        {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "temperature": 5000}
     )
     opened.keep(done)
     again = project.opened(str(file))

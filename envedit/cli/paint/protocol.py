@@ -46,7 +46,7 @@ class Document:
         As in ``[[input.lights]]``.
     rotate_degrees : float
         ``[input] rotate_degrees``.
-    exposure, white_balance : float
+    exposure, temperature : float
         As in ``[output]``.
     """
 
@@ -54,7 +54,7 @@ class Document:
     lights: tuple[dict, ...] = ()
     rotate_degrees: float = 0.0
     exposure: float = 0.0
-    white_balance: float = 0.0
+    temperature: float = 0.0
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -66,7 +66,7 @@ _CHECKS = {
     "lights": LightList(),
     "rotate_degrees": Number(-360, 360),
     "exposure": Number(-20, 20),
-    "white_balance": Kelvin(),
+    "temperature": Kelvin(),
 }
 
 

@@ -8,6 +8,7 @@ import threading
 import traceback
 from pathlib import Path
 
+from envedit.cli import run
 from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Open, Pick, Save
 from envedit.cli.paint.session import Session, SupersededError, Tell
@@ -147,11 +148,12 @@ class Worker(threading.Thread):
         self.session = session
         self._painting += 1
         project.note(opened)
+        scene = run.scene_name(self.session.lit.path)
         self.tell.say(
             {
                 "type": "opened",
                 "painting": self._painting,
-                "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
+                "title": f"{scene}, {Path(opened.settings.input.envmap).name}",
                 "folder": opened.folder.name,
                 "views": [view.name for view in self.session.lit.views],
                 "again": opened.again,
@@ -159,6 +161,7 @@ class Worker(threading.Thread):
                 "width": self.session.lit.width,
                 "height": self.session.lit.height,
                 "notes": self.session.notes,
+                "exposure": self.session.exposure,
             }
         )
         self.session.again()

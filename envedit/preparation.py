@@ -38,8 +38,9 @@ target. Between renderings of one map the ratio is 1, with a standard error of 0
 AREAS = 16
 """Areas on each axis of a picture over which residuals are averaged, beside single pixels: noise is smaller
 there, and a small change of the light is not. 256 residuals, as in :data:`.map_problem.INDEPENDENT`."""
-TURN_SPP = 64
-"""Most samples a pixel of renderings that are compared to find a turn."""
+TURN_PATHS = 2**20
+"""Paths of a rendering that is compared to find a turn, all pixels together, up to a factor of two; at most
+as many as the target's."""
 PREFERRED = 0.05
 """The unturned sky is chosen only if its residual is smaller by this share: a turn adds no content."""
 
@@ -168,11 +169,14 @@ class Preparation:
             return None
         with self.clock("start_s"):
             self.watch.stage("testing turns of the sky")
-            seed = Seeds.of(self.settings.seed).turn_check
-            spp = min(TURN_SPP, target.spp or TURN_SPP)
+            seeds = Seeds.of(self.settings.seed)
+            drawn = seeds.turn_check, seeds.target_again
+            # A power of four, for as many strata across as down.
+            spp = 4 ** (max(1, TURN_PATHS // (self.lit.width * self.lit.height)).bit_length() // 2)
+            spp = spp if target.spp is None else min(spp, target.spp)
             return turning.find(
                 transport,
-                lambda envmap: self.lit.render(envmap, spp, seed),
+                lambda envmap, k: self.lit.render(envmap, spp, drawn[k]),
                 self.original,
                 target.picture,
                 target.weight,

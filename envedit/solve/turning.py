@@ -26,11 +26,9 @@ LITTLE, BEYOND = 0.8, 2.0
 more than so many times the block transport's own error."""
 FINEST = 0.02
 """Finest turn in texels."""
-FRACTIONS = 5
-"""Turns between two whole ones, both included, through which the squared residual is fitted."""
 WHOLE = 3.0
-"""A turn by whole texels is preferred where the squared residual rises by at most so many standard errors of
-that rise, sqrt(2 / n) of itself for n pixels whose noise is independent. Texels keep their bits then."""
+"""A turn by whole texels is preferred up to so many standard errors of the turn's fraction of a texel: texels
+keep their bits then."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class Turn:
 
 def find(
     transport: LightTransport,
-    render: Callable[[np.ndarray], np.ndarray],
+    render: Callable[[np.ndarray, int], np.ndarray],
     envmap: np.ndarray,
     picture: np.ndarray,
     weight: np.ndarray | None = None,
@@ -65,7 +63,8 @@ def find(
     transport : LightTransport
         T; its block transport is used.
     render : callable
-        Renders a map (H, W, 3) to (h, w, 3), linear radiance, with the same samples each time.
+        Renders a map (H, W, 3) to (h, w, 3), linear radiance, with the same samples each time; those of an
+        integer from 0.
     envmap : ndarray (H, W, 3)
         The map.
     picture : ndarray (h, w, 3)
@@ -77,7 +76,7 @@ def find(
         something (:data:`LITTLE`, :data:`BEYOND`), and no turn is found elsewhere.
     """
     width = envmap.shape[1]
-    rendering = render(envmap)
+    rendering = render(envmap, 0)
     known = {0.0: apart(rendering, picture, weight)}
 
     # ---- Turns by whole texels, through the block transport
@@ -95,7 +94,7 @@ def find(
     def error(texels):
         texels = round(texels % width / FINEST) * FINEST % width
         if texels not in known:
-            known[texels] = apart(render(latlong.rotate(envmap, 360 * texels / width)), picture, weight)
+            known[texels] = apart(render(latlong.rotate(envmap, 360 * texels / width), 0), picture, weight)
         return known[texels]
 
     sure = error(best[0]) < SURE * known[0.0]
@@ -106,17 +105,32 @@ def find(
         texels = nearer
 
     # ---- A fraction of a texel, where noise does not leave it open
-    # Between neighbouring whole turns the map is linear in the fraction, and the squared residual quadratic.
-    side = min((-1, 1), key=lambda way: error(texels + way / 2))
-    parts = side * np.linspace(0, 1, FRACTIONS)
-    curvature, slope, _ = np.polyfit(parts, [error(texels + part) ** 2 for part in parts], 2)
-    if curvature > 0:
-        part = float(np.clip(-slope / (2 * curvature), parts.min(), parts.max()))
-        pixels = picture.shape[0] * picture.shape[1] if weight is None else np.count_nonzero(weight)
-        within = 1 + WHOLE * (2 / pixels) ** 0.5
-        texels += part if error(texels) ** 2 > within * error(texels + part) ** 2 else 0
+    for side in (1, -1):
+        maps = [latlong.rotate(envmap, 360 * (texels + k) / width) for k in (0, side)]
+        part, deviation = _fraction(render, maps, picture, weight)
+        if part > 0:
+            break
+    part = min(max(part, 0.0), 1.0)
+    texels += side * (part if abs(part - round(part)) > WHOLE * deviation else round(part))
     texels = round(texels / FINEST) * FINEST % width
     return Turn(360 * texels / width, error(texels), error(0.0))
+
+
+def _fraction(render, maps, picture, weight):
+    """Return how far a picture is on the way from one map to another, and the standard error of that.
+
+    Between them the map is linear in the fraction f: d(t) = d(a) + f (d(b) - d(a)). Both are rendered twice,
+    as in a product of differences with independent noise that noise is no bias.
+    """
+    (a1, b1), (a2, b2) = ([_shown(render(envmap, k)) for envmap in maps] for k in (0, 1))
+    target, count = _shown(picture), 1.0 if weight is None else weight
+    lengths = count * (b1 - a1) * (b2 - a2)
+    towards = count * ((target - a1) * (b2 - a2) + (target - a2) * (b1 - a1)) / 2
+    if not lengths.sum() > 0:
+        return 0.0, np.inf
+    part = float(towards.sum() / lengths.sum())
+    left = (towards - part * lengths).sum(axis=2)
+    return part, float(np.sqrt(np.square(left).sum()) / lengths.sum())
 
 
 def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
@@ -136,8 +150,11 @@ def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None 
 
 def residuals(rendering: np.ndarray, picture: np.ndarray) -> np.ndarray:
     """Return display values of a rendering less those of a picture, (h, w, 3) float64 both."""
-    off = np.float64(display_curve.to_display(tensor(rendering)).numpy())
-    return off - display_curve.to_display(tensor(picture)).numpy()
+    return _shown(rendering) - _shown(picture)
+
+
+def _shown(picture):
+    return np.float64(display_curve.to_display(tensor(picture)).numpy())
 
 
 def _at_a_glance(transport, envmap, picture, weight, rendering):

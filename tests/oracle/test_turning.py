@@ -28,7 +28,7 @@ def rendered(transport, image):
 
 def found_of(transport, image, picture, **more):
     """Find a turn where T is exact, so that it renders turned maps too."""
-    return turning.find(transport, lambda envmap: rendered(transport, envmap), image, picture, **more)
+    return turning.find(transport, lambda envmap, _: rendered(transport, envmap), image, picture, **more)
 
 
 @pytest.mark.parametrize("texels", [0.0, 0.5, 7.0, 21.3, 32.0, 63.9])
@@ -93,10 +93,10 @@ def test_a_whole_turn_is_preferred_within_the_noise(texels, noise, whole, traced
     """Every rendering with noise of its own, as where other samples find the sun."""
     image, degrees = sky(rng), 360 * texels / GRID[1]
 
-    def render(envmap):
+    def render(envmap, _):
         picture = rendered(traced, envmap)
         return np.float32(picture * np.exp(noise * rng.standard_normal((*FILM, 1))))
 
-    picture = render(latlong.rotate(image, degrees))
+    picture = render(latlong.rotate(image, degrees), 2)
     found = turning.find(traced, render, image, picture)
     assert found.degrees % (360 / GRID[1]) == 0 if whole else abs(found.degrees - degrees) < 0.5

@@ -808,6 +808,17 @@ def test_a_turned_sky_is_turned_back_to_the_bit(kind, tmp_path, rng):
     assert found.maps["initial"].tobytes() == picture.tobytes()
 
 
+@pytest.mark.parametrize("degrees", [60.0, 90.0])
+def test_a_turn_is_as_exact_where_the_transport_is_not(degrees, tmp_path, rng):
+    """T with few samples; texels of 11.25 degrees each."""
+    target, film = {"rotate_degrees": degrees, "spp": 256}, {"width": 48, "height": 36}
+    renderer = {"spp": 4, "max_depth": 3}
+    settings, picture = turned_world(tmp_path, rng, target=target, scene=film, renderer=renderer)
+    found = pipeline.run(settings)
+    assert found.metrics["turn_degrees"] == pytest.approx(degrees, abs=0.6 if degrees == 60 else 1e-9)
+    assert degrees == 60 or found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()
+
+
 def test_a_sky_that_must_not_turn_does_not(tmp_path, rng):
     settings, _ = turned_world(tmp_path, rng, representation={"turn": False}, optimizer={"iterations": 3})
     found = pipeline.run(settings)

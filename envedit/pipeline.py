@@ -155,7 +155,8 @@ def run(
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, within, notes = job.renderer, None, list(edit.notes)
     traced = renderer.transport
-    warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
+    solver = "gauss-newton" if job.newton else "adam"
+    warnings += config.unused(settings, solver if job.settings is settings else None)  # None: no step is made
     in_file_units = functools.partial(_in_file_units, given, edit.degrees)
     with clock("edit_s"), in_file_units():
         watch.stage("editing")

@@ -1,6 +1,7 @@
 """One run from configuration to result: load, prepare, optimise, judge.
 
 Nothing here prints or writes but the checkpoint; ``cli`` and ``report`` do, with what this returns.
+Longer than 400 lines: runs with and without an edit stand side by side, with what both are judged by.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
 from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
 from envedit.targets import working_size
+from envedit.targets.target import Target
 from envedit.targets.target import make as make_target
 from envedit.targets.working_size import at_size
 
@@ -125,15 +127,17 @@ def run(
             said.append(f"the map gives {part:.3g} % of the picture's light; scene.scale changes that")
         height, width, _ = original.shape
         rows = inputs.active_rows(settings.input.rows, height)
-        if settings.target.kind == "none":
+        target = None
+        if settings.target.kind != "none":
+            small = working_size.smaller(settings, lit)
+            renderers.check(settings, small, (height, width))
+            watch.stage("rendering the target")
+            target = make_target(settings, lit, original, memory.picture, memory.mask, memory.target_map)
+            warnings += target.warnings
+        if target is None or (target.envmap is not None and np.array_equal(target.envmap, original)):
             warnings += config.unused(settings)
-            found = _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
+            found = _adjusted(settings, lit, given, target, warnings, watch, clock, begun, lpips)
             return replace(found, memory=memory, base=base)
-        small = working_size.smaller(settings, lit)
-        renderers.check(settings, small, (height, width))
-        watch.stage("rendering the target")
-        target = make_target(settings, lit, original, memory.picture, memory.mask, memory.target_map)
-        warnings += target.warnings
         solved = target if small is lit else working_size.worked_on(settings, lit, small, original, target)
 
     # ---- Transport, at the size that the edit is solved at
@@ -156,7 +160,8 @@ def run(
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, within, notes = job.renderer, None, list(edit.notes)
     traced = renderer.transport
-    warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
+    solver = "gauss-newton" if job.newton else "adam"
+    warnings += config.unused(settings, solver if job.settings is settings else None)  # None: no step is made
     in_file_units = functools.partial(_in_file_units, given, edit.degrees)
     with clock("edit_s"), in_file_units():
         watch.stage("editing")
@@ -193,6 +198,7 @@ def run(
         unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
         initial = unedited if target.initial is None else target.initial
         by_hand = settings.input.rotate_degrees
+        alike = _alike(settings, lit, target, original, judged)
         lights, core = light_list.of_edit(given, edited, lit.to_world, by_hand, edit.degrees)
 
     # ---- Notes
@@ -209,7 +215,7 @@ def run(
     maps = {"initial": original, "target": target.envmap, "edited": edited}
     with in_file_units(), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit, noise)
+        measured = _measure(settings, renders, maps, rows, alike, target.coverage, within, lpips, lit, noise)
     if measured["painted"] and measured["painted"]["towards"] is None:
         notes.append("the painted change is below the noise of the renderings: no share of it is measured")
     rate = "; lower optimizer.lr" if job.raised_rate else ""
@@ -278,26 +284,35 @@ def run(
     )
 
 
-def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
-    """Adjust a map without a target; compared with the initial rendering."""
+def _adjusted(settings, lit, given, target, warnings, watch, clock, begun, lpips):
+    """Adjust a map that is not edited: there is no target, or the map is the target's own.
+
+    Without a target it is compared with the initial rendering.
+    """
     original = given.radiance
     with clock("edit_s"):
         watch.stage("adjusting the map")
         edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        seeds, spp = Seeds.of(settings.seed), settings.output.spp
-        initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, settings.renderer.cache)
+        seeds, spp, keep = Seeds.of(settings.seed), settings.output.spp, settings.renderer.cache
         final, judged, _ = lit.sampled(edited, spp, seeds.judged)
-        renders = {"initial": initial, "target": initial, "edited": final}
-        maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
-        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
+        if target is None:
+            initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, keep)
+            source = "no target: the result is compared with the initial rendering"
+            target = Target(initial, None, None, source, initial=initial)
+        else:
+            initial, _, _ = rendered(lit, original, spp, seeds.judged, keep, judged)
+            source = f"{target.source}; that is the input map, bit for bit: nothing is solved"
+        renders = {"initial": initial, "target": target.picture, "edited": final}
+        maps, rows = {"initial": original, "target": target.envmap, "edited": edited}, Rows.of(len(original))
+        alike = _alike(settings, lit, target, original, judged)
+        measured = _measure(settings, renders, maps, rows, alike, None, None, lpips, lit)
         stored = given.as_stored(edited)
         lights, core = light_list.of_edit(given, edited, lit.to_world, settings.input.rotate_degrees)
-    said = "no target: the result is compared with the initial rendering"
     notes = [
         *inputs.notes(settings.input, lit, given),
-        said,
+        source,
         *notes,
         *filter(None, [light_list.summary(lights, len(original))]),
         f"rendered with {judged} samples a pixel",
@@ -307,6 +322,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         "timing": clock.table([], time.perf_counter() - begun),
         "iterations": 0,
         "non_finite_steps": 0,
+        "worse": False,
         "transport": None,
         "turn_degrees": 0.0,
         "choices": notes,
@@ -314,6 +330,19 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
     more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
     more |= {"settings": settings}
     return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
+
+
+def _alike(settings, lit, target, original, judged):
+    """Return two pictures that differ by noise alone: a map rendered as the result is, and as the target was.
+
+    The map is that of the target; where the picture was painted, the one whose rendering was painted on.
+    """
+    envmap, picture = target.envmap, target.picture
+    if envmap is None:
+        envmap, picture = original, target.initial
+    spp, seed, keep = settings.output.spp, Seeds.of(settings.seed).judged, settings.renderer.cache
+    again, _, _ = rendered(lit, envmap, spp, seed, keep, judged)
+    return again, picture
 
 
 @contextlib.contextmanager
@@ -344,14 +373,18 @@ def _perceptual(settings):
     return dists, lpips
 
 
-def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=None):
-    """Compare renderings and maps: the part of the metrics that says how good the result is."""
+def _measure(settings, renders, maps, rows, alike, coverage, within, lpips, lit, noise=None):
+    """Compare renderings and maps: the part of the metrics that says how good the result is.
+
+    ``alike`` are two pictures that differ by noise alone: no rendering can be expected to do better.
+    """
     tonemap = settings.output.tonemap
     before, target, after = (renders[name] for name in ("initial", "target", "edited"))
     seen = None if lit.alpha is None else lit.alpha > 0
     measured = {
         "render": metrics.compare(after, target, tonemap, lpips, seen, lit.rows),
         "initial": metrics.compare(before, target, tonemap, lpips, seen, lit.rows),
+        "ceiling": metrics.compare(alike[0], alike[1], tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.first, rows.last],
@@ -359,7 +392,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=
         "painted": None,
     }
     if len(lit.views) > 1:
-        measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap, noise)
+        measured["views"] = _of_views(lit.views, renders, alike, coverage, lpips, seen, tonemap, noise)
     if coverage is not None:
         measured["painted"] = metrics.painted(after, target, before, coverage, tonemap, seen, noise)
         measured["painted"]["reachable"] = None if within is None else within.share
@@ -371,7 +404,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=
     return measured
 
 
-def _of_views(views, renders, coverage, lpips, seen, tonemap, noise):
+def _of_views(views, renders, alike, coverage, lpips, seen, tonemap, noise):
     """Compare the renderings of each view."""
     found = []
     for view in views:
@@ -381,6 +414,7 @@ def _of_views(views, renders, coverage, lpips, seen, tonemap, noise):
         of_view = {"name": view.name}
         of_view |= {"render": metrics.compare(after, target, *some)}
         of_view |= {"initial": metrics.compare(before, target, *some), "painted": None}
+        of_view["ceiling"] = metrics.compare(alike[0][view.rows], alike[1][view.rows], *some)
         if coverage is not None:
             error = None if noise is None else noise[view.rows]
             cover = coverage[view.rows]

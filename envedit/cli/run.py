@@ -383,6 +383,7 @@ def _verdict(measured):
         line = f"rendering {change('initial', 'render')}"
         if measured["envmap"]:
             line += f", map {change('initial_envmap', 'envmap')}"
+        line += f", noise alone leaves {metrics.score(measured['ceiling'], [measured['render']])}"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 

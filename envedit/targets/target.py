@@ -17,7 +17,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
-from envedit.core.color import tonemap
+from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.seeds import Seeds
@@ -55,6 +55,8 @@ class Target:
         rendering that was painted on: rendered anew, it may differ in its last bits.
     noise : ndarray (h, w) or None
         Standard error of the picture's display values; None where it is not known.
+    spp : int or None
+        Samples a pixel that the picture was rendered with; None where it was not rendered.
     compared : ndarray (h, w, 3) or None
         What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
         (:meth:`seen_as`).
@@ -69,6 +71,7 @@ class Target:
     coverage: np.ndarray | None = None
     asked: tuple[np.ndarray, ...] = ()
     noise: np.ndarray | None = None
+    spp: int | None = None
     compared: np.ndarray | None = None
 
     @property
@@ -233,7 +236,7 @@ def _seen(target, hidden, curve):
 
     And warn of a target that is largely white on a display.
     """
-    white = (tonemap(target.picture, curve) >= 1).all(axis=2)
+    white = (apply_tonemap(target.picture, curve) >= 1).all(axis=2)
     counted = white if hidden is None else white & ~hidden
     share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
     if share > MOST_WHITE:
@@ -287,9 +290,7 @@ def _rendered(settings, scene, envmap, other):
         true, warnings = latlong.rotate(envmap, chosen.degrees), ()
         source = f"rendered under the map turned by {chosen.degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
-    picture, spp, noise = rendered(
-        scene, true, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
-    )
+    picture, spp, noise = with_noise(settings, scene, true)
     weights = np.ones((*picture.shape[:2], 1), np.float32)
     for view, mask in _by_view(scene, chosen.views, chosen.masks).items():
         if mask:
@@ -298,4 +299,37 @@ def _rendered(settings, scene, envmap, other):
     weight = weights if chosen.masks else None
     asked = (true,) if weight is None else (true, weight)
     source += f", {spp} samples a pixel"
-    return Target(picture, weight, true, source, warnings, asked=asked, noise=noise)
+    return Target(picture, weight, true, source, warnings, asked=asked, noise=noise, spp=spp)
+
+
+def with_noise(
+    settings: config.Config, scene: Scene, envmap: np.ndarray
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """Render a target.
+
+    Parameters
+    ----------
+    settings : config.Config
+        Samples, seed and cache.
+    scene : Scene
+        The scene.
+    envmap : ndarray (H, W, 3)
+        The map that it is rendered under.
+
+    Returns
+    -------
+    picture : ndarray (h, w, 3)
+        Linear radiance.
+    spp : int
+        Samples a pixel that were taken.
+    noise : ndarray (h, w)
+        Standard error of display values, RMS over channels; where it is not known from passes,
+        |d1 - d2| / sqrt(2), with d2 a second rendering with as many samples.
+    """
+    asked, seeds, keep = settings.target.spp, Seeds.of(settings.seed), settings.renderer.cache
+    picture, spp, noise = rendered(scene, envmap, asked, seeds.target, keep)
+    if noise is None:
+        again, _, _ = rendered(scene, envmap, asked, seeds.target_again, keep)
+        off = np.float64(apply_tonemap(picture)) - apply_tonemap(again)
+        noise = np.sqrt(np.square(off).mean(axis=2) / 2)
+    return picture, spp, noise

@@ -14,12 +14,10 @@ import numpy as np
 from envedit import config
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.resampling import fit
-from envedit.core.seeds import Seeds
 from envedit.representations.layers.gain import CYCLES
-from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering
-from envedit.targets.target import Target, first_hold, pixel_weight
+from envedit.targets.target import Target, first_hold, pixel_weight, with_noise
 
 PIXELS = 128 * 128
 """Pixels that an edit is solved on with "auto": of pictures of 256x256 pixels, three edits on two scenes, it
@@ -84,12 +82,11 @@ def worked_on(
     hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0
     if target.coverage is None or target.initial is None or target.weight is None:
         assert target.envmap is not None, "what was not painted was rendered"
-        asked = chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
-        picture, _, noise = rendered(small, target.envmap, *asked)
+        picture, spp, noise = with_noise(settings, small, target.envmap)
         weight = None
         if target.weight is not None:
             weight = np.where(hidden[..., None], 0, at_size(target.weight, lit, small)).astype("f4")
-        return replace(target, picture=picture, noise=noise, weight=weight)
+        return replace(target, picture=picture, noise=noise, spp=spp, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
     change = at_size(target.picture - target.initial, lit, small)
     picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))

@@ -52,6 +52,16 @@ def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     assert made.weight is None and made.warnings == () and "40 degrees" in made.source
 
 
+def test_noise_is_that_of_as_many_samples_as_were_taken(ball, rng):
+    """Against the difference from a rendering almost without noise; display values, mean over pixels."""
+    envmap = sky(rng) + 0.1
+    made = target.make(asking(rotate_degrees=0), ball, envmap)
+    shown, true = (np.clip(p, 0, 1) ** (1 / 2.2) for p in (made.picture, ball.render(envmap, spp=1024)))
+    assert made.spp == 4 and made.noise.shape == SIZE
+    ratio = np.mean(made.noise**2) / np.mean((shown - true) ** 2)
+    assert 0.5 < ratio < 2
+
+
 def test_a_turn_by_whole_texels_only_moves_columns(ball, rng):
     envmap = sky(rng)
     made = target.make(asking(rotate_degrees=360 * 3 / 16), ball, envmap)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from envedit import config, inputs
 from envedit.config.validators import show
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.radiance import require_unmasked
 from envedit.images import analytic_sky, images
 from envedit.pipeline import Watch, run
 from envedit.representations.siren import fit as siren
@@ -82,7 +83,7 @@ def edit(
         The configuration has an unknown key or an unusable value, which the message names, or arguments do
         not go together.
     InputError
-        A file or an array cannot be used: missing, of another shape, not finite.
+        A file or an array cannot be used: missing, of another shape, not finite, masked.
     EnveditError
         As :func:`envedit.pipeline.run`.
 
@@ -206,7 +207,7 @@ def load_scene(
     ConfigError
         A parameter, a sensor or the size cannot be used.
     InputError
-        A file is missing or damaged, or the scene is not lit by exactly one environment emitter.
+        A file is missing or damaged, or the scene has something that is not supported.
     """
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
@@ -274,7 +275,8 @@ def _lit(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
     """Load a scene in any form."""
     size = settings.width, settings.height
     scene = dict(scene) if isinstance(scene, Mapping) else scene
-    return built_scene.load(scene, *size, settings.parameters, base, settings.sensors)
+    up, scale = settings.up, settings.scale
+    return built_scene.load(scene, *size, settings.parameters, base, settings.sensors, up, scale)
 
 
 def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
@@ -285,8 +287,8 @@ def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
         if lit.digest.startswith(built_scene.UNKNOWN):
             settings = replace(settings, renderer=replace(settings.renderer, cache=False))
         return replace(settings, scene=config.Scene(file=GIVEN, **given))
-    kept = {"sensors": settings.scene.sensors} if len(lit.views) == 1 else {"sensors": "all"}
-    given |= {"parameters": lit.parameters} | kept
+    given["sensors"] = settings.scene.sensors if len(lit.views) == 1 else "all"
+    given |= {"parameters": lit.parameters, "up": settings.scene.up, "scale": settings.scene.scale}
     return replace(settings, scene=config.Scene(file=str(lit.path), **given))
 
 
@@ -306,6 +308,7 @@ def _settings(given: object) -> tuple[config.Config, Path | None]:
 
 def _array(name: str, value: ArrayLike) -> np.ndarray:
     """Return an argument as float32, as which it is saved; shape and values are checked where it is used."""
+    require_unmasked(value, name)
     try:
         found = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths

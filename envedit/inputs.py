@@ -17,10 +17,10 @@ from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images
 from envedit.representations.layers.placed_lights import PlacedLights, missing
-from envedit.scene import scene
+from envedit.scene import scene, supported
 
 SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
-"""Words for ``[input] envmap``: Mitsuba's analytic sky; the scene's own map; that one if there is one."""
+"""Words for ``[input] envmap``: Mitsuba's analytic sky; the scene's own light; that one if there is one."""
 _ROUNDING = 1e-6  # of a texel's largest channel
 
 
@@ -59,7 +59,7 @@ class InputMap:
     Attributes
     ----------
     source : str
-        The file, or "sunsky".
+        The file, "sunsky", or "scene" for its own light that is no file.
     stored : ndarray (H, W, 3) float32
         Linear values as in the file, at the width asked for.
     scale : float
@@ -74,6 +74,8 @@ class InputMap:
         The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed.
     array : ndarray (H, W, 3), optional
         The whole map, where it came as an array and not from a file.
+    unmoved : ndarray (H, W, 3), optional
+        The :attr:`radiance` as the file has it, where lights were placed or the map was turned by hand.
     """
 
     source: str
@@ -84,6 +86,7 @@ class InputMap:
     chromaticities: Chromaticities | None = None
     placed: PlacedLights | None = None
     array: np.ndarray | None = None
+    unmoved: np.ndarray | None = None
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -161,26 +164,30 @@ def scaled(stored: np.ndarray, scale: float, source: str) -> np.ndarray:
 
 
 def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
-    """Return the file of a configuration's map, or "sunsky".
+    """Return the file of a configuration's map, "sunsky", or "scene" for a light of its own that is no file.
 
     Raises
     ------
     ConfigError
-        The scene's own map is asked for, and it names none.
+        The scene's own light is asked for, and there is no scene, or it is made for any map.
     InputError
-        The scene's own map is not there.
+        The scene has none, or its file is not there.
     """
-    own = None if lit is None else lit.own.file
-    if settings.envmap == AUTO and own is None:
-        return SUNSKY
     if settings.envmap not in (AUTO, SCENE):
         return settings.envmap
-    if own is None:
-        where = "no scene is given" if lit is None else f"{lit.path} names no file in an emitter envmap"
+    own = supported.OwnMap(None, 1.0) if lit is None else lit.own
+    if own.missing:
+        raise InputError(own.missing)
+    if own.light is not None:
+        return SCENE
+    if own.file is None:
+        if settings.envmap == AUTO:
+            return SUNSKY
+        where = "no scene is given" if lit is None else f"{lit.path} has no light of its own"
         raise ConfigError(f'input.envmap: got "scene", but {where}: name a map, or "sunsky"')
-    if not os.path.isfile(own):  # no error for a name that no file can have
-        raise InputError(f"{own}: the scene's own map is missing; name another with [input] envmap")
-    return str(own)
+    if not os.path.isfile(own.file):  # no error for a name that no file can have
+        raise InputError(f"{own.file}: the scene's own map is missing; name another with [input] envmap")
+    return str(own.file)
 
 
 def read_map(
@@ -196,9 +203,9 @@ def read_map(
     settings : config.Input
         Which map.
     lit : scene.Scene, optional
-        Whose own map and scale; None: none, and 1.
+        Whose own light and scale; None: none, and 1.
     width : int, optional
-        Texels across; None: as many as the file has (of the analytic sky: the working width).
+        Texels across; None: as many as the file has (of a map that is made: the working width).
     array : ndarray (H, 2 H, 3), optional
         The map itself, in place of the one that the configuration names.
 
@@ -215,6 +222,9 @@ def read_map(
         width = width or settings.width
         sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
         return by_hand(settings, InputMap(source, sky, scale, (width, width // 2), []))
+    if source == SCENE and lit is not None and lit.own.light is not None:
+        made = lit.own.light.map(width or settings.width, lit.to_world)
+        return by_hand(settings, replace(_read(made, width, settings, scale), source=SCENE))
     return by_hand(settings, _read(source, width, settings, scale))
 
 
@@ -233,7 +243,7 @@ def by_hand(settings: config.Input, given: InputMap) -> InputMap:
             warnings.append(f"input.lights: got light = {named}, but {had}; the {entries} ignored")
         found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
     turned = latlong.rotate(found.stored, settings.rotate_degrees)
-    return replace(given, stored=turned, warnings=warnings, placed=placed)
+    return replace(given, stored=turned, warnings=warnings, placed=placed, unmoved=given.radiance)
 
 
 def _read(source, width, settings, scale):
@@ -281,15 +291,27 @@ def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = Non
     """Say which map a run took and what the scene's file has that is used otherwise."""
     said, own = list(lit.notes), lit.own
     source = source_of(settings, lit) if given is None else given.source
-    if settings.envmap == AUTO and source != SUNSKY:
-        said.insert(0, f"map: the scene's own, {source}")
+    if source == SCENE and own.light is not None:
+        said.insert(0, f"map: the scene's own light, {own.light.plugin}")
+    elif settings.envmap == AUTO:
+        made = "the analytic sky, as the scene is made for any map"
+        said.insert(0, f"map: {made}" if source == SUNSKY else f"map: the scene's own, {source}")
     if given is not None and given.chromaticities is not None:
         space = primaries.name_of(given.chromaticities)
         said.append(f"map in {space}: edited in Rec. 709, written in {space}")
     if own.scale != 1:
-        whose = "it" if source == str(own.file) else "the map (which is not the scene's own)"
-        said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}")
+        of_scene = source in (str(own.file), SCENE)
+        whose = "it" if of_scene else "the map (which is not the scene's own)"
+        drop = "" if of_scene else "; scene.scale = 1 drops that"
+        said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}{drop}")
     return said
+
+
+def share(lit: scene.Scene, radiance: np.ndarray, seed: int) -> float:
+    """Return the share of the picture's radiance that the map gives; 1 where the scene has no other lamps."""
+    spp = 16  # a pixel
+    black = lit.render(np.zeros((4, 8, 3), np.float32), spp, seed).mean(dtype=np.float64)
+    return float(1 - black / max(lit.render(radiance, spp, seed).mean(dtype=np.float64), 1e-30))
 
 
 def active_rows(rows: str | tuple[int, int], height: int) -> Rows:
@@ -302,4 +324,12 @@ def active_rows(rows: str | tuple[int, int], height: int) -> Rows:
 def load_scene(settings: config.Scene, base: Path | None = None) -> scene.Scene:
     """Load the scene of a configuration; ``base`` and errors as of :func:`.scene.load`."""
     size, filled = (settings.width, settings.height), dict(settings.parameters)
-    return scene.load(settings.file, *size, filled, base, sensors=settings.sensors)
+    return scene.load(
+        settings.file,
+        *size,
+        filled,
+        base,
+        sensors=settings.sensors,
+        up=settings.up,
+        scale=settings.scale,
+    )

@@ -1,6 +1,7 @@
 """One run from configuration to result: load, prepare, optimise, judge.
 
 Nothing here prints or writes but the checkpoint; ``cli`` and ``report`` do, with what this returns.
+Longer than 400 lines: runs with and without an edit stand side by side, with what both are judged by.
 """
 
 from __future__ import annotations
@@ -25,16 +26,19 @@ from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances
 from envedit.preparation import Preparation
-from envedit.representations.layers.separation import separate
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
 from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
 from envedit.targets import working_size
+from envedit.targets.target import Target
 from envedit.targets.target import make as make_target
 from envedit.targets.working_size import at_size
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
+
+LEAST_GAIN = 0.05
+"""Share of the residual below which an edit has achieved nothing: 0.45 dB."""
 
 
 @dataclass
@@ -118,17 +122,22 @@ def run(
         given = inputs.read_map(settings.input, lit, settings.input.width, memory.envmap)
         original, said = given.radiance, inputs.notes(settings.input, lit, given)
         warnings += given.warnings
+        if lit.own.added:
+            part = 100 * inputs.share(lit, original, Seeds.of(settings.seed).judged)
+            said.append(f"the map gives {part:.3g} % of the picture's light; scene.scale changes that")
         height, width, _ = original.shape
         rows = inputs.active_rows(settings.input.rows, height)
-        if settings.target.kind == "none":
+        target = None
+        if settings.target.kind != "none":
+            small = working_size.smaller(settings, lit)
+            renderers.check(settings, small, (height, width))
+            watch.stage("rendering the target")
+            target = make_target(settings, lit, original, memory.picture, memory.mask, memory.target_map)
+            warnings += target.warnings
+        if target is None or (target.envmap is not None and np.array_equal(target.envmap, original)):
             warnings += config.unused(settings)
-            found = _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips)
+            found = _adjusted(settings, lit, given, target, warnings, watch, clock, begun, lpips)
             return replace(found, memory=memory, base=base)
-        small = working_size.smaller(settings, lit)
-        renderers.check(settings, small, (height, width))
-        watch.stage("rendering the target")
-        target = make_target(settings, lit, original, memory.picture, memory.mask, memory.target_map)
-        warnings += target.warnings
         solved = target if small is lit else working_size.worked_on(settings, lit, small, original, target)
 
     # ---- Transport, at the size that the edit is solved at
@@ -151,7 +160,8 @@ def run(
     job, frozen, representation = edit.job, edit.frozen, edit.job.representation
     renderer, within, notes = job.renderer, None, list(edit.notes)
     traced = renderer.transport
-    warnings += config.unused(settings, "gauss-newton" if job.newton else "adam")
+    solver = "gauss-newton" if job.newton else "adam"
+    warnings += config.unused(settings, solver if job.settings is settings else None)  # None: no step is made
     in_file_units = functools.partial(_in_file_units, given, edit.degrees)
     with clock("edit_s"), in_file_units():
         watch.stage("editing")
@@ -164,6 +174,7 @@ def run(
             target = solved
     predicted = None
     if traced:
+        warnings += traced.warnings
         with in_file_units(), keeping(edited):
             predicted = traced.coarse_error(edited)
 
@@ -183,10 +194,12 @@ def run(
         watch.stage("rendering the result")
         spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
         final, judged, noise = lit.sampled(edited, spp, seed)
-        initial = target.initial
-        if initial is None:  # the same samples: what differs is the map
-            initial, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
-        lights, core = _lights(original, edited, lit.to_world, edit.degrees)
+        # The same samples: what differs is the map.
+        unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
+        initial = unedited if target.initial is None else target.initial
+        by_hand = settings.input.rotate_degrees
+        alike = _alike(settings, lit, target, original, judged)
+        lights, core = light_list.of_edit(given, edited, lit.to_world, by_hand, edit.degrees)
 
     # ---- Notes
     notes += [job.note] if job.note else []
@@ -202,17 +215,27 @@ def run(
     maps = {"initial": original, "target": target.envmap, "edited": edited}
     with in_file_units(), keeping(edited):
         stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, target.coverage, within, lpips, lit, noise)
+        measured = _measure(settings, renders, maps, rows, alike, target.coverage, within, lpips, lit, noise)
     if measured["painted"] and measured["painted"]["towards"] is None:
         notes.append("the painted change is below the noise of the renderings: no share of it is measured")
     rate = "; lower optimizer.lr" if job.raised_rate else ""
-    pair = [measured[name] for name in ("render", "initial")]
-    measured["worse"] = target.coverage is None and metrics.worse(*pair)
+    pair, where = [measured[name] for name in ("render", "initial")], ""
+    if target.coverage is not None:
+        painted, where = target.coverage[..., 0] > 0, " where painted"
+        tonemap = settings.output.tonemap
+        pair = [metrics.compare(one, target.picture, tonemap, None, painted) for one in (final, unedited)]
+    after, before = (metrics.score(one, pair, 2) for one in pair)
+    measured["worse"] = metrics.worse(*pair)
     if measured["worse"]:
-        after, before = (metrics.score(one, pair, 2) for one in pair)
         warnings.append(
-            f"the result is farther from the target than the input: {after} now, {before} before; "
+            f"the result is farther from the target than the input{where}: {after} now, {before} before; "
             f"the edited map is kept anyway: look at it before you use it{rate}"
+        )
+    solving = job.settings.optimizer.iterations > 0 and not measured["worse"]
+    if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
+        warnings.append(
+            f"the edit achieved nothing in {state.step} steps: {after} from the target{where} now, {before} "
+            "before; check the target's exposure, and that the map lights what is to change"
         )
     if state.bad_steps:
         warnings.append(
@@ -261,26 +284,35 @@ def run(
     )
 
 
-def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
-    """Adjust a map without a target; compared with the initial rendering."""
+def _adjusted(settings, lit, given, target, warnings, watch, clock, begun, lpips):
+    """Adjust a map that is not edited: there is no target, or the map is the target's own.
+
+    Without a target it is compared with the initial rendering.
+    """
     original = given.radiance
     with clock("edit_s"):
         watch.stage("adjusting the map")
         edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
     with clock("judge_s"), _in_file_units(given), keeping(edited):
         watch.stage("rendering the result")
-        seeds, spp = Seeds.of(settings.seed), settings.output.spp
-        initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, settings.renderer.cache)
+        seeds, spp, keep = Seeds.of(settings.seed), settings.output.spp, settings.renderer.cache
         final, judged, _ = lit.sampled(edited, spp, seeds.judged)
-        renders = {"initial": initial, "target": initial, "edited": final}
-        maps, rows = {"initial": original, "target": None, "edited": edited}, Rows.of(len(original))
-        measured = _measure(settings, renders, maps, rows, None, None, lpips, lit)
+        if target is None:
+            initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, keep)
+            source = "no target: the result is compared with the initial rendering"
+            target = Target(initial, None, None, source, initial=initial)
+        else:
+            initial, _, _ = rendered(lit, original, spp, seeds.judged, keep, judged)
+            source = f"{target.source}; that is the input map, bit for bit: nothing is solved"
+        renders = {"initial": initial, "target": target.picture, "edited": final}
+        maps, rows = {"initial": original, "target": target.envmap, "edited": edited}, Rows.of(len(original))
+        alike = _alike(settings, lit, target, original, judged)
+        measured = _measure(settings, renders, maps, rows, alike, None, None, lpips, lit)
         stored = given.as_stored(edited)
-        lights, core = _lights(original, edited, lit.to_world)
-    said = "no target: the result is compared with the initial rendering"
+        lights, core = light_list.of_edit(given, edited, lit.to_world, settings.input.rotate_degrees)
     notes = [
         *inputs.notes(settings.input, lit, given),
-        said,
+        source,
         *notes,
         *filter(None, [light_list.summary(lights, len(original))]),
         f"rendered with {judged} samples a pixel",
@@ -290,6 +322,7 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
         "timing": clock.table([], time.perf_counter() - begun),
         "iterations": 0,
         "non_finite_steps": 0,
+        "worse": False,
         "transport": None,
         "turn_degrees": 0.0,
         "choices": notes,
@@ -299,11 +332,20 @@ def _adjusted(settings, lit, given, warnings, watch, clock, begun, lpips):
     return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
 
 
-def _lights(original, edited, to_world, degrees=0.0):
-    """Match the lights of both maps, and return the edited one's alone as well."""
-    found = [separate(envmap) for envmap in (original, edited)]
-    before, after = (light_list.listed(one, to_world) for one in found)
-    return light_list.matched(before, after, degrees), np.minimum(found[1].core, edited).astype(np.float32)
+def _alike(settings, lit, target, original, judged):
+    """Return two pictures that differ by noise alone: a map rendered as the result is, and as the target was.
+
+    The map is that of the target; where the picture was painted, the one whose rendering was painted on; of a
+    picture of the scene it is not known: None.
+    """
+    envmap, picture = target.envmap, target.picture
+    if envmap is None:
+        envmap, picture = original, target.initial
+    if picture is None:
+        return None
+    spp, seed, keep = settings.output.spp, Seeds.of(settings.seed).judged, settings.renderer.cache
+    again, _, _ = rendered(lit, envmap, spp, seed, keep, judged)
+    return again, picture
 
 
 @contextlib.contextmanager
@@ -334,14 +376,18 @@ def _perceptual(settings):
     return dists, lpips
 
 
-def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=None):
-    """Compare renderings and maps: the part of the metrics that says how good the result is."""
+def _measure(settings, renders, maps, rows, alike, coverage, within, lpips, lit, noise=None):
+    """Compare renderings and maps: the part of the metrics that says how good the result is.
+
+    ``alike`` are two pictures that differ by noise alone: no rendering can be expected to do better.
+    """
     tonemap = settings.output.tonemap
     before, target, after = (renders[name] for name in ("initial", "target", "edited"))
     seen = None if lit.alpha is None else lit.alpha > 0
     measured = {
         "render": metrics.compare(after, target, tonemap, lpips, seen, lit.rows),
         "initial": metrics.compare(before, target, tonemap, lpips, seen, lit.rows),
+        "ceiling": alike and metrics.compare(alike[0], alike[1], tonemap, lpips, seen, lit.rows),
         "envmap": None,
         "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
         "active_rows": [rows.first, rows.last],
@@ -349,7 +395,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=
         "painted": None,
     }
     if len(lit.views) > 1:
-        measured["views"] = _of_views(lit.views, renders, coverage, lpips, seen, tonemap, noise)
+        measured["views"] = _of_views(lit.views, renders, alike, coverage, lpips, seen, tonemap, noise)
     if coverage is not None:
         measured["painted"] = metrics.painted(after, target, before, coverage, tonemap, seen, noise)
         measured["painted"]["reachable"] = None if within is None else within.share
@@ -361,7 +407,7 @@ def _measure(settings, renders, maps, rows, coverage, within, lpips, lit, noise=
     return measured
 
 
-def _of_views(views, renders, coverage, lpips, seen, tonemap, noise):
+def _of_views(views, renders, alike, coverage, lpips, seen, tonemap, noise):
     """Compare the renderings of each view."""
     found = []
     for view in views:
@@ -371,6 +417,7 @@ def _of_views(views, renders, coverage, lpips, seen, tonemap, noise):
         of_view = {"name": view.name}
         of_view |= {"render": metrics.compare(after, target, *some)}
         of_view |= {"initial": metrics.compare(before, target, *some), "painted": None}
+        of_view["ceiling"] = alike and metrics.compare(alike[0][view.rows], alike[1][view.rows], *some)
         if coverage is not None:
             error = None if noise is None else noise[view.rows]
             cover = coverage[view.rows]

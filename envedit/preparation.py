@@ -17,6 +17,7 @@ import numpy as np
 from envedit import config, renderers, representations
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
+from envedit.core.resampling import fit as fitted
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.losses.perceptual import distances
@@ -29,18 +30,17 @@ from envedit.solve import initialization, likelihood, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
-TURNED, CLOSER = 0.5, 0.8
-"""A turn is considered if it leaves at most the first share of the residual, or if it leaves at most the
-second share and only noise."""
-TO_NOISE, DOUBTFUL = 1.25, 4.0
-"""Residual of a map over that of T against Mitsuba's rendering of the same map up to which nothing is left to
-explain (renderings of one map differ by 0.5 to 1.1 of it on four scenes, under a light 5 % brighter by 1.7
-and more); and up to which the turned map is rendered to ask, as T's errors depend on where the sun stands."""
-NOISIEST, QUIET = 0.03, 0.008
-"""Display residual of T above which it is not used as the noise level (four scenes: at most 0.016), and the
-level used instead."""
-CHECKED_SPP = 256
-"""Samples a pixel of these renderings."""
+TURNED = 0.5
+"""A turn that leaves more than noise is considered if it leaves at most this share of the residual."""
+TO_NOISE = 1.25
+"""Residual of a map's rendering over that of a second one of the same map up to which the map explains the
+target. Between renderings of one map the ratio is 1, with a standard error of 0.06 in :data:`AREAS` areas."""
+AREAS = 16
+"""Areas on each axis of a picture over which residuals are averaged, beside single pixels: noise is smaller
+there, and a small change of the light is not. 256 residuals, as in :data:`.map_problem.INDEPENDENT`."""
+TURN_PATHS = 2**20
+"""Paths of a rendering that is compared to find a turn, all pixels together, up to a factor of two; at most
+as many as the target's."""
 PREFERRED = 0.05
 """The unturned sky is chosen only if its residual is smaller by this share: a turn adds no content."""
 
@@ -118,7 +118,7 @@ class Preparation:
 
     def detailed(self, target: Target) -> bool:
         """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""
-        if self.settings.representation.kind != "layers":
+        if self.settings.representation.kind != "layers" or self._started_before:
             return False
         with self.clock("fit_s"):
             representation: Any = representations.make(
@@ -130,32 +130,32 @@ class Preparation:
         return bool(found and found.octaves)
 
     def edit(self, target: Target) -> Edit:
-        """Prepare the edit; the sky is turned where that explains the target better."""
-        turn, settings = self._turn(target), self.settings
-        idle = replace(self, settings=replace(settings, optimizer=replace(settings.optimizer, iterations=0)))
-        noise = self._noise(target, turn)
-        worth = (
-            turn is not None
-            and turn.degrees != 0
-            and (
-                settings.representation.turn is True
-                or turn.error < TURNED * turn.still
-                or turn.error < min(TO_NOISE * noise, CLOSER * turn.still)
-            )
-        )
-        if not worth:
-            if noise > 0 and self._still(turn, target) <= TO_NOISE * noise:
-                said = "nothing changed: the map already renders to the target within noise"
-                said += f" (display residual of the stored transport {noise:.4f})"
-                return idle._prepared(target, 0.0, [said], search=False, ask=False)
+        """Prepare the edit; the sky is turned where that explains the target better.
+
+        One that goes on from a solution on disk is of the map and the layers as they are.
+        """
+        if self._started_before:
+            edit = self._prepared(target, 0.0, [], search=False, ask=False)
+            edit.job.go_on_from(self.settings.optimizer.start, edit.params)
+            return edit
+        # ---- Maps that explain the target to its noise are taken as they are
+        if self._explains(0.0, target):
+            said = "nothing changed: the map already renders to the target within noise"
+            return self._idle(target, 0.0, said)
+        turn = self._turn(target)
+        if turn is None or turn.degrees == 0:
             return self._prepared(target, 0.0, [])
         said = f"sky turned by {turn.degrees:.2f} degrees"
         said += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
-        if self._explained(turn, noise, target.weight):
-            said += "; the rest is noise, nothing else changed"
-            return idle._prepared(target, turn.degrees, [said], search=False, ask=False)
+        if self._explains(turn.degrees, target):
+            return self._idle(target, turn.degrees, f"{said}; the rest is noise, nothing else changed")
+
+        # ---- Edits of the turned and of the unturned map
+        always = self.settings.representation.turn is True
+        if not always and turn.error >= TURNED * turn.still:
+            return self._prepared(target, 0.0, [])
         turned = self._prepared(target, turn.degrees, [said], search=False)
-        if settings.representation.turn is True or not turned.job.newton:
+        if always or not turned.job.newton:
             return turned
         still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
@@ -167,6 +167,13 @@ class Preparation:
         )
         return chosen
 
+    @property
+    def _started_before(self):
+        """Whether a solution on disk is what Gauss-Newton steps go on from."""
+        chosen, stored = self.settings.optimizer, self.settings.renderer.kind == "transport"
+        layers = self.settings.representation.kind == "layers"
+        return bool(chosen.start) and chosen.kind != "adam" and layers and stored
+
     def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""
         asked, transport = self.settings.representation.turn, self.renderer.transport
@@ -176,43 +183,52 @@ class Preparation:
             return None
         with self.clock("start_s"):
             self.watch.stage("testing turns of the sky")
-            seen = self.original, target.picture, target.weight
-            return turning.find(transport, *seen, thorough=asked is True)
+            seeds = Seeds.of(self.settings.seed)
+            drawn = seeds.turn_check, seeds.target_again
+            # A power of four, for as many strata across as down.
+            spp = 4 ** (max(1, TURN_PATHS // (self.lit.width * self.lit.height)).bit_length() // 2)
+            spp = spp if target.spp is None else min(spp, target.spp)
+            return turning.find(
+                transport,
+                lambda envmap, k: self.lit.render(envmap, spp, drawn[k]),
+                self.original,
+                target.picture,
+                target.weight,
+                thorough=asked is True,
+            )
 
-    def _noise(self, target, turn):
-        """Return the residual of T against Mitsuba's rendering of the map; 0 where an edit is made anyway.
+    def _explains(self, degrees, target):
+        """Whether the turned map gives the target, to the noise of a rendering with as many samples.
 
-        That is where the target is painted, where nothing is left as it is (a network is no exact copy), and
-        where neither the map nor its turn come near the target.
+        Residuals of pixels and of areas are compared with those between two renderings of the turned map.
         """
-        transport = self.renderer.transport
-        if self.settings.representation.kind != "layers" or transport is None or target.coverage is not None:
-            return 0.0
-        with self.clock("start_s"):
-            cache, seed = self.settings.renderer.cache, Seeds.of(self.settings.seed).turn_check
-            shown, _, _ = rendered(self.lit, self.original, CHECKED_SPP, seed, cache)
-            near = turning.apart(shown, target.picture, target.weight) < 2 * TO_NOISE * NOISIEST
-            if not near and (turn is None or turn.error > DOUBTFUL * NOISIEST):
-                return 0.0
-            found = turning.residual(transport, self.original, shown, target.weight)
-        return found if found <= NOISIEST else QUIET
+        if target.spp is None:  # painted
+            return False
+        with self.clock("target_s"):
+            envmap = latlong.rotate(self.original, degrees)
+            shown = self._shown(envmap, target, "turn_check")
+            misfits = _misfits(shown, target.picture, target.weight)
+            # A mean of n values in [0, 1] has a standard error of at most 1 / (2 sqrt(n)).
+            if misfits[0] > (2 * target.spp) ** -0.5:
+                return False
+            noise = _misfits(shown, self._shown(envmap, target, "target_again"), target.weight)
+            return all(misfit <= TO_NOISE * least for misfit, least in zip(misfits, noise, strict=True))
 
-    def _still(self, turn, target):
-        """Return the residual of the map as it is."""
-        if turn is not None:
-            return turn.still
-        with self.clock("start_s"):
-            return turning.residual(self.renderer.transport, self.original, target.picture, target.weight)
+    def _shown(self, envmap, target, seed):
+        """Render a map with as many samples as the target had."""
+        asked, seed = self.settings.target.spp, getattr(Seeds.of(self.settings.seed), seed)
+        return rendered(self.lit, envmap, asked, seed, self.settings.renderer.cache, target.spp)[0]
 
-    def _explained(self, turn, noise, weight):
-        """Whether the turn alone gives the target, to the noise."""
-        if not DOUBTFUL * noise > turn.error > TO_NOISE * noise:
-            return turn.error <= TO_NOISE * noise
-        with self.clock("start_s"):
-            turned = latlong.rotate(self.original, turn.degrees)
-            shown = self.lit.render(turned, CHECKED_SPP, Seeds.of(self.settings.seed).turn_check)
-            asked = self.renderer.transport, turned, shown, weight
-            return turn.error <= TO_NOISE * turning.residual(*asked)
+    def _idle(self, target, degrees, note):
+        """Prepare an edit that leaves the turned map as it is, whatever the representation asked for."""
+        chosen = self.settings
+        chosen = replace(
+            chosen,
+            representation=replace(chosen.representation, kind="layers"),
+            optimizer=replace(chosen.optimizer, iterations=0),
+        )
+        idle = replace(self, settings=chosen)
+        return idle._prepared(target, degrees, [note], search=False, ask=False)
 
     def _prepared(self, target, degrees, notes, search=True, ask=True):
         """Prepare the edit of the turned map; ``ask``: how fine its gain may be."""
@@ -300,12 +316,12 @@ class Preparation:
                 return params, recordings.notes
             self.watch.stage("searching for lights")
             if job.target.coverage is not None:
-                params, found = initialization.explained(
+                params, explanation = initialization.explained(
                     self.settings, job.representation, params, recordings, job.target, job.original
                 )
-                job.begun = found.run if job.newton else None
-                said = f"of what was painted: {found.name} (-2 log evidence {found.score:.1f})"
-                return params, [*recordings.notes, said]
+                job.begun = explanation.run if job.newton else None
+                note = f"likeliest explanation of the paint: {explanation.name} (-2 log evidence {explanation.score:.1f})"
+                return params, [*recordings.notes, note]
             ready = initialization.find(
                 job.representation, params, recordings, job.target, job.original, only_own=job.newton
             )
@@ -327,6 +343,16 @@ class Preparation:
 
     def _count(self, done, total):
         self.watch.progress(done, total, "")
+
+
+def _misfits(rendering, picture, weight):
+    """Return the display residual, mean of its size over pixels and over areas."""
+    off = turning.residuals(rendering, picture)
+    if weight is not None:
+        off = off * weight / weight.mean(dtype=np.float64)
+    height, width, _ = off.shape
+    parts = off, fitted(off, min(AREAS, height), min(AREAS, width))
+    return [float(np.sqrt(np.square(part).mean(axis=2)).mean()) for part in parts]
 
 
 def _loss(edit: Edit) -> float:

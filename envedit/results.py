@@ -153,17 +153,22 @@ class Result:
             raise MachineError(f"Result.plot: needs matplotlib, which is not installed: {how}") from None
         figure, curve = Figure(figsize=(12, 6.5), layout="constrained"), self._settings.output.tonemap
         axes = figure.subplots(2, 3, squeeze=False)
+        at = [
+            preview.stops_of(one for one in pictures.values() if one is not None)
+            for pictures in (self.renders, self.maps)
+        ]
         for column, name in enumerate(("initial", "target", "edited")):
-            for axis, picture, extent in (
-                (axes[0, column], self.renders[name], None),
-                (axes[1, column], self.maps[name], (0, 360, -90, 90)),
+            for axis, picture, extent, stops in (
+                (axes[0, column], self.renders[name], None, at[0]),
+                (axes[1, column], self.maps[name], (0, 360, -90, 90), at[1]),
             ):
                 if picture is None:
                     axis.axis("off")
                     continue
-                axis.imshow(preview.display(picture, len(picture), picture.shape[1], curve), extent=extent)
+                size = len(picture), picture.shape[1]
+                axis.imshow(preview.display(picture, *size, curve, stops), extent=extent)
                 if extent is None:
-                    axis.set(title=name, xticks=[], yticks=[])
+                    axis.set(title=f"{name}{preview.exposed(stops)}", xticks=[], yticks=[])
                 else:
                     axis.set(xlabel="azimuth, degrees", ylabel="elevation, degrees")
         return figure
@@ -194,7 +199,8 @@ class Result:
         settings = replace(self._settings, output=replace(self._settings.output, dir=str(folder)))
         own = replace(self, metrics=copy.deepcopy(self.metrics), warnings=[*self.warnings])
         with output_folder.alone(folder):
-            named = output_folder.names(folder), output_folder.inputs_of(settings)
-            output_folder.prepare_folder(folder, *named)
+            read = [*output_folder.inputs_of(settings, self.base)]
+            read += self.memory.scene.files if self.memory and self.memory.scene else ()
+            output_folder.prepare_folder(folder, output_folder.names(folder), read)
             settings = run_folder.write_given(settings, folder, self.memory, own.warnings)
             return run_folder.write(settings, folder, own, 0.0, self.base)

@@ -94,7 +94,7 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
     if run_options.is_scene(name):
         file = Path(name)
         overrides = [f"scene.file={config.quote(name)}", *overrides]
-        label = str(file.with_name(f"{file.stem or 'scene'}.toml"))  # its stem names the folder of results
+        label = str(file.with_name(f"{scene_name(file)}.toml"))  # its stem names the folder of results
         return config.loads("", Path.cwd(), label, preset, overrides), None, Path.cwd()
     by_name = None if os.path.isfile(name) else shipped.configuration(name)
     file = by_name or Path(name)
@@ -109,6 +109,12 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
         return config.load(file, preset, overrides), file, file.absolute().parent
     text = file.read_text(encoding="utf-8")
     return config.loads(text, Path.cwd(), str(file), preset, overrides), file, Path.cwd()
+
+
+def scene_name(file: Path) -> str:
+    """Return the name of a scene: of its file, with the folder's for a ``scene.xml`` that lies elsewhere."""
+    own, folder = file.stem or "scene", file.absolute().parent
+    return f"{folder.name}_{own}" if own == "scene" and folder != Path.cwd() and folder.name else own
 
 
 def _missing(file):
@@ -149,8 +155,8 @@ def _edit(settings, arguments, folder, allowed, start):
     from envedit.report import output_folder
 
     spare = [] if arguments.config is None else [arguments.config]
-    asked = output_folder.names(folder), output_folder.inputs_of(settings), arguments.resume, spare
-    output_folder.prepare_folder(folder, *asked)
+    read = output_folder.inputs_of(settings, arguments.base)
+    output_folder.prepare_folder(folder, output_folder.names(folder), read, arguments.resume, spare)
     if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
         _check_same(settings, folder)
         _say(arguments, f"{folder}: this run is complete, there is nothing to resume")
@@ -377,6 +383,8 @@ def _verdict(measured):
         line = f"rendering {change('initial', 'render')}"
         if measured["envmap"]:
             line += f", map {change('initial_envmap', 'envmap')}"
+        if measured["ceiling"]:
+            line += f", noise alone leaves {metrics.score(measured['ceiling'], [measured['render']])}"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 

@@ -40,11 +40,16 @@ def parser() -> argparse.ArgumentParser:
     quick.add_argument(
         "--envmap",
         metavar="MAP",
-        help="map to edit: a file, scene or sunsky (default: the scene's own; without one, an analytic sky)",
+        help="map to edit: a file, scene or sunsky (default: the scene's own light; of a shipped scene, an "
+        "analytic sky)",
     )
     target = quick.add_mutually_exclusive_group()
     target.add_argument("--paint", metavar="PICTURE", help="target: the rendering, painted over")
-    target.add_argument("--target", metavar="MAP", help="target: the rendering under this map")
+    target.add_argument(
+        "--target",
+        metavar="FILE",
+        help="target: the rendering under this map (2:1), or this picture of the scene under other light",
+    )
     target.add_argument(
         "--rotate",
         metavar="DEGREES",
@@ -55,7 +60,8 @@ def parser() -> argparse.ArgumentParser:
         "--out",
         metavar="DIR",
         help="folder for the results (default: CONFIG_out beside the configuration; "
-        "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out)",
+        "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out, "
+        "for FOLDER/scene.xml FOLDER_scene_out)",
     )
     made.add_argument(
         "--preset",

@@ -27,8 +27,9 @@ class Input(Table):
     envmap: str = key(
         "auto",
         String(),
-        'HDR lat-long image; "scene": the one that the scene names; "sunsky": Mitsuba\'s analytic sky; '
-        '"auto": the scene\'s if it names one, else the analytic sky',
+        'HDR lat-long image; "scene": the scene\'s own light, of which its file is read, or a map made; '
+        '"sunsky": Mitsuba\'s analytic sky; "auto": the scene\'s own light, of a shipped scene the analytic '
+        "sky",
     )
     width: int = key(256, Integer(6, MOST_DIM, even=True), "working width; height is half", "texels")
     rows: str | tuple[int, int] = key(
@@ -92,6 +93,17 @@ class Scene(Table):
         (0,), ViewList(), 'views that one map explains: a list of sensors, by id or index from 0, or "all"'
     )
     parameters: dict[str, str | float | bool] = key({}, Parameters(), "values for the scene's `<default>`s")
+    up: str = key(
+        "auto",
+        Choice("auto", "x", "y", "z", "-x", "-y", "-z"),
+        "axis of the map's zenith where the scene's light has no orientation (constant, or none); auto: the "
+        "axis that is up for the first sensor",
+    )
+    scale: float | str = key(
+        "auto",
+        OrAuto(Number(0, positive=True)),
+        "factor of every map in the scene; auto: the scale of its envmap emitter, which 1 drops",
+    )
 
     def _check_together(self) -> None:
         if not self.file:

@@ -159,6 +159,12 @@ class Optimizer(Table):
         "course of the learning rate; cosine: to 0 at the end of the run",
         when=ADAM_STEPS,
     )
+    start: str = key(
+        "",
+        String(),
+        'solution to go on from, which envedit paint saves as painted.npz; "": lights are searched for',
+        when={"solver": ("gauss-newton",)} | EDITED,
+    )
     checkpoint_s: float = key(
         10.0, Number(0), "time between checkpoints; 0: whenever losses are read back", "seconds"
     )

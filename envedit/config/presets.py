@@ -65,6 +65,7 @@ PAINTED: dict[str, dict[str, Any]] = {
 
 _PATHS = (
     ("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"),
+    ("optimizer", "start"),
     *(("perceptual", key) for key in ("vgg", "dists", "backbone", "heads")),
 )  # fmt: skip
 

@@ -61,6 +61,12 @@ class Output(Table):
         "temperature of the light that becomes neutral in the edited map; 0: as it is",
         "kelvin",
     )
+    temperature: float = key(
+        0.0,
+        Kelvin(),
+        "of the light in place of 6500 K, in all of the edited map: less is warmer; 0: as it is",
+        "kelvin",
+    )
     half: bool = key(
         False, Boolean(), "OpenEXR with 16 bits a channel; what is above 65504 is cut, with a warning"
     )

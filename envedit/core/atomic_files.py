@@ -1,20 +1,25 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and read only where they are regular files."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
 import re
 import stat
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 from envedit.core.errors import EnveditError, InputError
 
 if TYPE_CHECKING:
     from envedit.core.types import FilePath
+
+MOST_BYTES = 2**32
+"""Size of a file that is hashed: twice what the largest map (four channels, float32) or mesh may have."""
 
 
 @contextlib.contextmanager
@@ -72,7 +77,7 @@ def write_atomically(path: FilePath, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def opened(path: FilePath) -> BinaryIO:
+def opened(path: FilePath) -> BufferedReader:
     """Open a regular file for reading bytes; a pipe or a device would wait or never end.
 
     Raises
@@ -91,3 +96,18 @@ def opened(path: FilePath) -> BinaryIO:
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def digest(path: FilePath) -> bytes:
+    """Return the SHA-256 of a regular file.
+
+    Raises
+    ------
+    OSError
+        As of :func:`opened`, and for a file of more than :data:`MOST_BYTES`, which is no input of a run.
+    """
+    with opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > MOST_BYTES:
+            raise OSError(errno.EFBIG, f"{size} bytes, expected at most {MOST_BYTES}", os.fspath(path))
+        return hashlib.file_digest(file, "sha256").digest()

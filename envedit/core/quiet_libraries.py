@@ -8,7 +8,15 @@ import io
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
+
+_ALONE = threading.RLock()
+"""Held while the descriptors lead elsewhere: they are the process's, so that threads take turns."""
+if hasattr(os, "register_at_fork"):  # a child that is forked has the descriptors and no holder of the lock
+    os.register_at_fork(
+        before=_ALONE.acquire, after_in_parent=_ALONE.release, after_in_child=_ALONE.release
+    )
 
 
 @contextlib.contextmanager
@@ -16,11 +24,11 @@ def quiet_libraries() -> Iterator[list[str]]:
     """Keep what C libraries print about a file off the user's terminal; yields a list that receives the text.
 
     OpenEXR and libjpeg write to file descriptor 2 and to ``sys.stdout``, OpenEXR's decoder of JPEG 2000 to
-    file descriptor 1, and carry on.
+    file descriptor 1, and carry on. Threads take turns; what others print meanwhile is in the text too.
     """
     said: list[str] = []
     text = io.StringIO()
-    with contextlib.ExitStack() as stack:
+    with _ALONE, contextlib.ExitStack() as stack:
         _flush_c()
         kept = {}
         for descriptor, stream in ((1, sys.stdout), (2, sys.stderr)):

@@ -97,8 +97,20 @@ def any_channel(mask: np.ndarray) -> np.ndarray:
     return mask[..., 0] | mask[..., 1] | mask[..., 2]
 
 
+def require_unmasked(values: ArrayLike, what: str) -> None:
+    """Refuse a masked array of which something is masked: its mask would not be read.
+
+    Raises
+    ------
+    InputError
+        With the number of values that are masked, and what to do.
+    """
+    if masked := int(np.count_nonzero(np.ma.getmask(values))):
+        raise InputError(f"{what}: {masked} values are masked, and masks are not read: fill them (ma.filled)")
+
+
 def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
-    """Refuse an image that holds anything but radiance: finite, not negative and at most ``brightest``.
+    """Refuse an image that holds anything but radiance: finite, from 0 to ``brightest``, not masked.
 
     Parameters
     ----------
@@ -116,6 +128,7 @@ def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest:
     InputError
         With the number of texels of the first kind found, the first of them, and what to do.
     """
+    require_unmasked(image, what)
     image = np.asarray(image)
     for bad, how, cure in (
         (~np.isfinite(image), "not finite", "repair the map"),

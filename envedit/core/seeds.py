@@ -29,8 +29,8 @@ class Seeds:
     step_check, turn_check, solution_check : int
         Renderings that decide about the solver's steps, and about the turn of the sky, and that show what T
         misses of the solution.
-    target : int
-        The target, rendered under another map.
+    target, target_again : int
+        The target, rendered under another map; and renderings that show how noisy it is.
     exported : int
         The rendering that is painted on.
     painted_initial : int
@@ -48,6 +48,7 @@ class Seeds:
     turn_check: int
     solution_check: int
     target: int
+    target_again: int
     exported: int
     painted_initial: int
     judged: int
@@ -64,6 +65,7 @@ class Seeds:
             turn_check=(seed + 800_011) % _WORDS,
             solution_check=(seed + 900_001) % _WORDS,
             target=seed + 7_000_003,
+            target_again=seed + 7_500_013,
             exported=seed + 8_000_009,
             painted_initial=seed + 9_000_011,
             judged=seed + 9_000_012,

@@ -22,7 +22,8 @@ _SEARCH, _NOTHING = 20, 1e-9  # halvings of a radius; share of a peak that is ro
 
 def any_asked(lights: config.Lights, output: config.Output) -> bool:
     """Return whether anything is to be adjusted."""
-    return bool(lights.max_radiance or lights.soften_degrees or output.exposure or output.white_balance)
+    colour = output.white_balance or output.temperature
+    return bool(lights.max_radiance or lights.soften_degrees or output.exposure or colour)
 
 
 def adjust(
@@ -37,7 +38,7 @@ def adjust(
     lights : config.Lights
         How its lights are changed.
     output : config.Output
-        Exposure and white balance.
+        Exposure, white balance and temperature.
     scale : float
         What the scene multiplies the map's file by; ``max_radiance`` is in the units of the file.
 
@@ -62,6 +63,9 @@ def adjust(
     if output.white_balance:
         found *= balance(output.white_balance)
         notes.append(f"white balance: light of {output.white_balance:g} K becomes neutral")
+    if output.temperature:
+        found *= gains(output.temperature)
+        notes.append(f"temperature: light of {output.temperature:g} K in place of 6500 K")
     if lights.soften_degrees or lights.max_radiance:
         found, said = _lights(found, lights.soften_degrees, lights.max_radiance * scale)
         notes += said

@@ -8,16 +8,19 @@ by where they are and how much flux they have, whatever moved them.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from envedit.core import latlong
-from envedit.representations.layers.separation import Separation
+from envedit.inputs import InputMap
+from envedit.representations.layers.separation import Light, Separation, separate
 
 FARTHEST = math.pi + 1
 """Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
 MOST_NAMED = 8
 """Lights that :func:`summary` names."""
+_POINTS = 100_000  # of a light, by which its radii are measured
 
 
 def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -39,6 +42,37 @@ def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.where(lights > 0, envmap - lights, envmap).astype(np.float32), lights
 
 
+def of_edit(
+    given: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: float, degrees: float = 0.0
+) -> tuple[dict[str, list[dict]], np.ndarray]:
+    """Match the lights of a map as its file has it and as edited.
+
+    Parameters
+    ----------
+    given : inputs.InputMap
+        The map.
+    edited : ndarray (H, W, 3)
+        The edited map, linear radiance that reaches the scene.
+    to_world : ndarray (3, 3)
+        As of :func:`listed`.
+    by_hand, degrees : float
+        By how much the map was turned when it was read, and by the edit.
+
+    Returns
+    -------
+    lights : dict
+        Of :func:`matched`.
+    core : ndarray (H, W, 3) float32
+        The lights of the edited map alone.
+    """
+    first = last = separate(given.radiance if given.unmoved is None else given.unmoved)
+    if given.unmoved is not None:
+        last = kept(first, separate(given.radiance), given.unmoved, given.radiance, by_hand)
+    last = kept(last, separate(edited), given.radiance, edited, degrees)
+    before, after = (listed(one, to_world) for one in (first, last))
+    return matched(before, after, by_hand + degrees), np.minimum(last.core, edited).astype(np.float32)
+
+
 def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
     """List the lights of a map, those with most flux first.
 
@@ -54,7 +88,8 @@ def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
     list of dict
         ``azimuth`` and ``elevation`` in degrees: the light is at column azimuth / 360 W - 1/2 and row
         (90 - elevation) / 180 (H - 1). ``direction``: unit vector towards it in the scene.
-        ``solid_angle``: of its texels, steradian. ``angle``: degrees across a disc of that solid angle.
+        ``solid_angle``: of its texels, steradian. ``radius_50``, ``radius_97``: degrees from its direction
+        within which lie half and 97 % of its flux; ``angle``: twice the latter.
         ``flux``: integral of its radiance over its solid angle, RGB; this is its irradiance on a surface
         that faces it. ``irradiance``: on the horizontal plane of the map, flux max(sin(elevation), 0).
     """
@@ -67,18 +102,82 @@ def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
         solid = float(weight.sum())
         x, y, z = light.direction
         elevation = math.atan2(y, math.hypot(x, z))
+        half, most = _radii(light, (height, width))
         lights.append(
             {
                 "azimuth": math.degrees(math.atan2(x, -z)) % 360,
                 "elevation": math.degrees(elevation),
                 "direction": (np.asarray(to_world, np.float64) @ light.direction).tolist(),
                 "solid_angle": solid,
-                "angle": 2 * math.degrees(math.acos(max(1 - solid / (2 * math.pi), -1))),
+                "radius_50": half,
+                "radius_97": most,
+                "angle": 2 * most,
                 "flux": flux.tolist(),
                 "irradiance": (flux * max(math.sin(elevation), 0)).tolist(),
             }
         )
     return sorted(lights, key=lambda light: -sum(light["flux"]))
+
+
+def _radii(light: Light, shape: tuple[int, int]) -> list[float]:
+    """Return the angles from a light's direction within which half and 97 % of its flux lie, degrees.
+
+    A texel counts as the tent that Mitsuba interpolates by, sampled at up to 8 x 8 points.
+    """
+    height, width = shape
+    row, column = np.divmod(light.texels, width)
+    count = int(np.clip(math.sqrt(_POINTS / len(row)), 1, 8))
+    offset = (2 * np.arange(count) + 1) / count - 1
+    tent = (1 - np.abs(offset)) / (1 - np.abs(offset)).sum()
+    theta = np.pi * np.abs(row[:, None] + offset) / (height - 1)
+    phi = 2 * np.pi * (column[:, None] + 0.5 + offset) / width
+    toward = latlong.on_sphere(theta[:, :, None], phi[:, None, :])
+    weight = np.abs(np.sin(theta))[:, :, None] * tent[:, None] * tent
+    flux = (weight * light.radiance.mean(axis=1)[:, None, None]).ravel()
+    chord = np.linalg.norm(toward - light.direction, axis=-1).ravel()
+    order = np.argsort(chord)
+    share = np.cumsum(flux[order]) / flux.sum()
+    radii = np.interp([0.5, 0.97], share, chord[order])
+    return np.degrees(2 * np.arcsin(np.clip(radii / 2, 0, 1))).tolist()
+
+
+def kept(
+    before: Separation, after: Separation, start: np.ndarray, end: np.ndarray, degrees: float
+) -> Separation:
+    """Let texels that an edit did not change be the same lights as before, whatever has been separated.
+
+    Parameters
+    ----------
+    before, after : separation.Separation
+        Of the map before and after the edit.
+    start, end : ndarray (H, W, 3)
+        These maps.
+    degrees : float
+        By how much the whole map was turned (:func:`.latlong.rotate`) before it was edited.
+
+    Returns
+    -------
+    separation.Separation
+        ``after`` with other lights, and the core of these.
+    """
+    same = np.asarray((latlong.rotate(start, degrees) == end).all(axis=2)).ravel()
+    lights, others, touched = [], list(after.lights), np.zeros(len(same), bool)
+    for light in before.lights:
+        core = np.zeros_like(after.core)
+        core.reshape(-1, 3)[light.texels] = light.radiance
+        core = latlong.rotate(core, degrees).reshape(-1, 3)
+        lit = np.asarray(core.any(axis=1))
+        touched |= lit
+        here = [other for other in others if lit[other.texels].any()]
+        if same[lit].all() and all(same[other.texels].all() for other in here):
+            toward, texels = _turned(light.direction, degrees), np.flatnonzero(lit)
+            lights.append(replace(light, direction=toward, texels=texels, radiance=core[lit]))
+            others = [other for other in others if all(other is not one for one in here)]
+    lights += [one for one in others if touched[one.texels].any() or not same[one.texels].all()]
+    core = np.zeros_like(after.core)
+    for light in lights:
+        core.reshape(-1, 3)[light.texels] += light.radiance
+    return replace(after, core=core, lights=lights)
 
 
 def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict[str, list[dict]]:
@@ -169,7 +268,7 @@ def _toward(light):
 
 
 def _turned(directions, degrees):
-    """Turn directions (n, 3) as :func:`.latlong.rotate` turns a map."""
+    """Turn directions (..., 3) as :func:`.latlong.rotate` turns a map."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return directions @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 

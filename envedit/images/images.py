@@ -126,6 +126,13 @@ def _decode(path, stored, space=marks.AUTO):
     raise InputError(f"{name}: not an image envedit can read; use OpenEXR or Radiance HDR (or PNG, JPEG)")
 
 
+def is_panorama(path: FilePath) -> bool:
+    """Say whether an image is 2:1, to a texel, as a lat-long map is; InputError if it cannot be read."""
+    _, info = read_stored(path)
+    width, height = info["size"]
+    return abs(width - 2 * height) <= 1
+
+
 def load_envmap(
     path: FilePath | np.ndarray,
     width: int | None = None,

@@ -29,6 +29,8 @@ SATURATED = 0.5
 With a half, PSNR is flattered by 3 dB, by arithmetic. Measured on 24 pairs of renderings (3 scenes, 4 maps,
 turned by 60 degrees or 5 % brighter) at exposures of -16 to 16 stops: below a half it rises towards white by
 0 dB in the median, at 0.8 by 4 dB, at 0.9 by 14 dB, at 0.99 by 169 dB, while `log_rmse` stays the same."""
+OFF_DECIBELS, OFF_STOPS = 30.0, 0.5
+"""PSNR and `log_rmse` beyond which renderings differ by more than noise: caustics leave 30 dB and more."""
 DISPLAY_STEP = 1 / 255
 """Step of the display values of a picture of 8 bits; what is within a half of black or white is shown so."""
 RELATIVE_EPS = 0.01
@@ -169,9 +171,23 @@ def saturated(compared: Iterable[dict]) -> bool:
 
 def worse(one: dict, other: dict) -> bool:
     """Say whether of two results of `compare` with the same image the first is farther from it."""
-    if saturated([one, other]):
-        return one["log_rmse"] > other["log_rmse"]
-    return one["psnr"] < other["psnr"]
+    return gained(one, other) < 0
+
+
+def gained(one: dict, other: dict) -> float:
+    """Return by which share the first of two results of `compare` with an image is nearer; below 0: farther.
+
+    In RMS of display values, or `log_rmse` where PSNR is no score; 0 where both are the image.
+    """
+    after, before = (
+        e["log_rmse"] if saturated([one, other]) else 10 ** (-e["psnr"] / 20) for e in (one, other)
+    )
+    return 1 - after / before if before else float(-after)
+
+
+def off(one: dict, among: Iterable[dict]) -> bool:
+    """Say whether a result of `compare` among others is farther from its image than noise explains."""
+    return one["log_rmse"] > OFF_STOPS if saturated([one, *among]) else one["psnr"] < OFF_DECIBELS
 
 
 def score(one: dict, among: Iterable[dict], digits: int = 1) -> str:

@@ -14,9 +14,11 @@ from envedit.report.preview import (
     RISING,
     difference_image,
     display,
+    exposed,
     fit_finite,
     influence_image,
     share_image,
+    stops_of,
 )
 from envedit.representations.layers.separation import Separation
 
@@ -159,7 +161,8 @@ def figure(pixels: np.ndarray, caption: str, below: str = "", over: str = "") ->
 def figure_of(pictures: Mapping[str, np.ndarray], name: str, what: str, tonemap: str) -> str:
     """Show one of some pictures, or that it is not known."""
     if name in pictures:
-        return figure(shrunk(pictures[name], tonemap), f"{name}, {what}")
+        stops = stops_of(pictures.values())
+        return figure(shrunk(pictures[name], tonemap, stops), f"{name}, {what}{exposed(stops)}")
     return f'<div class="unknown">{escape(f"{name}, {what}: not known")}</div>'
 
 
@@ -169,10 +172,10 @@ def grid(figures: Sequence[str], columns: int | None = None) -> str:
     return f'<div class="grid" style="grid-template-columns:repeat({columns},1fr)">{"".join(figures)}</div>'
 
 
-def shrunk(image: np.ndarray, tonemap: str) -> np.ndarray:
-    """Tonemap a picture at its own size, or at :data:`WIDEST` pixels where it is wider."""
+def shrunk(image: np.ndarray, tonemap: str, stops: float = 0.0) -> np.ndarray:
+    """Expose and tonemap a picture at its own size, or at :data:`WIDEST` pixels where it is wider."""
     height, width = _size(image)
-    return display(image, height, width, tonemap)
+    return display(image, height, width, tonemap, stops)
 
 
 def _size(image):
@@ -219,7 +222,8 @@ def separation_figures(separation: Separation | None, tonemap: str) -> list[str]
         "glow: what the lights add to the sky": separation.background * (separation.glow - 1),
         "the light" if count == 1 else f"the {count} lights": separation.core,
     }
-    return [figure(shrunk(image, tonemap), caption) for caption, image in pictures.items()]
+    stops = stops_of([separation.background])
+    return [figure(shrunk(image, tonemap, stops), caption) for caption, image in pictures.items()]
 
 
 def lights_figure(envmap: np.ndarray, lights: Mapping[str, list[dict]], tonemap: str) -> list[str]:
@@ -247,7 +251,7 @@ def lights_figure(envmap: np.ndarray, lights: Mapping[str, list[dict]], tonemap:
         "lights of the edited map, numbered as in lights.json; a small circle is where a light was "
         "(dashed: it is gone), a large one where it is (orange: it is new)"
     )
-    return [figure(shrunk(envmap, tonemap), caption, over=over)]
+    return [figure(shrunk(envmap, tonemap, stops_of([envmap])), caption, over=over)]
 
 
 def _on_map(light):

@@ -294,7 +294,7 @@ def _verdict(metrics):
         return found if number(found.get("psnr")) is not None else None
 
     before, after, true_map = table_of("initial"), table_of("render"), table_of("envmap")
-    unedited = table_of("initial_envmap")
+    unedited, ceiling = table_of("initial_envmap"), table_of("ceiling")
     known = [one for one in (before, after) if one]
     total = number((metrics.get("timing") or {}).get("total_s"))
 
@@ -303,6 +303,7 @@ def _verdict(metrics):
 
     kind = "log RMSE: a display shows little of what differs" if saturated(known) else "PSNR"
     parts = [f"Rendering against the target: {as_text(before)} → <strong>{as_text(after)}</strong> {kind}"]
+    parts[0] += f" (noise alone: {score(ceiling, known)})" if ceiling else ""
     if true_map:
         since = f"{score(unedited, [])} → " if unedited else ""
         parts.append(f"map against the true one: {since}{score(true_map, [])}")

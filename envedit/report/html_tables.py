@@ -24,6 +24,7 @@ _MEASURES = {
 def quality(metrics: dict, tonemap: str) -> str:
     """Compare renderings, and maps where the true one is known, with the target; each view by itself."""
     kinds = {"initial": "initial rendering", "render": "edited rendering"}
+    kinds |= {"ceiling": "noise alone"} if metrics.get("ceiling") else {}
     kinds |= {"initial_envmap": "unedited map", "envmap": "edited map"} if metrics.get("envmap") else {}
     quality = [metrics.get(name) or {} for name in kinds]
     rows = [
@@ -31,20 +32,23 @@ def quality(metrics: dict, tonemap: str) -> str:
         for key, name in _MEASURES.items()
         if key != "lpips" or any(one.get(key) is not None for one in quality)
     ]
+    columns = {"initial": "initial", "render": "edited", "ceiling": "noise alone"}
     views = [
         [
             f"{k} ({view['name']})",
-            *(show(view[when][key]) for key in _MEASURES for when in ("initial", "render")),
+            *(show((view.get(when) or {}).get(key)) for key in _MEASURES for when in columns),
         ]
         for k, view in enumerate(metrics.get("views") or [])
     ]
-    head = ["view", *(f"{what}, {name}" for name in _MEASURES.values() for what in ("initial", "edited"))]
+    head = ["view", *(f"{what}, {name}" for name in _MEASURES.values() for what in columns.values())]
     return "\n".join(
         [
             "<h2>Quality</h2>",
             table(["", *kinds.values()], rows),
             '<p class="soft">Against the target, and the map that it was rendered under where that is known. '
-            f"All but log RMSE: under the tonemap {escape(metrics.get('tonemap') or tonemap)}.</p>",
+            f"All but log RMSE: under the tonemap {escape(metrics.get('tonemap') or tonemap)}. "
+            "Noise alone: two renderings of the target's own map, or of the unedited one where the target "
+            "was painted; no rendering can be expected to be closer.</p>",
             *([f"<h2>Views</h2>{table(head, views)}"] if views else []),
         ]
     )

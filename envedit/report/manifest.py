@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import datetime
-import hashlib
 import importlib.metadata
 import io
 import json
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 import envedit
+from envedit.core import atomic_files
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
 
@@ -175,9 +175,8 @@ def changed(file: FilePath) -> list[str]:
 
 def _digest(path):
     try:
-        with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-            return {"path": str(path), "bytes": os.fstat(file.fileno()).st_size, "sha256": digest}
+        digest = atomic_files.digest(path).hex()
+        return {"path": str(path), "bytes": os.stat(path).st_size, "sha256": digest}
     except (OSError, ValueError) as error:
         return {"path": str(path), "bytes": None, "sha256": None, "error": str(error)}
 

@@ -81,7 +81,8 @@ def write_scene(settings: config.Config, folder: Path, base: Path | None = None)
     """
     chosen = settings.scene
     try:
-        text = scene.relit(chosen.file, f"edited.{settings.output.format}", dict(chosen.parameters), base)
+        file, filled = f"edited.{settings.output.format}", dict(chosen.parameters)
+        text = scene.relit(chosen.file, file, filled, base, chosen.up, chosen.scale)
     except InputError as error:  # the scene's files may be gone by now
         return [f"edited.xml is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())

@@ -54,11 +54,17 @@ def names(folder: Path) -> tuple[str, ...]:
     return (*RESULTS[:-1], *found, RESULTS[-1])
 
 
-def inputs_of(settings: config.Config) -> list[str]:
-    """List the files that a configuration reads, which no result may replace."""
-    target = settings.target
-    named = (settings.input.envmap, settings.scene.file, *target.files, *target.masks)
-    return [file for file in named if file]
+def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[FilePath]:
+    """Yield the files that a configuration reads, which no result may replace; at last those of its scene.
+
+    ``base`` is as of :func:`.scene.load`. Mitsuba is imported when the last are asked for.
+    """
+    target, weights = settings.target, settings.perceptual
+    yield from filter(None, (settings.input.envmap, settings.optimizer.start, *target.files, *target.masks))
+    yield from filter(None, (weights.vgg, weights.dists, weights.backbone, weights.heads))
+    from envedit.scene import scene
+
+    yield from scene.files(settings.scene.file, settings.scene.parameters, base)
 
 
 def tidy(folder: Path) -> None:
@@ -134,7 +140,7 @@ def prepare_folder(
         Their names; the first, which says that a run is complete, is moved first, and the last is a
         checkpoint's.
     inputs : sequence of path
-        What the run reads, and must not be moved.
+        What the run reads, and must not be moved; looked at where the folder holds any result.
     keep : bool
         Leave what is there, if it is complete or there is a checkpoint: it is to be continued.
     spare : sequence of path
@@ -147,7 +153,7 @@ def prepare_folder(
     """
     try:
         old = [folder / name for name in names if (folder / name).exists()]
-        read = {os.path.realpath(path) for path in inputs}
+        read = {os.path.realpath(path) for path in inputs} if old else set()
         if mine := [path for path in old if os.path.realpath(path) in read]:
             raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
         if keep and {folder / names[0], folder / names[-1]} & set(old):

@@ -5,7 +5,7 @@ For display only; nothing here feeds back into an edit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -62,6 +62,28 @@ def fit_finite(image: ArrayLike, height: int, width: int) -> tuple[np.ndarray, n
     return fit(np.where(finite, image, 0), height, width), fit(np.asarray(~finite), height, width)[..., 0] > 0
 
 
+SHOWN = 2e-3, 1.0
+"""Median luminance between which pictures are shown as they are; display values 0.06 and 1."""
+GREY = 0.18
+"""Luminance near which the median of others is shown."""
+
+
+def stops_of(pictures: Iterable[ArrayLike]) -> int:
+    """Return the exposure in whole stops at which pictures together are neither white nor black.
+
+    0 where the median luminance of what is not black is in :data:`SHOWN`, or where nothing is.
+    """
+    found = [luminance(np.where(np.isfinite(image), image, 0)).ravel() for image in pictures]
+    bright = np.concatenate([np.zeros(0), *(one[one > 0] for one in found)])
+    median = float(np.median(bright)) if bright.size else GREY
+    return 0 if SHOWN[0] <= median <= SHOWN[1] else round(np.log2(GREY / median))
+
+
+def exposed(stops: float) -> str:
+    """Return what is added to a caption of a picture that is shown at an exposure; "" at 0."""
+    return f", {stops:+g} stops" if stops else ""
+
+
 def display(
     image: ArrayLike, height: int, width: int, tonemap: str = "gamma", exposure: float = 0.0
 ) -> np.ndarray:
@@ -95,7 +117,7 @@ def preview(
     maps: Mapping[str, np.ndarray | None],
     tonemap: str = "gamma",
     labels: bool = True,
-    exposure: float = 0.0,
+    exposure: float | None = None,
     views: Views = (),
 ) -> None:
     """Write ``preview.png``: what :func:`drawn` draws; errors as there, or that it cannot be written."""
@@ -107,7 +129,7 @@ def drawn(
     maps: Mapping[str, np.ndarray | None],
     tonemap: str = "gamma",
     labels: bool = True,
-    exposure: float = 0.0,
+    exposure: float | None = None,
     views: Views = (),
 ) -> np.ndarray:
     """Draw a row of renderings and under each its environment map.
@@ -122,8 +144,9 @@ def drawn(
         A name of `envedit.core.color.TONEMAPS`.
     labels : bool
         Write the names above the columns.
-    exposure : float
-        Exposure of the maps in stops, on top of the tonemap; renderings are never exposed.
+    exposure : float, optional
+        Exposure of the maps in stops, before the tonemap, with renderings as they are; None: that of
+        :func:`stops_of` for the renderings and for the maps, named in the labels.
     views : sequence of slice
         Rows of each view, where renderings are of several: they are drawn below each other.
 
@@ -144,6 +167,8 @@ def drawn(
     drawn = {name: checked(image, name) for name, image in maps.items() if image is not None}
     if not shown and not drawn:
         raise InputError("report: no picture to preview")
+    at = 0 if exposure is not None else stops_of(shown.values())
+    exposure = stops_of(drawn.values()) if exposure is None else exposure
     # Columns of 214 to 768 pixels whatever the run's size; small pictures are enlarged by a whole factor.
     widest = max((image.shape[1] for image in shown.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
@@ -157,11 +182,12 @@ def drawn(
     for i, name in enumerate(names):
         column = slice(GAP + i * (width + GAP), (i + 1) * (width + GAP))
         if labels:
-            canvas[GAP : GAP + 7 * scale, column][_text(str(name), width, scale)] = INK
+            label = f"{name}{exposed(at)}" + (f" (map{exposed(exposure)})" if exposure else "")
+            canvas[GAP : GAP + 7 * scale, column][_text(label, width, scale)] = INK
         if name in shown:
             first = GAP + top
             for image, height in zip(pictures[name], heights[name], strict=True):
-                canvas[first : first + height, column] = display(image, height, width, tonemap)
+                canvas[first : first + height, column] = display(image, height, width, tonemap, at)
                 first += height + GAP
         else:
             canvas[GAP + top : map_top - GAP, column] = PLACEHOLDER

@@ -63,6 +63,7 @@ def write(
         "scene": result.scene or "",
         **_roles("target", settings.target.files),
         **_roles("mask", settings.target.masks),
+        "start": settings.optimizer.start,
         **weights,
     }
     files = {role: path for role, path in named.items() if os.path.isfile(path)}

@@ -12,6 +12,7 @@ import os
 import re
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene as scenes
 from envedit.scene.scene import Scene
-from envedit.scene.supported import OwnMap
+from envedit.scene.supported import ROULETTE, OwnMap
 
 _CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 # Names of classes, of which an integrator written in Python has another in Python than in C++.
@@ -47,6 +48,8 @@ def load(
     parameters: Mapping[str, Any] | None = None,
     base: Path | None = None,
     sensors: str | Sequence[int | str] = (0,),
+    up: str = "auto",
+    scale: float | str = "auto",
 ) -> Scene:
     """Take a scene in any form.
 
@@ -54,8 +57,8 @@ def load(
     ----------
     given : path, str, dict, mitsuba.Scene or Scene
         A file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, or a built scene, for which
-        all but ``sensors`` is fixed.
-    width, height, parameters, base, sensors
+        all but ``sensors`` and ``scale`` is fixed.
+    width, height, parameters, base, sensors, up, scale
         As of :func:`.scene.load`.
 
     Raises
@@ -67,8 +70,9 @@ def load(
         return given
     if isinstance(given, str | os.PathLike | dict):
         filled = dict(parameters or {})
-        return scenes.load(given, width, height, filled, base, sensors=sensors)
-    return wrapped(given, sensors)
+        return scenes.load(given, width, height, filled, base, sensors=sensors, up=up, scale=scale)
+    found = wrapped(given, sensors)
+    return found if isinstance(scale, str) else replace(found, own=OwnMap(None, scale))
 
 
 def is_built(given: object) -> bool:
@@ -126,11 +130,11 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     params[f"{stem}scale"] = 1.0
     params.update()
     width, views = scenes.views_of(given, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
-    depth, hide, notes = _integrator(given)
+    asked = _integrator(given)
     unique = UNKNOWN + uuid.uuid4().hex
     own = OwnMap(None, scale)
     rows = views[-1].rows.stop
-    return Scene(given, None, width, rows, key, to_world, unique, params, views, own, depth, hide, notes)
+    return Scene(given, None, width, rows, key, to_world, unique, params, views, own, *asked)
 
 
 def own_map(given: Any) -> np.ndarray:
@@ -171,8 +175,8 @@ def _rotation(transform: Any) -> np.ndarray:
     return found
 
 
-def _integrator(scene: Any) -> tuple[int, bool, tuple[str, ...]]:
-    """Return path depth, whether emitters are hidden, and notes, as :func:`.supported.take_integrator`."""
+def _integrator(scene: Any) -> tuple[int, int, bool, tuple[str, ...]]:
+    """Return max_depth, rr_depth, hide_emitters and notes, as :func:`.supported.take_integrator`."""
     given, media = scene.integrator(), any(shape.is_medium_transition() for shape in scene.shapes())
     names = {given.class_name(), type(given).__name__} if given is not None else {"PathIntegrator"}
     hide, notes = bool(getattr(given, "hide_emitters", False)), []
@@ -181,11 +185,12 @@ def _integrator(scene: Any) -> tuple[int, bool, tuple[str, ...]]:
     if media:
         notes.append("the scene's medium is not rendered, as its integrator has no media")
     if names & _DIRECT:
-        return 2, hide, tuple(notes)
+        return 2, ROULETTE, hide, tuple(notes)
     if not names & (_PATHS | _VOLUMES):
         kind = given.class_name()
         notes.append(f"integrator {kind} is not used: rendered by path, with paths of any length")
-        return -1, hide, tuple(notes)
-    found = re.search(r"max_depth = (\d+)", str(given))
-    depth = int(found[1]) if found else int(getattr(given, "max_depth", _ANY_DEPTH))
-    return (-1 if depth >= _ANY_DEPTH else depth), hide, tuple(notes)
+        return -1, ROULETTE, hide, tuple(notes)
+    printed = dict(re.findall(r"(\w+_depth) = (\d+)", str(given)))
+    depth = int(printed.get("max_depth", _ANY_DEPTH))
+    roulette = int(printed.get("rr_depth", getattr(given, "rr_depth", ROULETTE)))
+    return (-1 if depth >= _ANY_DEPTH else depth), roulette, hide, tuple(notes)

@@ -21,6 +21,7 @@ import numpy as np
 # 2^32 divided by the plastic number and by its square: integer overflow takes the fractional part.
 _R2 = (0xC13FA9A9, 0x91E10DA5)
 _TO_UNIT = 2.0**-32
+_MOST_SURVIVAL = 0.95  # of Russian roulette, as Mitsuba's: also a path that nothing absorbs ends
 
 
 @dataclass
@@ -43,11 +44,12 @@ class Vertex:
 class Escape:
     """Directions in which the paths left the scene after ``bounce`` bounces (0: seen by the camera).
 
-    ``pdf`` is the solid-angle density of the BSDF sample that chose the direction, infinite for camera rays
-    and specular reflection, which no other strategy can sample.
+    ``bounce`` is an array where paths were followed beyond the last one. ``pdf`` is the solid-angle density
+    of the BSDF sample that chose the direction, infinite for camera rays and specular reflection, which no
+    other strategy can sample.
     """
 
-    bounce: int
+    bounce: int | mi.UInt32
     direction: mi.Vector3f
     throughput: mi.Color3f
     pdf: mi.Float
@@ -66,7 +68,7 @@ def lattice(index: mi.UInt32, scramble: mi.UInt32) -> mi.Point2f:
 
 
 def trace(
-    scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: int
+    scene: mi.Scene, pixels: np.ndarray, paths: int, bounces: int, seed: int, beyond: bool = False
 ) -> Iterator[Vertex | Escape]:
     """Trace camera paths and yield, bounce by bounce, where they leave the scene and where they hit it.
 
@@ -82,6 +84,8 @@ def trace(
         Surface points along a path (Mitsuba's ``max_depth`` - 1). With 0 only camera rays are traced.
     seed : int
         Seed of every random choice.
+    beyond : bool
+        Follow paths that have not left the scene by then to their end, by Russian roulette.
 
     Where the scene's integrator hides emitters, camera rays pass shapes that are lamps, and those that leave
     the scene are not active.
@@ -89,7 +93,8 @@ def trace(
     Yields
     ------
     Escape, Vertex
-        Escape of bounce 0, vertex of bounce 1, escape of bounce 1, ... escape of bounce ``bounces``.
+        Escape of bounce 0, vertex of bounce 1, escape of bounce 1, ... escape of bounce ``bounces``; then,
+        with ``beyond``, one escape of all further bounces.
     """
     n = len(pixels) * paths
     lane = dr.arange(mi.UInt32, n)
@@ -116,6 +121,8 @@ def trace(
         yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid() & seen)
         active &= si.is_valid()
         if bounce == bounces:
+            if beyond:
+                yield _to_their_end(scene, ray, dr.select(active, throughput, 0), bounces, seed)
             break
         yield Vertex(bounce + 1, si, dr.select(active, throughput, 0), mi.Bool(active), hit)
         bs, value = si.bsdf().sample(context, si, sample(3 * bounce + 3).x, sample(3 * bounce + 4), active)
@@ -125,6 +132,31 @@ def trace(
         )
         active &= dr.max(dr.abs(throughput)) > 0
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
+
+
+@dr.syntax
+def _to_their_end(scene, ray, throughput, bounces, seed):
+    """Follow paths from the last ray that met a surface until they leave the scene; returns their Escape.
+
+    A path survives a bounce with the probability of its albedo there, so that throughputs stay as they are.
+    """
+    random = mi.PCG32(dr.width(ray), dr.opaque(mi.UInt64, seed))
+    bounce = dr.opaque(mi.UInt32, bounces)
+    active = dr.any(throughput != 0)
+    while active:
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        bounce = dr.select(active, bounce + 1, bounce)
+        lobe = random.next_float32()
+        u = mi.Point2f(random.next_float32(), random.next_float32())
+        bs, value = si.bsdf().sample(mi.BSDFContext(), si, lobe, u, active)
+        value = mi.Color3f(mi.unpolarized_spectrum(value))
+        survival = dr.clip(dr.max(value) * dr.square(bs.eta), 0, _MOST_SURVIVAL)
+        value = dr.select(random.next_float32() < survival, value / survival, 0)
+        throughput = dr.select(active, throughput * value, throughput)
+        active &= dr.any(throughput != 0)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+    return Escape(bounce, ray.d, throughput, mi.Float(dr.inf), mi.Bool(True))
 
 
 def _behind_lamps(scene, hit, si, active):

@@ -16,21 +16,16 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import atomic_files
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene_files
 
-# Emitters at infinity that shine from every direction, with the rotation that brings an envmap's zenith (+y)
-# to theirs. Mitsuba's sky models stand upright on z.
-_UPRIGHT_ON_Z = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-_ENVIRONMENTS = {
-    "envmap": np.eye(3),
-    "constant": np.eye(3),
-    "sky": _UPRIGHT_ON_Z,
-    "sunsky": _UPRIGHT_ON_Z,
-    "timed_sunsky": _UPRIGHT_ON_Z,
-}
+# Emitters at infinity that shine from every direction, with the axis of their zenith. Mitsuba's sky models
+# stand upright on z; a constant light has no zenith.
+_ENVIRONMENTS = {"envmap": "y", "constant": None, "sky": "z", "sunsky": "z", "timed_sunsky": "z"}
 _SMOOTH = {"roughconductor": "conductor", "roughplastic": "plastic", "roughdielectric": "dielectric"}
 _SMALLEST_ALPHA = 1e-4  # Mitsuba's own clamp
+_LEVEL = 1e-3  # of a sensor's right: how far from a level one it may be
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 _REQUIRED = {"bitmap": ("filename", "bitmap", "data"), "blendbsdf": ("weight",), "normalmap": ("normalmap",)}
 """Of which one must be given: Mitsuba 3.9 reads beyond the properties of such a plugin that has none."""
@@ -58,6 +53,8 @@ def called(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any
                        f"Parsing of XML file {where} failed: ", f'Parsing of XML file "{where}" failed: ',
                        'At dictionary node "root": '):  # fmt: skip
             text = text.replace(prefix, "")
+        hint = r"\g<0>; give it: --set scene.parameters.\1=VALUE"
+        text = re.sub(r"undefined parameter: \$(\w+)", hint, text)
         raise InputError(f"{where}: {text if len(text) <= 300 else text[:297] + '...'}") from None
 
 
@@ -78,75 +75,156 @@ def lower_names(state: mi.parser.ParserState) -> None:
             node.props.set_plugin_name(name.lower())
 
 
-def check_required(state: mi.parser.ParserState, where: str) -> None:
-    """Refuse plugins that lack a property without which Mitsuba stops with a signal."""
-    for node in state.nodes:
-        name = node.props.plugin_name()
-        needed = _REQUIRED.get(name, ())
-        if needed and not any(key in node.props for key in needed):
-            place = place_of(state, node, where)
-            raise InputError(f"{place}: {name} has no {' or '.join(needed)}; give it one")
+def check_required(state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str) -> None:
+    """Refuse a plugin that lacks a property without which Mitsuba stops with a signal."""
+    name = node.props.plugin_name()
+    needed = _REQUIRED.get(name, ())
+    if needed and not any(key in node.props for key in needed):
+        place = place_of(state, node, where)
+        raise InputError(f"{place}: {name} has no {' or '.join(needed)}; give it one")
 
 
-def replace_environment(state: mi.parser.ParserState, where: str) -> tuple[mi.Properties, np.ndarray]:
-    """Put an ``envmap`` in place of the one environment emitter; return its properties and rotation."""
-    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter]
-    found = [n for n in nodes if n.props.plugin_name() in _ENVIRONMENTS]
-    if len(found) != 1:
-        kinds = ", ".join(n.props.plugin_name() for n in found)
-        what = f"{len(found)} environment emitters ({kinds})" if found else "no environment emitter"
-        raise InputError(f'{where}: {what}; expected exactly one, such as <emitter type="constant"/>')
-    node, plugin = found[0], found[0].props.plugin_name()
+def environment(state: mi.parser.ParserState, where: str) -> int | None:
+    """Return the index of the environment emitter's node; None if there is none, InputError if several."""
+    emitters = [i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Emitter]
+    found = [i for i in emitters if state.nodes[i].props.plugin_name() in _ENVIRONMENTS]
+    if len(found) > 1:
+        kinds = ", ".join(state.nodes[i].props.plugin_name() for i in found)
+        raise InputError(f"{where}: {len(found)} environment emitters ({kinds}); expected one: remove others")
+    return found[0] if found else None
+
+
+def replace_environment(
+    state: mi.parser.ParserState, where: str, up: str = "auto"
+) -> tuple[mi.Properties, np.ndarray, tuple[str, ...]]:
+    """Put an ``envmap`` in place of the environment emitter, or add one.
+
+    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+
+    Parameters
+    ----------
+    up : str
+        Axis of the map's zenith where the emitter has none: x, y, z, with or without a minus; "auto": that of
+        the first sensor (:func:`_sensor_up`).
+
+    Returns
+    -------
+    props : mitsuba.Properties
+        Of the ``envmap``.
+    to_world : ndarray (3, 3)
+        Its rotation.
+    notes : tuple of str
+        Where its zenith is, unless that is +y or the emitter's own.
+    """
+    index, note = environment(state, where), ""
+    plugin = "constant" if index is None else state.nodes[index].props.plugin_name()
     matrix = np.eye(4)
-    if plugin != "constant" and "to_world" in node.props:
-        matrix = _matrix(node.props["to_world"], place_of(state, node, where))
+    if (zenith := _ENVIRONMENTS[plugin]) is None:
+        zenith = _sensor_up(state) if up == "auto" else up
+        if zenith != "y" or up != "auto":
+            why = "the sensor's up" if up == "auto" else "as scene.up says"
+            note = f"map: its zenith is the scene's {zenith if zenith[0] == '-' else f'+{zenith}'}, {why}"
+            note += "; scene.up sets another" if up == "auto" else ""
+    else:
+        place, props = place_of(state, state.nodes[index], where), state.nodes[index].props
+        matrix = _matrix(props["to_world"], place) if "to_world" in props else matrix
+        if up != "auto":
+            note = f"scene.up has no effect: the scene's {plugin} has an orientation of its own"
     rotation = matrix[:3, :3]
     # A uniform scale has no meaning at infinity.
     size = np.cbrt(np.linalg.det(rotation)) if np.isfinite(rotation).all() else 0.0
     rotation = rotation / size if size > 0 else rotation
     if not size > 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
         raise InputError(
-            f"{place_of(state, node, where)}: to_world of the environment emitter stretches, shears or "
+            f"{place}: to_world of the environment emitter stretches, shears or "
             "mirrors; expected a rotation (the axis of <rotate> has length 1)"
         )
-    rotation = rotation @ _ENVIRONMENTS[plugin]
+    rotation = rotation @ _upright(zenith).T
     matrix = np.eye(4)  # where an environment stands has no meaning: a translation is dropped
     matrix[:3, :3] = rotation
-    taken = {n.props.id() for n in state.nodes if n is not node}
+    if index is None:
+        index = append(state, mi.ObjectType.Emitter, "envmap")
+    taken = {n.props.id() for i, n in enumerate(state.nodes) if i != index}
     emitter = mi.Properties("envmap")
     emitter.set_id(next(name for i in range(len(taken) + 1) if (name := f"envmap{i or ''}") not in taken))
     emitter["to_world"] = mi.ScalarTransform4d(matrix)
-    node.props = emitter
-    return node.props, rotation
+    state.nodes[index].props = emitter
+    return state.nodes[index].props, rotation, (note,) if note else ()
+
+
+def _sensor_up(state):
+    """Return the axis +x, +y or +z that is up for the first sensor: perpendicular to what is right of it.
+
+    Of two, the one that the sensor is tilted less against. +y where there is none.
+    """
+    sensor = next((n for n in state.nodes if n.type == mi.ObjectType.Sensor), None)
+    if sensor is None or "to_world" not in sensor.props:
+        return "y"
+    right, upward = _matrix(sensor.props["to_world"], "sensor")[:3, :2].T
+    level = [k for k in range(3) if abs(right[k]) < _LEVEL * np.linalg.norm(right) and upward[k] > 0]
+    return "xyz"[max(level, key=lambda k: (upward[k], k == 1))] if level else "y"
+
+
+def append(state: mi.parser.ParserState, kind: mi.ObjectType, plugin: str, parent: int | None = None) -> int:
+    """Add a node inside another, by default the scene, and return its index.
+
+    Moves the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+    """
+    if parent is None:
+        parent = next(i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Scene)
+    # Before the append, which moves the nodes.
+    state.nodes[parent].props[f"added_{plugin}"] = mi.Properties.ResolvedReference(len(state.nodes))
+    node = mi.parser.SceneNode()
+    node.type, node.props = kind, mi.Properties(plugin)
+    state.nodes.append(node)
+    return len(state.nodes) - 1
 
 
 def set_film(state: mi.parser.ParserState, where: str, sensor: int, width: int, height: int) -> None:
-    """Give the film of a sensor, a node's index, the asked size and float32 RGB pixels."""
-    node = state.nodes[sensor]
-    inside = [
-        state.nodes[v.index()]
-        for _, v in node.props.items()
-        if isinstance(v, mi.Properties.ResolvedReference)
-    ]
-    films = [n for n in inside if n.type == mi.ObjectType.Film]
-    if not films or films[0].props.plugin_name() != "hdrfilm":
-        raise InputError(f'{place_of(state, node, where)}: the sensor needs a <film type="hdrfilm">')
-    film = films[0].props
-    own = [film.get("width", 768), film.get("height", 576)]  # Mitsuba's defaults
-    if not all(isinstance(n, int) and n > 0 for n in own):
-        place = place_of(state, films[0], where)
-        raise InputError(f"{place}: the film is {own[0]} x {own[1]}, expected whole numbers above 0")
-    if width or height:
-        if any(str(name).startswith("crop_") for name, _ in film.items()):
-            raise ConfigError(
-                f"scene.width: the film of {where} is cropped and takes no other size; remove the crop"
-            )
-        if not height:
-            height = max(1, round(width * own[1] / own[0]))
-        if not width:
-            width = max(1, round(height * own[0] / own[1]))
-        film["width"], film["height"] = width, height
+    """Give the film of a sensor, a node's index, the asked size and float32 RGB pixels.
+
+    The size is that of the picture: of the crop, where the film has one, which keeps its part of the film to
+    half a pixel. May move the scene's nodes in memory, as :func:`append`.
+    """
+    inside = [v.index() for _, v in state.nodes[sensor].props.items() if _is_reference(v)]
+    films = [i for i in inside if state.nodes[i].type == mi.ObjectType.Film]
+    if not films:
+        films = [append(state, mi.ObjectType.Film, "hdrfilm", sensor)]  # what Mitsuba takes
+    place, film = place_of(state, state.nodes[films[0]], where), state.nodes[films[0]].props
+    if film.plugin_name() != "hdrfilm":
+        raise InputError(f'{place}: the sensor needs a <film type="hdrfilm">, got {film.plugin_name()}')
     film["pixel_format"], film["component_format"] = "rgb", "float32"
+    own = film.get("width", 768), film.get("height", 576)  # Mitsuba's defaults
+    crop = film.get("crop_width", own[0]), film.get("crop_height", own[1])
+    offset = film.get("crop_offset_x", 0), film.get("crop_offset_y", 0)
+    numbers = *own, *crop, *(n + 1 if isinstance(n, int) else n for n in offset)
+    whole = all(isinstance(n, int) and n > 0 for n in numbers)
+    if not whole or any(crop[k] + offset[k] > own[k] for k in (0, 1)):
+        part = "" if crop == own else f", its crop {crop[0]} x {crop[1]} at {offset[0]}, {offset[1]}"
+        raise InputError(
+            f"{place}: the film is {own[0]} x {own[1]}{part}, expected whole numbers above 0, the crop inside"
+        )
+    cropped = any(str(name).startswith("crop_") for name, _ in film.items())
+    for k, size in enumerate(_of_aspect(width, height, *crop)):
+        side, scale = ("width", "height")[k], size / crop[k]
+        film[side] = max(size, round(scale * own[k]))
+        if cropped:
+            film[f"crop_{side}"] = size
+            film[f"crop_offset_{'xy'[k]}"] = min(round(scale * offset[k]), film[side] - size)
+
+
+def _of_aspect(width, height, own_width, own_height):
+    """Return both sides of a picture of which any may be 0: by the aspect of the other, or its own."""
+    if not width and not height:
+        return own_width, own_height
+    return (
+        width or max(1, round(height * own_width / own_height)),
+        height or max(1, round(width * own_height / own_width)),
+    )
+
+
+def _is_reference(value):
+    return isinstance(value, mi.Properties.ResolvedReference)
 
 
 def set_sampler(state: mi.parser.ParserState, sensor: int, plugin: str) -> None:
@@ -154,40 +232,36 @@ def set_sampler(state: mi.parser.ParserState, sensor: int, plugin: str) -> None:
 
     May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
     """
-    props = state.nodes[sensor].props
-    for _, value in props.items():
-        if isinstance(value, mi.Properties.ResolvedReference):
+    for _, value in state.nodes[sensor].props.items():
+        if _is_reference(value):
             node = state.nodes[value.index()]
             if node.type == mi.ObjectType.Sampler:
                 if node.props.plugin_name() == "independent":
                     node.props.set_plugin_name(plugin)
                 return
-    # Before the append, which moves the nodes: references to them, ``props`` too, are void after it.
-    props["sampler"] = mi.Properties.ResolvedReference(len(state.nodes))
-    node = mi.parser.SceneNode()
-    node.type, node.props = mi.ObjectType.Sampler, mi.Properties(plugin)
-    state.nodes.append(node)
+    append(state, mi.ObjectType.Sampler, plugin, sensor)
 
 
-def find_files(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -> None:
-    """Make every file name absolute; the environment's own bitmap is already gone and need not exist."""
-    for node in state.nodes:
-        if "filename" not in node.props:
-            continue
-        if not isinstance(name := node.props["filename"], str):
-            raise InputError(f"{place_of(state, node, where)}: filename is {name}, expected a text")
-        found = [f / name for f in folders if os.path.isfile(f / name)]
-        if not found:
-            kind = str(node.type).rpartition(".")[2].lower()
-            raise InputError(
-                f"{place_of(state, node, where)}: the {kind} names a missing file: {name or '(empty)'}\n"
-                f"looked in {' and '.join(dict.fromkeys(map(str, folders)))}"
-            )
-        kind = node.props.plugin_name()
-        if "fit_height" in node.props:  # a mesh of any kind, see fit_to_stage
-            kind = _MESHES.get(found[0].suffix.lower(), "")
-        scene_files.check(kind, str(found[0]))
-        node.props["filename"] = str(found[0])
+def find_file(
+    state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str, folders: Iterable[Path]
+) -> None:
+    """Make the name of a node's file absolute; an environment map is replaced and need not exist."""
+    if "filename" not in node.props or node.props.plugin_name() == "envmap":
+        return
+    if not isinstance(name := node.props["filename"], str):
+        raise InputError(f"{place_of(state, node, where)}: filename is {name}, expected a text")
+    found = [f / name for f in folders if os.path.isfile(f / name)]
+    if not found:
+        kind = str(node.type).rpartition(".")[2].lower()
+        raise InputError(
+            f"{place_of(state, node, where)}: the {kind} names a missing file: {name or '(empty)'}\n"
+            f"looked in {' and '.join(dict.fromkeys(map(str, folders)))}"
+        )
+    kind = node.props.plugin_name()
+    if "fit_height" in node.props:  # a mesh of any kind, see fit_to_stage
+        kind = _MESHES.get(found[0].suffix.lower(), "")
+    scene_files.check(kind, str(found[0]))
+    node.props["filename"] = str(found[0])
 
 
 def smooth_limit(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> None:
@@ -275,8 +349,7 @@ def hash_node(digest: hashlib._Hash, node: mi.parser.SceneNode) -> None:
         digest.update(f"{key}=".encode())
         if key == "filename":
             try:
-                with open(value, "rb") as file:
-                    digest.update(hashlib.file_digest(file, "sha256").digest())
+                digest.update(atomic_files.digest(value))
             except OSError as error:
                 raise InputError(f"{value}: cannot be read ({error.strerror})") from None
         else:

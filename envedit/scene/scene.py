@@ -1,13 +1,13 @@
-"""Load a Mitsuba scene lit by one environment emitter, and render it under any map: the reference renderer.
+"""Load a Mitsuba scene and render it under any environment map: the reference renderer.
 
 A scene comes from an XML file, a dict or the name of a shipped scene. Mitsuba's parser turns it into a list
 of nodes, and five things are changed there before anything is built, so that a broken reference in a part
 that is not used cannot get in the way:
 
 - the environment emitter, whatever its kind, becomes an ``envmap`` with the same orientation whose texels
-  are set by :meth:`Scene.set_envmap`;
+  are set by :meth:`Scene.set_envmap`; where there is none, one is added;
 - the film gets the asked size and float32 RGB; its reconstruction filter stays the author's;
-- the integrator gives way to ``path``, with the path depth and ``hide_emitters`` that it asks for;
+- the integrator gives way to ``path``, with ``max_depth``, ``rr_depth`` and ``hide_emitters`` of its own;
 - a rough BSDF whose alpha is at most 1e-4, which Mitsuba would clamp, becomes its limit, the smooth one;
 - a shape with the properties ``fit_height`` (and ``fit_up``, one of x, y, z with or without a minus) is
   centred on the y axis, set on the plane y = 0 and scaled to that height, or to 1.5 times it in width.
@@ -27,7 +27,7 @@ import difflib
 import functools
 import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,9 @@ import numpy as np
 
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
-from envedit.core.errors import ConfigError, InputError, NumericalError, place_of
+from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
 from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_text, supported
 
@@ -51,6 +52,7 @@ QUIET_LEAST, QUIET_MOST = 256, 768
 """Samples a pixel between which a rendering of "auto" ends."""
 _QUIET_PASS = 64  # samples a pixel
 _ALPHA_SPP = 256
+_SAMPLED = 3e-4  # of the radiance of a pole's row, in the next row, which adds 0.2 % to the light
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
@@ -93,6 +95,8 @@ class Scene:
         File and scale of the map that the scene itself names.
     max_depth : int
         Longest path in segments that the scene's integrator asks for, as Mitsuba counts them; -1: any.
+    rr_depth : int
+        Path length in segments from which on Russian roulette ends paths.
     hide_emitters : bool
         The camera sees neither the environment nor shapes that are lamps.
     notes : tuple of str
@@ -102,6 +106,8 @@ class Scene:
     again : callable or None
         Loads it with a film of another (width, height), in pixels, height 0 by the aspect; errors as of
         :func:`load`. None of a scene that was not loaded from a file or dict.
+    files : tuple of str
+        What it was loaded from beside :attr:`path`: meshes, textures, its own map.
     """
 
     mi: mi.Scene
@@ -115,10 +121,12 @@ class Scene:
     views: tuple[View, ...]
     own: supported.OwnMap = supported.OwnMap(None, 1.0)
     max_depth: int = -1
+    rr_depth: int = supported.ROULETTE
     hide_emitters: bool = False
     notes: tuple[str, ...] = ()
     parameters: dict[str, str | float | bool] = field(default_factory=dict)
     again: Callable[[int, int], Scene] | None = None
+    files: tuple[str, ...] = ()
 
     @functools.cached_property
     def alpha(self) -> np.ndarray | None:
@@ -160,6 +168,7 @@ class Scene:
         NumericalError
             If a texel is not finite or is negative in float32; one such texel spoils every lit pixel.
         """
+        require_unmasked(image, "environment map")
         image = np.asarray(image)
         if image.ndim != 3 or image.shape[2] != 3 or not np.issubdtype(image.dtype, np.number):
             what = f"shape {image.shape} of {image.dtype}"
@@ -173,6 +182,9 @@ class Scene:
                 f"environment map: {bad} texels are not finite or are negative, "
                 f"the first at row {row}, column {column}: {image[row, column, channel]} in {'RGB'[channel]}"
             )
+        if not image[1:-1].any():  # Mitsuba's density has a factor sin(theta): it would sample nothing
+            image = image.copy()
+            image[[1, -2]] = np.maximum(image[[1, -2]], _SAMPLED * image[[0, -1]])
         self.params[self.envmap_key] = mi.TensorXf(latlong.to_envmap_data(image))
         self.params.update()
 
@@ -284,8 +296,8 @@ class Scene:
     def _traced(self, count, seed, i, max_depth):
         """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
-        asked = {"type": "path", "max_depth": max_depth, "hide_emitters": self.hide_emitters}
-        integrator = mi.load_dict(asked)
+        asked = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+        integrator = mi.load_dict({"type": "path", **asked})
         pictures = []
         for k in range(len(self.views)):
             pass_seed = int(np.random.SeedSequence([seed, i, k]).generate_state(1)[0])
@@ -325,8 +337,10 @@ def load(
     base: FilePath | None = None,
     sampler: str = "multijitter",
     sensors: str | Sequence[int | str] = (0,),
+    up: str = "auto",
+    scale: float | str = "auto",
 ) -> Scene:
-    """Load a scene and make its environment emitter replaceable.
+    """Load a scene and make its environment emitter replaceable; it gets one if it has none.
 
     Parameters
     ----------
@@ -345,6 +359,10 @@ def load(
         samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
     sensors : "all" or sequence of int and str
         Indices or ids of the sensors whose pictures a rendering consists of; all of one width.
+    up : str
+        Axis of the map's zenith, as of :func:`.parser.replace_environment`.
+    scale : float or "auto"
+        What maps are multiplied by, in place of the ``scale`` of the emitter.
 
     Returns
     -------
@@ -356,33 +374,46 @@ def load(
     ConfigError
         If a parameter or sensor is unknown, missing or unusable, or the size is.
     InputError
-        If a file is missing or damaged, or the scene is not lit by exactly one environment emitter.
+        If files are missing or damaged, the scene has several environment emitters, or something that is not
+        supported; all that is found of it is named.
     """
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
     config, state, path, where, folders = _parsed(file, parameters, base)
-    own = supported.own_map(state, where, folders)
-    asked = supported.take_integrator(state, where)
-    nodes, names, said = supported.take_sensors(state, where, sensors)
-    notes = (*own.notes, *asked.notes, *said)
-    emitter, to_world = parser.replace_environment(state, where)
-    digest = hashlib.sha256(b"envedit scene 1")
+    refused = _Refusals()
+    nodes: list[int] = []
+    with refused.collected():
+        own = supported.own_map(state, where, folders, scale)
+    with refused.collected():
+        asked = supported.take_integrator(state, where)
+    with refused.collected():
+        nodes, names, said = supported.take_sensors(state, where, sensors)
     for node in nodes:
-        parser.set_film(state, where, node, width, height)
-    parser.find_files(state, where, folders)
-    for node in state.nodes:
-        parser.smooth_limit(state, node)
-        parser.fit_to_stage(state, node)
-        parser.hash_node(digest, node)
+        with refused.collected():
+            parser.set_film(state, where, node, width, height)
+    with refused.collected():
+        emitter, to_world, turned = parser.replace_environment(state, where, up)
+    for one in state.nodes:
+        with refused.collected():
+            parser.find_file(state, one, where, folders)
+            parser.smooth_limit(state, one)
+            parser.fit_to_stage(state, one)
+    refused.raise_all()
+    notes = (*own.notes, *turned, *asked.notes, *supported.polarised(state), *said)
+    read = [one.props["filename"] for one in state.nodes if "filename" in one.props]
+    read += [] if own.file is None else [str(own.file)]
+    digest = hashlib.sha256(b"envedit scene 1")
+    for one in state.nodes:
+        parser.hash_node(digest, one)
     emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
     name = str(emitter.id())
     for node in nodes:  # after the digest: light transport has its own samples
         parser.set_sampler(state, node, sampler)
     # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
-    for node in state.nodes:
-        for key in node.props.keys():  # noqa: SIM118 (no dict)
-            node.props.mark_queried(key, False)
+    for one in state.nodes:
+        for key in one.props.keys():  # noqa: SIM118 (no dict)
+            one.props.mark_queried(key, False)
 
     with _two_threads(), quiet_libraries():  # libjpeg prints about odd textures
         built = parser.called(where, mi.parser.instantiate, config, state)
@@ -393,13 +424,55 @@ def load(
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    rest = views, own, asked.max_depth, asked.hide_emitters, notes
     given: dict[str, Any] = dict(parameters or {})
 
     def again(width: int, height: int) -> Scene:
-        return load(file, width, height, parameters, base, sampler, sensors)
+        return load(file, width, height, parameters, base, sampler, sensors, up, scale)
 
-    return Scene(scene, path, columns, rows, key, to_world, digest.hexdigest(), params, *rest, given, again)
+    return Scene(
+        scene,
+        path,
+        columns,
+        rows,
+        key,
+        to_world,
+        digest.hexdigest(),
+        params,
+        views,
+        own=own,
+        max_depth=asked.max_depth,
+        rr_depth=asked.rr_depth,
+        hide_emitters=asked.hide_emitters,
+        notes=notes,
+        parameters=given,
+        again=again,
+        files=tuple(read),
+    )
+
+
+class _Refusals:
+    """What a scene is refused for, to be said at once."""
+
+    def __init__(self) -> None:
+        self.errors: list[EnveditError] = []
+
+    @contextlib.contextmanager
+    def collected(self) -> Iterator[None]:
+        """Keep a refusal for :meth:`raise_all` and go on."""
+        try:
+            yield
+        except (ConfigError, InputError) as error:
+            self.errors.append(error)
+
+    def raise_all(self) -> None:
+        """Raise all that was refused, each thing once, in an error of the first one's kind."""
+        if not self.errors:
+            return
+        first, *others = dict.fromkeys(map(str, self.errors))
+        if not others:
+            raise self.errors[0]
+        lines = [text.replace("\n", ", ") for text in (first, "; ".join(others))]
+        raise type(self.errors[0])(f"{lines[0]}\nalso: {lines[1]}")
 
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
@@ -439,25 +512,33 @@ def _parsed(file, parameters, base):
     parser.called(where, mi.parser.transform_all, config, state)
     parser.lower_names(state)
     installed_plugins.come_first()
+    refused = _Refusals()
     for node in state.nodes:
-        installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
-    parser.check_required(state, where)
+        with refused.collected():
+            installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
+            parser.check_required(state, node, where)
+    refused.raise_all()  # nothing else is loaded
     return config, state, path, where, folders
 
 
 def relit(
-    file: FilePath, envmap: str, parameters: Mapping[str, object] | None = None, base: FilePath | None = None
+    file: FilePath,
+    envmap: str,
+    parameters: Mapping[str, object] | None = None,
+    base: FilePath | None = None,
+    up: str = "auto",
+    scale: float | str = "auto",
 ) -> str:
     """Return the XML of a scene that is lit by another map and otherwise as its author has it.
 
     Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
     and what plain Mitsuba does not know (``fit_height``, names in capitals) is written out. The environment
-    emitter becomes an ``envmap`` with the same rotation and ``scale``; a scene without an integrator gets
-    ``path``.
+    emitter becomes an ``envmap`` with the rotation and ``scale`` of :func:`load`, or one is added; a scene
+    without an integrator gets ``path``.
 
     Parameters
     ----------
-    file, parameters, base
+    file, parameters, base, up, scale
         As of :func:`load`.
     envmap : str
         Name of the map's file, as it shall stand in the XML.
@@ -468,10 +549,10 @@ def relit(
         As of :func:`load`.
     """
     _, state, _, where, folders = _parsed(file, parameters, base)
-    own = supported.own_map(state, where, folders)
-    emitter, _ = parser.replace_environment(state, where)
-    parser.find_files(state, where, folders)
+    own = supported.own_map(state, where, folders, scale)
+    emitter, _, _ = parser.replace_environment(state, where, up)
     for node in state.nodes:
+        parser.find_file(state, node, where, folders)
         parser.smooth_limit(state, node)
         parser.fit_to_stage(state, node)
     emitter["filename"] = envmap
@@ -501,6 +582,21 @@ def find(file: FilePath) -> Path:
     raise InputError(f"scene {file}: no such file; {hint}")
 
 
+def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | None = None) -> list[Path]:
+    """List what a scene may read, itself included: every file that it names, in every folder of :func:`load`.
+
+    Nothing is built. A scene that cannot be read has itself only.
+    """
+    path = Path(file).absolute()
+    try:
+        path = find(file)
+        outline = scene_text.read(path, {name: str(value) for name, value in parameters.items()})
+    except EnveditError:
+        return [path]
+    folders = path.parent, Path(base or ".").absolute(), *outline.folders
+    return [path, *(folder / name for name in outline.files for folder in folders)]
+
+
 def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], list[Path]]:
     """Return the parameters as text, after comparing their names with the ``$names`` of the XML.
 
@@ -519,8 +615,8 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], lis
             )
     if missing := sorted(used - defaults - parameters.keys()):
         raise ConfigError(
-            f"scene.parameters: {path.name} needs {', '.join(missing)}, which has no default; "
-            f"write parameters = {{ {missing[0]} = ... }}"
+            f"scene.parameters: {path.name} needs {', '.join(missing)}, which has no default; give it: "
+            + " ".join(f"--set scene.parameters.{name}=VALUE" for name in missing)
         )
     filled = {}
     for name, value in parameters.items():

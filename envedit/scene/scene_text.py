@@ -48,11 +48,14 @@ class Outline:
         Names after ``$``, and those with a ``<default>``.
     folders : list of Path
         Of ``<path value="...">``, in order.
+    files : list of str
+        What it includes, and the values of properties called ``filename``.
     """
 
     used: set[str] = field(default_factory=set)
     defaults: set[str] = field(default_factory=set)
     folders: list[Path] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
 
 
 def read(path: Path, parameters: dict[str, str]) -> Outline:
@@ -193,9 +196,13 @@ class _Reader:
             found = _resolved(values["filename"], folders)
             if not os.path.isfile(found):
                 raise _WrongError(f"includes a missing file: {shown(values['filename'], 200)}")
+            self.outline.files.append(os.path.abspath(found))
             self.file(Path(found), folders, above)
         elif tag == "spectrum" and values.get("filename"):
+            self.outline.files.append(values["filename"])
             scene_files.check_numbers(Path(_resolved(values["filename"], folders)))
+        elif values.get("name") == "filename" and "value" in values:
+            self.outline.files.append(values["value"])
 
     def _filled(self, value):
         """Fill in ``$names``, the longest name first, as Mitsuba does."""

@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.errors import ConfigError, InputError
-from envedit.scene.parser import place_of
+from envedit.scene.own_light import OwnLight
+from envedit.scene.parser import append, environment, place_of
 
 SENSORS = ("perspective", "thinlens", "orthographic")
 """Sensors whose rays make a picture; others are refused."""
@@ -29,63 +30,101 @@ VOLUMES = ("volpath", "volpathmis", "prbvolpath")
 """Integrators that would follow light through media."""
 WRAPPERS = ("aov", "moment", "stokes")
 """Integrators that render by another one inside."""
+ROULETTE = 5
+"""Path length from which on Mitsuba ends paths by Russian roulette, where the integrator names none."""
+POLARISING = ("circular", "measured_polarized", "polarizer", "pplastic", "retarder")
+"""Materials that are there for polarised light."""
 
 _ROUNDING = 1e-3  # of a rotation's columns that a file gives with few digits
 
 
 @dataclass(frozen=True)
 class OwnMap:
-    """The map that a scene's environment emitter names.
+    """The light that a scene's environment emitter gives.
 
     Attributes
     ----------
     file : Path or None
-        Its file, which need not exist; None where the emitter is no ``envmap`` or names none.
+        The map's file, which need not exist; None where the emitter is no ``envmap`` or names none.
     scale : float
-        What the emitter multiplies any map by, above 0.
+        What any map is multiplied by, above 0.
     notes : tuple of str
         What the user should know.
+    light : OwnLight or None
+        The emitter, where it names no file.
+    missing : str
+        Why the scene has neither, as an error says it; "" of a scene that is made for any map.
+    added : bool
+        The scene has no environment emitter: the map is light beside its own.
     """
 
     file: Path | None
     scale: float
     notes: tuple[str, ...] = ()
+    light: OwnLight | None = None
+    missing: str = ""
+    added: bool = False
 
 
-def own_map(state: mi.parser.ParserState, where: str, folders: Iterable[Path]) -> OwnMap:
-    """Read the file and the ``scale`` of the scene's ``envmap`` emitter, before it is replaced.
+PLACEHOLDER = "placeholder"
+"""The id of a ``constant`` emitter that stands for any map and is no light of its own."""
+_GIVE_MAP = "or give a map to light it: --envmap FILE, or [input] envmap"
+
+
+def own_map(
+    state: mi.parser.ParserState, where: str, folders: Iterable[Path], scale: float | str = "auto"
+) -> OwnMap:
+    """Read what the scene's environment emitter gives, before it is replaced.
+
+    Parameters
+    ----------
+    scale : float or "auto"
+        In place of the emitter's.
 
     Raises
     ------
     InputError
-        ``scale`` is not a finite number above 0.
+        There are several, or ``scale`` is not a finite number above 0.
     """
-    nodes = [n for n in state.nodes if n.type == mi.ObjectType.Emitter and n.props.plugin_name() == "envmap"]
-    if len(nodes) != 1:
-        return OwnMap(None, 1.0)
-    props = nodes[0].props
-    scale: Any = props.get("scale", 1.0)
-    number = isinstance(scale, int | float) and not isinstance(scale, bool)
-    if not number or not math.isfinite(scale) or not 0 < float(np.float32(scale)) < math.inf:
-        raise InputError(
-            f"{place_of(state, nodes[0], where)}: scale of the environment map is {scale}, expected a number "
-            "above 0"
-        )
+    factor = 1.0 if isinstance(scale, str) else scale
+    index = environment(state, where)
+    if index is None:
+        emitter = '<emitter type="envmap"><string name="filename" value="FILE"/></emitter>'
+        missing = f"{where}: no environment emitter: add {emitter} inside <scene>, {_GIVE_MAP}"
+        note = "no environment emitter: the map lights the scene beside its own lamps"
+        return OwnMap(None, factor, (note,), missing=missing, added=True)
+    node, place = state.nodes[index], place_of(state, state.nodes[index], where)
+    props, plugin = node.props, node.props.plugin_name()
+    if plugin != "envmap":
+        if plugin == "constant" and props.id() == PLACEHOLDER:
+            return OwnMap(None, factor)
+        return OwnMap(None, factor, light=OwnLight.of(state, index, where))
+    own: Any = props.get("scale", 1.0)
+    number = isinstance(own, int | float) and not isinstance(own, bool)
+    if not number or not math.isfinite(own) or not 0 < float(np.float32(own)) < math.inf:
+        raise InputError(f"{place}: scale of the environment map is {own}, expected a number above 0")
     matrix = getattr(props.get("to_world", None), "matrix", None)
     size = 1.0
     if matrix is not None:
         size = float(np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0]))
-    notes: tuple[str, ...] = ()
+    notes = []
     if np.isfinite(size) and abs(size - 1) > _ROUNDING:
-        notes = (
+        notes.append(
             f"to_world of the environment map scales by {size:.4g}: taken as the rotation in it, while "
-            "Mitsuba would look up wrong elevations",
+            "Mitsuba would look up wrong elevations"
         )
+    if isinstance(scale, str):
+        factor = float(own)
+    elif scale != own:
+        notes.append(f"scale {scale:g} (scene.scale) takes the place of the emitter's, {own:g}")
+    if "bitmap" in props:
+        return OwnMap(None, factor, tuple(notes), OwnLight.of(state, index, where))
     name = props.get("filename", None)
     if not isinstance(name, str) or not name:
-        return OwnMap(None, float(scale), notes)
+        missing = f"{place}: the environment map names no file; name one, {_GIVE_MAP}"
+        return OwnMap(None, factor, tuple(notes), missing=missing)
     found = [folder / name for folder in folders if os.path.isfile(folder / name)]
-    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), float(scale), notes)
+    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), factor, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -96,6 +135,8 @@ class Integrator:
     ----------
     max_depth : int
         Longest path in segments, as Mitsuba counts; -1: any.
+    rr_depth : int
+        Path length in segments from which on Russian roulette ends paths.
     hide_emitters : bool
         The camera does not see the environment, nor shapes that are lamps.
     notes : tuple of str
@@ -103,6 +144,7 @@ class Integrator:
     """
 
     max_depth: int
+    rr_depth: int
     hide_emitters: bool
     notes: tuple[str, ...]
 
@@ -113,40 +155,51 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     Raises
     ------
     InputError
-        The scene has a participating medium and an integrator that would render it, or ``max_depth`` gives
-        no picture.
+        The scene has a participating medium and an integrator that would render it, or ``max_depth`` or
+        ``rr_depth`` is out of range.
     """
     for n in state.nodes:  # of a dict, the parser does not know the type of a plugin written in Python
         if n.type == mi.ObjectType.Unknown and n.props.plugin_name() in PATHS + DIRECT + VOLUMES:
             n.type = mi.ObjectType.Integrator
     nodes = [n for n in state.nodes if n.type == mi.ObjectType.Integrator]
-    node = next(iter(nodes), None)
+    node, notes = next(iter(nodes), None), []
     while node is not None and node.props.plugin_name() in WRAPPERS:
+        if node.props.plugin_name() == "stokes":
+            notes.append("integrator stokes: rendered without polarisation")
         inside = [n for n in _references(state, node) if n.type == mi.ObjectType.Integrator]
         if not inside:
             break
         node = inside[0]
-    name, depth, hide, notes = "path", -1, False, []
+    name, depth, roulette, hide = "path", -1, ROULETTE, False
     if node is not None:
         props, name = node.props, node.props.plugin_name()
         hide = props.get("hide_emitters", False) is True
         if name in DIRECT:
             depth = 2
         elif name in PATHS + VOLUMES:
-            depth = props.get("max_depth", -1)
+            depth, roulette = props.get("max_depth", -1), props.get("rr_depth", ROULETTE)
         else:
             notes.append(f"integrator {name} is not used: rendered by path, with paths of any length")
-        if isinstance(depth, bool) or not isinstance(depth, int) or depth < -1 or not depth:
-            raise InputError(
-                f"{place_of(state, node, where)}: max_depth is {depth}, expected -1 or a whole number above 0"
-            )
+        for key, value, expected in (("max_depth", depth, "-1 or "), ("rr_depth", roulette, "")):
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if not whole or not (value > 0 or expected and value == -1):
+                expected += "a whole number above 0"
+                raise InputError(f"{place_of(state, node, where)}: {key} is {value}, expected {expected}")
     _check_media(state, where, name, notes)
     for n in nodes:
         identity = n.props.id()
         n.props = mi.Properties("path")
         n.props.set_id(identity)
         n.props["max_depth"], n.props["hide_emitters"] = depth, hide
-    return Integrator(depth, hide, tuple(notes))
+        if roulette != ROULETTE:
+            n.props["rr_depth"] = roulette
+    return Integrator(depth, roulette, hide, tuple(notes))
+
+
+def polarised(state: mi.parser.ParserState) -> tuple[str, ...]:
+    """Say which materials of the scene polarise light, which is not followed."""
+    names = sorted({n.props.plugin_name() for n in state.nodes if n.props.plugin_name() in POLARISING})
+    return (f"{', '.join(names)}: rendered without polarisation",) if names else ()
 
 
 def ensure_integrator(state: mi.parser.ParserState) -> None:
@@ -156,11 +209,7 @@ def ensure_integrator(state: mi.parser.ParserState) -> None:
     """
     if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
         return
-    root = next(n for n in state.nodes if n.type == mi.ObjectType.Scene)
-    root.props["integrator"] = mi.Properties.ResolvedReference(len(state.nodes))
-    node = mi.parser.SceneNode()
-    node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
-    state.nodes.append(node)
+    append(state, mi.ObjectType.Integrator, "path")
 
 
 def _check_media(state, where, integrator, notes):

@@ -12,12 +12,15 @@ import json
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from envedit import config
 from envedit.core.atomic_files import opened, replacing
 from envedit.core.errors import InputError
+from envedit.core.types import FilePath
+from envedit.solve import gauss_newton
 from envedit.solve.adam_loop import State
 
 NAME = "checkpoint.npz"
@@ -93,6 +96,35 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
             "run without --resume to start afresh"
         )
     return state, parts["optimiser"], parts["renderer"], picture
+
+
+def save_solution(path: Path, run: gauss_newton.Run) -> None:
+    """Write where a solution stands, for another run to go on from (``optimizer.start``)."""
+    arrays: dict[str, Any] = run.arrays()
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)
+
+
+def load_solution(path: FilePath, like: dict[str, np.ndarray]) -> gauss_newton.Run:
+    """Read what :func:`save_solution` wrote, as a run without steps; ``like`` has unknowns of its shapes.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or is not of this map.
+    """
+    remedy = "save again in `envedit paint`, or leave [optimizer] start out"
+    try:
+        with opened(Path(path)) as file, np.load(file) as stored:
+            run = gauss_newton.Run.of_arrays({name: stored[name] for name in stored.files}, [])
+    except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
+        reason = ascii(" ".join(str(error).split())[:160])
+        raise InputError(f"{path}: the solution cannot be read ({reason}): {remedy}") from error
+    for one in (run.state, run.start):
+        same = one.keys() == like.keys() and all(one[name].shape == like[name].shape for name in like)
+        if not same or not all(np.isfinite(array).all() for array in one.values()):
+            raise InputError(f"{path}: is the solution of another map or another configuration: {remedy}")
+    return gauss_newton.Run(run.state, run.start, hold=max(1.0, float(run.hold)))
 
 
 def remove(folder: Path) -> None:

@@ -282,6 +282,10 @@ class Job:
                 raise Stopped(str(error), self.last_good(adam)) from error
         return adam.params, state
 
+    def go_on_from(self, file: str, params: Params) -> None:
+        """Let :meth:`optimise` go on from a solution on disk; InputError if it is not of these layers."""
+        self.begun = checkpoint.load_solution(file, self._problem().state(params))
+
     def _problem(self):
         transport = self.renderer.transport
         return task.problem(

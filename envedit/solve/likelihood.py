@@ -8,12 +8,13 @@ logarithm of the likelihood is, but for a constant,
 * A is the number of pixels whose errors go together, n = pixels / A the number of independent values of a
   channel. A rendering has :data:`INDEPENDENT`. A stroke is no measurement of each pixel that it covers, but a
   few statements (:data:`STATEMENTS`) of somebody who cannot paint physics.
-* rho_s is Huber's loss for a rendering: quadratic up to s = sigma, linear beyond, so that pixels which no light
-  can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts by its
-  square: a large one is the change that is asked for.
-* What was not painted makes two statements. Its pattern (shading, highlights, shadows) has a small weight w and
-  may follow the paint. Its mean, which is its exposure and colour as a whole, stays to :data:`VISIBLE`: q is the
-  mean residual of each channel over that, (3,), times the root of the share of pixels that were not painted.
+* rho_s is Huber's loss for a rendering: quadratic up to s = sigma, linear beyond, so that pixels which no
+  light can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts
+  by its square: a large one is the change that is asked for.
+* What was not painted makes two statements. Its pattern (shading, highlights, shadows) has a small weight w
+  and may follow the paint. Its mean, which is its exposure and colour as a whole, stays to :data:`VISIBLE`: q
+  is the mean residual of each channel over that, (3,), times the root of the share of pixels that were not
+  painted.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Likelihood:
 
     @classmethod
     def of_paint(cls, weight: np.ndarray, coverage: np.ndarray) -> Likelihood:
-        """Return the likelihood of a painted picture, whose rest counts for as much as it weighs beside paint.
+        """Return the likelihood of a painted picture; its rest counts for as much as it weighs beside paint.
 
         Parameters
         ----------
@@ -140,7 +141,8 @@ def on_average_one(weight: np.ndarray | None, shape: tuple[int, int]) -> np.ndar
     if weight is None:
         return np.ones((*shape, 1), np.float32)
     mean = float(np.mean(weight, dtype=np.float64))
-    return np.float32(weight) if abs(mean - 1) < 1e-6 else np.float32(weight / max(mean, 1e-30))
+    scale = 1.0 if abs(mean - 1) < 1e-6 else 1 / max(mean, 1e-30)
+    return np.asarray(weight * scale, np.float32)
 
 
 def sizes(residual: np.ndarray) -> np.ndarray:

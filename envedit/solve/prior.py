@@ -55,7 +55,7 @@ NUGGET = 1e-6
 class Prior:
     """How far a sky changes: standard deviations, the same for every scene and map.
 
-    Those of a rendered target, which may be of quite another sky; :func:`of_paint` has those of a painted one.
+    Those of a rendered target, which may be of quite another sky; of a painted one see :func:`of_paint`.
 
     Attributes
     ----------
@@ -107,7 +107,8 @@ class Prior:
         """
         coarse = [rows * columns for rows, columns in gain.sizes]
         if self.freedom is None:
-            fall = np.concatenate([np.full(count, 0.5**i) for i, count in enumerate(coarse)] + [[1.0] * ground])
+            fall = np.concatenate([np.full(count, 0.5**i) for i, count in enumerate(coarse)])
+            fall = np.append(fall, 1.0) if ground else fall
             deviations = np.sqrt(3) * self.luminance, self.chroma, self.tint
             return np.stack([np.diag((deviation * fall) ** -2.0) for deviation in deviations])
         directions = gain.directions(len(gain.sizes) - 1)

@@ -1,9 +1,9 @@
 """Which explanation of a painted picture is likeliest: moves of lights, compared by their evidence.
 
-An explanation is a local maximum of the posterior: the lights where they are, one of them elsewhere, softer or
-out, one more. No small step leads from one to the other. Each is begun where a search over all directions puts
-the light, descended to by a few Gauss-Newton steps, and judged by one number, -2 log evidence in Laplace's
-approximation (MacKay 1992),
+An explanation is a local maximum of the posterior: the lights where they are, one of them elsewhere, softer
+or out, one more. No small step leads from one to the other. Each is begun where a search over all directions
+puts the light, descended to by a few Gauss-Newton steps, and judged by one number, -2 log evidence in
+Laplace's approximation (MacKay 1992),
 
     F(x) + 6 n log(sigma) + log det H - log det K,
 
@@ -14,7 +14,7 @@ number is lower by :data:`POSITIVE`, and the search goes on from there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,7 +134,7 @@ def _descended(problem, name, state, centre, sigma):
     return Explanation(name, run, point, score(problem, run, point, sigma))
 
 
-# ---- Moves ---------------------------------------------------------------------------------------------------
+# ---- Moves -------------------------------------------------------------------------------------------------
 
 
 def _moves(problem, best, sigma):
@@ -153,8 +153,8 @@ def _moves(problem, best, sigma):
     return sorted(found, key=lambda move: -move.gain)[:CANDIDATES]
 
 
-def _changes(problem, state, start, sigma) -> Iterator[tuple[str, dict, dict, float, float]]:
-    """Yield what can be done to the lights.
+def _changes(problem, state, start, sigma):
+    """Yield what can be done to the lights: (str, dict, dict, float, float).
 
     Its name, state, centre of the prior, -2 log likelihood, and what it costs to add the light.
     """
@@ -205,7 +205,7 @@ def _unlikeliness(problem, state, sigma):
     return np.inf if point.residual is None else problem.likelihood.at_best(point.residual, sigma)
 
 
-# ---- Where a light raises the likelihood ---------------------------------------------------------------------
+# ---- Where a light raises the likelihood -------------------------------------------------------------------
 
 
 def _places(problem, state, k, sigma, away=None):
@@ -243,7 +243,7 @@ def _places(problem, state, k, sigma, away=None):
 
 
 def _refined(problem, point, flux, own, direction, sigma):
-    """Look around a direction through exact columns; returns direction, factor of the flux, -2 log likelihood."""
+    """Look around a direction through exact columns; returns direction, factor of the flux, and -2 log."""
     transport, likelihood = problem.transport, problem.likelihood
     height, width = problem.envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
@@ -290,7 +290,8 @@ class _Seen:
             unit = self.before.mean() / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
         goal = _display(self.target)
         count = 3 * self.likelihood.independent
-        least, found = np.full(len(pictures), np.inf), np.ones(len(pictures))
+        least: np.ndarray = np.full(len(pictures), np.inf)
+        found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
             more = pictures * np.float32(factor * unit)[:, None, None]
             off = _display(np.float32(self.before) + more) - goal

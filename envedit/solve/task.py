@@ -54,5 +54,5 @@ def problem(
 
 
 def sigma(target: Target) -> float:
-    """Return the standard error of display values: what was measured of the target, at least :data:`SIGMA`."""
+    """Return the standard error of display values: that of the target, at least :data:`SIGMA`."""
     return SIGMA if target.noise is None else max(SIGMA, float(np.median(target.noise)))

@@ -1,12 +1,14 @@
 """By how much the whole sky has turned about the vertical, if it has.
 
-Every turn by whole texels is tried through the block transport; the best ones are rendered through T, and
-refined to a tenth of a texel. The misfit is the mean over pixels of the residual of display values, not of
-its square: a few bright specks of caustics, which no two renderings share, do not decide.
+Every turn by whole texels is tried through the block transport; the best ones are rendered by Mitsuba, all
+with the same samples, and refined to a fraction of a texel. T is not used for that: how far it errs depends
+on where the sun stands. The misfit is the mean over pixels of the residual of display values, not of its
+square: a few bright specks of caustics, which no two renderings share, do not decide.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,15 +19,16 @@ from envedit.losses import display_curve
 from envedit.transport.light_transport import LightTransport
 
 CANDIDATES, APART, SURE = 3, 4, 0.5
-"""Turns that are tried through T, by how many texels they differ at least, and the share of the residual
-below which the first leaves no doubt."""
+"""Turns that are rendered, by how many texels they differ at least, and the share of the residual below which
+the first leaves no doubt."""
 LITTLE, BEYOND = 0.8, 2.0
 """A turn explains nothing where the best one leaves more than the first share of the block residual, and
 more than so many times the block transport's own error."""
-COLUMNS = 64
-"""Exact columns that are traced for one map, at most."""
-TENTH = 0.1
-"""Finest turn in texels; one nearer to a whole number is taken to be that: its texels keep their bits."""
+FINEST = 0.02
+"""Finest turn in texels."""
+WHOLE = 3.0
+"""A turn by whole texels is preferred up to so many standard errors of the turn's fraction of a texel: texels
+keep their bits then."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class Turn:
     degrees : float
         As for :func:`.latlong.rotate`.
     error, still : float
-        Display residual, as of :func:`residual`, with the turn alone and without.
+        Display residual, as of :func:`apart`, with the turn alone and without.
     """
 
     degrees: float
@@ -47,6 +50,7 @@ class Turn:
 
 def find(
     transport: LightTransport,
+    render: Callable[[np.ndarray, int], np.ndarray],
     envmap: np.ndarray,
     picture: np.ndarray,
     weight: np.ndarray | None = None,
@@ -57,7 +61,10 @@ def find(
     Parameters
     ----------
     transport : LightTransport
-        T; gets exact columns for the texels that become bright.
+        T; its block transport is used.
+    render : callable
+        Renders a map (H, W, 3) to (h, w, 3), linear radiance, with the same samples each time; those of an
+        integer from 0.
     envmap : ndarray (H, W, 3)
         The map.
     picture : ndarray (h, w, 3)
@@ -65,63 +72,89 @@ def find(
     weight : ndarray (h, w, 1), optional
         How much each pixel counts.
     thorough : bool
-        Refine through T in any case; otherwise only where the block transport shows that a turn explains
+        Render turns in any case; otherwise only where the block transport shows that a turn explains
         something (:data:`LITTLE`, :data:`BEYOND`), and no turn is found elsewhere.
     """
     width = envmap.shape[1]
-    rendering = _rendered(transport, envmap)
+    rendering = render(envmap, 0)
     known = {0.0: apart(rendering, picture, weight)}
+
+    # ---- Turns by whole texels, through the block transport
     misfit, least = _at_a_glance(transport, envmap, picture, weight, rendering)
     explains = misfit.min() <= max(LITTLE**2 * misfit[0], BEYOND**2 * least)
     if not (thorough or explains):
         return Turn(0.0, known[0.0], known[0.0])
-
-    def error(texels):
-        texels = round(texels % width / TENTH) * TENTH % width
-        if texels not in known:
-            turned = latlong.rotate(envmap, 360 * texels / width)
-            known[texels] = residual(transport, turned, picture, weight)
-        return known[texels]
-
     best: list[int] = []
     for shift in np.argsort(misfit, kind="stable"):
         apart_by = [min(abs(shift - other), width - abs(shift - other)) for other in best]
         if len(best) < CANDIDATES and (not apart_by or min(apart_by) >= APART):
             best.append(int(shift))
+
+    # ---- The best of them rendered, and refined
+    def error(texels):
+        texels = round(texels % width / FINEST) * FINEST % width
+        if texels not in known:
+            known[texels] = apart(render(latlong.rotate(envmap, 360 * texels / width), 0), picture, weight)
+        return known[texels]
+
     sure = error(best[0]) < SURE * known[0.0]
     texels: float = best[0] if sure else min(best, key=error)
     for step in (2.0,) if sure else (4.0, 2.0):
         texels = min((texels, texels - step, texels + step), key=error)
     while (nearer := min((texels, texels - 1, texels + 1), key=error)) != texels:
         texels = nearer
-    for step in (0.5, 0.3, TENTH):
-        texels = min((texels, texels - step, texels + step), key=error)
-    texels = round(texels / TENTH) * TENTH % width
+
+    # ---- A fraction of a texel, where noise does not leave it open
+    for side in (1, -1):
+        maps = [latlong.rotate(envmap, 360 * (texels + k) / width) for k in (0, side)]
+        part, deviation = _fraction(render, maps, picture, weight)
+        if part > 0:
+            break
+    part = min(max(part, 0.0), 1.0)
+    texels += side * (part if abs(part - round(part)) > WHOLE * deviation else round(part))
+    texels = round(texels / FINEST) * FINEST % width
     return Turn(360 * texels / width, error(texels), error(0.0))
 
 
-def _rendered(transport, envmap):
-    transport.resolve(envmap, limit=COLUMNS)
-    return transport.apply(tensor(envmap)).numpy()
+def _fraction(render, maps, picture, weight):
+    """Return how far a picture is on the way from one map to another, and the standard error of that.
 
-
-def residual(
-    transport: LightTransport, envmap: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None
-) -> float:
-    """Return a map's display residual, RMS over channels and mean over pixels; inf if it is not finite.
-
-    Parameters are those of :func:`find`.
+    Between them the map is linear in the fraction f: d(t) = d(a) + f (d(b) - d(a)). Both are rendered twice,
+    as in a product of differences with independent noise that noise is no bias.
     """
-    return apart(_rendered(transport, envmap), picture, weight)
+    (a1, b1), (a2, b2) = ([_shown(render(envmap, k)) for envmap in maps] for k in (0, 1))
+    target, count = _shown(picture), 1.0 if weight is None else weight
+    lengths = count * (b1 - a1) * (b2 - a2)
+    towards = count * ((target - a1) * (b2 - a2) + (target - a2) * (b1 - a1)) / 2
+    if not lengths.sum() > 0:
+        return 0.0, np.inf
+    part = float(towards.sum() / lengths.sum())
+    left = (towards - part * lengths).sum(axis=2)
+    return part, float(np.sqrt(np.square(left).sum()) / lengths.sum())
 
 
 def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Return the display residual of a rendering (h, w, 3), likewise."""
-    off = np.float64(display_curve.to_display(tensor(rendering)).numpy())
-    off -= display_curve.to_display(tensor(picture)).numpy()
-    size = np.sqrt(np.square(off).mean(axis=2, keepdims=True))
+    """Return a rendering's display residual, RMS over channels and mean over pixels; inf if it is not finite.
+
+    Parameters
+    ----------
+    rendering, picture : ndarray (h, w, 3)
+        Linear radiance.
+    weight : ndarray (h, w, 1), optional
+        How much each pixel counts.
+    """
+    size = np.sqrt(np.square(residuals(rendering, picture)).mean(axis=2, keepdims=True))
     mean = size.mean() if weight is None else (size * weight).mean() / max(float(weight.mean()), 1e-30)
     return float(mean) if np.isfinite(mean) else np.inf
+
+
+def residuals(rendering: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Return display values of a rendering less those of a picture, (h, w, 3) float64 both."""
+    return _shown(rendering) - _shown(picture)
+
+
+def _shown(picture):
+    return np.float64(display_curve.to_display(tensor(picture)).numpy())
 
 
 def _at_a_glance(transport, envmap, picture, weight, rendering):

@@ -17,6 +17,7 @@ from pathlib import Path
 import envedit
 from envedit import config
 from envedit.config import presets
+from envedit.core import atomic_files
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 
@@ -201,5 +202,4 @@ def _digest(path):
 
 @functools.lru_cache(maxsize=4096)
 def _sha256(path, size, changed):  # many jobs share few maps
-    with open(path, "rb") as file:
-        return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
+    return f"sha256:{atomic_files.digest(path).hex()}"

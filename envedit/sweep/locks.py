@@ -46,7 +46,8 @@ class Lock:
     def __enter__(self) -> Lock:
         self.add(os.getpid())
         now = self._path.stat().st_mtime  # by the clock of whoever keeps the files
-        for other in set(self._path.parent.glob("lock-*")) - {self._path}:
+        named = self._path.parent.glob(f"lock-{32 * '[0-9a-f]'}")
+        for other in [path for path in named if path != self._path and path.is_file()]:
             if holder := _holder(other, now):
                 self.holder = holder
                 break
@@ -76,9 +77,12 @@ class Lock:
 
 
 def _holder(path, now):
-    """Who holds a lock, in words; empty if its owner is dead or it is gone."""
+    """Who holds a lock, in words; empty if its owner is dead or it is gone.
+
+    A time far in the future is no sign of a living owner, as one far in the past is none.
+    """
     try:
-        age = now - path.stat().st_mtime
+        age = abs(now - path.stat().st_mtime)
         owner = json.loads(path.read_bytes())
         host, processes = owner["host"], owner["processes"]
         if host == _host():

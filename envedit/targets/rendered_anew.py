@@ -21,6 +21,8 @@ CHANGED = 0.9
 DEVIATIONS = 5.0
 """Standard deviations by which the picture must be nearer to A than to B to be painted on A: chance does it
 once in three million pictures."""
+MOST_SAMPLES = 1024
+"""More are not told apart from a picture without noise, such as one that was denoised."""
 _IMMERKAER = np.outer([1, -2, 1], [1, -2, 1]) / 6
 """The filter of Immerkaer (1996), which takes out what is linear in rows or columns; of white noise it leaves
 the standard deviation."""
@@ -64,6 +66,27 @@ def noise(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
     """
     size = float(np.median(np.abs(high_pass(picture, views)))) / 0.6745
     return np.full(picture.shape[:2], size)
+
+
+def samples(
+    picture: np.ndarray, known: np.ndarray, initial: np.ndarray, spp: int, views: Views = (slice(None),)
+) -> int:
+    """Return how many samples a pixel a picture of the scene seems to have been rendered with.
+
+    By its noise and that of a rendering of the same scene, as the variance falls as 1 / samples; from 1 to
+    :data:`MOST_SAMPLES`.
+
+    Parameters
+    ----------
+    picture, known : ndarray (h, w, 3), (h, w)
+        The picture and its :func:`noise`.
+    initial, spp : ndarray (h, w, 3), int
+        A rendering of the scene and its samples a pixel.
+    views : sequence of slice
+        Rows of each view.
+    """
+    ratio = float(np.median(noise(initial, views))) / max(float(np.median(known)), 1e-6)
+    return int(np.clip(round(spp * ratio**2), 1, MOST_SAMPLES))
 
 
 def high_pass(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:

@@ -17,6 +17,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
+from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.seeds import Seeds
@@ -26,12 +27,14 @@ from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
 
 FOLLOWS = 0.3
-"""Weight of the pattern of what was not painted, beside the paint, where it may follow: with 1 a shadow that is
-painted elsewhere does not take the sun along, with 0.05 a highlight moves the sun (experiments/painted_edits)."""
+"""Weight of the pattern of what was not painted, beside the paint, where it may follow."""
 FOUND_ANEW = (
     " (its noise is not that of the initial rendering: it is solved as a rendering under other light; "
     "if it was painted, give a mask)"
 )
+
+MOST_WHITE = 0.1
+"""Share of the target's pixels that may be white without a warning."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Target:
         rendering that was painted on: rendered anew, it may differ in its last bits.
     noise : ndarray (h, w) or None
         Standard error of the picture's display values; None where it is not known.
+    spp : int or None
+        Samples a pixel that the picture was rendered with; None where it was not rendered.
     compared : ndarray (h, w, 3) or None
         What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
         (:meth:`seen_as`).
@@ -73,6 +78,7 @@ class Target:
     coverage: np.ndarray | None = None
     asked: tuple[np.ndarray, ...] = ()
     noise: np.ndarray | None = None
+    spp: int | None = None
     compared: np.ndarray | None = None
 
     @property
@@ -133,10 +139,15 @@ def make(
     """
     chosen, alpha = settings.target, scene.alpha
     hidden = None if alpha is None else alpha == 0
+    named = picture is None and other is None and chosen.kind == "envmap" and chosen.file
+    if named and not images.is_panorama(str(chosen.file)):
+        made = _of_rendering(settings, scene, envmap, None, None, " (it is not 2:1, as a map is)")
+        return _seen(made, hidden, settings.output.tonemap)
     if picture is None and chosen.kind == "envmap":
-        return _seen(_rendered(settings, scene, envmap, other), hidden)
+        return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
     if chosen.kind == "rendering":
-        return _seen(_of_rendering(scene, chosen, picture, mask), hidden)
+        made = _of_rendering(settings, scene, envmap, picture, mask)
+        return _seen(made, hidden, settings.output.tonemap)
     shape = scene.height, scene.width
     initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
@@ -155,7 +166,8 @@ def make(
             found.picture, initial, found.coverage, lambda: _again(scene, envmap, settings), scene.rows
         )
         if anew:
-            return _seen(_of_rendering(scene, chosen, picture, mask, FOUND_ANEW), hidden)
+            made = _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
+            return _seen(made, hidden, settings.output.tonemap)
     picture, warnings = found.picture, tuple(found.warnings)
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
         # Squares and sums of what is more would leave single precision; on a display it is as white.
@@ -171,7 +183,8 @@ def make(
     weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
-    return _seen(Target(picture, weight, None, source, warnings, initial, coverage, asked), hidden)
+    made = Target(picture, weight, None, source, warnings, initial, coverage, asked)
+    return _seen(made, hidden, settings.output.tonemap)
 
 
 def _again(scene, envmap, settings):
@@ -180,9 +193,10 @@ def _again(scene, envmap, settings):
     return rendered(scene, envmap, settings.target.spp, seed, settings.renderer.cache)[0]
 
 
-def _of_rendering(scene, chosen, picture, mask, how=""):
+def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     """Take a picture of the scene under other light; ``how``: why it is taken for one."""
-    shape = scene.height, scene.width
+    # ---- The picture
+    chosen, shape = settings.target, (scene.height, scene.width)
     if picture is not None:
         everywhere = np.ones(shape) if mask is None else mask
         found = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
@@ -199,14 +213,18 @@ def _of_rendering(scene, chosen, picture, mask, how=""):
         found = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
         source = f"a picture of the scene: {', '.join(chosen.files)}"
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
+
+    # ---- Pixels that count, and its noise
     weight = np.where(found.excluded[..., None], 0, found.coverage).astype(np.float32)
     if not weight.any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
-    weight = None if (weight == 1).all() else weight
+    counts = None if (weight == 1).all() else weight
     picture = np.minimum(found.picture, np.float32(BRIGHTEST))
-    known = rendered_anew.noise(picture, scene.rows)
-    source += f"{how}, noise of its display values {float(np.median(known)):.2g}"
-    return Target(picture, weight, None, source, tuple(found.warnings), asked=asked, noise=known)
+    noise = rendered_anew.noise(picture, scene.rows)
+    initial, spp, _ = with_noise(settings, scene, envmap)
+    spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
+    source += f"{how}, as noisy as {spp} samples a pixel"
+    return Target(picture, counts, None, source, tuple(found.warnings), asked=asked, noise=noise, spp=spp)
 
 
 def _by_view(scene, views, given):
@@ -274,8 +292,18 @@ def _of_views(scene, initial, painted, of_view):
     return painted_image.Painted(picture, coverage, excluded, said)
 
 
-def _seen(target, hidden):
-    """Take the pixels that see no surface, where the scene hides what lights it, out of the loss."""
+def _seen(target, hidden, curve):
+    """Take the pixels that see no surface, where the scene hides what lights it, out of the loss.
+
+    And warn of a target that is largely white on a display.
+    """
+    white = (apply_tonemap(target.picture, curve) >= 1).all(axis=2)
+    counted = white if hidden is None else white & ~hidden
+    share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
+    if share > MOST_WHITE:
+        said = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
+        said += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
+        target = replace(target, warnings=(*target.warnings, said))
     if hidden is None or not hidden.any():
         return target
     weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight
@@ -325,9 +353,7 @@ def _rendered(settings, scene, envmap, other):
         true, warnings = latlong.rotate(envmap, chosen.degrees), ()
         source = f"rendered under the map turned by {chosen.degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
-    picture, spp, noise = rendered(
-        scene, true, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
-    )
+    picture, spp, noise = with_noise(settings, scene, true)
     weights = np.ones((*picture.shape[:2], 1), np.float32)
     for view, mask in _by_view(scene, chosen.views, chosen.masks).items():
         if mask:
@@ -336,4 +362,37 @@ def _rendered(settings, scene, envmap, other):
     weight = weights if chosen.masks else None
     asked = (true,) if weight is None else (true, weight)
     source += f", {spp} samples a pixel"
-    return Target(picture, weight, true, source, warnings, asked=asked, noise=noise)
+    return Target(picture, weight, true, source, warnings, asked=asked, noise=noise, spp=spp)
+
+
+def with_noise(
+    settings: config.Config, scene: Scene, envmap: np.ndarray
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """Render a target.
+
+    Parameters
+    ----------
+    settings : config.Config
+        Samples, seed and cache.
+    scene : Scene
+        The scene.
+    envmap : ndarray (H, W, 3)
+        The map that it is rendered under.
+
+    Returns
+    -------
+    picture : ndarray (h, w, 3)
+        Linear radiance.
+    spp : int
+        Samples a pixel that were taken.
+    noise : ndarray (h, w)
+        Standard error of display values, RMS over channels; where it is not known from passes,
+        |d1 - d2| / sqrt(2), with d2 a second rendering with as many samples.
+    """
+    asked, seeds, keep = settings.target.spp, Seeds.of(settings.seed), settings.renderer.cache
+    picture, spp, noise = rendered(scene, envmap, asked, seeds.target, keep)
+    if noise is None:
+        again, _, _ = rendered(scene, envmap, asked, seeds.target_again, keep)
+        off = np.float64(apply_tonemap(picture)) - apply_tonemap(again)
+        noise = np.sqrt(np.square(off).mean(axis=2) / 2)
+    return picture, spp, noise

@@ -12,15 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from envedit import config
-from envedit.core.errors import ConfigError
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.resampling import fit
-from envedit.core.seeds import Seeds
 from envedit.representations.layers.gain import CYCLES
-from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, rendered_anew
-from envedit.targets.target import Target, first_hold, pixel_weight
+from envedit.targets.target import Target, first_hold, pixel_weight, with_noise
 
 PIXELS = 128 * 128
 """Pixels that an edit is solved on with "auto": of pictures of 256x256 pixels, three edits on two scenes, it
@@ -44,7 +41,7 @@ def most_pixels(settings: config.Config) -> int | None:
 def smaller(settings: config.Config, lit: Scene) -> Scene:
     """Return the scene on a film of at most so many pixels as are asked for, all views together.
 
-    It is the scene itself where its film is hardly larger, or takes no other size.
+    It is the scene itself where its film is hardly larger, or somebody has built it.
     """
     most, pixels = most_pixels(settings), lit.width * lit.height
     if most is None or pixels <= MUCH * most:
@@ -54,15 +51,12 @@ def smaller(settings: config.Config, lit: Scene) -> Scene:
 
 
 def scaled(lit: Scene, factor: float) -> Scene | None:
-    """Return the scene on a film that is ``factor`` times as wide and high; None where it takes no other."""
+    """Return the scene on a film that is ``factor`` times as wide and high; None if it is built already."""
     if lit.again is None:
         return None
     heights = {rows.stop - rows.start for rows in lit.rows}
     height = max(1, round(factor * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
-    try:
-        return lit.again(max(4, round(factor * lit.width)), height)
-    except ConfigError:  # a cropped film
-        return None
+    return lit.again(max(4, round(factor * lit.width)), height)
 
 
 def worked_on(
@@ -91,13 +85,12 @@ def worked_on(
         if target.envmap is None:  # a picture of the scene
             picture = at_size(target.picture, lit, small)
             noise = rendered_anew.noise(picture, small.rows)
+            spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)
         else:
-            picture, _, noise = rendered(
-                small, target.envmap, chosen.spp, Seeds.of(settings.seed).target, settings.renderer.cache
-            )
+            picture, spp, noise = with_noise(settings, small, target.envmap)
         if target.weight is not None:
             weight = np.where(hidden[..., None], 0, at_size(target.weight, lit, small)).astype("f4")
-        return replace(target, picture=picture, noise=noise, weight=weight)
+        return replace(target, picture=picture, noise=noise, spp=spp, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
     change = at_size(target.picture - target.initial, lit, small)
     picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))

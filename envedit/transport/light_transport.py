@@ -34,7 +34,7 @@ from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError
-from envedit.core.radiance import require_radiance
+from envedit.core.radiance import require_radiance, require_unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
@@ -59,7 +59,7 @@ LEAST_LIGHT = 1 / 256
 """Light of a texel, as a share of the brightest's, below which it gets no column for a picture of its own."""
 TYPICAL_PIXELS = 128 * 128
 """Of larger pictures the error is predicted for the whole picture: errors of neighbours are independent."""
-_RECORDING = 1  # raise when the same scene, grid and seed give another recording, or other arrays of it
+_RECORDING = 2  # raise when the same scene, grid and seed give another recording, or other arrays of it
 
 
 class LightTransport:
@@ -84,13 +84,15 @@ class LightTransport:
         The first recording was found on disk.
     paths, tolerance : (int, int, int), float
         Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
+    warnings : tuple of str
+        What the user should know: how much light comes by longer paths.
     """
 
     def __init__(self, scene: Scene, grid: Grid, plan: SamplingPlan, seed: int, refresh: int):
         self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
         self.spp, self.bounces, self.capacity, self.refresh = plan.spp, plan.bounces, plan.capacity, refresh
         self.epoch, self._base_seed, self._choices, self._lost = 0, seed, plan.choices, 0
-        self.cached, self.depth_error = False, plan.depth_error
+        self.cached, self.depth_error, self.warnings = False, plan.depth_error, plan.warnings
         self.paths, self.tolerance = plan.paths, plan.tolerance
         self._looks = np.zeros(grid.texels, np.uint8)
         self._bright: np.ndarray = np.zeros(0, np.int64)
@@ -532,6 +534,7 @@ class LightTransport:
             Number of columns traced. Texels stay exact while there is room; then those that are not bright
             any more make room for those that are.
         """
+        require_unmasked(envmap, "light transport")
         envmap, exact = np.asarray(envmap), self._exact
         wanted = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
         tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1

@@ -24,7 +24,7 @@ from envedit.transport.sparse_matrix import SLICE, merge
 from envedit.transport.texel_sampling import Grid
 
 MAX_BOUNCES = 8
-"""Bounces that the pilot follows, and the most that an automatic path depth allows."""
+"""Most bounces that an automatic path depth allows."""
 DEPTH_TOLERANCE = 0.002
 """Share of the picture under a white sky that an automatic path depth may leave out."""
 LANES = 1 << 18
@@ -93,8 +93,14 @@ def bsdf_weight(pdf: mi.Float, sampled: mi.Float) -> mi.Float:
 
 
 def contributions(
-    scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: int, seed: int
-) -> Iterator[tuple[int, mi.UInt32, mi.UInt32, mi.Color3f]]:
+    scene: mi.Scene,
+    grid: Grid,
+    pixels: np.ndarray,
+    spp: int,
+    bounces: int,
+    seed: int,
+    beyond: bool = False,
+) -> Iterator[tuple[int | mi.UInt32, mi.UInt32, mi.UInt32, mi.Color3f]]:
     """Yield (bounce, pixel of each lane, texel, RGB weight) of one block of pixels, as batches on the device.
 
     T[p, j] is the radiance of pixel p per unit of radiance of texel j: a sum over the surface points of a
@@ -118,11 +124,14 @@ def contributions(
         Surface points along a path.
     seed : int
         Seed of every random choice.
+    beyond : bool
+        As of :func:`.camera_paths.trace`: the last batch has an array of bounces then.
     """
     lane = dr.arange(mi.UInt32, len(pixels) * spp)
     pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), lane // spp)
-    for event in camera_paths.trace(scene, pixels, spp, bounces, seed):
-        key = dr.opaque(mi.UInt32, (seed * 1009 + 512 + event.bounce) & 0xFFFFFFFF)
+    for event in camera_paths.trace(scene, pixels, spp, bounces, seed, beyond):
+        bounce = event.bounce if isinstance(event.bounce, int) else bounces + 1
+        key = dr.opaque(mi.UInt32, (seed * 1009 + 512 + bounce) & 0xFFFFFFFF)
         scramble = mi.sample_tea_32(pixel, key)[0]
         u = camera_paths.lattice(mi.permute_kensler(lane % spp, spp, scramble), scramble)
         if isinstance(event, camera_paths.Escape):
@@ -191,27 +200,36 @@ def pilot(scene: Scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     by_row : ndarray (H,)
-        Light by row of the map.
-    by_bounce : ndarray (MAX_BOUNCES + 1,)
-        Light by bounce; 0 is the sky seen directly.
+        Light by row of the map, of paths of at most :data:`MAX_BOUNCES` bounces.
+    by_bounce : ndarray (n,)
+        Light by bounce, to the end of the longest path; 0 is the sky seen directly, n > MAX_BOUNCES.
     """
     pixels = np.arange(scene.width * scene.height, dtype=np.uint32)
     stride = max(1, int(np.sqrt(len(pixels) / 4096)))
     some = pixels.reshape(scene.height, scene.width)[::stride, ::stride].ravel()
     by_row, by_bounce = np.zeros(grid.height), np.zeros(MAX_BOUNCES + 1)
     for bounce, _, texel, value in contributions(
-        scene.mi, grid, some, PILOT_SPP, MAX_BOUNCES, seeds.pilot(seed)
+        scene.mi, grid, some, PILOT_SPP, MAX_BOUNCES, seeds.pilot(seed), True
     ):
         # Summed on the host: atomics would give other bits, and so other samples, on every run.
         amount = np.nan_to_num(dr.mean(value).numpy().astype(np.float64), nan=0, posinf=0, neginf=0)
-        by_row += np.bincount(texel.numpy() // grid.width, amount, minlength=grid.height)
-        by_bounce[bounce] += amount.sum()
+        if isinstance(bounce, int):
+            by_row += np.bincount(texel.numpy() // grid.width, amount, minlength=grid.height)
+            by_bounce[bounce] += amount.sum()
+        else:
+            further = np.bincount(bounce.numpy(), amount, minlength=len(by_bounce))
+            by_bounce = np.pad(by_bounce, (0, len(further) - len(by_bounce))) + further
     return by_row, by_bounce
 
 
 def left_out(by_bounce: np.ndarray, bounces: int) -> float:
     """Share of the picture under a white sky that comes from beyond ``bounces``, of the light by bounce."""
     return max(1 - float(by_bounce[: bounces + 1].sum() / by_bounce.sum()), 0.0)
+
+
+def enough_bounces(by_bounce: np.ndarray) -> int:
+    """Return the fewest bounces that leave out at most :data:`DEPTH_TOLERANCE`, of the light by bounce."""
+    return next(n for n in range(len(by_bounce)) if left_out(by_bounce, n) <= DEPTH_TOLERANCE)
 
 
 def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[int, list[str]]:
@@ -223,7 +241,7 @@ def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) ->
         Named in the error.
     max_depth : int or "auto"
         Mitsuba's path depth; taken as it is if it is a number.
-    by_bounce : ndarray (MAX_BOUNCES + 1,)
+    by_bounce : ndarray (n,)
         Light by bounce.
 
     Returns
@@ -239,17 +257,16 @@ def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) ->
         If no light arrives within that depth.
     """
     automatic = max_depth == "auto"
-    total = by_bounce.sum()
-    if not (total if automatic else by_bounce[:max_depth].sum()) > 0:
-        within = "" if automatic else f" within path depth {max_depth}"
+    most = MAX_BOUNCES + 1 if automatic else max_depth
+    if not by_bounce[:most].sum() > 0:
+        within = "" if automatic and not by_bounce.any() else f" within path depth {most}"
         raise InputError(
             f"{scene.path or 'scene dict'}: no pixel receives light from the environment{within}: "
             "check the camera and that the scene is open"
         )
     if not automatic:
         return int(max_depth) - 1, []
-    enough = [left_out(by_bounce, bounces) <= DEPTH_TOLERANCE for bounces in range(MAX_BOUNCES + 1)]
-    bounces = enough.index(True) if any(enough) else MAX_BOUNCES
+    bounces = min(enough_bounces(by_bounce), MAX_BOUNCES)
     left = left_out(by_bounce, bounces)
     added = f"further bounces add {100 * left:.2g} % of the picture under a white sky"
     return bounces, [f"path depth {bounces + 1}: {added}"]

@@ -12,9 +12,11 @@ from envedit.core import latlong
 from envedit.core.array_cache import DiskCache, holds
 from envedit.scene.scene import Scene
 from envedit.transport.recording import (
+    DEPTH_TOLERANCE,
     MAX_BOUNCES,
     choose_bounces,
     choose_samples,
+    enough_bounces,
     gigabytes,
     left_out,
     pilot,
@@ -50,6 +52,8 @@ class SamplingPlan:
         Memory for camera paths that are kept for further columns.
     choices : tuple of str
         What was chosen automatically, with the measurement that decided.
+    warnings : tuple of str
+        What the user should know: how much light comes by longer paths.
     """
 
     spp: int
@@ -62,6 +66,7 @@ class SamplingPlan:
     tolerance: float
     paths_bytes: int
     choices: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     def key(self) -> dict[str, Any]:
         """Return what a recording depends on, for its place on disk."""
@@ -79,7 +84,7 @@ def white_sky(
         key,
         lambda found: (
             holds(found, known)
-            and len(found["by_bounce"]) == MAX_BOUNCES + 1
+            and len(found["by_bounce"]) > MAX_BOUNCES
             and found["by_bounce"].sum() > 0
         ),
     )
@@ -108,7 +113,7 @@ def choose(
         Scene, camera and film.
     shape : (int, int)
         Rows and columns of the map.
-    light : (ndarray (H,), ndarray (MAX_BOUNCES + 1,))
+    light : (ndarray (H,), ndarray (n,))
         Of :func:`white_sky`.
     spp, max_depth, few
         As of :meth:`.LightTransport.build`.
@@ -125,6 +130,13 @@ def choose(
         by_bounce[scene.max_depth :] = 0
     bounces, choices = choose_bounces(scene, max_depth, by_bounce)
     samples, capacity, choice = choose_samples(scene, spp, shape[0] * shape[1], memory_gb)
+    depth_error, warnings = left_out(by_bounce, bounces), []
+    if depth_error > DEPTH_TOLERANCE:
+        warnings.append(
+            f"light transport: paths of more than {bounces + 1} segments are left out, which add "
+            f"{100 * depth_error:.2g} % of the picture under a white sky: set [renderer] max_depth = "
+            f"{enough_bounces(by_bounce) + 1}"
+        )
     left = memory_gb - gigabytes(scene.width * scene.height, samples, capacity)
     # The light of other lamps is constant: it need not be cut where no path depth is asked for.
     most = scene.max_depth if max_depth == "auto" else bounces + 1
@@ -134,9 +146,10 @@ def choose(
         capacity=capacity,
         mass=row_mass(latlong.solid_angles(*shape), by_row),
         lamps=most if len(scene.mi.emitters()) > 1 else 0,
-        depth_error=left_out(by_bounce, bounces),
+        depth_error=depth_error,
         paths=FEW_PATHS if few else COLUMN_PATHS,
         tolerance=FEW_TOLERANCE if few else COLUMN_TOLERANCE,
         paths_bytes=int(1e9 * max(left, 0)),
         choices=(*choices, choice),
+        warnings=tuple(warnings),
     )

@@ -1,4 +1,4 @@
-"""How much photographed skies differ: what the prior of painted targets and ``natural.patches`` are measured by.
+"""How much photographed skies differ: the measure of painted targets' prior and of ``natural.patches``.
 
 Of every pair of maps, with the suns at one azimuth: the field of differences of log radiance in cells of the
 upper half, along luminance, blue-amber and green-magenta. Its covariance by angle is fitted by that of

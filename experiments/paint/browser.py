@@ -68,7 +68,7 @@ def opened(browser, work: Path):
                 page.goto(line.split()[-1])
                 page.wait_for_function(
                     "() => Number(document.querySelector('[data-testid=status]').dataset.frame) > 0 "
-                    f"&& ['done', 'solving'].includes({STATE})",
+                    f"&& ['done', 'rendering', 'solving'].includes({STATE})",
                     timeout=300_000,
                 )
                 yield page, process, time.perf_counter() - began, errors

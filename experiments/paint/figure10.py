@@ -101,6 +101,7 @@ def edit(settings, folder, strokes) -> dict:
     """Paint an edit in the page and save it; returns seconds, the edit's figures and the strokes as saved."""
     work = prepared(folder)
     with browsing() as browser, opened(browser, work) as (page, *_):
+        set_to(page, "exposure", 0)  # amounts of light are of what is shown as white
         began = time.perf_counter()
         for stroke in strokes:
             paint(page, stroke)

@@ -1,12 +1,11 @@
 """Random use of the page of ``envedit paint``, in a real browser."""
 
+import os
 import random
 import re
 import time
 from collections import Counter
 from pathlib import Path
-
-import numpy as np
 
 from experiments.harness import Experiment, calling, number
 from experiments.paint.browser import browsing, converged, opened, place, prepared
@@ -15,10 +14,28 @@ OWN = {"edit.toml", "edit_out", "server.log"}
 """What may lie in the folder that the command works in."""
 
 
-def memory(process) -> float:
-    """Return the resident memory of a process, MB."""
+RESTING, QUIET = 0.1, 3.0
+"""Share of a processor below which a process rests, over so many seconds."""
+LONGEST_REST = 300.0
+"""Seconds in which it must come to rest."""
+
+
+def memory_at_rest(process) -> float:
+    """Wait until a process rests; return its resident memory, MB."""
+    end, used = time.monotonic() + LONGEST_REST, processor_time(process)
+    while time.monotonic() < end:
+        time.sleep(QUIET)
+        before, used = used, processor_time(process)
+        if used - before < RESTING * QUIET:
+            break
     found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{process.pid}/status").read_text())
     return int(found[1]) / 1024 if found else float("nan")
+
+
+def processor_time(process) -> float:
+    """Return the seconds that a process has computed, of its own and in the system."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(int(ticks) for ticks in fields[11:13]) / os.sysconf("SC_CLK_TCK")
 
 
 def act(page, chance: random.Random) -> str:
@@ -71,34 +88,32 @@ def act(page, chance: random.Random) -> str:
 
 def soak(settings, folder, minutes) -> dict:
     """Use the page for some minutes; the configuration's seed is that of the actions."""
-    chance, done, grown, work = random.Random(settings.seed), Counter(), [], prepared(folder)
+    chance, done, at_rest, work = random.Random(settings.seed), Counter(), [], prepared(folder)
     before = set(folder.iterdir())
     with browsing() as browser, opened(browser, work) as (page, process, _, errors):
-        end, noted = time.monotonic() + 60 * minutes, 0.0
-        while time.monotonic() < end and process.poll() is None:
-            done[act(page, chance)] += 1
-            if time.monotonic() > noted + 10:
-                noted = time.monotonic()
-                grown.append(memory(process))
+        for _ in ("first half", "second half"):
+            end = time.monotonic() + 30 * minutes
+            while time.monotonic() < end and process.poll() is None:
+                done[act(page, chance)] += 1
+            if process.poll() is None:
+                page.get_by_test_id("clear").click(force=True)
+                converged(page)
+                at_rest.append(memory_at_rest(process))
         alive = process.poll() is None
-        if alive:
-            page.get_by_test_id("clear").click(force=True)
-            converged(page)
-    third = max(1, len(grown) // 3)
-    middle, last = float(np.median(grown[third : 2 * third] or grown)), float(np.median(grown[-third:]))
+    half, last = [*at_rest, float("nan"), float("nan")][:2]
     outside = sorted(map(str, set(folder.iterdir()) - before))
     return {
         "seed": settings.seed,
         "minutes": minutes,
         "actions": done,
-        "middle_mb": middle,
+        "half_mb": half,
         "last_mb": last,
         "page_errors": errors,
         "alive": alive,
         "exit_code": process.returncode,
         "server_log": (work / "server.log").read_text()[-2000:],
         "files_outside": outside + sorted(p.name for p in work.iterdir() if p.name not in OWN),
-        "memory_grew": last > 1.1 * middle + 20,
+        "memory_grew": last > 1.1 * half + 20,
     }
 
 
@@ -112,9 +127,7 @@ def failures(rows) -> list[str]:
             f"exit code {row['exit_code']} of the server": row["exit_code"],
             f"the server wrote to its log: {row['server_log']}": row["server_log"],
             f"files where there must be none: {', '.join(row['files_outside'])}": row["files_outside"],
-            "memory of the last third is above 1.1 times that of the middle one and 20 MB": row[
-                "memory_grew"
-            ],
+            "memory at rest is above 1.1 times that of half time and 20 MB": row["memory_grew"],
         }
         found += [f"seed {row['seed']}: {sentence}" for sentence, holds in wrong.items() if holds]
     return found
@@ -134,8 +147,8 @@ EXPERIMENT = Experiment(
         "minutes": "{minutes:g}",
         "actions": lambda row: str(sum(row["actions"].values())),
         "of them": lambda row: ", ".join(f"{row['actions'][what]} {what}" for what in sorted(row["actions"])),
-        "memory, middle third, MB": lambda row: number(row["middle_mb"], ".0f"),
-        "last third": lambda row: number(row["last_mb"], ".0f"),
+        "memory at rest, half time, MB": lambda row: number(row["half_mb"], ".0f"),
+        "at the end": lambda row: number(row["last_mb"], ".0f"),
     },
     failures=failures,
     options=lambda parser: parser.add_argument("--minutes", type=float, default=60.0, metavar="N"),

@@ -177,6 +177,7 @@ COUNTS = {
     "painted_edits": 18,
     "painted_edits.full_resolution": 2,
     "paper": 540,
+    "scenes": 6,
     "solver.columns": 2,
     "solver.edits": 9,
     "solver.growth": 5,

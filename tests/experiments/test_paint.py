@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from experiments.harness import Done, calling
 from experiments.paint import browser, figure10, rates, soak
 
 GOOD = {
-    "seed": 3, "minutes": 1.0, "actions": {"stroke": 2, "light": 1}, "middle_mb": 100.0, "last_mb": 101.4,
+    "seed": 3, "minutes": 1.0, "actions": {"stroke": 2, "light": 1}, "half_mb": 100.0, "last_mb": 101.4,
     "page_errors": [], "alive": True, "exit_code": 0, "server_log": "", "files_outside": [],
     "memory_grew": False,
 }  # fmt: skip
@@ -27,15 +28,27 @@ GOOD = {
         ({"exit_code": 1}, "exit code 1 of the server"),
         ({"server_log": "Traceback"}, "the server wrote to its log: Traceback"),
         ({"files_outside": ["x"]}, "files where there must be none: x"),
-        (
-            {"memory_grew": True},
-            "memory of the last third is above 1.1 times that of the middle one and 20 MB",
-        ),
+        ({"memory_grew": True}, "memory at rest is above 1.1 times that of half time and 20 MB"),
     ],
 )
 def test_random_use_fails_by_each_thing_that_must_not_happen(changed, said):
     assert soak.failures([GOOD]) == []
     assert soak.failures([GOOD, GOOD | changed]) == [f"seed 3: {said}"]
+
+
+def test_memory_is_taken_when_a_process_rests(monkeypatch):
+    """Processor time as of one that works until its third look."""
+    process, times = subprocess.Popen(["sleep", "60"]), iter([0.0, 2.0, 4.0, 4.1, 9.0])
+    monkeypatch.setattr(soak, "QUIET", 0.01)
+    monkeypatch.setattr(soak, "RESTING", 20.0)
+    try:
+        assert 0 <= soak.processor_time(process) < 1
+        monkeypatch.setattr(soak, "processor_time", lambda _: next(times))
+        assert 0 < soak.memory_at_rest(process) < 100
+        assert next(times) == 9.0
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_random_use_is_listed():

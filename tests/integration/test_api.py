@@ -17,6 +17,7 @@ from envedit.images import images
 from envedit.scene import built_scene
 from tests.oracles import ROOT
 
+MASKED = np.ma.array(np.ones((8, 16, 3)), mask=np.arange(384).reshape(8, 16, 3) < 3)
 TINY = {
     "preset": "draft",
     "input": {"width": 16},
@@ -128,14 +129,16 @@ def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
 
 
 @pytest.mark.parametrize("integrator", [
-    {"type": "path"}, {"type": "path", "max_depth": 6}, {"type": "direct"}, {"type": "prb", "max_depth": 4},
+    {"type": "path", "rr_depth": 9}, {"type": "path", "max_depth": 6}, {"type": "direct"},
+    {"type": "prb", "max_depth": 4, "rr_depth": 3},
     {"type": "prb", "max_depth": -1}, {"type": "direct_projective"}, {"type": "volpath", "max_depth": 3},
     {"type": "depth"}, {"type": "ptracer", "max_depth": 5},
 ])  # fmt: skip
 def test_a_built_scene_s_integrator_asks_for_the_same_as_a_dict_s(integrator):
     made = ball(np.ones((4, 8, 3), np.float32)) | {"integrator": integrator}
     built, parsed = (envedit.load_scene(scene) for scene in (mi.load_dict(made), made))
-    assert (built.max_depth, built.hide_emitters) == (parsed.max_depth, parsed.hide_emitters)
+    for name in ("max_depth", "rr_depth", "hide_emitters"):
+        assert getattr(built, name) == getattr(parsed, name)
     assert len(built.notes) == len(parsed.notes)
 
 
@@ -173,6 +176,7 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
         (lambda: {"envmap": np.full((8, 16, 3), 1e39)}, InputError, ["envmap: 128 texels are NaN or"]),
         (lambda: {"target_map": np.full((8, 16, 3), -np.inf)}, InputError, ["target_map: 128 texels are"]),
         (lambda: {"target": np.full((64, 64, 3), np.nan)}, InputError, ["target: pixel at row 0, column 0"]),
+        (lambda: {"envmap": MASKED}, InputError, ["envmap: 3 values are masked", "fill them"]),
         (lambda: {"target": np.ones((4, 4, 3))}, InputError, ["the picture has shape (4, 4, 3)"]),
         (lambda: {"scene": 3}, ConfigError, ["scene: got int, expected a file, a dict"]),
         (lambda: {"scene": "no_such.xml"}, InputError, ["no_such.xml: no such file"]),
@@ -218,6 +222,8 @@ def test_tables_made_in_python_name_the_key(make, text):
     ("make", "text"),
     [
         (lambda: envedit.fit(np.ones((8, 16))), "image: got an array of shape (8, 16), expected (H, W, 3)"),
+        (lambda: envedit.fit(MASKED), "image: 3 values are masked"),
+        (lambda: envedit.load_scene("sphere", 8).render(MASKED, 1), "map: 3 values are masked"),
         (lambda: envedit.fit("sky.exr"), "image: got 'sky.exr', expected an array"),
         (lambda: envedit.fit(np.ones((8, 16, 3)), {"hiden": 3}), "hiden: unknown key; did you mean hidden?"),
         (lambda: envedit.fit(np.ones((8, 16, 3)), settings={"epochs": -1}), "fit.epochs: got -1, expected"),

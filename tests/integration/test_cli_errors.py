@@ -203,7 +203,6 @@ def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
 @pytest.mark.parametrize(
     ("parts", "says"),
     [
-        ([SENSOR, BALL], ["no environment emitter"]),
         ([SENSOR, BALL, LIGHT, SKY], ["2 environment emitters", "constant", "envmap"]),
         ([BALL, LIGHT], ["no sensor"]),
         ([SENSOR, BALL, LIGHT, '<shape type="spere"/>'], ["spere"]),

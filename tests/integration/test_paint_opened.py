@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from envedit import config, pipeline
+from envedit.cli.paint import protocol
+from envedit.images import images
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, served
 
@@ -42,7 +45,39 @@ def test_a_large_picture_is_painted_at_the_size_at_which_it_is_solved(units, sho
         assert sizes_shown(server) == {(source, 0): (width, width) for source, width in enumerate(shown)}
 
 
-def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path):
+def test_save_goes_on_from_what_is_shown_and_tells_what_differs(tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    folder = tmp_path / "edit_out"
+    erased = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
+    with served(tmp_path / "edit.toml") as server, connected(server) as page:
+        heard(page, "opened")
+        page.send(json.dumps({"type": "document", "number": 1, "document": {"strokes": [erased]}}))
+        heard(page, "status", lambda m: m.get("number") == 1 and m["iterations"] > 1)
+        page.send(json.dumps({"type": "save"}))
+        shown = {}
+        while not isinstance(received := page.recv(timeout=120), str) or '"type":"saved"' not in received:
+            if isinstance(received, bytes) and received[4] == 0:
+                shown[received[5]] = struct.unpack("<H", received[6:8])[0]
+        saved = json.loads(received)
+        assert shown[2] == 2 * 48, "a sharp picture was replaced by a coarse one"
+        assert "the picture differs from the one shown before by 0.0" in saved["notes"][0]
+        assert saved["notes"][1].startswith("target.hold = "), saved["notes"]
+        kept = folder / "painted.toml"
+        assert 'start = "painted.npz"' in kept.read_text()
+        again = pipeline.run(config.load(kept), folder=None)
+        stored, _ = images.load_envmap(str(folder / "edited.exr"), 64)
+        assert np.array_equal(again.envmap, stored), "envedit run makes another map"
+        assert not any("start " in note for note in again.notes), "another start was chosen"
+    with served(kept) as server, connected(server) as page:
+        heard(page, "opened")
+        assert server.worker.session.hold > 1, "the saved solution is not what is opened"
+        page.send(json.dumps({"type": "document", "document": {"strokes": [erased, erased]}}))
+        heard(page, "status", lambda m: m["iterations"] > 0)
+        assert "start" not in kept.read_text(), "a solution of other strokes is gone on from"
+
+
+def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
     (tmp_path / "edit.toml").write_text(OF_TWO)
     square = {"rectangle": [0.3, 0.3, 0.7, 0.7], "softness": 0.05}
@@ -74,13 +109,27 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
             (1, 0): (64, 40),
             (1, 1): (64, 56),
         }
+        before = session.document
         page.send(json.dumps({"type": "document", "document": {"strokes": [{**light, "view": 2}]}}))
+        given = heard(page, "document")
+        assert given["client"] == "" and protocol.document(given["document"]) == before == session.document
         assert "got view 2, expected one of 0 (front), 1 (behind)" in heard(page, "error")["text"]
+        with connected(server) as later:
+            assert protocol.document(heard(later, "opened")["document"]) == before
+        page.send(json.dumps({"type": "open", "name": "edit.toml", "envmap": "missing.exr"}))
+        assert "missing.exr" in heard(page, "error")["text"] and server.worker.session is session
         toward = []
         for view in (0, 1):
             page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.5, "light": 0, "view": view}))
             toward.append(heard(page, "picked")["azimuth"])
         assert abs((toward[1] - toward[0]) % 360 - 180) < 60, toward
+
+    with open(tmp_path / "edit_out" / "painted.toml", "a") as painted:
+        painted.write('\n[[target.strokes]]\ntype = "light"\nview = 5\nellipse = [0.5, 0.5, 0.1, 0.1]\n')
+    with served(tmp_path / "edit.toml") as server, connected(server) as page:
+        opened = heard(page, "opened")
+        assert protocol.document(opened["document"]) == before
+        assert "strokes[2].view: got view 5" in opened["notes"][0] and "left out" in opened["notes"][0]
 
 
 def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, monkeypatch):
@@ -105,6 +154,10 @@ def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, m
             "maps/a.hdr",
         ]
         assert Path(path).read_bytes() == b"#?RADIANCE"
+        Path("maps").rename("kept")
+        Path("maps").write_text("in the way")
+        code, text = asked(f"{server.url}map/b.hdr", **put)
+        assert code == 500 and text.startswith("not written: ") and "maps" in text, text
         page.send(json.dumps({"type": "save"}))
         assert "no scene is open" in heard(page, "error")["text"]
         page.send(json.dumps({"type": "open", "name": "nowhere.toml"}))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from envedit import config, pipeline
+from envedit.core.color import luminance
 from envedit.images import images
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, served, until
@@ -108,6 +109,8 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
     with served(file) as server:
         page = Page(browser, server.url)
         page.settled()
+        white = np.quantile(luminance(server.worker.session.before), 0.95)
+        assert abs(float(page.page.get_by_test_id("exposure").input_value()) + np.log2(white)) <= 0.125
         begun = page.picture("map")
         page.page.get_by_test_id("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.2 + 0.1 * k, 0.82) for k in range(5)))
@@ -116,10 +119,12 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         page.shot("painted")
         assert page.picture("map") != begun, "the map did not follow the stroke"
         assert 'type = "shadow"' in (folder / "painted.toml").read_text(), "the stroke was not kept"
+        sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_visible()
         page.page.get_by_test_id("undo").click()
         until(lambda: "[[target.strokes]]" not in (folder / "painted.toml").read_text())
         page.settled()
         assert page.picture("map") == begun, "undo did not give the map back"
+        sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_hidden()
         page.page.get_by_test_id("redo").click()
         page.settled()
         handle = page.page.get_by_test_id("handle-1").bounding_box()
@@ -131,6 +136,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         assert page.picture("map") != painted, "the map did not follow the light"
         page.page.get_by_test_id("save").click()
         sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("Saved in", timeout=240_000)
+        sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("differs from the one shown")
         page.shot("saved")
         assert not page.faults, page.faults
         assert all(url.startswith((server.url, "data:")) for url in page.asked), "the page asks elsewhere"
@@ -165,10 +171,14 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
         second = page.page.evaluate(ratio)
         assert first["width"] / first["height"] == pytest.approx(32 / 20, rel=0.02)
         assert second["width"] / second["height"] == pytest.approx(32 / 28, rel=0.02)
+        page.page.get_by_test_id("tool-light").click()
         page.page.get_by_test_id("shape-rectangle").click()
+        stops = float(page.page.get_by_test_id("exposure").input_value())
         page.drag(page.at("#overlay", 0.3, 0.3), page.at("#overlay", 0.7, 0.7))
         kept = tmp_path / "edit_out" / "painted.toml"
         until(lambda: kept.exists() and "view = 1" in kept.read_text())
+        (stroke,) = config.load(kept).target.strokes
+        assert stroke["amount"] == pytest.approx(0.6 / 2**stops, rel=1e-3), "not of what is shown as white"
         page.shot("views")
 
         assert not page.page.evaluate(UNNAMED)

@@ -1,5 +1,6 @@
 """``envedit paint`` without a browser: who is let in, what is refused, several pages, ends."""
 
+import itertools
 import json
 import os
 import signal
@@ -7,12 +8,14 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 
 import numpy as np
 import pytest
 
+from envedit.cli.paint import protocol
 from envedit.cli.paint.protocol import Document
 from tests.oracles.painting import SMALL, asked, connected, heard, served, until
 
@@ -73,6 +76,30 @@ def test_no_other_file_is_served_or_written(server):
     assert set(os.listdir()) <= {"edit.toml", "edit_out", "secret.txt"}
 
 
+def test_an_address_without_its_slash_is_not_redirected(server):
+    for path in (f"/{server.token}", "/somebody/ws/", f"/{server.token}/main.js/"):
+        with socket.create_connection(("127.0.0.1", server.port), timeout=30) as plain:
+            plain.sendall(f"GET {path} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n".encode())
+            answer = plain.makefile("rb").read()
+        assert answer.startswith(b"HTTP/1.1 404") and b"evil.example" not in answer, path
+
+
+def test_while_a_message_is_read_others_are_served(server, monkeypatch):
+    read, asked_for, waited = protocol.read, threading.Event(), []
+
+    def slow(text, client=""):
+        waited.append(asked_for.wait(20))
+        return read(text, client)
+
+    monkeypatch.setattr(protocol, "read", slow)
+    with connected(server) as page:
+        page.send("{")
+        assert asked(server.url)[0] == 200
+        asked_for.set()
+        assert "expected JSON" in heard(page, "refused")["text"]
+    assert waited == [True], "the page was served only after the message had been read"
+
+
 def test_bad_messages_are_told_and_huge_ones_end_the_connection(server):
     with connected(server) as page:
         assert "Sec-WebSocket-Extensions" not in page.response.headers  # no frame is compressed
@@ -116,6 +143,25 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
     until(lambda: server.worker.session.document == Document())
 
 
+def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
+    stroke = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
+    told = []
+    with connected(server) as page:
+        page.send(json.dumps({"type": "document", "number": 20, "document": {"strokes": [stroke]}}))
+        while not told or told[-1] != "done":
+            status = heard(page, "status", lambda m: m.get("number") == 20)
+            told.append(status["state"])
+        assert status["hold"] > 1, "the weight of what was not painted is not told"
+        with pytest.raises(TimeoutError):
+            while True:
+                received = page.recv(timeout=3)
+                told += [json.loads(received).get("state")] if isinstance(received, str) else []
+        states = [state for state, _ in itertools.groupby(filter(None, told))]
+        assert states == ["solving", "rendering", "done"]
+        page.send(json.dumps({"type": "document", "number": 21, "document": {}}))
+        heard(page, "status", lambda m: m.get("number") == 21)
+
+
 def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):
     with connected(server) as page:
         heard(page, "lights")
@@ -127,6 +173,12 @@ def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):
             found.append(heard(page, "picked")["azimuth"])
         turned = (found[1] - found[0] + 180) % 360 - 180
         assert abs(turned) > 10, found
+        page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.45, "light": 0, "number": 3}))
+        reflected = heard(page, "picked")
+        assert abs(reflected["azimuth"] - 180) < 5 and abs(reflected["elevation"] - 25) < 5, reflected
+        page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.9, "light": 0, "number": 4}))
+        floor = heard(page, "picked")
+        assert "not glossy" in floor["text"] and "azimuth" not in floor, floor
 
 
 def test_a_light_that_was_placed_is_told_with_the_number_of_its_edit(server):

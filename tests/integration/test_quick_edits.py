@@ -1,6 +1,7 @@
 """Edits of a scene without a configuration, and runs that programs read."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from envedit import config
 from envedit.images import images
 from tests.oracles import users_scenes
-from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
+from tests.oracles.builders import BALL, SENSOR, sky, write_scene
 from tests.oracles.runs import TINY, call, changed, no_constant, pixels, world
 from tests.oracles.users_scenes import PATH, light
 
@@ -55,6 +56,39 @@ def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
     assert pixels(here / "again" / "edited.exr").tobytes() == before.tobytes()
 
 
+@pytest.mark.parametrize("named", ["own map", "texture", "include"])
+def test_what_the_scene_names_is_not_moved_out_of_the_folder_of_results(named, here, capsys):
+    """Two of the files that a run leaves are what this scene reads."""
+    (here / "out").mkdir()
+    file = here / "out" / {"own map": "edited.exr", "texture": "preview.png", "include": "edited.xml"}[named]
+    image = '<texture type="bitmap" name="reflectance"><string name="filename" value="$folder/preview.png"/>'
+    ball = BALL.replace('<rgb name="reflectance" value="0.2, 0.4, 0.6"/>', f"{image}</texture>")
+    if named == "own map":
+        parts = '<default name="folder" value="out"/>', SENSOR, BALL, light(name="$folder/edited.exr")
+        images.write_exr(file, sky(np.random.default_rng(1)) + 0.1)
+    elif named == "texture":
+        parts = '<default name="folder" value="gone"/>', SENSOR, ball, light()
+        images.write_png(file, np.ones((4, 4, 3)))
+    else:
+        parts = SENSOR, '<include filename="out/edited.xml"/>', light()
+        write_scene(here / "out", BALL, name="edited.xml")
+    write_scene(here, PATH, *parts, name="own.xml")
+    before, values = file.read_bytes(), ["--set", "scene.parameters.folder=out"] if named == "texture" else []
+    assert call("own.xml", "--out", "out", *values, *small(), "--quiet") == 3
+    assert f"{file}: this input lies where its own results would go" in capsys.readouterr().err
+    assert file.read_bytes() == before and [path.name for path in (here / "out").iterdir()] == [file.name]
+
+
+def test_a_scene_without_an_environment_is_edited_by_a_map_beside_its_lamps(here, capsys):
+    write_scene(here, PATH, SENSOR, BALL, users_scenes.LAMP, name="lamps.xml")
+    assert call("lamps.xml", "--envmap", "other.exr", "--rotate", "90", *small()) == 0
+    said = capsys.readouterr().out
+    assert "the map lights the scene beside its own lamps" in said
+    assert re.search(r"the map gives \d\d(\.\d)? % of the picture's light", said)
+    assert 'type="envmap"' in (here / "lamps_out" / "edited.xml").read_text()
+    assert call("lamps_out/edited.xml", "--rotate", "90", "--out", "again", *small(), "--quiet") == 0
+
+
 def test_a_shipped_scene_by_its_name_and_another_map(here):
     assert call("matte", "--envmap", "other.exr", "--rotate", "90", *small(), "--quiet") == 0
     ran = config.load(here / "matte_out" / "config.toml")
@@ -72,12 +106,13 @@ def test_a_shipped_scene_by_its_name_and_another_map(here):
             "--rotate: got it beside a configuration, expected it beside a scene",
         ),
         (["nothing"], 2, "no such configuration file"),
-        (["dark.xml", "--envmap", "scene"], 2, 'got "scene", but'),
+        (["matte", "--envmap", "scene"], 2, 'got "scene", but'),
+        (["dark.xml"], 3, "no environment emitter: add"),
     ],
 )
 def test_what_goes_wrong_is_an_object_too(arguments, code, says, here, rng, capsys):
     world(here, rng)
-    write_scene(here, SENSOR, BALL, LIGHT, name="dark.xml")
+    write_scene(here, SENSOR, BALL, name="dark.xml")
     assert call(*arguments, "--json", "--progress", "json", "--quiet") == code
     out, err = capsys.readouterr()
     found = json.loads(out)

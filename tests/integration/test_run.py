@@ -361,6 +361,29 @@ def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, 
     assert measured(tmp_path / "out")["worse"] is True
 
 
+def test_paint_that_a_result_is_farther_from_is_a_warning(tmp_path, rng, capsys):
+    """Brighter is asked for; what is written is darker, by the exposure of the output."""
+    stroke = {"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}
+    path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]}, output={"exposure": -3.0})
+    assert call(path, "--quiet", "--out", tmp_path / "out") == 0
+    said = capsys.readouterr().err
+    assert "the result is farther from the target than the input where painted: " in said
+    assert measured(tmp_path / "out")["worse"] is True
+
+
+@pytest.mark.parametrize("factor", [0.05, 1e20])
+def test_steps_that_achieve_nothing_are_a_warning(factor, tmp_path, rng, capsys):
+    light = (sky(rng) + 0.1) * (1 if factor < 1 else 1e6)
+    for name, image in (("map", light), ("other", factor * light)):
+        images.write_exr(tmp_path / f"{name}.exr", np.float32(image))
+    slow = {"kind": "adam", "iterations": 2, "lr": 1e-6}
+    path = world(tmp_path, rng, target={"file": "other.exr"}, optimizer=slow)
+    assert call(path, "--quiet", "--out", tmp_path / "out", *changed(representation__kind="pixels")) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "achieved nothing" in line]
+    unit = "dB" if factor < 1 else "stops"
+    assert re.search(rf"nothing in 2 steps: \S+ {unit} from the target now, \S+ {unit} before", line)
+
+
 def test_what_a_display_does_not_show_is_judged_in_stops(tmp_path, rng, capsys):
     """A map a million times brighter than white: both renderings are white, and 200 dB from the target."""
     path = world(tmp_path, rng)

@@ -477,6 +477,14 @@ def test_files_that_a_scene_names_count(tmp_path):
     assert shipped["sphere"] != shipped["matte"]
 
 
+def test_a_file_that_no_run_could_read_is_not_hashed(tmp_path):
+    """A sparse file of 60 GB, which would take half a minute or more."""
+    with open(tmp_path / "sky.hdr", "wb") as file:
+        file.truncate(60 * 10**9)
+    with pytest.raises(InputError, match=r"sky.hdr: cannot be read \(60000000000 bytes, expected at most"):
+        job("x", '[input]\nenvmap = "sky.hdr"', tmp_path)
+
+
 def test_files_in_scene_parameters_are_found_from_the_job_s_folder_too(tmp_path):
     (tmp_path / "mesh.ply").write_text("one")
     text = '[scene]\nfile = "mesh"\nparameters = { mesh = "mesh.ply", kind = "rough" }'
@@ -551,7 +559,7 @@ def test_usage(wrong, tmp_path, capsys):
 
 
 def lock_of(folder, host, processes, age=0.0):
-    path = folder / "lock-0"
+    path = folder / f"lock-{32 * '0'}"
     path.write_text(json.dumps({"host": host, "processes": processes}))
     then = time.time() - age
     os.utime(path, (then, then))
@@ -599,13 +607,23 @@ def test_a_zombie_holds_nothing(tmp_path):
 def test_the_lock_of_another_machine_lives_by_its_age(tmp_path):
     path = lock_of(tmp_path, "elsewhere pid:[1]", [[1, 2]], age=locks.LOST - 20)
     assert holder(tmp_path) == "process 1 on elsewhere" and path.exists()
-    lock_of(tmp_path, "elsewhere pid:[1]", [[1, 2]], age=locks.LOST + 20)
-    assert holder(tmp_path) == "" and not path.exists()
+    for age in (locks.LOST + 20, -locks.LOST - 20):  # long silent, and of a clock that is far ahead
+        lock_of(tmp_path, "elsewhere pid:[1]", [[1, 2]], age=age)
+        assert holder(tmp_path) == "" and not path.exists()
+
+
+def test_what_is_only_called_like_a_lock_is_left_alone(tmp_path):
+    (tmp_path / "lock-x").mkdir()
+    (tmp_path / f"lock-{32 * 'a'}").mkdir()
+    (tmp_path / "lock-notes").write_text("of a user")
+    for path in tmp_path.iterdir():
+        os.utime(path, (1, 1))
+    assert holder(tmp_path) == "" and len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"host": 1}', '{"host": "x", "processes": 3}'])
 def test_a_lock_that_cannot_be_read_is_respected_for_a_while(tmp_path, content):
-    path = tmp_path / "lock-x"
+    path = tmp_path / f"lock-{32 * 'e'}"
     path.write_text(content)
     assert holder(tmp_path) != ""
     os.utime(path, (1, 1))

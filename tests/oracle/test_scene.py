@@ -47,6 +47,30 @@ def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(
     np.testing.assert_allclose(ours[0, 0], seen, rtol=0.2)
 
 
+def test_russian_roulette_begins_where_the_scene_says(tmp_path, rng):
+    image = sky(rng)
+    for kind in ("path", "volpath"):
+        asked = f'<integrator type="{kind}"><integer name="rr_depth" value="1"/></integrator>'
+        loaded = scene.load(write_scene(tmp_path, asked, SENSOR, BALL, LIGHT))
+        ours = loaded.render(image, spp=16, seed=3)
+        seed = int(np.random.SeedSequence([3, 0, 0]).generate_state(1)[0])
+        for depth in (1, 5):
+            integrator = mi.load_dict({"type": "path", "rr_depth": depth})
+            theirs = film.render(loaded.mi, integrator, 16, seed)[..., :3].astype(np.float32)
+            assert np.array_equal(ours, theirs) == (depth == 1)
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_light_in_the_row_of_a_pole_alone_is_seen(row, tmp_path):
+    """As in the sum with another map, as rendering is linear."""
+    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+    pole = np.zeros((16, 32, 3), np.float32)
+    pole[row] = 100
+    even = np.full_like(pole, 0.1)
+    alone, both, faint = (loaded.render(image, spp=4096).mean() for image in (pole, pole + even, even))
+    assert alone > 0.01 and alone == pytest.approx(both - faint, rel=0.02)
+
+
 def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     picture = loaded.render(np.ones((8, 16, 3)), spp=256)
@@ -188,14 +212,13 @@ def test_a_dict_scene_is_the_same_as_its_xml(tmp_path, rng):
 TEXTURED = """<shape type="sphere"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
     <string name="filename" value="wood.png"/></texture></bsdf></shape>"""
 MESH = '<shape type="ply"><string name="filename" value="a.ply"/></shape>'
-SCALED = '<emitter type="envmap"><transform name="to_world"><scale x="-1"/></transform></emitter>'
+SCALED = """<emitter type="envmap"><string name="filename" value="no.exr"/>
+    <transform name="to_world"><scale x="-1"/></transform></emitter>"""
 
 
 @pytest.mark.parametrize(
     "parts, says",
     [
-        ((SENSOR, BALL), "no environment emitter"),
-        ((SENSOR, BALL, '<emitter type="point"/>'), "no environment emitter"),
         ((SENSOR, BALL, LIGHT, '<emitter type="envmap"/>'), r"2 environment emitters \(constant, envmap\)"),
         ((SENSOR, BALL, SCALED), "to_world of the environment emitter .*rotation"),
         ((SENSOR, TEXTURED, LIGHT), r"line \d+.*texture names a missing file: wood.png"),
@@ -206,6 +229,10 @@ SCALED = '<emitter type="envmap"><transform name="to_world"><scale x="-1"/></tra
         ((SENSOR, BALL, LIGHT, "<shape"), r"line \d+: a tag is not well formed"),
         ((BALL, LIGHT), "no sensor"),
         ((SENSOR.replace("hdrfilm", "specfilm"), BALL, LIGHT), "hdrfilm"),
+        (
+            (SENSOR.replace("hdrfilm", "specfilm"), TEXTURED, MESH, LIGHT, SCALED),
+            r"2 environment emitters .*\nalso: .*hdrfilm.*; .* file: wood.png, .* file: a.ply, [^;]*$",
+        ),
     ],
 )
 def test_a_broken_scene_is_told_in_short(tmp_path, parts, says):
@@ -249,7 +276,7 @@ def test_parameters_fill_the_names_and_reach_the_material():
     [
         ("sphere", {"rougness": 1}, r"no parameter rougness; did you mean roughness\? \(known: roughness\)"),
         ("mirror", {"roughness": 1}, r"known: none"),
-        ("mesh", {}, "mesh.xml needs mesh, which has no default"),
+        ("mesh", {}, "mesh.xml needs mesh, .* --set scene.parameters.mesh=VALUE$"),
         ("sphere", {"roughness": float("nan")}, "roughness is nan"),
         ("sphere", {"roughness": -0.1}, "roughness alpha is -0.1"),
         ("sphere", {"roughness": [1]}, "roughness is a list"),
@@ -264,6 +291,15 @@ def test_unusable_parameters_are_config_errors(name, parameters, says):
 def test_text_where_a_number_belongs_is_told():
     with pytest.raises(InputError, match='could not parse floating point value "smooth"'):
         scene.load("sphere", parameters={"roughness": "smooth"})
+
+
+def test_a_default_after_its_use_is_told_with_what_to_give(tmp_path):
+    """Mitsuba takes a default where it stands, for what follows."""
+    sized = BALL.replace("<bsdf", '<float name="radius" value="$size"/><bsdf')
+    path = write_scene(tmp_path, SENSOR, sized, '<default name="size" value="1"/>', LIGHT)
+    with pytest.raises(InputError, match=r"parameter: \$size; give it: --set scene.parameters.size=VALUE"):
+        scene.load(path)
+    scene.load(path, parameters={"size": 0.5})
 
 
 def test_names_are_found_in_included_files(tmp_path):

@@ -14,7 +14,7 @@ from envedit.images import images
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT, users_scenes
 from tests.oracles.builders import BALL, SENSOR, sky, write_scene
-from tests.oracles.users_scenes import FLOOR, KINDS, LAMP, PATH, PLUGINS, TURN, light
+from tests.oracles.users_scenes import CONSTANT, FLOOR, KINDS, LAMP, NO_FILM, PATH, PLUGINS, TURN, light
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
@@ -136,7 +136,8 @@ def test_plugins_that_are_replaced_or_refused(tmp_path):
             assert f"sensor {name} makes no picture" in said(PATH, sensor, BALL, light())
     for name in PLUGINS["emitter"]:
         if name in ("constant", "sunsky", "timed_sunsky"):
-            assert not said(PATH, SENSOR, BALL, f'<emitter type="{name}"/>')
+            own = f'<emitter type="{name}"/>'
+            assert said(PATH, SENSOR, BALL, own) == f"map: the scene's own light, {name}"
     depth = '<integer name="max_depth" value="4"/>'
     expected = {"direct": 2, "depth": -1} | dict.fromkeys(("aov", "moment", "stokes"), 4)
     for name in PLUGINS["integrator"]:
@@ -148,8 +149,9 @@ def test_plugins_that_are_replaced_or_refused(tmp_path):
         lit, _, notes = users_scenes.loaded(users_scenes.write(tmp_path, parts))
         assert lit.max_depth == expected.get(name, 4)
         assert any("depth is not used" in note for note in notes) == (name == "depth")
-    zero = '<integrator type="path"><integer name="max_depth" value="0"/></integrator>'
-    assert "max_depth is 0, expected -1 or" in said(zero, SENSOR, BALL, light())
+    for key, expected in (("max_depth", "-1 or a whole"), ("rr_depth", "a whole")):
+        zero = f'<integrator type="path"><integer name="{key}" value="0"/></integrator>'
+        assert f"{key} is 0, expected {expected} number above 0" in said(zero, SENSOR, BALL, light())
 
 
 @pytest.mark.parametrize("scale", ["0", "-2", "nan", "1e-60"])
@@ -172,10 +174,141 @@ def test_the_scene_s_own_map_must_be_there(tmp_path):
     for word in ("auto", "scene"):
         with pytest.raises(InputError, match="gone.exr: the scene's own map is missing"):
             inputs.load_map(config.Input(envmap=word), lit)
-    with pytest.raises(ConfigError, match='got "scene", but .* names no file'):
+    with pytest.raises(ConfigError, match='got "scene", but .* has no light of its own'):
         inputs.load_map(config.Input(envmap="scene"), inputs.load_scene(config.Scene(width=16)))
     with pytest.raises(ConfigError, match='got "scene", but no scene is given'):
         inputs.load_map(config.Input(envmap="scene"))
+
+
+# ---- light that is no file, or none ----------------------------------------------------------------------
+
+Z_UP = SENSOR.replace('origin="0,1,6" target="0,0,0" up="0,1,0"', 'origin="0,-6,1" target="0,0,0" up="0,0,1"')
+GROUND = """<shape type="rectangle"><transform name="to_world"><scale value="9"/><translate z="-1"/>
+    </transform></shape>"""
+SUN = '<emitter type="sunsky"><vector name="sun_direction" x="0.5" y="-0.6" z="0.7"/></emitter>'
+
+
+def map_of(parts, folder, **keys):
+    """Load a scene and the map of its configuration, 256 texels wide."""
+    path = write_scene(folder, *parts)
+    given = {"input": {"width": 256}, "scene": {"file": str(path), "width": 16} | keys}
+    settings = config.from_dict(given, folder)
+    lit = inputs.load_scene(settings.scene)
+    return lit, inputs.read_map(settings.input, lit, 256).radiance, inputs.notes(settings.input, lit)
+
+
+@pytest.mark.parametrize(
+    "parts", [(SENSOR, BALL, CONSTANT), (Z_UP, BALL, GROUND, SUN)], ids=["constant", "sunsky"]
+)
+def test_a_light_that_is_no_file_is_the_map(parts, tmp_path):
+    lit, radiance, notes = map_of((PATH, *parts), tmp_path)
+    close(lit.render(radiance, SPP, 3), plain(tmp_path / "test.xml"), 0.015)
+    assert "map: the scene's own light, " in notes[0]
+
+
+def test_the_texels_that_a_light_was_given_are_the_map(rng):
+    texels = sky(rng)
+    to_world = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 12}
+    given = {
+        "type": "scene",
+        "eye": {"type": "perspective", "to_world": to_world, "film": film},
+        "ball": {"type": "sphere"},
+        "light": {"type": "envmap", "bitmap": mi.Bitmap(texels), "scale": 2.0},
+    }
+    found = inputs.read_map(config.Input(width=16), inputs.scene.load(given), 16)
+    assert found.stored.tobytes() == texels.tobytes() and found.scale == 2
+
+
+def test_a_map_without_a_name_is_refused(tmp_path):
+    for inside in ('<string name="filename" value=""/>', ""):
+        with pytest.raises(InputError, match="the environment map names no file; name one, or .* --envmap"):
+            map_of((PATH, SENSOR, BALL, f'<emitter type="envmap">{inside}</emitter>'), tmp_path)
+
+
+def test_a_scene_without_an_environment_is_lit_by_a_map_beside_its_lamps(tmp_path, rng):
+    parts = PATH, SENSOR, BALL, FLOOR, LAMP
+    with pytest.raises(InputError, match=r"no environment emitter: add <emitter.*>, or .* --envmap FILE"):
+        map_of(parts, tmp_path)
+    images.write_exr(tmp_path / "own.exr", sky(rng) + 0.1)
+    lit = inputs.load_scene(config.Scene(file=str(tmp_path / "test.xml"), width=16))
+    radiance, _ = inputs.load_map(config.Input(envmap=str(tmp_path / "own.exr"), width=16), lit)
+    alone, both = plain(tmp_path / "test.xml"), plain(write_scene(tmp_path, *parts, light(), name="both.xml"))
+    close(lit.render(radiance, SPP, 3), both)
+    assert inputs.share(lit, radiance, 1) == pytest.approx(1 - alone.mean() / both.mean(), abs=0.03)
+    assert any("the map lights the scene beside its own lamps" in note for note in lit.notes)
+    again = tmp_path / "again.xml"
+    again.write_text(inputs.scene.relit(tmp_path / "test.xml", "own.exr"))
+    close(plain(again)[..., :3], both)
+
+
+@pytest.mark.parametrize(
+    "origin, up, asked, zenith",
+    [
+        ("0,1,6", "0,1,0", "auto", [0, 1, 0]),
+        ("0,6,3", "0,1,0", "auto", [0, 1, 0]),  # steeply down
+        ("0,-6,1", "0,0,1", "auto", [0, 0, 1]),
+        ("2,1,-6", "1,0,0", "auto", [1, 0, 0]),
+        ("1,2,3", "1,1,1", "auto", [0, 1, 0]),  # no axis
+        ("0,1,6", "0,1,0", "-x", [-1, 0, 0]),
+    ],
+)
+def test_the_zenith_of_a_light_without_one_is_the_sensor_s_up(origin, up, asked, zenith, tmp_path):
+    sensor = SENSOR.replace('origin="0,1,6"', f'origin="{origin}"').replace('up="0,1,0"', f'up="{up}"')
+    lit, _, notes = map_of((PATH, sensor, BALL, CONSTANT), tmp_path, up=asked)
+    np.testing.assert_allclose(lit.to_world @ [0, 1, 0], zenith, atol=1e-12)
+    assert any("its zenith is the scene's" in note for note in notes) == (zenith != [0, 1, 0])
+    assert np.linalg.det(lit.to_world) == pytest.approx(1)
+
+
+def test_a_light_with_an_orientation_keeps_it(tmp_path):
+    lit, _, notes = map_of((PATH, Z_UP, BALL, SUN), tmp_path, up="y")
+    np.testing.assert_allclose(lit.to_world @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    assert "scene.up has no effect: the scene's sunsky has an orientation of its own" in notes
+
+
+def test_the_scale_of_the_scene_can_be_dropped(tmp_path, rng):
+    images.write_exr(tmp_path / "own.exr", sky(rng) + 0.1)
+    scaled, other, _ = map_of((PATH, SENSOR, BALL, light(800)), tmp_path)
+    lit, radiance, notes = map_of((PATH, SENSOR, BALL, light(800)), tmp_path, scale=1)
+    np.testing.assert_allclose(other, 800 * radiance, rtol=1e-6)
+    assert lit.own.scale == 1 and any("scale 1 (scene.scale) takes the place of" in note for note in notes)
+    again = tmp_path / "again.xml"
+    again.write_text(inputs.scene.relit(tmp_path / "test.xml", "own.exr", scale=1))
+    close(lit.render(radiance, SPP, 3), plain(again)[..., :3])
+
+
+# ---- films ---------------------------------------------------------------------------------------------
+
+
+def test_a_cropped_film_is_enlarged_with_its_crop(tmp_path):
+    def cropped(size, part):
+        film = f'<integer name="width" value="{size[0]}"/><integer name="height" value="{size[1]}"/>'
+        names = "crop_width", "crop_height", "crop_offset_x", "crop_offset_y"
+        film += "".join(f'<integer name="{n}" value="{v}"/>' for n, v in zip(names, part, strict=True))
+        own = '<integer name="width" value="16"/><integer name="height" value="12"/>'
+        return write_scene(tmp_path, PATH, SENSOR.replace(own, film), BALL, FLOOR, CONSTANT)
+
+    expected = plain(cropped((32, 24), (16, 12, 8, 4)))
+    lit = inputs.load_scene(config.Scene(file=str(cropped((16, 12), (8, 6, 4, 2))), width=16))
+    radiance = inputs.read_map(config.Input(), lit, 64).radiance
+    close(lit.render(radiance, SPP, 3), expected[..., :3])
+    with pytest.raises(InputError, match="its crop 8 x 6 at 9, 2, expected .* the crop inside"):
+        inputs.load_scene(config.Scene(file=str(cropped((16, 12), (8, 6, 9, 2)))))
+
+
+def test_a_sensor_without_a_film_has_mitsuba_s(tmp_path):
+    path = write_scene(tmp_path, PATH, NO_FILM, BALL, CONSTANT)
+    lit = inputs.scene.load(path)
+    assert (lit.width, lit.height) == tuple(mi.load_file(str(path)).sensors()[0].film().size()) == (768, 576)
+
+
+def test_polarisation_that_is_left_out_is_said(tmp_path):
+    polarised = BALL.replace("diffuse", "pplastic").replace("reflectance", "diffuse_reflectance")
+    stokes = f'<integrator type="stokes">{PATH}</integrator>'
+    notes = map_of((stokes, SENSOR, polarised, CONSTANT), tmp_path)[2]
+    what = "integrator stokes", "pplastic"
+    assert {f"{one}: rendered without polarisation" for one in what} <= {*notes}
 
 
 def test_what_is_written_has_the_units_of_the_file_and_the_bits_of_what_stays(rng):

@@ -136,3 +136,14 @@ def test_a_run_without_a_target(tmp_path, isolated, capsys):
     assert "exposure of the map changed by +1 stops" in found["choices"]
     assert "no target; log RMSE of the rendering against the initial one 0." in capsys.readouterr().out
     assert (out / "report.html").exists() and (out / "edited.xml").exists()
+
+
+def test_temperature_is_the_inverse_of_white_balance_and_less_is_warmer():
+    grey = np.full((4, 8, 3), 0.5, np.float32)
+    warm, notes = adjustments.adjust(grey, config.Lights(), config.Output(temperature=3200.0))
+    assert warm[0, 0, 0] > 0.5 > warm[0, 0, 2]
+    assert notes == ["temperature: light of 3200 K in place of 6500 K"]
+    back, _ = adjustments.adjust(warm, config.Lights(), config.Output(white_balance=3200.0))
+    ratio = back / grey
+    assert np.allclose(ratio, ratio[0, 0, 0], rtol=1e-5)
+    assert np.allclose(grey * gains(3200.0), warm, rtol=1e-5), "not as a stroke of that temperature"

@@ -13,7 +13,7 @@ import pytest
 from envedit import config
 from envedit.core.errors import InputError
 from envedit.losses import optimizer
-from envedit.solve import checkpoint
+from envedit.solve import checkpoint, gauss_newton
 from envedit.solve.adam_loop import State
 
 PICTURE = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
@@ -228,3 +228,20 @@ def test_a_pipe_in_place_of_the_checkpoint_does_not_wait(tmp_path):
     os.mkfifo(tmp_path / checkpoint.NAME)
     with pytest.raises(InputError, match="the checkpoint cannot be read .*no regular file"):
         checkpoint.load(tmp_path, "what")
+
+
+def test_a_solution_comes_back_as_a_run_without_steps_and_only_to_its_own_map(tmp_path):
+    state = {"gain": np.ones((5, 3)), "turn": np.zeros((2, 3))}
+    start = {"gain": np.zeros((5, 3)), "turn": np.ones((2, 3))}
+    run = gauss_newton.Run(state, start, finished=True, history=[{"loss": 1.0}], hold=21.0)
+    path = tmp_path / "painted.npz"
+    checkpoint.save_solution(path, run)
+    found = checkpoint.load_solution(path, like=state)
+    assert not found.finished and not found.history and found.hold == 21.0
+    for name, array in state.items():
+        assert np.array_equal(found.state[name], array) and np.array_equal(found.start[name], start[name])
+    with pytest.raises(InputError, match="painted.npz: is the solution of another map"):
+        checkpoint.load_solution(path, like=state | {"gain": np.ones((6, 3))})
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(InputError, match="painted.npz: the solution cannot be read"):
+        checkpoint.load_solution(path, like=state)

@@ -169,3 +169,12 @@ def test_a_file_goes_before_a_shipped_name_and_a_folder_does_not(here):
 def test_a_configuration_that_is_not_there(wrong, says, here, capsys):
     assert run.main([wrong]) == 2
     assert capsys.readouterr().err == f"envedit: {wrong}: no such configuration file; {says}\n"
+
+
+def test_each_scene_xml_has_a_folder_of_results_with_its_own_folders_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"kitchen/scene.xml": "kitchen_scene_out", "hall/scene.xml": "hall_scene_out"}
+    names |= {"scene.xml": "scene_out", "hall/lamp.xml": "lamp_out"}
+    for scene, folder in names.items():
+        settings, _, _ = run.load(scene, None, [])
+        assert settings.output.dir == str(tmp_path / folder)

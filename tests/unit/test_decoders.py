@@ -4,6 +4,7 @@ import os
 import struct
 import subprocess
 import sys
+import threading
 import time
 import zlib
 
@@ -360,6 +361,27 @@ print(refused)
     done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     assert int(done.stdout) > 20
+
+
+def test_threads_that_read_leave_the_standard_streams_as_they_were(tmp_path, rng):
+    path = exr(tmp_path / "a.exr", **planes(rng))
+    before = [os.fstat(descriptor) for descriptor in (1, 2)]
+    streams = sys.stdout, sys.stderr
+    start = threading.Barrier(4)
+
+    def read_some():
+        start.wait(20)
+        for _ in range(50):
+            images.read(path)
+
+    threads = [threading.Thread(target=read_some) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    after = [os.fstat(descriptor) for descriptor in (1, 2)]
+    assert [(a.st_dev, a.st_ino) for a in after] == [(b.st_dev, b.st_ino) for b in before]
+    assert (sys.stdout, sys.stderr) == streams
 
 
 def test_no_file_stays_open(tmp_path, rng):

@@ -60,6 +60,53 @@ def test_a_turn_goes_the_way_of_the_map():
     assert [row[0] for row in numbers(light_list.matched(*lists, 45.0))] == [1, 2]
 
 
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_light_that_the_edit_left_alone_is_the_same_light(changed):
+    """Half a texel of turn halves its contrast, so that it is separated no more."""
+    envmap = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
+    envmap[12:14, 50] = 1.2
+    degrees = 2.5 * 360 / WIDTH
+    turned = latlong.rotate(envmap, degrees)
+    if changed:
+        turned[12, 47] = 0.6  # one of the texels that it lies in now
+    before, after = separate(envmap), separate(turned)
+    assert len(before.lights) == 1 and not after.lights
+    found = light_list.kept(before, after, envmap, turned, degrees)
+    lists = [light_list.listed(one, np.eye(3)) for one in (before, found)]
+    said = light_list.summary(light_list.matched(*lists, degrees), HEIGHT)
+    azimuth = round(50.5 / WIDTH * 360 - degrees)
+    assert "is gone" in said if changed else f"to azimuth {azimuth}, elevation" in said
+    np.testing.assert_array_equal(found.core, 0 if changed else latlong.rotate(before.core, degrees))
+
+
+def test_what_was_no_light_and_did_not_change_is_none():
+    envmap = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
+    envmap[12, 50], envmap[9, 20] = 100, 200
+    sun, both = separate(envmap, most=1), separate(envmap)
+    assert len(sun.lights) == 1 and len(both.lights) == 2
+    assert len(light_list.kept(sun, both, envmap, envmap, 0.0).lights) == 1
+    brighter = envmap.copy()
+    brighter[12, 50] = 120
+    assert len(light_list.kept(sun, separate(brighter), envmap, brighter, 0.0).lights) == 2
+
+
+def test_radii_are_those_of_half_and_nearly_all_of_the_flux():
+    """Of an even disc, and of a sun of one texel whose faint glare is five degrees wide."""
+    height, width, row, column = 256, 512, 80, 300
+    toward = latlong.directions(height, width)
+    angle = np.degrees(np.arccos(np.clip(toward @ toward[row, column], -1, 1)))[..., None]
+    disc, sun = (np.full((height, width, 3), 0.1, np.float32) for _ in range(2))
+    disc[angle[..., 0] < 6] = 50
+    sun[angle[..., 0] < 5] = 0.6
+    sun[row, column] = 5000
+    (of_disc,), (of_sun,) = (light_list.listed(separate(one), np.eye(3)) for one in (disc, sun))
+    assert of_disc["radius_50"] == pytest.approx(6 * np.sqrt(0.5), abs=0.1)
+    assert of_disc["radius_97"] == pytest.approx(6 * np.sqrt(0.97), abs=0.2)
+    texel = 360 / width
+    assert 0.3 * texel < of_sun["radius_50"] < 0.7 * texel and of_sun["radius_97"] < 1.5 * texel
+    assert of_sun["angle"] == 2 * of_sun["radius_97"] < of_disc["angle"] / 4
+
+
 def test_lights_that_come_go_and_stay_are_told():
     before = [light(90, 35, 3), light(200, 60, 1), light(300, 10, 1e-4)]
     after = [light(92, 35, 3.1), light(200, 60, 2.0), light(20, 80, 1.5)]

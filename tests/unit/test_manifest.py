@@ -118,3 +118,10 @@ def test_digest_reads_files_larger_than_a_block(tmp_path):
     content = bytes(range(256)) * 20_000
     (tmp_path / "big").write_bytes(content)
     assert manifest._digest(tmp_path / "big")["sha256"] == hashlib.sha256(content).hexdigest()
+
+
+def test_a_file_that_is_too_large_for_an_input_is_listed_without_its_digest(tmp_path):
+    with open(tmp_path / "sparse", "wb") as file:
+        file.truncate(60 * 10**9)
+    entry = manifest._digest(tmp_path / "sparse")
+    assert entry["sha256"] is None and "60000000000 bytes, expected at most 4294967296" in entry["error"]

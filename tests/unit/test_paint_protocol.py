@@ -1,15 +1,21 @@
 """What page and server say to each other, and ``painted.toml``."""
 
 import json
+import os
+import resource
 import struct
+from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit import config
-from envedit.cli.paint import project, protocol, worker
+from envedit.cli import paint
+from envedit.cli.paint import project, protocol, session, worker
 from envedit.cli.paint.session import Tell
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, InputError
 
 STROKE = {"type": "shadow", "points": [[0.1, 0.2], [0.3, 0.4]], "width": 0.1}
 
@@ -36,6 +42,8 @@ def message(**more):
         (message(document={"strokes": [{"type": "x"}]}), r"target.strokes\[0\].type"),
         (message(document={"strokes": [{**STROKE, "width": -1}]}), r"target.strokes\[0\].width"),
         (message(document={"strokes": [STROKE] * 501}), "expected at most 500"),
+        (message(document={"strokes": ["unread"] * 501}), "expected at most 500"),
+        (message(document={"strokes": [{**STROKE, "points": ["unread"] * 20_001}]}), "expected at most 500"),
         (message(document={"lights": [{"light": 9}]}), r"input.lights\[0\].light"),
         (message(document={"lights": [{"light": 1}, {"light": 1}]}), "more than once"),
         (message(document={"lights": [{"azimuth": 1}]}), "azimuth and elevation"),
@@ -77,7 +85,7 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     )
     light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3]}
     done = protocol.document(
-        {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "white_balance": 5000}
+        {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "temperature": 5000}
     )
     opened.keep(done)
     again = project.opened(str(file))
@@ -92,11 +100,53 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     assert other.folder == tmp_path / "edit_out-2", "another map's painting would be overwritten"
 
 
+def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):
+    file = tmp_path / "edit.toml"
+    file.write_text('[input]\nenvmap = "sunsky"\n')
+    opened = project.opened(str(file))
+    with opened.alone():
+        said = f"edit_out: process {os.getpid()} .* has this painting open"
+        with pytest.raises(InputError, match=said), project.opened(str(file)).alone():
+            pass
+        assert paint.main([str(file), "--no-browser", "--port", "0"]) == 3
+        assert "has this painting open: end that `envedit paint`" in capsys.readouterr().err
+    with opened.alone():
+        assert len(list(opened.folder.iterdir())) == 1
+    assert list(opened.folder.iterdir()) == []
+
+
 def test_what_paint_cannot_solve_is_refused(tmp_path):
     file = tmp_path / "edit.toml"
     file.write_text('preset = "paper"\n')
     with pytest.raises(ConfigError, match="expected layers and transport"):
         project.opened(str(file))
+
+
+def test_memory_is_given_back_when_nothing_is_left_to_do(monkeypatch):
+    given, resting = [], session.Session.__new__(session.Session)
+    monkeypatch.setattr(session, "give_back_memory", lambda: given.append(resting.phase))
+    states = (True, False, "done"), (False, True, "dragging")
+    for resting.resting, resting._dragged, resting.phase in states:
+        assert not resting.advance()
+    resting._worked = lambda: True
+    resting._dragged = False
+    assert resting.advance()
+    assert given == ["done"], "while a light is dragged the next frame needs the buffers"
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
+def test_what_is_given_back_leaves_the_process():
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    cycle = [dr.arange(mi.Float, 2**25)]
+    cycle.append(cycle)
+    dr.eval(cycle[0])
+    dr.sync_thread()
+    del cycle
+    kept = resident()
+    session.give_back_memory()
+    assert kept - resident() > 0.9 * 4 * 2**25
 
 
 def test_a_stroke_is_solved_for_while_it_is_drawn_however_fast_the_pointer_moves():

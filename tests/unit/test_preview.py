@@ -40,6 +40,20 @@ def test_preview_places_tonemapped_renderings_above_their_maps(tmp_path):
     assert read_png(tmp_path / "bare.png").shape[0] == png.shape[0] - 14 - gap
 
 
+@pytest.mark.parametrize("factor", [1e-6, 0.3, 1.0, 800.0, 1e20])
+def test_pictures_that_would_be_white_or_black_are_exposed(factor, rng):
+    """Most pixels are between 5 % and 95 % of white, whatever the unit; and the caption says how."""
+    image = (rng.random((8, 16, 3)).astype(np.float32) + 0.1) * np.float32(factor)
+    stops = preview.stops_of([image])
+    shown = preview.display(image, 8, 16, "gamma", stops).mean(axis=2)
+    assert ((shown > 12) & (shown < 243)).mean() > 0.8
+    assert (stops == 0) == (0.1 < factor < 2)
+    assert preview.exposed(stops) == (f", {stops:+d} stops" if stops else "")
+    drawn = preview.drawn({"edited": image}, {"edited": image}, labels=False)
+    assert 12 < np.median(drawn[drawn != preview.BACKGROUND[0]]) < 243
+    assert preview.stops_of([np.zeros((4, 8, 3))]) == preview.stops_of([]) == 0
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4096), (4096, 1), (3, 5), (64, 64), (100, 1500)])
 def test_preview_takes_any_size(tmp_path, shape):
     preview.preview(tmp_path / "p.png", {"a": np.ones((*shape, 3), np.float32)}, {"a": grey(0.0, 1, 1)})

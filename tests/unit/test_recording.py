@@ -84,6 +84,32 @@ def test_depth_follows_the_light_by_bounce():
             recording.choose_bounces(s, depth, light * (depth == 2))
 
 
+def test_depth_error_is_the_share_of_a_rendering_without_bound():
+    """In the middle of a long white tube: paths of nine segments lack a part of the picture."""
+    eye = mi.ScalarTransform4d().look_at([0, 0, 0], [1, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    white = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.9}}
+    s = scene.load(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 90, "to_world": eye, "film": film},
+            "tube": {"type": "cylinder", "p0": [0, 0, -2], "p1": [0, 0, 2], "radius": 1, "bsdf": white},
+            "sky": {"type": "constant"},
+        }
+    )
+    white = np.ones((4, 8, 3), np.float32)
+    whole = s.render(white, spp=1024, max_depth=-1).mean(dtype=np.float64)
+    for asked, depth in (("auto", recording.MAX_BOUNCES + 1), (3, 3)):
+        t = LightTransport.build(s, 4, 8, spp=64, max_depth=asked, memory_gb=0.1)
+        left = 1 - s.render(white, spp=1024, max_depth=depth).mean(dtype=np.float64) / whole
+        assert left > 0.05 and t.depth_error == pytest.approx(left, abs=0.01)
+        (warning,) = t.warnings
+        said = f"paths of more than {depth} segments are left out, which add {100 * t.depth_error:.2g} % of"
+        assert said in warning
+        enough = int(re.search(r"set \[renderer\] max_depth = (\d+)", warning)[1])
+    assert not LightTransport.build(s, 4, 8, spp=4, max_depth=enough, memory_gb=0.1).warnings
+
+
 def test_rows_share_samples_by_their_light_and_none_gets_nothing():
     sphere = np.array([0.1, 0.4, 0.4, 0.1])
     mass = recording.row_mass(sphere, np.array([0.4, 0.4, 0.0, 0.0]))

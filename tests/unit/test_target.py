@@ -1,6 +1,6 @@
 """Targets: rendered under a known map, painted as a picture, or painted by strokes."""
 
-import dataclasses
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -52,6 +52,16 @@ def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     assert made.weight is None and made.warnings == () and "40 degrees" in made.source
 
 
+def test_noise_is_that_of_as_many_samples_as_were_taken(ball, rng):
+    """Against the difference from a rendering almost without noise; display values, mean over pixels."""
+    envmap = sky(rng) + 0.1
+    made = target.make(asking(rotate_degrees=0), ball, envmap)
+    shown, true = (np.clip(p, 0, 1) ** (1 / 2.2) for p in (made.picture, ball.render(envmap, spp=1024)))
+    assert made.spp == 4 and made.noise.shape == SIZE
+    ratio = np.mean(made.noise**2) / np.mean((shown - true) ** 2)
+    assert 0.5 < ratio < 2
+
+
 def test_a_turn_by_whole_texels_only_moves_columns(ball, rng):
     envmap = sky(rng)
     made = target.make(asking(rotate_degrees=360 * 3 / 16), ball, envmap)
@@ -96,6 +106,17 @@ def test_a_missing_map_is_refused(ball, tmp_path, rng):
 def test_black_map_makes_a_black_target(ball):
     made = target.make(asking(rotate_degrees=60), ball, np.zeros((8, 16, 3), np.float32))
     assert not made.picture.any()
+
+
+def test_a_target_that_is_largely_white_is_warned_of(ball, rng):
+    """More than a tenth of the pixels of this film see the sky beside the ball."""
+    for factor, curve, warned in ((1, "gamma", False), (100, "gamma", True), (100, "reinhard", False)):
+        settings = asking(rotate_degrees=60)
+        settings = replace(settings, output=replace(settings.output, tonemap=curve))
+        made = target.make(settings, ball, factor * (sky(rng) + 0.2) / 4)
+        assert bool(made.warnings) == warned
+        white = (tonemap(made.picture, curve) >= 1).all(axis=2).mean()
+        assert not warned or f"target: {100 * white:.3g} % of its pixels are white" in made.warnings[0]
 
 
 def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
@@ -154,7 +175,7 @@ def test_a_painted_picture_is_read_as_it_was_exported(ball, seen, tmp_path):
     display, _ = images.read_stored(file)
     display[3:9, 4:12] = display[3:9, 4:12] * 0.5
     png(file, display)
-    narrow = dataclasses.replace(exported, input=config.Input(width=32))
+    narrow = replace(exported, input=config.Input(width=32))
     with pytest.raises(InputError, match="exported with input.width 256, where this run has 32"):
         target.make(narrow, ball, envmap)
     (tmp_path / "paint.png.envedit.json").unlink()
@@ -162,7 +183,8 @@ def test_a_painted_picture_is_read_as_it_was_exported(ball, seen, tmp_path):
         made = target.make(settings, ball, envmap)
         shown = tonemap(made.picture, "reinhard")[3:9, 4:12] * 65535
         np.testing.assert_allclose(shown, display[3:9, 4:12], atol=1)
-        assert made.coverage.sum() == 6 * 8 and made.warnings == ()
+        assert made.coverage.sum() == 6 * 8
+        assert all("are white under the tonemap" in line for line in made.warnings), made.warnings
 
 
 def test_mask_of_an_array_overrides_what_is_seen(ball, seen):

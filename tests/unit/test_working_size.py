@@ -43,15 +43,16 @@ def test_a_large_film_is_made_smaller_and_keeps_its_aspect():
         assert (small is lit) == (size == (48, 24))
 
 
-def test_what_takes_no_other_size_stays_as_it_is(tmp_path):
+def test_a_crop_is_made_smaller_and_what_takes_no_other_size_stays_as_it_is(tmp_path):
     crop = '<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="48"/>'
     crop += '<integer name="crop_width" value="40"/><integer name="crop_height" value="40"/></film>'
     sensor = f'<sensor type="perspective"><float name="fov" value="40"/>{crop}</sensor>'
     cropped = scene.load(write_scene(tmp_path, sensor, '<shape type="sphere"/>', LIGHT, name="crop.xml"))
     loaded = scene.load("sphere", 48)
     built = envedit.load_scene(loaded.mi)
-    for lit in (cropped, built):
-        assert working_size.smaller(settings(), lit) is lit
+    small = settings(renderer={"pixels": 100})
+    assert working_size.smaller(small, cropped).width == 10
+    assert working_size.smaller(small, built) is built
 
 
 def test_views_are_scaled_each_by_itself(rng):

@@ -36,6 +36,9 @@ def main(argv: list[str] | None = None) -> int:
             opened = project.opened(arguments.name, arguments.envmap or "", arguments.preset)
         elif arguments.envmap:
             opened = project.opened("sphere", arguments.envmap, arguments.preset)
+        if opened is not None:
+            with opened.alone():  # an error here if another server has it; the worker holds it
+                pass
     except EnveditError as error:
         print(f"envedit: {error}", file=sys.stderr)
         return error.exit_code

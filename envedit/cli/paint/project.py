@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -12,8 +13,10 @@ from envedit.cli import run
 from envedit.cli.paint.protocol import Document
 from envedit.core import array_cache, atomic_files
 from envedit.core.errors import ConfigError, InputError
+from envedit.sweep import locks
 
-NAME = "painted.toml"
+NAME, SOLUTION = "painted.toml", "painted.npz"
+"""Files of a painting: what was painted, and the solution that was saved last."""
 _RECENT = 12
 
 
@@ -33,6 +36,8 @@ class Project:
         As it was left the last time.
     again : bool
         Whether ``painted.toml`` was there already.
+    start : str
+        File of the solution that was saved of the document, "" where it has changed since.
     """
 
     settings: config.Config
@@ -40,13 +45,14 @@ class Project:
     base: Path
     document: Document
     again: bool = False
+    start: str = ""
 
-    def configured(self, document: Document) -> config.Config:
-        """Return the configuration that makes the map of a document."""
-        return _resolved(self.text(document), self.folder)
+    def configured(self, document: Document, start: str = "") -> config.Config:
+        """Return the configuration that makes the map of a document; arguments as of :meth:`text`."""
+        return _resolved(self.text(document, start), self.folder)
 
-    def text(self, document: Document) -> str:
-        """Return ``painted.toml``: what was given, and what was painted."""
+    def text(self, document: Document, start: str = "") -> str:
+        """Return ``painted.toml``: what was given, what was painted, and the solution that goes on from."""
         settings = self.settings
         target = {"kind": "strokes", "strokes": document.strokes} if document.strokes else {"kind": "none"}
         kept = ("tonemap", "paint", "hold", "spp") if document.strokes else ("spp",)
@@ -62,7 +68,8 @@ class Project:
             given["scene"]["parameters"] = {key: self._found(value) for key, value in named.items()}
         own = {"rotate_degrees": document.rotate_degrees} if document.rotate_degrees else {}
         given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
-        moved = {"exposure": document.exposure, "white_balance": document.white_balance}
+        given["optimizer"] = given["optimizer"] | ({"start": start} if start else {})
+        moved = {"exposure": document.exposure, "temperature": document.temperature}
         given["output"] = given["output"] | {key: value for key, value in moved.items() if value}
         given["output"].pop("dir", None)
         lines = [
@@ -87,19 +94,40 @@ class Project:
                 return str((self.base / value).absolute())
         return value
 
-    def keep(self, document: Document) -> None:
-        """Write ``painted.toml``, whole or not at all.
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[locks.Lock]:
+        """Make the folder, and let no other server paint in it meanwhile.
+
+        Raises
+        ------
+        InputError
+            It cannot be made, or another server has it.
+        """
+        self._make_folder()
+        with locks.Lock(self.folder) as lock:
+            if lock.holder:
+                raise InputError(
+                    f"{self.folder}: {lock.holder} has this painting open: end that `envedit paint`, or "
+                    "give a configuration of another [output] dir"
+                )
+            yield lock
+
+    def _make_folder(self):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
+
+    def keep(self, document: Document, start: str = "") -> None:
+        """Write ``painted.toml``, whole or not at all; arguments as of :meth:`text`.
 
         Raises
         ------
         InputError
             It cannot be written.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
-        atomic_files.write_atomically(self.folder / NAME, self.text(document).encode())
+        self._make_folder()
+        atomic_files.write_atomically(self.folder / NAME, self.text(document, start).encode())
 
 
 def _resolved(text, folder):
@@ -136,13 +164,13 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
         lights=settings.input.lights,
         rotate_degrees=settings.input.rotate_degrees,
         exposure=settings.output.exposure,
-        white_balance=settings.output.white_balance,
+        temperature=settings.output.temperature,
     )
     painted = file is not None and file.name == NAME
     folder = file.absolute().parent if file and painted else Path(settings.output.dir)
     plain = _plain(settings, folder)
     if painted:
-        return Project(plain, folder, base, document, True)
+        return Project(plain, folder, base, document, True, settings.optimizer.start)
     return _continued(Project(plain, folder, base, document))
 
 
@@ -156,8 +184,9 @@ def _plain(settings, folder):
     return replace(
         settings,
         input=_without(settings.input, "lights", "rotate_degrees"),
-        output=_without(settings.output, "exposure", "white_balance", dir=str(folder)),
+        output=_without(settings.output, "exposure", "temperature", dir=str(folder)),
         target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees"),
+        optimizer=_without(settings.optimizer, "start"),
     )
 
 
@@ -195,7 +224,7 @@ def recent() -> list[dict]:
 def note(project: Project) -> None:
     """Note that a project was worked on; a cache that cannot be written is no error."""
     path = str(project.folder / NAME)
-    title = f"{Path(project.settings.scene.file).stem}, {Path(project.settings.input.envmap).stem}"
+    title = f"{run.scene_name(Path(project.settings.scene.file))}, {Path(project.settings.input.envmap).stem}"
     listed = [{"path": path, "title": title}, *(one for one in recent() if one["path"] != path)]
     with contextlib.suppress(OSError, AttributeError, InputError):
         file = _recent_file()

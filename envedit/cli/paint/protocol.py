@@ -46,7 +46,7 @@ class Document:
         As in ``[[input.lights]]``.
     rotate_degrees : float
         ``[input] rotate_degrees``.
-    exposure, white_balance : float
+    exposure, temperature : float
         As in ``[output]``.
     """
 
@@ -54,7 +54,7 @@ class Document:
     lights: tuple[dict, ...] = ()
     rotate_degrees: float = 0.0
     exposure: float = 0.0
-    white_balance: float = 0.0
+    temperature: float = 0.0
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -66,7 +66,7 @@ _CHECKS = {
     "lights": LightList(),
     "rotate_degrees": Number(-360, 360),
     "exposure": Number(-20, 20),
-    "white_balance": Kelvin(),
+    "temperature": Kelvin(),
 }
 
 
@@ -74,6 +74,7 @@ def document(value: Any) -> Document:
     """Read a document; raises BadMessageError."""
     if not isinstance(value, dict) or not value.keys() <= _CHECKS.keys():
         raise BadMessageError(f"document: got {show(value)[:80]}, expected keys among {', '.join(_CHECKS)}")
+    _check_counts(value.get("strokes"))
     found: dict[str, Any] = {}
     for name, given in value.items():
         try:
@@ -82,14 +83,21 @@ def document(value: Any) -> Document:
             raise BadMessageError(str(error)) from None
         except WantedError as error:
             raise BadMessageError(f"document.{name}: got {show(given)[:80]}, expected {error}") from None
-    made = Document(**found)
-    points = sum(len(s.get("points", ())) + len(s.get("polygon", ())) for s in made.strokes)
-    if len(made.strokes) > MOST_STROKES or points > MOST_POINTS:
+    return Document(**found)
+
+
+def _check_counts(strokes):
+    """Refuse more strokes or points than are painted, before each of them is checked."""
+    if not isinstance(strokes, list | tuple):
+        return
+    tables = [stroke for stroke in strokes if isinstance(stroke, dict)]
+    lists = [table.get(key) for table in tables for key in ("points", "polygon")]
+    points = sum(len(one) for one in lists if isinstance(one, list | tuple))
+    if len(strokes) > MOST_STROKES or points > MOST_POINTS:
         raise BadMessageError(
-            f"document: got {len(made.strokes)} strokes of {points} points, expected at most {MOST_STROKES} "
+            f"document: got {len(strokes)} strokes of {points} points, expected at most {MOST_STROKES} "
             f"of {MOST_POINTS}"
         )
-    return made
 
 
 @dataclass(frozen=True)

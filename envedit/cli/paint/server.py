@@ -50,9 +50,10 @@ _KEPT = ("opened", "lights", "status", "error", "saved", "start")
 
 
 class Client:
-    """What waits for one page: of each kind of frame and of state the latest, everything else in turn."""
+    """What waits for one page, ``name``: of each kind of frame and of state the latest, all else in turn."""
 
-    def __init__(self):
+    def __init__(self, name: str):
+        self.name = name
         self.waiting: dict[str, bytes | dict] = {}
         self.event = asyncio.Event()
 
@@ -87,10 +88,15 @@ class Hub(Tell):
             self._send(f"frame {kind} {view}", sent)
 
     def say(self, message: dict) -> None:
-        """Send a message, of each type the latest; a status says which frame it is about."""
+        """Send a message, of each type the latest; a status says which frame it is about.
+
+        A document goes to all pages but the one that it is of, which has it, and to those that come later.
+        """
         kind = message["type"]
         if kind == "status":
             message = {**message, "frame": self.count}
+        if kind == "document":
+            self.last["opened"] = {**self.last["opened"], "document": message["document"]}
         if kind in _KEPT:
             self.last[kind] = message
         if kind in ("opened", "status"):  # what went wrong before is over
@@ -104,7 +110,8 @@ class Hub(Tell):
 
     def _put(self, key, value):
         for client in self.clients:
-            client.put(key, value)
+            if key != "document" or value["client"] != client.name:
+                client.put(key, value)
 
 
 class Server:
@@ -160,7 +167,7 @@ class Server:
             yield
             self.worker.stop()
 
-        return Starlette(
+        app = Starlette(
             routes=[
                 Route("/{token}/", self._page),
                 WebSocketRoute("/{token}/ws", self._socket),
@@ -170,6 +177,8 @@ class Server:
             ],
             lifespan=lifespan,
         )
+        app.router.redirect_slashes = False  # it would answer without asking for the token
+        return app
 
     def _known(self, request: HTTPConnection) -> bool:
         """Whether a request has the token, and comes to this machine's own name."""
@@ -208,9 +217,9 @@ class Server:
             wanted = "expected a plain name that ends in .exr, .hdr, .png or .jpg"
             return PlainTextResponse(wanted, 400, _SAFE)
         folder = Path.cwd() / MAPS
-        folder.mkdir(exist_ok=True)
         part, size = folder / f".{name}.{secrets.token_hex(8)}", 0
         try:
+            folder.mkdir(exist_ok=True)
             with open(part, "xb") as file:
                 async for piece in request.stream():
                     size += len(piece)
@@ -222,7 +231,8 @@ class Server:
         except (OSError, ClientDisconnect) as error:
             return PlainTextResponse(f"not written: {error}", 500, _SAFE)
         finally:
-            part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
         return PlainTextResponse(f"{MAPS}/{name}", headers=_SAFE)
 
     async def _socket(self, socket: WebSocket) -> None:
@@ -233,11 +243,11 @@ class Server:
             await socket.close(1013)
             return
         await socket.accept()
-        client, name = Client(), secrets.token_hex(4)
+        client = Client(secrets.token_hex(4))
         for kind, message in list(self.hub.last.items()):  # the worker may say something meanwhile
             client.put(kind, message)
         self.hub.clients.add(client)
-        await socket.send_json({"type": "hello", "client": name})
+        await socket.send_json({"type": "hello", "client": client.name})
         self.worker.post(Again())
         sender = asyncio.create_task(_send(client, socket))
         try:
@@ -246,12 +256,14 @@ class Server:
                 if received["type"] == "websocket.disconnect":
                     break
                 given = received.get("text")
+                given = received["bytes"] if given is None else given
                 try:
-                    request = protocol.read(received["bytes"] if given is None else given, name)
+                    # A message of many points takes seconds, in which frames go on to all pages.
+                    request = await asyncio.to_thread(protocol.read, given, client.name)
                 except protocol.BadMessageError as error:
                     client.put("error", {"type": "refused", "text": str(error)})
                     continue
-                self._take(request, client)
+                self.worker.post(request)
         except WebSocketDisconnect:
             pass
         finally:
@@ -259,16 +271,6 @@ class Server:
             sender.cancel()
             with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
                 await sender
-
-    def _take(self, request, client):
-        if isinstance(request, protocol.Edit):
-            opened = self.hub.last.get("opened")
-            if opened is not None and request.painting in (0, opened["painting"]):
-                opened["document"] = request.document.plain()
-            message = {"type": "document", "client": request.client, "document": request.document.plain()}
-            for other in self.hub.clients - {client}:
-                other.put("document", message)
-        self.worker.post(request)
 
 
 def _free(part, folder, name):

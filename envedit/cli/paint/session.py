@@ -6,26 +6,33 @@ new edit comes.
 
 While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
 target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit
-that is saved is the pipeline's, which paints on Mitsuba's rendering, tries several starts, and judges its
-result.
+that is saved is the pipeline's, which paints on Mitsuba's rendering, goes on from the solution here, and
+judges its result.
 
 Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
-from envedit import config, inputs, pipeline, renderers
-from envedit.cli.paint.project import Project
+from envedit import inputs, pipeline, renderers
+from envedit.cli.paint.project import SOLUTION, Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.color import luminance, tonemap
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
@@ -35,8 +42,9 @@ from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
+from envedit.scene import highlight
 from envedit.scene.scene import Scene
-from envedit.solve import feasibility, gauss_newton, hold, map_problem, prior, search
+from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes, working_size
 from envedit.targets.target import first_hold, pixel_weight
@@ -50,6 +58,8 @@ SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
+NOT_WHITE = 0.95
+"""Share of the pixels of the rendering that the page does not show white when it is opened."""
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
@@ -68,6 +78,17 @@ class Tell:
         """Send a message."""
 
 
+def give_back_memory() -> None:
+    """Return to the system what Dr.Jit and the C library keep of freed buffers for the next ones.
+
+    Problems that were solved, which hold large arrays, are in reference cycles: they are collected first.
+    """
+    gc.collect()
+    dr.flush_malloc_cache()
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # glibc's alone
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 class Session:
     """A painting that is open.
 
@@ -82,7 +103,10 @@ class Session:
     """
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
-        self.project, self.tell, self.newer = project, tell, newer
+        self.project, self.tell = project, tell
+        self._saving = self.solving = False
+        self.newer = lambda: not self._saving and newer()
+        self._kept = project.document  # as painted.toml has it
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
         self._shown: np.ndarray | None = None  # the rendering by T that the pages show
@@ -107,7 +131,7 @@ class Session:
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
-        self._watched: Any = _Watched(self.transport, newer)  # a transport in all it does
+        self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
         self._quick = self.transport
         if self.transport.spp > QUICK_SPP:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
@@ -116,29 +140,65 @@ class Session:
         self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
-        self._aim(project.document)
+        self._aim(self._usable(project.document))
+        if project.start and self.solving:
+            self._go_on_from(project.start)
+
+    def _usable(self, document):
+        """Return a document without the strokes on views that the scene has not, each with a note."""
+        kept = []
+        for i, stroke in enumerate(document.strokes):
+            try:
+                self.lit.view(stroke.get("view", 0), f"target.strokes[{i}].view")
+            except ConfigError as error:
+                self.notes = [*self.notes, f"{error}: the stroke is left out"]
+            else:
+                kept.append(stroke)
+        return replace(document, strokes=tuple(kept))
+
+    @property
+    def exposure(self) -> float:
+        """Stops that leave :data:`NOT_WHITE` of the pixels below white, in quarters; 0 if they are black."""
+        bright = float(np.quantile(luminance(self.before), NOT_WHITE))
+        return float(np.clip(np.round(-4 * np.log2(bright)) / 4, -8, 8)) if bright > 0 else 0.0
 
     # ---- edits ---------------------------------------------------------------------------------------------
 
     def update(self, edit: Edit) -> None:
-        """Take a document: paint, move lights, and show what is known at once."""
+        """Take a document: paint, move lights, and show what is known at once.
+
+        One that cannot be painted or shown is refused: that before it stays, and pages get it back.
+        """
         began = time.perf_counter()
         before, self.document = self.document, edit.document
         moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
         self.phase, self._rendered, self.resting = edit.phase, None, False
         whose = {"steps": self.status["steps"], "number": edit.number, "client": edit.client}
         self.status = {"reachable": None, "iterations": 0, **whose}
-        if edit.phase == "dragging":
-            self._drag()
-        elif moved or self._dragged:
-            self._aim(edit.document)
-        else:
-            self._paint()
-        if edit.phase == "done":
+        try:
+            if edit.phase == "dragging":
+                self._drag()
+            elif moved or self._dragged:
+                self._aim(edit.document)
+            else:
+                self._paint()
+            self._show("transport")
+        except Exception:
+            self.phase = "done"
+            self._aim(before)
+            self._show("transport")
+            self._tell_document("")
+            raise
+        self._tell_document(edit.client)
+        if edit.phase == "done" and self.document != self._kept:
             self.project.keep(self.document)
-        self._show("transport")
+            self._kept = self.document
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self.tell_state()
+
+    def _tell_document(self, client):
+        """Say what is painted, to all pages but the one that has painted it."""
+        self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
 
     def _aim(self, document):
         """Take lights and turn of a document for the map that is painted on."""
@@ -192,6 +252,17 @@ class Session:
         self.target, self.coverage = painted.picture, coverage
         self._weigh()
 
+    def _go_on_from(self, file):
+        """Take the solution that was saved of this document."""
+        try:
+            self.run = checkpoint.load_solution(Path(file), self.still)
+        except InputError as error:
+            self.notes = [*self.notes, str(error)]
+            return
+        self.start, self.hold, self.searched = self.run.start, self.run.hold, True
+        self.point = self.problem.evaluate(self.run.state)
+        self._weigh()
+
     def _weigh(self):
         """Aim the solution at the paint, with the present weight of what was not painted."""
         paint = self.project.settings.target.paint
@@ -207,7 +278,7 @@ class Session:
         more = hold.further(chosen, self.hold, *seen)
         if more is None:
             return False
-        self.hold = more
+        self.hold = self.status["hold"] = more
         self._weigh()
         return True
 
@@ -242,8 +313,13 @@ class Session:
 
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
-        if self._dragged or self.resting:
-            return False
+        more = not self._dragged and not self.resting and self._worked()
+        if not more and self.phase == "done":
+            give_back_memory()
+        return more
+
+    def _worked(self):
+        """Do a piece of work; False where there is none left."""
         if not self.converged:
             self._step()
             return True
@@ -256,10 +332,7 @@ class Session:
                 self._recorded = True
                 self._quick.resolve(self.point.edited, limit=COLUMNS)
                 return True
-            if self.solving and not self.searched:
-                self._search()
-                return True
-            if self.solving and self._held_more():
+            if self._searched_further():
                 return True
             if self.solving and self.reach is None:
                 self._reach()
@@ -267,6 +340,24 @@ class Session:
             return self._render(PASSES)
         except SupersededError:
             return True
+
+    def _searched_further(self):
+        """Try other lights, or give more weight to what was not painted; False where neither is due."""
+        if self.solving and not self.searched:
+            self._search()
+            return True
+        return self.solving and self._held_more()
+
+    @property
+    def state(self) -> str:
+        """What goes on: moving (of lights), solving or rendering; done: nothing is left to do."""
+        if self._dragged:
+            return "moving"
+        if self.resting:
+            return "done"
+        if self.phase != "done" or not self.converged or (self.solving and self.reach is None):
+            return "solving"
+        return "rendering" if self._rendered is None or self._rendered[0] < PASSES else "done"
 
     @property
     def converged(self) -> bool:
@@ -314,10 +405,7 @@ class Session:
         done, total = self._rendered
         if done >= passes:
             return False
-        if self._sharp is None:
-            self._sharp = working_size.scaled(self.lit, SHARPER) or self.lit
-        seed = Seeds.of(self.project.settings.seed).pass_of_page(done)
-        total = total + self._sharp.render(self._adjusted(self._edited()), PASS, seed)
+        total = total + self._pass(done, self._adjusted(self._edited()))
         done += 1
         self._rendered = done, total
         if done in (1, 2, 4, 8, PASSES):
@@ -325,6 +413,12 @@ class Session:
             self.tell.frame("render", "mitsuba", total / done, self._sharp.rows)
             self.tell_state()
         return True
+
+    def _pass(self, i, shown):
+        """Return one pass of Mitsuba's rendering of a map, at the size that is shown when idle."""
+        if self._sharp is None:
+            self._sharp = working_size.scaled(self.lit, SHARPER) or self.lit
+        return self._sharp.render(shown, PASS, Seeds.of(self.project.settings.seed).pass_of_page(i))
 
     def _worked_on(self, lit):
         """Return the scene at the size that an edit is solved at; as it is, if strokes are in its pixels."""
@@ -338,19 +432,24 @@ class Session:
         painted, known = self.coverage[..., 0], self.point.edited
         self.reach = feasibility.reachable(self._watched, *asked, painted, self.base, known)
         self.status["reachable"] = self.reach.share
-        self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
+        self._tell_unreachable()
         self.tell_state()
+
+    def _tell_unreachable(self):
+        """Show what of the paint is not feasible, once that is known."""
+        if self.reach is not None:
+            self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
 
     # ---- what is shown -------------------------------------------------------------------------------------
 
     def _edited(self):
-        """Return the map as it is edited (H, W, 3), before exposure and white balance."""
+        """Return the map as it is edited (H, W, 3), before exposure and colours."""
         return self._preview[0] if self._dragged else unseen_kept(self.origin, self.point.edited)
 
     def _adjusted(self, edited):
-        """Return a map as it is shown: with exposure and white balance; the map itself without."""
+        """Return a map as it is shown: with exposure and temperature; the map itself without."""
         document, settings = self.document, self.project.settings
-        output = config.Output(exposure=document.exposure, white_balance=document.white_balance)
+        output = replace(settings.output, exposure=document.exposure, temperature=document.temperature)
         return adjustments.adjust(edited, settings.lights, output, self.given.scale)[0]
 
     def _show(self, source):
@@ -373,6 +472,7 @@ class Session:
         """Show everything anew, to a page that has just come."""
         self.resting, self._shown = False, None
         self.tell.frame("before", "transport", self.before, self.lit.rows)
+        self._tell_unreachable()
         self._show("transport")
         self._rendered = None
         self._tell_lights()
@@ -393,12 +493,9 @@ class Session:
         self.tell.say({"type": "lights", "own": own, "found": found})
 
     def tell_state(self) -> None:
-        """Say whether there is a solution yet, and how good it is."""
-        busy = not self._dragged and not self.converged
+        """Say what goes on, and how good the solution is."""
         rendered = self._rendered[0] * PASS if self._rendered else 0
-        self.tell.say(
-            {"type": "status", "state": "solving" if busy else "done", "samples": rendered, **self.status}
-        )
+        self.tell.say({"type": "status", "state": self.state, "samples": rendered, **self.status})
 
     def _tell_doing(self, text):
         self.tell.say({"type": "doing", "text": text})
@@ -413,25 +510,31 @@ class Session:
 
     def pick(self, asked: Pick) -> None:
         """Find which light a pixel is lit by most, or where one must go for its highlight to lie there."""
-        patch = np.zeros(self.base.shape, np.float32)
-        seen = patch[self.lit.rows[min(asked.view, len(self.lit.rows) - 1)]]
-        height, width = seen.shape[:2]
-        row, column = min(int(asked.y * height), height - 1), min(int(asked.x * width), width - 1)
-        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
-        seen = self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
+        view = min(asked.view, len(self.lit.rows) - 1)
         if asked.light < 0:
-            answer["light"] = self._lit_by(seen)
+            answer["light"] = self._lit_by(self._seen(view, asked.x, asked.y))
         else:
-            omega = latlong.lookup_solid_angles(*seen.shape)[:, None]
-            toward = latlong.directions(*seen.shape)
-            best = _smooth(seen / np.maximum(omega, 1e-12))
-            best[self.rows.stop :] = 0
-            i = int(best.argmax())
-            azimuth, elevation = angles(toward.reshape(-1, 3)[i])
-            answer |= {"light": asked.light, "azimuth": (azimuth + self.document.rotate_degrees) % 360}
-            answer["elevation"] = elevation
+            answer["light"] = asked.light
+            try:
+                toward = highlight.direction(self.lit, view, asked.x, asked.y)
+                row, _ = latlong.texel_position(toward, *self.map.shape[:2])
+                if not self.rows.first <= round(float(row)) < self.rows.stop:
+                    raise highlight.NoHighlightError("the light would stand where [input] rows keeps the map")
+                azimuth, answer["elevation"] = angles(toward)
+                answer["azimuth"] = (azimuth + self.document.rotate_degrees) % 360
+            except highlight.NoHighlightError as reason:
+                answer["text"] = str(reason)
         self.tell.say(answer)
+
+    def _seen(self, view, x, y):
+        """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
+        patch = np.zeros(self.base.shape, np.float32)
+        seen = patch[self.lit.rows[view]]
+        height, width = seen.shape[:2]
+        row, column = min(int(y * height), height - 1), min(int(x * width), width - 1)
+        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
+        return self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
 
     def _lit_by(self, seen):
         """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
@@ -459,13 +562,38 @@ class Session:
     # ---- results -------------------------------------------------------------------------------------------
 
     def save(self, import_s: float = 0.0) -> list[str]:
-        """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings."""
-        project = self.project
-        project.keep(self.document)
-        settings, folder = project.configured(self.document), project.folder
+        """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings.
+
+        The run goes on from the solution that is shown, which is solved to its end first.
+        """
+        self._saving = True
+        try:
+            return self._save(import_s)
+        finally:
+            self._saving = False
+
+    def _save(self, import_s):
+        project, folder = self.project, self.project.folder
+
+        # ---- The solution that is shown, to its end
+        if self._dragged:
+            self._aim(self.document)
+        shown = self._adjusted(self._edited())
+        while not self.converged or self._searched_further():
+            if not self.converged:
+                self._step()
+        start = SOLUTION if self.solving else ""
+        project.keep(self.document, start)
+        self._kept = self.document
+        if start:
+            solution = gauss_newton.Run(self.run.state, self.run.start, hold=self.hold)
+            checkpoint.save_solution(folder / SOLUTION, solution)
+
+        # ---- The run that goes on from it
+        settings = project.configured(self.document, start)
         with output_folder.alone(folder):
-            named = output_folder.names(folder), output_folder.inputs_of(settings)
-            output_folder.prepare_folder(folder, *named)
+            read = output_folder.inputs_of(settings, project.base)
+            output_folder.prepare_folder(folder, output_folder.names(folder), read)
             watch = pipeline.Watch(
                 lambda text: self.tell.say({"type": "saving", "text": text}),
                 lambda done, total, text: self._progress(done, total, text),
@@ -473,14 +601,34 @@ class Session:
             result = pipeline.run(settings, folder=folder, base=project.base, watch=watch)
             self.tell.say({"type": "saving", "text": "writing"})
             warnings = run_folder.write(settings, folder, result, import_s, project.base)
-        rows = tuple(view.rows for view in result.views)
-        self.tell.frame("render", "saved", result.renders["edited"], rows)
-        self.tell.frame("map", "saved", result.maps["edited"])
+
+        # ---- What was saved, no less sharp than what is shown, and how it differs
+        saved, rows = result.maps["edited"], tuple(view.rows for view in result.views)
+        rendering = result.renders["edited"]
+        passed = self._pass(0, saved)
+        if passed.shape[1] > rendering.shape[1]:
+            rest = (self._pass(i, saved) for i in range(1, PASSES))
+            rendering, rows = sum(rest, passed) / PASSES, self._sharp.rows
+        self.tell.frame("render", "saved", rendering, rows)
+        self.tell.frame("map", "saved", saved)
         self._shown = None
         self.resting = True  # what is shown is what was saved
         files = [name for name in output_folder.names(folder) if (folder / name).exists()]
-        self.tell.say({"type": "saved", "folder": folder.name, "files": files, "warnings": warnings})
+        notes = [self._differs(shown, saved), *(note for note in result.notes if "target.hold =" in note)]
+        told = {"folder": folder.name, "files": files, "warnings": warnings, "notes": notes}
+        self.tell.say({"type": "saved", **told})
         return warnings
+
+    def _differs(self, shown, saved):
+        """Say by how much the rendering of the map that was saved differs from the one that was shown."""
+        self.transport.resolve(saved, limit=COLUMNS)
+        before, after = (tonemap(self.transport.apply(tensor(one)).numpy()) for one in (shown, saved))
+        self.point = self.problem.evaluate(self.run.state)  # that has taken its columns
+        change = np.abs(after - before)
+        return (
+            f"the picture differs from the one shown before by {change.mean():.2g} of a display value on "
+            f"average, {change.max():.2g} at most"
+        )
 
 
 class _Watched:
@@ -494,9 +642,3 @@ class _Watched:
         if callable(found) and self._newer():
             raise SupersededError
         return found
-
-
-def _smooth(image):
-    """Sum an image (H, W) over 3x3 texels, around the horizon."""
-    wide = np.pad(np.pad(image, ((1, 1), (0, 0)), mode="edge"), ((0, 0), (1, 1)), mode="wrap")
-    return np.lib.stride_tricks.sliding_window_view(wide, (3, 3)).sum(axis=(2, 3))

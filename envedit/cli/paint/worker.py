@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 import traceback
 from pathlib import Path
 
+from envedit.cli import run
 from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Open, Pick, Save
 from envedit.cli.paint.session import Session, SupersededError, Tell
 from envedit.core.errors import EnveditError, unwrapped
+from envedit.sweep import locks
 
 ORDER = (Open, Pick, Edit, Save)
 """Of requests that wait, which kind goes first: what is saved has all edits."""
@@ -39,6 +42,8 @@ class Worker(threading.Thread):
         self._lock = threading.Condition()
         self._over = self._owed = False
         self._painting = 0
+        self._held = contextlib.ExitStack()  # the folder of the painting that is open
+        self._folder_lock: locks.Lock | None = None
         self.faults: list[Exception] = []  # of ours, no user's mistakes
 
     def post(self, request: object) -> None:
@@ -60,13 +65,20 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """Work until :meth:`stop`."""
+        try:
+            self._work()
+        finally:
+            self._held.close()
+
+    def _work(self):
         if self._opened is not None:
             self._attempt(lambda: self._open(self._opened))
         busy = self.session is not None
         while not self._over:
             with self._lock:
                 while not (self._waiting or busy or self._over):
-                    self._lock.wait()
+                    self._lock.wait(locks.BEAT)
+                    self._beat()
                 kinds = [kind for kind in (*ORDER, Again) if kind in self._waiting]
                 owed, self._owed = self._owed and busy, False
                 request = self._waiting.pop(kinds[0]) if kinds and not owed else None
@@ -79,6 +91,12 @@ class Worker(threading.Thread):
                 busy = self.session is not None
             else:
                 busy = self.session is not None and bool(self._attempt(self.session.advance))
+            self._beat()
+
+    def _beat(self):
+        """Give a sign of life to servers of other machines, as often as one is due."""
+        if self._folder_lock is not None:
+            self._folder_lock.beat()
 
     def _carry_out(self, request):
         if isinstance(request, Open):
@@ -106,29 +124,44 @@ class Worker(threading.Thread):
             self.session.again()
 
     def _open(self, opened):
+        """Open a painting in the place of the one that is open, which stays if that fails."""
         import mitsuba as mi
 
         from envedit.cli import doctor
 
-        self.session = None
-        doctor.ensure(opened.settings.variant)
-        mi.set_variant(opened.settings.variant)
-        mi.set_log_level(mi.LogLevel.Error)
-        self.session = Session(opened, self.tell, lambda: self.newer)
+        before, variant = self.session, mi.variant()
+        again = before is not None and before.project.folder == opened.folder
+        try:
+            with contextlib.ExitStack() as stack:
+                lock = self._folder_lock if again else stack.enter_context(opened.alone())
+                doctor.ensure(opened.settings.variant)
+                mi.set_variant(opened.settings.variant)
+                mi.set_log_level(mi.LogLevel.Error)
+                session = Session(opened, self.tell, lambda: self.newer)
+                if not again:
+                    self._held.close()
+                    self._held, self._folder_lock = stack.pop_all(), lock
+        except BaseException:
+            if before is not None:
+                mi.set_variant(variant)
+            raise
+        self.session = session
         self._painting += 1
         project.note(opened)
+        scene = run.scene_name(self.session.lit.path)
         self.tell.say(
             {
                 "type": "opened",
                 "painting": self._painting,
-                "title": f"{self.session.lit.path.stem}, {Path(opened.settings.input.envmap).name}",
+                "title": f"{scene}, {Path(opened.settings.input.envmap).name}",
                 "folder": opened.folder.name,
                 "views": [view.name for view in self.session.lit.views],
                 "again": opened.again,
-                "document": opened.document.plain(),
+                "document": self.session.document.plain(),
                 "width": self.session.lit.width,
                 "height": self.session.lit.height,
                 "notes": self.session.notes,
+                "exposure": self.session.exposure,
             }
         )
         self.session.again()

@@ -1,6 +1,6 @@
 // The document (what is saved), and what undo and redo go through.
 
-export const EMPTY = { strokes: [], lights: [], rotate_degrees: 0, exposure: 0, white_balance: 0 };
+export const EMPTY = { strokes: [], lights: [], rotate_degrees: 0, exposure: 0, temperature: 0 };
 
 export class History {
   constructor(changed) {
@@ -33,9 +33,9 @@ export class History {
   undo() { if (this.undoable) { this.at--; this.changed("done"); } }
   redo() { if (this.redoable) { this.at++; this.changed("done"); } }
 
-  // Another page has changed the document.
-  follow(document) {
-    this.steps.length = this.at + 1;
+  // Another page has changed the document, or the server has refused the last change of it.
+  follow(document, refused) {
+    this.steps.length = refused ? this.at : this.at + 1;
     this.steps.push(document);
     this.at = this.steps.length - 1;
   }

@@ -15,6 +15,7 @@ const displays = {
   difference: new Display($("difference"), "signed", plain),
   unreachable: new Display($("unreachable"), "values", plain),
 };
+const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
 window.envedit = { log, displays };
@@ -73,6 +74,7 @@ function show(frame) {
     $("render-stack").parentElement.style.setProperty("--aspect", frame.width / frame.height);
     $("badge").textContent = NAMES[frame.source];
   }
+  if (frame.kind === "unreachable") $("unreachable").parentElement.hidden = !history.document.strokes.length;
   if (frame.kind !== "map") displays[frame.kind].canvas.style.setProperty("aspect-ratio", frame.width / frame.height);
   displays[frame.kind].show(frame);
 }
@@ -140,13 +142,17 @@ const RECEIVED = {
     if (!opened || JSON.stringify(message.document) !== JSON.stringify(history.document)) {
       if (!mine) history.begin({ ...EMPTY, ...message.document });
     }
+    if (!opened || painting !== message.painting) {
+      $("exposure").value = message.exposure;
+      look({ stops: message.exposure });
+    }
     opened = true;
     painting = message.painting;
     if (mine) flush();
     say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();
   },
-  document(message) { history.follow({ ...EMPTY, ...message.document }); refresh(); },
+  document(message) { history.follow({ ...EMPTY, ...message.document }, !message.client); refresh(); },
   lights(message) { lights.set(message); },
   status(message) {
     last = message;
@@ -165,19 +171,20 @@ const RECEIVED = {
   saved(message) {
     say("", true);
     $("progress").hidden = true;
-    const links = message.files.filter((name) => ["report.html", "edited.exr", "lights.json"].includes(name));
-    $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...message.warnings.map((line) => `${line}. `));
+    const links = message.files.filter((name) => ["report.html", "edited.exr", "edited_full.exr", "edited_full.hdr", "lights.json"].includes(name));
+    $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...[...message.notes, ...message.warnings].map((line) => `${line}. `));
   },
   refused(message) { say(message.text); },
   error(message) { $("progress").hidden = true; say(message.text); state("error", "Error"); },
 };
 
 function told(message) {
-  const parts = [message.state === "solving" ? "Solving" : "Done"];
+  const parts = [WORDS[message.state]];
   if (message.iterations) parts.push(`${message.iterations} iterations`);
   if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
   if (message.reachable != null) parts.push(`${Math.round(100 * message.reachable)} % of the paint is feasible`);
-  if (message.state === "done" && message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
+  if (message.hold) parts.push(`target.hold = ${+message.hold.toPrecision(3)}`);
+  if (message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
   return parts.join(" · ");
 }
 
@@ -212,7 +219,7 @@ const strokes = new Strokes($("overlay"), () => ({
   size: Number($("size").value),
   softness: Number($("softness").value),
   opacity: Number($("opacity").value),
-  amount: Number($("amount").value),
+  amount: tool === "light" ? brought($("amount").value) : Number($("amount").value),
   color: linear($("color").value).map((v) => Math.round(v * 1e4) / 1e4),
   kelvin: Number($("kelvin").value),
   radius: Number($("radius").value),
@@ -224,6 +231,9 @@ const strokes = new Strokes($("overlay"), () => ({
   cancel() { send(history.document, "done"); },
   drag(phase, x, y) { pick(phase, x, y); },
 });
+
+// Radiance of a light stroke, whose amount is of what is shown as white.
+function brought(amount) { return Number((amount / 2 ** displays.render.settings.stops).toPrecision(4)); }
 
 // Strokes name their view by its index, or by the id of its sensor.
 function viewed(stroke) {
@@ -241,11 +251,13 @@ function pick(phase, x, y) {
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
-  if (message.azimuth === undefined) {
+  if (message.text) say(`Light not moved: ${message.text}`);
+  else if (message.azimuth === undefined) {
     picked = message.light;
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
     else lights.choose(picked);
   } else if (!ended || message.number === asked) {
+    say("");
     lights.moveTo(message.light, message.azimuth, message.elevation);
     if (ended) lights.commit();
   }
@@ -267,9 +279,13 @@ function refresh() {
   $("undo").disabled = !history.undoable;
   $("redo").disabled = !history.redoable;
   $("clear").disabled = JSON.stringify(now) === JSON.stringify(EMPTY);
+  if (!now.strokes.length) { // nothing is asked for that might not be feasible
+    frames.unreachable = [];
+    $("unreachable").parentElement.hidden = true;
+  }
   $("degrees").value = now.rotate_degrees;
   $("map-exposure").value = now.exposure;
-  $("map-white").value = now.white_balance;
+  $("map-temperature").value = now.temperature;
   lights.draft = null;
   lights.draw();
   strokes.draw();
@@ -321,11 +337,11 @@ $("size").addEventListener("input", () => strokes.draw());
 $("outlines").addEventListener("click", outline);
 $("help").addEventListener("click", () => $("keys").showModal());
 $("keys-close").addEventListener("click", () => $("keys").close());
-for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposure"], ["map-white", "white_balance"]]) {
+for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposure"], ["map-temperature", "temperature"]]) {
   $(id).addEventListener("change", () => {
     const value = Number($(id).value);
-    if (!$(id).checkValidity() || !Number.isFinite(value) || (key === "white_balance" && value && value < 2000)) {
-      say(`${$(id).closest("label").textContent.trim()}: ${key === "white_balance" ? "0, or 2000 to 25000 kelvin" : `${$(id).min} to ${$(id).max}`}`);
+    if (!$(id).checkValidity() || !Number.isFinite(value) || (key === "temperature" && value && value < 2000)) {
+      say(`${$(id).closest("label").textContent.trim()}: ${key === "temperature" ? "0, or 2000 to 25000 kelvin" : `${$(id).min} to ${$(id).max}`}`);
       refresh();
     } else history.push({ [key]: value });
   });

@@ -1,0 +1,109 @@
+"""Where a light must stand for its highlight to lie at a place of the picture: what is reflected there."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.scene import camera_paths
+from envedit.scene.scene import Scene
+
+PATHS = 256
+"""Paths from one place: samples of the glossy lobes that are seen there."""
+BOUNCES = 8
+"""Most surfaces on a path, such as mirrors that show a glossy surface."""
+
+
+class NoHighlightError(ValueError):
+    """No light of the map makes a highlight at a place; the text says why."""
+
+
+def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
+    """Return the direction of a map from which a light is reflected best into a place of a view.
+
+    Paths from the camera follow glossy and specular reflection only. A path that leaves the scene after
+    surfaces of glossy lobes f_i (with cosine) shows prod(f_i) of a small light that stands there, and after
+    specular surfaces alone the light itself. The result is the mean of the directions that show at least
+    half as much as the best one.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its sensors are the views.
+    view : int
+        Index of the view.
+    x, y : float
+        Place on the picture, as shares of its width and height from the upper left corner.
+
+    Returns
+    -------
+    ndarray (3,) float64
+        Unit vector in the frame of the map.
+
+    Raises
+    ------
+    NoHighlightError
+        What is seen there is not glossy, or reflects mostly another object.
+    """
+    value, specular, bounces, leaves, toward = _followed(scene, view, x, y)
+    reflected = bounces > 0
+    if not reflected.any():
+        reflected = leaves  # the map itself is seen there
+    if not reflected.any():
+        raise NoHighlightError("the surface is not glossy there: no light makes a highlight")
+    if specular[reflected].any():
+        reflected &= specular
+    lobe = reflected & (value >= 0.5 * value[reflected].max())
+    if 2 * np.count_nonzero(lobe & leaves) < np.count_nonzero(lobe):
+        raise NoHighlightError("another object is reflected there: no light makes a highlight")
+    mean = scene.to_world.T @ toward[lobe & leaves].mean(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _followed(scene, view, x, y):
+    """Follow paths by glossy and specular reflection, an entry a path.
+
+    Returns
+    -------
+    value : ndarray (paths,) float64
+        prod(f_i), of specular surfaces their reflectance.
+    specular : ndarray of bool (paths,)
+        Whether all surfaces are.
+    bounces : ndarray of int (paths,)
+        Surfaces that reflect.
+    leaves : ndarray of bool (paths,)
+        Whether the path leaves the scene, and does not end at a surface that is not glossy.
+    toward : ndarray (paths, 3) float64
+        Its last direction in the world.
+    """
+    sensor, path = scene.mi.sensors()[view], dr.arange(mi.UInt32, PATHS)
+    context = mi.BSDFContext()
+    passed = mi.BSDFFlags.Null
+    context.type_mask = int(passed | mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.DeltaReflection)
+    place = mi.Point2f(dr.opaque(mi.Float, x, PATHS), dr.opaque(mi.Float, y, PATHS))
+    ray = mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
+    active = dr.full(mi.Bool, True, PATHS)
+    value, specular = np.ones(PATHS), np.ones(PATHS, bool)
+    bounces, leaves = np.zeros(PATHS, int), np.zeros(PATHS, bool)
+    for bounce in range(BOUNCES + 1):
+        # ---- The next surface, or none: what the camera sees beside all surfaces may be hidden
+        si = scene.mi.ray_intersect(ray, active)
+        if bounce or not scene.hide_emitters:
+            leaves |= (active & ~si.is_valid()).numpy()
+        active &= si.is_valid()
+
+        # ---- A glossy, specular or null sample there; some BSDFs sample other lobes although not asked to
+        one, two = (camera_paths.lattice(path, dr.opaque(mi.UInt32, 2 * bounce + k)) for k in range(2))
+        bs, weight = si.bsdf().sample(context, si, one.x, two, active)
+        weight = dr.mean(mi.Color3f(mi.unpolarized_spectrum(weight)))
+        active &= ((bs.sampled_type & context.type_mask) != 0) & (weight > 0)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | mi.has_flag(bs.sampled_type, passed)
+        factor = weight * dr.select(delta, 1, bs.pdf)
+        ray = dr.select(active, si.spawn_ray(si.to_world(bs.wo)), ray)
+        dr.eval(ray, active, factor)
+        goes_on = active.numpy()
+        value = np.where(goes_on, value * factor.numpy(), value)
+        specular &= ~goes_on | delta.numpy()
+        bounces += goes_on & ~mi.has_flag(bs.sampled_type, passed).numpy()
+    return value, specular, bounces, leaves, ray.d.numpy().T.astype(np.float64)

@@ -1,0 +1,141 @@
+"""Load, render and edit every Mitsuba scene of a folder: what is refused, and whether it is as Mitsuba's."""
+
+import argparse
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from envedit import config, inputs, pipeline
+from envedit.core import shipped
+from envedit.core.errors import EnveditError, InputError
+from envedit.core.quiet_libraries import quiet_libraries
+from envedit.scene import parser, scene
+from experiments.harness import Experiment, calling, number
+
+WIDTH, MAP = 64, 128
+"""Pixels and texels across."""
+RENDERINGS, SPP = 8, 64
+"""Renderings by either program, and samples a pixel of each: what they differ by is the noise."""
+NEAR, SIGMA = 0.005, 3.0
+"""A rendering counts as Mitsuba's if the means differ by at most the first, or that many standard errors."""
+_ROOT = re.compile(rb"\A(\xef\xbb\xbf)?\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*<scene\b", re.DOTALL)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    text = "of XML files, at any depth (default: the shipped scenes)"
+    parser.add_argument("folder", nargs="?", type=Path, default=shipped.folder(), metavar="FOLDER", help=text)
+
+
+def cases(given):
+    files = sorted(given.folder.absolute().rglob("*.xml"))
+    files = [file for file in files if _ROOT.match(file.read_bytes())]
+    if not files:
+        raise InputError(f"{given.folder}: no Mitsuba scene, NAME.xml, in this folder")
+    tables = {
+        "preset": "draft",
+        "input": {"width": MAP},
+        "scene": {"width": WIDTH},
+        "target": {"rotate_degrees": 60},
+    }
+    found = []
+    for file in files:
+        name = str(file.relative_to(given.folder.absolute()))
+        own = tables | {"scene": tables["scene"] | {"file": str(file)}}
+        found.append(calling(name, "experiments.scenes.experiment:tried", own, {"scene": name}))
+    return found
+
+
+def tried(settings: config.Config, folder: Path) -> dict:
+    """Load a scene, compare its initial rendering with plain Mitsuba's, and edit it.
+
+    A scene without an environment emitter, or that is made for any map, is lit by the analytic sky, in
+    Mitsuba as well.
+    """
+    found = {"refused": "", "light": "its own", "plain": ""}
+    file = settings.scene.file
+    found |= dict.fromkeys(("ratio", "noise", "psnr", "initial", "map", "unedited"))
+    try:
+        lit = inputs.load_scene(settings.scene)
+        if lit.own.added:
+            settings = replace(settings, input=replace(settings.input, envmap=inputs.SUNSKY))
+        if inputs.source_of(settings.input, lit) == inputs.SUNSKY:
+            found["light"] = "analytic sky"
+        given = inputs.read_map(settings.input, lit, settings.input.width)
+    except EnveditError as error:
+        return found | {"refused": str(error).replace(file, Path(file).name)}
+    try:
+        expected = plain(lit, settings, given, folder)
+    except (EnveditError, RuntimeError) as error:
+        found["plain"] = f"Mitsuba: {str(error).replace(file, Path(file).name)}"
+    else:
+        ours = [lit.render(given.radiance, SPP, k).mean(dtype=np.float64) for k in range(RENDERINGS)]
+        found["ratio"] = float(np.mean(ours) / np.mean(expected))
+        spread = [np.std(means, ddof=1) / np.mean(means) for means in (ours, expected)]
+        found["noise"] = float(np.hypot(*spread) / RENDERINGS**0.5)
+    try:
+        edit = pipeline.run(settings)
+    except EnveditError as error:
+        return found | {"refused": str(error)}
+    found |= {"psnr": edit.metrics["render"]["psnr"], "initial": edit.metrics["initial"]["psnr"]}
+    return found | {"map": edit.metrics["envmap"]["psnr"], "unedited": edit.metrics["initial_envmap"]["psnr"]}
+
+
+def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, folder: Path) -> list[float]:
+    """Render the user's file by ``mi.render``, on a film of our size; the mean of each rendering.
+
+    Without a light of its own, the file that a run would leave.
+    """
+    file, filled = settings.scene.file, {key: str(value) for key, value in settings.scene.parameters.items()}
+    if given.source == inputs.SUNSKY:
+        file, filled = str(folder / "lit.xml"), {}
+        mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
+        Path(file).write_text(scene.relit(settings.scene.file, "sky.exr", dict(settings.scene.parameters)))
+    with quiet_libraries():
+        whole = parser.called(Path(file).name, mi.load_file, file, **filled)
+        params, ours = mi.traverse(whole), lit.mi.sensors()[0].film()
+        sizes = {"size": ours.size(), "crop_size": ours.crop_size(), "crop_offset": ours.crop_offset()}
+        film = next(key for key, _ in params if key.endswith("film.size")).removesuffix("size")
+        for key, value in sizes.items():
+            params[f"{film}{key}"] = value
+        params.update()
+        pictures = (mi.render(whole, sensor=0, spp=SPP, seed=100 + k) for k in range(RENDERINGS))
+        return [float(np.array(picture)[..., :3].mean(dtype=np.float64)) for picture in pictures]
+
+
+def summary(rows: list[dict]) -> str:
+    loaded = [row for row in rows if not row["refused"]]
+    compared = [row for row in loaded if row["ratio"] is not None]
+    near = sum(abs(row["ratio"] - 1) <= max(NEAR, SIGMA * row["noise"]) for row in compared)
+    better = sum(row["psnr"] >= row["initial"] for row in loaded)
+    text = f"{len(loaded)} of {len(rows)} scenes are edited; {near} of {len(compared)} initial renderings "
+    text += f"have Mitsuba's mean to {100 * NEAR:g} % or their noise; {better} of {len(loaded)} edited "
+    text += "renderings are no farther from the target, under the turned map, than the initial one."
+    reasons = Counter(re.sub(r"^.*?: ", "", row["refused"].splitlines()[0]) for row in rows if row["refused"])
+    return "\n".join([text, *(f"- refused, {count}: {why}" for why, count in reasons.most_common())])
+
+
+def cell(text: str) -> str:
+    return text.replace("\n", " ").replace("|", "\\|") or "-"
+
+
+EXPERIMENT = Experiment(
+    "scenes",
+    "Load, render and edit every Mitsuba scene of a folder, and compare with Mitsuba.",
+    cases,
+    columns={
+        "scene": "{scene}",
+        "refused": lambda m: cell(m["refused"]),
+        "light": "{light}",
+        "mean over Mitsuba's, with standard error": lambda m: (
+            cell(m["plain"]) if m["ratio"] is None else f"{m['ratio']:.4f} ± {m['noise']:.4f}"
+        ),
+        "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['initial'])})",
+        "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m['unedited'])})",
+    },
+    summary=summary,
+    options=options,
+)

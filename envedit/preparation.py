@@ -320,8 +320,8 @@ class Preparation:
                     self.settings, job.representation, params, recordings, job.target, job.original
                 )
                 job.begun = explanation.run if job.newton else None
-                note = f"likeliest explanation of the paint: {explanation.name} (-2 log evidence {explanation.score:.1f})"
-                return params, [*recordings.notes, note]
+                note = f"likeliest explanation of the paint: {explanation.name}"
+                return params, [*recordings.notes, f"{note} (-2 log evidence {explanation.score:.1f})"]
             ready = initialization.find(
                 job.representation, params, recordings, job.target, job.original, only_own=job.newton
             )

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -290,16 +291,16 @@ class _Seen:
             unit = self.before.mean() / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
         goal = _display(self.target)
         count = 3 * self.likelihood.independent
-        least: np.ndarray = np.full(len(pictures), np.inf)
+        least: Any = np.full(len(pictures), np.inf)
         found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
             more = pictures * np.float32(factor * unit)[:, None, None]
             off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
             mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)
-            variance = np.maximum(squares / count, self.sigma**2)
-            unlikeliness = squares / variance + count * np.log(variance) + mean
-            better = unlikeliness < least
+            variance: Any = np.maximum(squares / count, self.sigma**2)
+            unlikeliness: Any = squares / variance + count * np.log(variance) + mean
+            better: Any = unlikeliness < least
             least = np.where(better, unlikeliness, least)
             found = np.where(better, factor * unit, found)
         return found, least

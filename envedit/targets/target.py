@@ -141,6 +141,7 @@ def make(
     hidden = None if alpha is None else alpha == 0
     named = picture is None and other is None and chosen.kind == "envmap" and chosen.file
     if named and not images.is_panorama(str(chosen.file)):
+        settings = replace(settings, target=replace(chosen, kind="rendering"))
         made = _of_rendering(settings, scene, envmap, None, None, " (it is not 2:1, as a map is)")
         return _seen(made, hidden, settings.output.tonemap)
     if picture is None and chosen.kind == "envmap":

@@ -284,23 +284,23 @@ class _Seen:
     weight: np.ndarray
     share: np.ndarray
 
-    def best(self, pictures, own):
+    def best(self, pictures: Any, own: bool) -> tuple[Any, Any]:
         """Return the likeliest factor of the flux of each picture (k, n, 3), and -2 log likelihood then."""
-        unit = np.ones(len(pictures))
+        unit: Any = np.ones(len(pictures))
         if not own:  # of any flux
             unit = self.before.mean() / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
         goal = _display(self.target)
         count = 3 * self.likelihood.independent
-        least: Any = np.full(len(pictures), np.inf)
+        least = np.full(len(pictures), np.inf)
         found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
             more = pictures * np.float32(factor * unit)[:, None, None]
             off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
             mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)
-            variance: Any = np.maximum(squares / count, self.sigma**2)
-            unlikeliness: Any = squares / variance + count * np.log(variance) + mean
-            better: Any = unlikeliness < least
+            variance = np.maximum(squares / count, self.sigma**2)
+            unlikeliness = squares / variance + count * np.log(variance) + mean
+            better = unlikeliness < least
             least = np.where(better, unlikeliness, least)
             found = np.where(better, factor * unit, found)
         return found, least

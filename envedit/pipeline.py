@@ -218,6 +218,8 @@ def run(
         measured = _measure(settings, renders, maps, rows, alike, target.coverage, within, lpips, lit, noise)
     if measured["painted"] and measured["painted"]["towards"] is None:
         notes.append("the painted change is below the noise of the renderings: no share of it is measured")
+    if measured["painted"] and (unnatural := naturalness.warning(measured["natural"])):
+        warnings.append(unnatural)
     rate = "; lower optimizer.lr" if job.raised_rate else ""
     pair, where = [measured[name] for name in ("render", "initial")], ""
     if target.coverage is not None:

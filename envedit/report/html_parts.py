@@ -79,6 +79,8 @@ NUMBERS = {
     "natural colours_outside": "share of the sky in colours that neither map has",
     "natural seam": "step at the horizon over the original's",
     "natural high_frequency": "detail of the sky over the original's",
+    "natural white": "share of the sky that is white, less the original's",
+    "natural patches": "patches of the edit, over those between two photographed skies",
     "painted towards": "share of the painted change that is reached",
     "painted elsewhere": "change of what was not painted (display values)",
     "painted reachable": "share of the painted change that is feasible",

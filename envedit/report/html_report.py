@@ -311,6 +311,8 @@ def _verdict(metrics):
     towards, elsewhere = number(painted.get("towards")), number(painted.get("elsewhere"))
     if towards is not None:
         parts[0] = f"<strong>{100 * towards:.0f} %</strong> of the painted change reached"
+        feasible = number(painted.get("reachable"))
+        parts[0] += f" ({100 * feasible:.0f} % feasible)" if feasible is not None else ""
         parts += [f"mean change elsewhere {elsewhere:.3f}"] if elsewhere is not None else []
     elif painted:
         parts[0] = "The painted change is below the noise of the renderings"

@@ -162,8 +162,8 @@ class Target(Table):
     hold: float | str = key(
         "auto",
         OrAuto(Number(0)),
-        "weight of all pixels that were not painted; auto: 0.3 where they follow; where they keep "
-        "their values 1, and with Gauss-Newton steps as much more as keeps their mean change below 0.02",
+        "weight of all pixels that were not painted; auto: 1, and where they keep their values, with "
+        "Gauss-Newton steps, as much more as keeps their mean change of display values below 0.02",
         when=_PAINTED,
     )
     spp: int | str = key(

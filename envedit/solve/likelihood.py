@@ -11,8 +11,8 @@ logarithm of the likelihood is, but for a constant,
 * rho_s is Huber's loss for a rendering: quadratic up to s = sigma, linear beyond, so that pixels which no
   light can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts
   by its square: a large one is the change that is asked for.
-* What was not painted makes two statements. Its pattern (shading, highlights, shadows) has a small weight w
-  and may follow the paint. Its mean, which is its exposure and colour as a whole, stays to :data:`VISIBLE`: q
+* What was not painted makes two statements. Its pattern (shading, highlights, shadows) has weights w that
+  are as small as those of paint, and may follow it. Its mean, which is its exposure and colour as a whole, stays to :data:`VISIBLE`: q
   is the mean residual of each channel over that, (3,), times the root of the share of pixels that were not
   painted.
 """

@@ -38,7 +38,7 @@ LIGHT = 2 * np.log(20.0)
 STEPS = 5
 """Gauss-Newton steps after which explanations are compared."""
 CANDIDATES = 2
-"""Places of one light that are tried, and explanations that are descended to in one round."""
+"""Best places of one light that are refined."""
 APART = np.cos(np.radians(15.0))
 """Cosine of the angle between two places of a light that are different explanations."""
 SOFT_DEGREES = 2.0
@@ -139,19 +139,19 @@ def _descended(problem, name, state, centre, sigma):
 
 
 def _moves(problem, best, sigma):
-    """List the most promising moves from an explanation.
+    """List the most promising move of each kind from an explanation.
 
     Lights come first: the sky's gain is as in the original. Promising is what raises the likelihood then, all
     else as it is, so far that the evidence may rise by it.
     """
     state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
     now = _unlikeliness(problem, state, sigma)
-    found = []
+    found: dict[str, _Move] = {}
     for name, changed, centre, unlikeliness, cost in _changes(problem, state, best.run.start, sigma):
-        gain = now - unlikeliness - cost
-        if gain > POSITIVE:
-            found.append(_Move(name, changed, centre, gain))
-    return sorted(found, key=lambda move: -move.gain)[:CANDIDATES]
+        move = _Move(name, changed, centre, gain=now - unlikeliness - cost)
+        if move.gain > max(POSITIVE, found[name].gain if name in found else 0.0):
+            found[name] = move
+    return list(found.values())
 
 
 def _changes(problem, state, start, sigma):

@@ -26,8 +26,6 @@ from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
 
-FOLLOWS = 0.3
-"""Weight of the pattern of what was not painted, beside the paint, where it may follow."""
 FOUND_ANEW = (
     " (its noise is not that of the initial rendering: it is solved as a rendering under other light; "
     "if it was painted, give a mask)"
@@ -317,9 +315,7 @@ def _seen(target, hidden, curve):
 
 def first_hold(chosen: config.Target) -> float:
     """Return the weight of what was not painted that an edit begins with."""
-    if chosen.hold != "auto":
-        return float(chosen.hold)
-    return 1.0 if chosen.rest == "keep" else FOLLOWS
+    return 1.0 if chosen.hold == "auto" else float(chosen.hold)
 
 
 def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:

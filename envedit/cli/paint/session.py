@@ -31,6 +31,7 @@ from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
 from envedit.losses import display_curve
+from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
@@ -478,7 +479,7 @@ class Session:
         """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings."""
         project = self.project
         project.keep(self.document)
-        settings, folder = project.configured(self.document), project.folder
+        settings, folder = installed.settled(project.configured(self.document)), project.folder
         with output_folder.alone(folder):
             named = output_folder.names(folder), output_folder.inputs_of(settings)
             output_folder.prepare_folder(folder, *named)

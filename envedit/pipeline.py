@@ -24,7 +24,7 @@ from envedit.core.seeds import Seeds
 from envedit.export import adjustments, light_list
 from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
-from envedit.losses.perceptual import backbones, distances
+from envedit.losses.perceptual import backbones, distances, installed
 from envedit.preparation import Preparation
 from envedit.results import Result
 from envedit.scene.renderings import rendered
@@ -108,12 +108,11 @@ def run(
     watch, clock, begun = watch or Watch(), _Clock(), time.perf_counter()
     memory = memory or inputs.Given()
     warnings: list[str] = []
+    without = installed.missing(settings)
+    settings = installed.settled(settings)
     dists, lpips = _perceptual(settings)
     if settings.loss.dists and dists is None:
-        warnings.append(
-            "DISTS is off: set [perceptual] vgg and dists to weight files (sources: docs/architecture.md), "
-            "or loss.dists to 0"
-        )
+        warnings.append(f"{without}, or set loss.dists to 0")
 
     # ---- Scene, map and target
     with clock("target_s"):
@@ -121,6 +120,7 @@ def run(
         lit = memory.scene or inputs.load_scene(settings.scene, base)
         given = inputs.read_map(settings.input, lit, settings.input.width, memory.envmap)
         original, said = given.radiance, inputs.notes(settings.input, lit, given)
+        said += [without] if without and not settings.loss.dists else []
         warnings += given.warnings
         if lit.own.added:
             part = 100 * inputs.share(lit, original, Seeds.of(settings.seed).judged)
@@ -369,12 +369,12 @@ def _in_file_units(given, degrees=0.0):
 
 
 def _perceptual(settings):
-    """Load DISTS, where the loss has it, and LPIPS; None where no weights are named."""
-    named, dists, lpips = settings.perceptual, None, None
-    if settings.loss.dists and named.vgg:
-        dists = distances.Dists(backbones.Backbone.load("vgg", named.vgg), named.dists)
-    if named.backbone:
-        lpips = distances.Lpips(named.network, named.backbone, named.heads)
+    """Load DISTS, where the loss has it, and LPIPS; None where there are no weights."""
+    files, dists, lpips = installed.files(settings), None, None
+    if "vgg" in files:
+        dists = distances.Dists(backbones.Backbone.load("vgg", files["vgg"]), files["dists"])
+    if "backbone" in files:
+        lpips = distances.Lpips(settings.perceptual.network, files["backbone"], files["heads"])
     return dists, lpips
 
 

@@ -47,6 +47,14 @@ def threads_stay():
     assert dr.thread_count() == before
 
 
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch):
+    """Keep trained weights that this machine may have out of every run."""
+    from envedit.losses.perceptual import installed
+
+    monkeypatch.setattr(installed, "cache_folder", lambda kind: None)
+
+
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """Keep what is cached on disk to this test."""

@@ -40,7 +40,11 @@ from envedit.core.errors import InputError, MachineError
 __all__ = ["Diagnosis", "check", "ensure", "main"]
 
 ALBEDO = 0.5
-_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb")
+_GPUS = {
+    "cuda_ad_rgb": ("NVIDIA GPU or driver", "install the NVIDIA driver"),
+    "metal_ad_rgb": ("Apple GPU", "use a Mitsuba for macOS that has this variant"),
+}
 _TIMEOUT = 300  # seconds; a cold start on a loaded machine takes ten
 _MEND = "install LLVM 19 (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
 # Where Dr.Jit and the dynamic loader find libraries; a change there ends the validity of a remembered probe.
@@ -116,7 +120,7 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
         if isinstance(radiance, float) and abs(radiance - ALBEDO) < 1e-3:
             return Diagnosis(True, (), versions)
         wrong = f"the self test computed {radiance}, not {ALBEDO}, with {_backend(variant, versions)}"
-        remedy = _MEND if variant.startswith("llvm") else "update the driver"
+        remedy = _MEND if variant.startswith("llvm") else "update the driver or the system"
         return Diagnosis(False, (wrong, remedy), versions)
     return Diagnosis(False, _explain(variant, code, said, versions), versions)
 
@@ -152,9 +156,10 @@ def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple
     errors = [line.strip() for line in said.splitlines() if line.strip()]
     if code is None:
         return f"the self test did not end in {_TIMEOUT} s with {backend}", "try again on an idle machine"
-    if variant.startswith("cuda"):
-        why = "no usable NVIDIA GPU or driver was found" if not versions.get("selected") else _last(errors)
-        return f"{variant}: {why}", 'use variant = "llvm_ad_rgb", or install the NVIDIA driver'
+    if variant in _GPUS:
+        device, remedy = _GPUS[variant]
+        why = _last(errors) if versions.get("selected") else f"no usable {device} was found"
+        return f"{variant}: {why}", f'use variant = "llvm_ad_rgb", or {remedy}'
     for line in errors:
         if "is too old" in line:
             found = line.partition("located LLVM version (")[2].partition(")")[0]

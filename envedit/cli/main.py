@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, paint, fit, init, sweep, doctor, schema, cache."""
+"""The command ``envedit``: run, paint, fit, init, sweep, doctor, schema, cache, weights."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ COMMANDS = {
     "doctor": "check whether this machine can run envedit",
     "schema": "print every key of the configuration, as JSON Schema or as a page",
     "cache": "show or delete what is kept on disk between runs",
+    "weights": "fetch the trained networks of LPIPS and DISTS",
 }
 
 

@@ -204,7 +204,7 @@ def _edit(settings, arguments, folder, allowed, start):
         result.metrics["choices"] = result.notes = said + result.notes
         progress.stage("writing")
     try:
-        return _write(arguments, settings, folder, result, import_s, said)
+        return _write(arguments, folder, result, import_s, said)
     except KeyboardInterrupt:
         return _interrupted(arguments, folder, again)
 
@@ -320,11 +320,13 @@ def _check_same(settings, folder):
     """Refuse to call the run in a folder complete when it was asked for something else."""
     from envedit import config
     from envedit.core.errors import ConfigError, InputError
+    from envedit.losses.perceptual import installed
     from envedit.report import manifest
 
     try:
         done = config.load(folder / "config.toml")
-        same = replace(done, output=replace(done.output, dir=settings.output.dir)) == settings
+        same_place = replace(done, output=replace(done.output, dir=settings.output.dir))
+        same = same_place == installed.settled(settings)
     except ConfigError:
         same = False
     if not same:
@@ -333,10 +335,10 @@ def _check_same(settings, folder):
         raise InputError(f"{changed[0]}: has changed since the run in {folder}: run without --resume")
 
 
-def _write(arguments, settings, folder, result, import_s, said):
+def _write(arguments, folder, result, import_s, said):
     from envedit.report import run_folder
 
-    for line in run_folder.write(settings, folder, result, import_s, arguments.base):
+    for line in run_folder.write(result.settings, folder, result, import_s, arguments.base):
         _tell(arguments, "warning", line)
     for line in result.notes[len(said) :]:
         _say(arguments, line)

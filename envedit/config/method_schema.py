@@ -96,7 +96,9 @@ class Loss(Table):
     ssim: Ramp = key(0.1, Weight(), "1 - SSIM of rendering and target")
     luminance: Ramp = key(0.0, Weight(), "change of the map's summed luminance (Eq. 8)")
     l1: Ramp = key(0.0, Weight(), "sum of the map's radiance (Eq. 9)")
-    dists: Ramp = key(0.0, Weight(), "DISTS of map and original")
+    dists: Ramp | str = key(
+        0.0, OrAuto(Weight()), "DISTS of map and original; auto: 0.3 for a SIREN where weights are, else 0"
+    )
     tv: Ramp = key(0.0, Weight(), "total variation of the map")
     change: Ramp = key(0.0, Weight(), "mean change of the map's logarithm: what need not change stays")
     image_l1: Ramp = key(1.0, Weight(), "mean absolute difference of rendering and target")
@@ -109,15 +111,14 @@ class Loss(Table):
 
 @dataclass(frozen=True)
 class Perceptual(Table):
-    """Weights of perceptual terms, from files of the user's; without them DISTS is off and LPIPS null."""
+    """Trained weights, as `envedit weights` fetches them; without them DISTS is off and LPIPS null."""
 
-    vgg: str = key("", String(), "DISTS: VGG16 (safetensors or npz, torchvision's names)", when=_DISTS)
-    dists: str = key("", String(), "DISTS: its alpha and beta (safetensors or npz)", when=_DISTS)
-    network: str = key(
-        "alex", Choice("alex", "vgg", "squeeze"), "LPIPS: its network", when={"perceptual.backbone": ()}
-    )
-    backbone: str = key("", String(), "LPIPS: weights of that network (safetensors or npz)")
-    heads: str = key("", String(), "LPIPS: its heads, version 0.1 (safetensors or npz)")
+    weights: str = key("", String(), "folder of the files; empty: where `envedit weights` puts them")
+    vgg: str = key("", String(), "DISTS: file of VGG16 (safetensors, npz; torchvision's names)", when=_DISTS)
+    dists: str = key("", String(), "DISTS: file of its alpha and beta (safetensors or npz)", when=_DISTS)
+    network: str = key("alex", Choice("alex", "vgg", "squeeze"), "LPIPS: its network")
+    backbone: str = key("", String(), "LPIPS: file of that network (safetensors or npz)")
+    heads: str = key("", String(), "LPIPS: file of its heads, version 0.1 (safetensors or npz)")
 
     def _check_together(self) -> None:
         for one, other in (("vgg", "dists"), ("backbone", "heads")):
@@ -135,10 +136,11 @@ class Optimizer(Table):
         "gauss-newton (layers through a stored transport) or adam; "
         "auto: gauss-newton where it is possible, otherwise adam",
     )
-    iterations: int = key(
+    iterations: int = key(  # "auto" in files; a number once a run has looked for weights
         100,
-        Integer(0, 10**7),
-        "most steps; Gauss-Newton ends after 16, or later where a light was added or moved",
+        OrAuto(Integer(0, 10**7)),
+        "most steps; Gauss-Newton ends after 16, or later where a light was added or moved; "
+        "auto: 300 with DISTS, 600 without",
         "steps",
     )
     lr: float | str = key(

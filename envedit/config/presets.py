@@ -55,6 +55,13 @@ MANY_PARAMETERS: dict[str, dict[str, Any]] = {
     "paper": {},
 }
 
+# DISTS keeps the sky of a network from being speckled, and needs half the steps. "auto": where weights are.
+SIREN: dict[str, dict[str, Any]] = {
+    "draft": {"loss": {"dists": "auto"}},
+    "standard": {"loss": {"dists": "auto"}, "optimizer": {"iterations": "auto"}},
+    "paper": {},
+}
+
 # Paint need not be what any sky does: the map is held where the paint leaves it free. For the paper's method,
 # luminance weighs less, so that light may be added (Sec. 6.4; a tenth: the paper gives no number).
 PAINTED: dict[str, dict[str, Any]] = {
@@ -66,7 +73,7 @@ PAINTED: dict[str, dict[str, Any]] = {
 _PATHS = (
     ("input", "envmap"), ("scene", "file"), ("target", "file"), ("target", "mask"), ("output", "dir"),
     ("optimizer", "start"),
-    *(("perceptual", key) for key in ("vgg", "dists", "backbone", "heads")),
+    *(("perceptual", key) for key in ("weights", "vgg", "dists", "backbone", "heads")),
 )  # fmt: skip
 
 
@@ -124,8 +131,11 @@ def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
     """Return a preset's defaults for the representation and the target that it, or what is given, names."""
     chosen = PRESETS[preset]
     asked = overlaid(chosen, given)
-    if asked.get("representation", {}).get("kind", "layers") != "layers":
+    kind = asked.get("representation", {}).get("kind", "layers")
+    if kind != "layers":
         chosen = overlaid(chosen, MANY_PARAMETERS[preset])
+    if kind == "siren":
+        chosen = overlaid(chosen, SIREN[preset])
     if asked.get("target", {}).get("kind", "envmap") in ("image", "strokes"):
         chosen = overlaid(chosen, PAINTED[preset])
     return chosen

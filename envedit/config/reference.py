@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from envedit.config import light_schema, stroke_schema
-from envedit.config.presets import MANY_PARAMETERS, PAINTED, PRESETS
+from envedit.config.presets import MANY_PARAMETERS, PAINTED, PRESETS, SIREN
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.toml import quote
 from envedit.config.unused import condition
@@ -113,7 +113,8 @@ def _kinds() -> str:
     rows = []
     painted = '`target.kind = "image" | "strokes"`'
     many = '`representation.kind = "siren" | "pixels" | "log-pixels"`'
-    for where, kinds in ((many, MANY_PARAMETERS), (painted, PAINTED)):
+    siren = '`representation.kind = "siren"`'
+    for where, kinds in ((many, MANY_PARAMETERS), (siren, SIREN), (painted, PAINTED)):
         for preset, tables in kinds.items():
             for table, keys in tables.items():
                 rows += [[where, preset, f"`{table}.{key}`", f"`{quote(v)}`"] for key, v in keys.items()]

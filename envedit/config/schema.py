@@ -92,7 +92,11 @@ class Config(Table):
 
     preset: str = key("standard", Choice(*presets.PRESETS), "named set of defaults")
     seed: int = key(0, Integer(0, 2**32 - 1), "base of every random number")
-    variant: str = key("llvm_ad_rgb", Choice("llvm_ad_rgb", "cuda_ad_rgb"), "Mitsuba variant")
+    variant: str = key(
+        "llvm_ad_rgb",
+        Choice("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"),
+        "Mitsuba variant: by LLVM on the CPU, or on a GPU of NVIDIA or of Apple, both untried",
+    )
     input: Input = table_key(Input)
     scene: Scene = table_key(Scene)
     target: Target = table_key(Target)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from dataclasses import replace
@@ -16,6 +15,7 @@ from envedit.core import atomic_files
 from envedit.core.errors import InputError, NumericalError
 from envedit.export import file_resolution
 from envedit.images import images, layered_exr
+from envedit.losses.perceptual import installed
 from envedit.report import html_report, manifest, map_files, output_folder, preview
 from envedit.solve import checkpoint, feasibility
 
@@ -56,15 +56,13 @@ def write(
     start = time.perf_counter()
     atomic_files.write_atomically(folder / "config.toml", config.to_toml(settings).encode())
     manifest.write_history(folder / "history.csv", result.history)
-    weights = dataclasses.asdict(settings.perceptual)
-    del weights["network"]  # the only one that is no file
     named = {
         "envmap": result.given.source,
         "scene": result.scene or "",
         **_roles("target", settings.target.files),
         **_roles("mask", settings.target.masks),
         "start": settings.optimizer.start,
-        **weights,
+        **installed.files(settings),
     }
     files = {role: path for role, path in named.items() if os.path.isfile(path)}
     facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, files, settings.variant)

@@ -13,8 +13,8 @@ logarithm of the likelihood is, but for a constant,
   by its square: a large one is the change that is asked for.
 * What was not painted makes two statements. Its pattern (shading, highlights, shadows) has weights w that
   are as small as those of paint, and may follow it. Its mean, which is its exposure and colour as a whole,
-  stays to :data:`VISIBLE`: q is the mean residual of each channel over that, (3,), times the root of the share
-  of pixels that were not painted.
+  stays to :data:`VISIBLE`: q is the mean residual of each channel over that, (3,), times the root of the
+  share of pixels that were not painted.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from envedit.config import presets
 from envedit.core import atomic_files
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
+from envedit.losses.perceptual import installed
 
 
 @dataclass(frozen=True)
@@ -102,11 +103,11 @@ def job(
         elif file := _beside(base, value):
             given[key], files[key] = str(file), _digest(file)
     settings = dataclasses.replace(
-        settings,
+        installed.settled(settings),
         scene=dataclasses.replace(scene, parameters=given),
         output=dataclasses.replace(settings.output, dir=""),
     )
-    content = _with_contents(dataclasses.asdict(settings))
+    content = _with_contents(dataclasses.asdict(settings) | {"weights": installed.files(settings)})
     content["scene"] |= {"file": _scene_digest(scene.file), "parameters": given | files}
     content["program"] = [program(), version]
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]

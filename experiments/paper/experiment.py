@@ -11,15 +11,17 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from envedit import config
 from envedit.config import presets
 from envedit.core import latlong
 from envedit.images import images
+from envedit.losses.perceptual import installed
 from experiments import puresky
 from experiments.harness import Case, Experiment, calling, make, overridden
 from experiments.painted_edits import experiment as painted_edits
 
 from . import sheets, tables
-from .methods import FITS, METHODS, ONLY_OURS, PAINTED
+from .methods import FITS, METHODS, ONLY_OURS, PAINTED, REGULARISERS
 
 ROUGHNESS = (0.0, 0.5, 1.0)
 """Of Table 3 and Figure 8."""
@@ -85,7 +87,8 @@ def options(parser):
 
 def cases(given):
     kind, maps = KINDS[given.name], maps_of(given)
-    has_dists = bool(overridden({}, given.sets).get("perceptual", {}).get("vgg"))
+    regularised = config.from_dict(overridden({"loss": {"dists": REGULARISERS["dists"]}}, given.sets))
+    has_dists = "vgg" in installed.files(regularised)
     found = []
     # Maps last: what shares a fit is then many jobs apart, and finds it on disk also with several workers.
     for settings, roughness, row, sky in itertools.product(

@@ -1,17 +1,20 @@
-"""Record what the authors' published DISTS and LPIPS make of seeded images, with seeded random weights.
+"""Record what the authors' published DISTS and LPIPS make of seeded images, with random or trained weights.
 
 The package and its tests hold no PyTorch; this script does, in an environment of its own:
 
     python -m venv torchenv
     torchenv/bin/pip install torch==2.13.0 torchvision==0.28.0 lpips==0.1.4 DISTS-pytorch==0.1
     torchenv/bin/python experiments/references/perceptual.py tests/data/perceptual/reference.npz
+    torchenv/bin/python experiments/references/perceptual.py tests/data/perceptual/trained.npz WEIGHTS
 
 The networks are torchvision's, the measures those of the packages ``lpips`` and ``DISTS_pytorch``, in
-double precision. The trained weights are not needed: weights and images are drawn by numpy, here and
-in the tests, by the functions below; the file holds a checksum of the draws beside scores, gradients
-seen along four directions, and means of features.
+double precision. Images are drawn by numpy, here and in the tests, by the functions below, and so are the
+weights of the first file, which holds a checksum of the draws beside scores, gradients seen along four
+directions, and means of features. The second has the scores of ten pairs with the trained weights:
+convolutions from the folder WEIGHTS that ``envedit weights`` makes, all else from the authors' packages.
 """
 
+import os
 import sys
 import zlib
 
@@ -89,12 +92,59 @@ def images(height, width):
     return x, y, rng.standard_normal((DIRECTIONS, *y.shape))
 
 
+def pairs():
+    """Make ten pairs of images, from all but the same to as unlike as those of :func:`images`."""
+    for k in range(10):
+        x, y, _ = images(*((40, 64), (52, 39))[k % 2])
+        share = 0.05 * 20 ** (k / 9)
+        yield share * x + (1 - share) * y, y
+
+
 def checksum(drawn):
     """CRC of arrays: whether numpy draws the same ones as when the file was recorded."""
     crc = 0
     for values in drawn:
         crc = zlib.crc32(np.ascontiguousarray(values), crc)
     return np.uint32(crc)
+
+
+def trained(path, folder):
+    """Record LPIPS (AlexNet, VGG16) and DISTS of :func:`pairs`, with trained weights."""
+    import lpips
+    import torch
+    import torchvision
+    from DISTS_pytorch import DISTS
+
+    def features(kind):
+        name = {"alex": "alexnet", "vgg": "vgg16"}[kind]
+        model = getattr(torchvision.models, name)(weights=None)
+        with np.load(os.path.join(folder, f"{name}_features.npz")) as file:
+            found = {key.removeprefix("features."): torch.tensor(file[key]) for key in file.files}
+        model.features.load_state_dict(found)
+        return model
+
+    def with_network(kind, make):
+        """Let a package make its measure with this network where it asks torchvision for the trained one."""
+        name, model = {"alex": "alexnet", "vgg": "vgg16"}[kind], features(kind)
+        asked = getattr(torchvision.models, name)
+        setattr(torchvision.models, name, lambda *_, **__: model)
+        try:
+            return make().double().eval()
+        finally:
+            setattr(torchvision.models, name, asked)
+
+    alex = with_network("alex", lambda: lpips.LPIPS(net="alex", verbose=False))
+    vgg = with_network("vgg", lambda: lpips.LPIPS(net="vgg", verbose=False))
+    dists = with_network("vgg", DISTS)
+    scores, drawn = [], []
+    with torch.no_grad():
+        for x, y in pairs():
+            drawn += [x, y]
+            a, b = (torch.tensor(one.transpose(2, 0, 1)[None]) for one in (x, y))
+            found = alex(a, b, normalize=True), vgg(a, b, normalize=True), dists(a, b)
+            scores.append([float(one) for one in found])
+            print(*scores[-1])
+    np.savez_compressed(path, images=checksum(drawn), scores=np.array(scores))
 
 
 def main(path):
@@ -158,4 +208,4 @@ def main(path):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:]) if len(sys.argv) == 2 else trained(*sys.argv[1:])

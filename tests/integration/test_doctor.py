@@ -60,6 +60,13 @@ def test_cuda_without_a_gpu(healthy):
     assert "NVIDIA" in found.lines[0] and "llvm_ad_rgb" in found.lines[1]
 
 
+def test_metal_where_mitsuba_has_no_such_variant():
+    found = doctor.check("metal_ad_rgb")
+    if found.ok:
+        pytest.skip("this machine has an Apple GPU")
+    assert "Apple GPU" in found.lines[0] and "llvm_ad_rgb" in found.lines[1] and len(found.lines) == 2
+
+
 def test_a_variant_envedit_does_not_know():
     assert "does not run on variant 'scalar_rgb'" in doctor.check("scalar_rgb").lines[0]
 

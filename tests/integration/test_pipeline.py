@@ -422,7 +422,31 @@ def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp
 
 def test_an_asked_for_loss_that_is_off_is_told(tmp_path, rng):
     settings = settings_of(tmp_path, smooth(rng), loss={"dists": 0.6}, optimizer={"iterations": 1})
-    assert any("dists" in line for line in pipeline.run(settings).warnings)
+    found = pipeline.run(settings)
+    assert any("DISTS is off" in line and "loss.dists to 0" in line for line in found.warnings)
+
+
+def test_a_siren_says_how_to_get_weights_and_has_dists_where_they_are(tmp_path, rng, monkeypatch):
+    few = {"representation": {"kind": "siren", "hidden": 16, "depth": 1}, "fit": {"epochs": 20}}
+    few["optimizer"] = {"iterations": 2}
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), **few))
+    said = [line for line in found.notes if "DISTS is off" in line]
+    assert len(said) == 1 and "`envedit weights" in said[0] and "\n" not in said[0]
+    assert not any("dists" in line.lower() for line in found.warnings)
+    assert found.settings.loss.dists == 0 and "dists" not in found.history[0]
+    monkeypatch.setattr(pipeline, "_perceptual", lambda settings: (Stub(), None))
+    (tmp_path / "weights").mkdir()
+    there = {"perceptual": {"weights": str(tmp_path / "weights")}}
+    found = pipeline.run(settings_of(tmp_path, sunny(rng), **few, **there))
+    assert found.settings.loss.dists == 0.3 and found.history[-1]["dists"] > 0
+    assert found.settings.optimizer.iterations == 2 and not any("DISTS" in line for line in found.notes)
+
+
+def test_the_folder_that_a_configuration_names_must_hold_the_weights(tmp_path, rng):
+    for table in ({}, {"loss": {"dists": 0.1}}):
+        settings = settings_of(tmp_path, sunny(rng), perceptual={"weights": str(tmp_path)}, **table)
+        with pytest.raises(InputError, match=r"_features\.npz: no such file"):
+            pipeline.run(settings)
 
 
 class Stub:

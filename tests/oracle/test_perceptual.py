@@ -1,6 +1,7 @@
 """DISTS and LPIPS against plain numpy, the authors' recorded numbers, and finite differences.
 
-The weights are random and seeded: the trained ones are not needed to tell whether the formulas are right.
+The weights are random and seeded, as the trained ones are not needed to tell whether the formulas are right;
+one test has those, where they are.
 """
 
 import functools
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from envedit.core.errors import ConfigError, InputError
-from envedit.losses.perceptual import convolution
+from envedit.losses.perceptual import convolution, installed
 from envedit.losses.perceptual.backbones import KINDS, Backbone
 from envedit.losses.perceptual.distances import Dists, Lpips
 from tests.oracles import ROOT
@@ -275,6 +276,22 @@ def test_measures_match_the_authors_code(recorded, dists, lpips, backbones, meas
     np.testing.assert_allclose(
         np.tensordot(directions, slope, 3), recorded[case + "slopes"], atol=1e-3 * scale
     )
+
+
+def test_trained_networks_score_as_the_authors_programs(data):
+    """Ten pairs, the weights that ``envedit weights`` fetches; see experiments/references/perceptual.py."""
+    folder = data / "weights"
+    if not (folder / installed.VGG).is_file():
+        pytest.skip(f"no trained weights in {folder}")
+    with np.load(ROOT / "tests/data/perceptual/trained.npz") as file:
+        images, expected = file["images"], file["scores"]
+    pairs = list(drawn.pairs())
+    assert drawn.checksum(image for pair in pairs for image in pair) == images
+    vgg, heads = Backbone.load("vgg", folder / installed.VGG), str(folder / installed.HEADS)
+    alex = Lpips("alex", folder / installed.BACKBONES["alex"], heads.format("alex"))
+    measures = alex, Lpips("vgg", vgg, heads.format("vgg")), Dists(vgg, folder / installed.DISTS)
+    found = [[measure.against(single(y))(single(x))[0] for measure in measures] for x, y in pairs]
+    np.testing.assert_allclose(found, expected, atol=1e-6, rtol=1e-4)
 
 
 @pytest.mark.parametrize("measure, kind, size", drawn.CASES[1:])

@@ -81,7 +81,7 @@ MANY = ("siren", "pixels", "log-pixels")
     [
         ("standard", "layers", 0.1, 100),
         ("draft", "layers", 0.1, 100),
-        *(("standard", kind, 1.0, 600) for kind in MANY),
+        *(("standard", kind, 1.0, "auto" if kind == "siren" else 600) for kind in MANY),
         *(("draft", kind, 1.0, 150) for kind in MANY),
         *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
     ],
@@ -99,7 +99,7 @@ def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
 
 def test_the_kind_that_counts_is_the_last_one_given():
     text = '[representation]\nkind = "siren"'
-    assert cfg.loads(text).optimizer.iterations == 600
+    assert cfg.loads(text).optimizer.iterations == "auto"
     assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 100
     assert cfg.loads(text, overrides=["representation.kind=pixels"]).loss.ssim == 1.0
     assert cfg.loads("", preset="paper").representation.kind == "siren"
@@ -115,7 +115,17 @@ def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
     assert config.input.width == 128 and config.scene.width == 64
     # A given key that has the value of another kind's default is kept.
     same = cfg.loads("[loss]\nssim = 0.1", overrides=["representation.kind=siren"])
-    assert same.loss.ssim == 0.1 and same.optimizer.iterations == 600
+    assert same.loss.ssim == 0.1 and same.optimizer.iterations == "auto"
+
+
+def test_dists_is_left_to_the_weights_for_a_siren_alone():
+    for preset in ("draft", "standard"):
+        found = {kind: cfg.loads("", preset, overrides=[f"representation.kind={kind}"]) for kind in MANY}
+        assert {kind: one.loss.dists for kind, one in found.items()} == dict.fromkeys(MANY, 0.0) | {
+            "siren": "auto"
+        }
+    paper = cfg.loads("", preset="paper")
+    assert (paper.loss.dists, paper.optimizer.iterations) == (0.6, 400)
 
 
 def test_asking_for_a_kind_changes_nothing_else():
@@ -126,7 +136,7 @@ def test_asking_for_a_kind_changes_nothing_else():
             back = dataclasses.replace(
                 config,
                 representation=plain.representation,
-                loss=dataclasses.replace(config.loss, ssim=plain.loss.ssim),
+                loss=dataclasses.replace(config.loss, ssim=plain.loss.ssim, dists=0.0),
                 optimizer=dataclasses.replace(config.optimizer, iterations=plain.optimizer.iterations),
             )
             assert back == plain

@@ -46,7 +46,7 @@ def test_a_preset_names_the_kind_where_none_is_given(preset, target):
         ("draft", "layers", 100, 0.1),
         ("draft", "siren", 150, 1.0),
         ("standard", "layers", 100, 0.1),
-        ("standard", "siren", 600, 1.0),
+        ("standard", "siren", "auto", 1.0),
         ("standard", "log-pixels", 600, 1.0),
         ("paper", "siren", 400, (1.0, 1e4)),
     ],

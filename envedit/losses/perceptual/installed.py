@@ -1,0 +1,74 @@
+"""Weights that runs find by themselves, and what is chosen where they are."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from envedit import config
+from envedit.config import presets
+from envedit.core.array_cache import cache_folder
+
+VGG, DISTS = "vgg16_features.npz", "dists_alpha_beta.npz"
+BACKBONES = {"alex": "alexnet_features.npz", "vgg": VGG, "squeeze": "squeezenet_features.npz"}
+HEADS = "lpips_v0.1_{}.npz"
+"""Names of the files in a folder of weights."""
+
+DISTS_WEIGHT = 0.3
+"""``loss.dists`` of a SIREN at "auto", where weights are; 0 elsewhere."""
+STEPS_WITH_DISTS = 300
+"""``optimizer.iterations`` at "auto" with DISTS; without it, as for other maps of many parameters."""
+
+
+def folder() -> Path | None:
+    """Return the folder in which every run looks for weights, in that of the caches; None: there is none."""
+    return cache_folder("weights")
+
+
+def files(settings: config.Config) -> dict[str, str]:
+    """Return the weight files that a configuration uses: backbone and heads, vgg and dists.
+
+    Files that it names come first, then those of the folder that it names, whether they are there or not,
+    then those of :func:`folder`, where both of a pair are. What is missing is not in the table.
+    """
+    named = settings.perceptual
+    chosen = named.weights or folder()
+    pairs = {("backbone", "heads"): (BACKBONES[named.network], HEADS.format(named.network))}
+    if settings.loss.dists:
+        pairs["vgg", "dists"] = VGG, DISTS
+    found: dict[str, str] = {}
+    for keys, names in pairs.items():
+        paths = [getattr(named, key) for key in keys]
+        if not paths[0] and chosen:
+            paths = [os.path.join(chosen, name) for name in names]
+            if not named.weights and not all(map(os.path.isfile, paths)):
+                continue
+        if paths[0]:
+            found |= zip(keys, paths, strict=True)
+    return found
+
+
+def settled(settings: config.Config) -> config.Config:
+    """Put numbers in the place of "auto" for ``loss.dists`` and ``optimizer.iterations``, by the weights."""
+    loss, optimizer = settings.loss, settings.optimizer
+    able = "vgg" in files(settings)
+    if loss.dists == "auto":
+        chosen = able and settings.representation.kind == "siren"
+        loss = replace(loss, dists=DISTS_WEIGHT if chosen else 0.0)
+    if optimizer.iterations == "auto":
+        plain = presets.MANY_PARAMETERS["standard"]["optimizer"]["iterations"]
+        optimizer = replace(optimizer, iterations=STEPS_WITH_DISTS if able and loss.dists else plain)
+    return replace(settings, loss=loss, optimizer=optimizer)
+
+
+def missing(settings: config.Config) -> str:
+    """Say that DISTS is off without weights, and how to get them; "" where it is on, or not asked for."""
+    asked = settings.loss.dists
+    if asked == "auto":
+        asked = settings.representation.kind == "siren"
+    if settings.target.kind == "none" or not asked or "vgg" in files(settings):
+        return ""
+    place = folder()
+    where = " DIR` and [perceptual] weights = DIR" if place is None else f"` ({place})"
+    return f"DISTS is off: no trained weights; to fetch them once, 64 MB: `envedit weights{where}"

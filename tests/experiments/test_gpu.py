@@ -1,0 +1,80 @@
+"""The measurement of a GPU, as far as a machine without one can try it: failures, time, and tiny sizes."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from experiments import gpu
+from tests.oracles import ROOT
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """Let steps be made up in place of measured; the fixture is their results by step and variant."""
+    made = {}
+
+    def measured(step, variant, small, left):
+        assert small and 0 < left <= 480
+        return made.get((step, variant), {"wall_s": 1.0})
+
+    monkeypatch.setattr(gpu, "measured", measured)
+    return made
+
+
+def test_both_variants_are_measured_and_stand_beside_each_other(tmp_path, steps, capsys):
+    out = tmp_path / "gpu.json"
+    steps["solver", "llvm_ad_rgb"] = {"error": "slow"}  # the CPU is only there to compare with
+    assert gpu.main([str(out), "--small"]) == 0
+    found = json.loads(out.read_text())
+    assert list(found["steps"]) == ["doctor", "quickstart", "engine", "solver", "fit"]
+    assert all(list(one) == ["cuda_ad_rgb", "llvm_ad_rgb"] for one in found["steps"].values())
+    assert found["machine"]["cores"] and "cuda_ad_rgb fit: 1.0 s" in capsys.readouterr().out
+
+
+def test_without_a_gpu_the_cpu_is_measured_and_the_exit_code_says_so(tmp_path, steps):
+    steps["doctor", "cuda_ad_rgb"] = {"error": "no GPU"}
+    assert gpu.main([str(tmp_path / "gpu.json"), "--small"]) == 1
+    found = json.loads((tmp_path / "gpu.json").read_text())["steps"]
+    assert "cuda_ad_rgb" not in found["engine"] and found["engine"]["llvm_ad_rgb"] == {"wall_s": 1.0}
+
+
+def test_a_step_that_fails_is_a_result():
+    found = gpu.measured("doctor", "none_ad_rgb", True, 60)
+    assert found.keys() == {"error"} and "none_ad_rgb" in found["error"]
+    assert gpu.measured("fit", "llvm_ad_rgb", True, 0) == {"error": "no time left"}
+
+
+def test_a_step_ends_with_all_that_it_has_started_when_the_time_is_over(tmp_path, monkeypatch):
+    program = tmp_path / "sleeping.sh"
+    program.write_text(f"#!/bin/sh\nsleep 60 & echo $! >{tmp_path}/pid\nwait\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    assert gpu.measured("fit", "llvm_ad_rgb", True, 2.0) == {"error": "not done after 2 s"}
+    pid = int((tmp_path / "pid").read_text())
+    for _ in range(100):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        if " Z " in (tmp_path.joinpath("/proc", str(pid), "stat")).read_text():
+            return  # ended, and nobody has waited for it
+        time.sleep(0.05)
+    pytest.fail(f"process {pid} is still there")
+
+
+@pytest.mark.slow
+def test_every_step_runs_at_tiny_sizes(tmp_path):
+    out = tmp_path / "gpu.json"
+    command = ["bash", ROOT / "experiments/gpu.sh", out, "--small", "--variant", "llvm_ad_rgb"]
+    own = {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(command, env=os.environ | own, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = {step: one["llvm_ad_rgb"] for step, one in json.loads(out.read_text())["steps"].items()}
+    assert found["quickstart"]["psnr"]["render"] > found["quickstart"]["psnr"]["initial"]
+    assert found["solver"]["iterations"] > 0 and found["fit"]["epochs"] == 6
+    assert found["engine"]["transport"]["adjointness"] < 1e-5
+    assert all(seconds > 0 for seconds in found["engine"]["seconds"].values())

@@ -316,19 +316,16 @@ class Pursuit:
         """Squared picture."""
         return sum(float(w @ w) for w in self.target)
 
-    def solve(self, atoms: Sequence[np.ndarray], signed: bool = False) -> np.ndarray:
+    def solve(self, atoms: Sequence[np.ndarray]) -> np.ndarray:
         """Strength of each atom per channel, (n, 3), not negative, beside one gain of the background.
 
         The gain is a factor per channel that is the same everywhere.
-
-        ``signed``: the target is a change, and the background may become darker.
         """
         found = np.zeros((len(atoms), 3))
         for c in range(3):
             span = self.overview.matrix[c] @ self.background[:, c] * self.weight
-            spans = [span, -span] if signed else [span]
-            columns = np.stack([*spans, *(a[c] for a in atoms)], axis=1)
-            found[:, c] = not_negative(columns, self.target[c])[len(spans) :]
+            columns = np.stack([span, *(a[c] for a in atoms)], axis=1)
+            found[:, c] = not_negative(columns, self.target[c])[1:]
         return found
 
 

@@ -29,10 +29,10 @@ class SkyDifference:
     falloff: float
 
     def covariance(self, cosine: np.ndarray, freedom: float) -> np.ndarray:
-        """Return C at angles given by their cosines; all but the factor of the whole sky times freedom^2."""
+        """Return freedom^2 C at angles given by their cosines; for ``whole`` at least :data:`FACTOR` counts."""
         degree = np.arange(1, DEGREES + 1)
         series = (2 * degree + 1) * (freedom * self.gradient * degree**-self.falloff) ** 2
-        return np.polynomial.legendre.legval(cosine, np.append(self.whole**2, series))
+        return np.polynomial.legendre.legval(cosine, np.append((max(freedom, FACTOR) * self.whole) ** 2, series))
 
 
 DEGREES = 32
@@ -43,6 +43,8 @@ PHOTOGRAPHED = (
     SkyDifference(0.078, 0.015, 1.3),
 )
 """Along luminance, blue-amber and green-magenta; nine maps (``experiments/natural``)."""
+FACTOR = 0.25
+"""Least freedom of one factor for the whole sky: photographs differ in exposure as their makers chose it."""
 LEAST_FREEDOM = 0.01
 """Freedom that 0 stands for: a gain that is the same everywhere, to a hundredth of how skies differ."""
 FIXED = 1e6
@@ -120,7 +122,7 @@ class Prior:
             covariance[np.diag_indices_from(covariance)] *= 1 + NUGGET
             precision[first:last, first:last] = np.linalg.inv(covariance)
             precision[np.arange(first), np.arange(first)] = FIXED
-            precision[last:, last:] = skies.whole**-2.0
+            precision[last:, last:] = (max(self.freedom, FACTOR) * skies.whole) ** -2.0
         return found
 
     @property

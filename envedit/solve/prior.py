@@ -29,7 +29,7 @@ class SkyDifference:
     falloff: float
 
     def covariance(self, cosine: np.ndarray, freedom: float) -> np.ndarray:
-        """Return freedom^2 C at angles given by their cosines; of ``whole`` at least :data:`FACTOR` counts."""
+        """Return freedom^2 C at angles given by cosines; of ``whole`` at least :data:`FACTOR` counts."""
         degree = np.arange(1, DEGREES + 1)
         series = (2 * degree + 1) * (freedom * self.gradient * degree**-self.falloff) ** 2
         whole = max(freedom, FACTOR) * self.whole

@@ -1,4 +1,4 @@
-"""How likely residuals are: independent values, the most likely noise, and the mean of what was not painted."""
+"""How likely residuals are: independent values, the most likely noise, the mean of what was not painted."""
 
 import numpy as np
 import pytest

@@ -60,8 +60,6 @@ class SearchProblem:
         How much each pixel counts.
     envmap : ndarray (H, W, 3)
         The whole original map.
-    initial : ndarray (h, w, 3), optional
-        What the target was painted on: the change is explained then, ``picture - initial``.
     """
 
     layers: Layers
@@ -69,7 +67,6 @@ class SearchProblem:
     picture: np.ndarray
     weight: np.ndarray | None
     envmap: np.ndarray
-    initial: np.ndarray | None = None
 
 
 def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple[dict, list[str]]:
@@ -78,7 +75,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
     Parameters
     ----------
     problem : SearchProblem
-        Without ``initial``.
+        Map, target and what renders.
     params : dict
         Of the layers, as ``encode`` returned them.
     only_own : bool
@@ -152,7 +149,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
 
 
 class Question:
-    """What is asked: the picture less all that is fixed, or the painted change, and what may make it."""
+    """What is asked: the picture less all that is fixed, and what may make it."""
 
     def __init__(self, problem: SearchProblem):
         layers, transport, envmap = problem.layers, problem.transport, problem.envmap
@@ -164,11 +161,8 @@ class Question:
         explained = layers.active if layers.mirrored else rows
         rest = envmap.copy()
         rest[explained] = 0
-        painted = problem.initial is not None
-        self.known = problem.initial if painted else problem.picture
-        self.target = problem.picture - (
-            problem.initial if painted else transport.apply(tensor(rest)).numpy()
-        )
+        self.known = problem.picture
+        self.target = problem.picture - transport.apply(tensor(rest)).numpy()
         self.active: np.ndarray = np.zeros(envmap.shape[:2], bool)
         self.active[rows] = True
         self.active = self.active.ravel()

@@ -211,11 +211,9 @@ class Pursuit:
         What a pursuit is given.
     picture : ndarray (h, w, 3)
         What is to be explained, linear radiance.
-    order : int
-        Of the gains that the background may take on.
     """
 
-    def __init__(self, given: Given, picture: np.ndarray, order: int = GAIN_ORDER):
+    def __init__(self, given: Given, picture: np.ndarray):
         overview, omega = given.overview, given.omega
         self.overview = overview
         blocks = overview.to_blocks(picture)
@@ -232,7 +230,7 @@ class Pursuit:
         self.target = [w * self.weight for w in target]
         self.residual = list(self.target)
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
-        self.allow(products(d, order))
+        self.allow(products(d, GAIN_ORDER))
 
     def allow(self, gains: np.ndarray) -> None:
         """Let the background take on any mixture of gains, (cells, n)."""
@@ -316,19 +314,16 @@ class Pursuit:
         """Squared picture."""
         return sum(float(w @ w) for w in self.target)
 
-    def solve(self, atoms: Sequence[np.ndarray], signed: bool = False) -> np.ndarray:
+    def solve(self, atoms: Sequence[np.ndarray]) -> np.ndarray:
         """Strength of each atom per channel, (n, 3), not negative, beside one gain of the background.
 
         The gain is a factor per channel that is the same everywhere.
-
-        ``signed``: the target is a change, and the background may become darker.
         """
         found = np.zeros((len(atoms), 3))
         for c in range(3):
             span = self.overview.matrix[c] @ self.background[:, c] * self.weight
-            spans = [span, -span] if signed else [span]
-            columns = np.stack([*spans, *(a[c] for a in atoms)], axis=1)
-            found[:, c] = not_negative(columns, self.target[c])[len(spans) :]
+            columns = np.stack([span, *(a[c] for a in atoms)], axis=1)
+            found[:, c] = not_negative(columns, self.target[c])[1:]
         return found
 
 

@@ -155,7 +155,7 @@ class Target(Table):
     rest: str = key(
         "follow",
         Choice("follow", "keep"),
-        "what the pixels do that were not painted: follow the light that the paint asks for (shading, "
+        "what the pixels do that were not painted: follow the light that the paint requires (shading, "
         "highlights, shadows), with the same mean; or keep their values",
         when=_PAINTED,
     )

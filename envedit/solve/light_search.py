@@ -75,7 +75,7 @@ def start(problem: SearchProblem, params: dict, only_own: bool = False) -> tuple
     Parameters
     ----------
     problem : SearchProblem
-        What is asked.
+        Map, target and what renders.
     params : dict
         Of the layers, as ``encode`` returned them.
     only_own : bool

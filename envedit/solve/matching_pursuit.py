@@ -211,11 +211,9 @@ class Pursuit:
         What a pursuit is given.
     picture : ndarray (h, w, 3)
         What is to be explained, linear radiance.
-    order : int
-        Of the gains that the background may take on.
     """
 
-    def __init__(self, given: Given, picture: np.ndarray, order: int = GAIN_ORDER):
+    def __init__(self, given: Given, picture: np.ndarray):
         overview, omega = given.overview, given.omega
         self.overview = overview
         blocks = overview.to_blocks(picture)
@@ -232,7 +230,7 @@ class Pursuit:
         self.target = [w * self.weight for w in target]
         self.residual = list(self.target)
         self.spans = [np.zeros((len(blocks), 0)) for _ in range(3)]
-        self.allow(products(d, order))
+        self.allow(products(d, GAIN_ORDER))
 
     def allow(self, gains: np.ndarray) -> None:
         """Let the background take on any mixture of gains, (cells, n)."""

@@ -51,7 +51,7 @@ LEAST_FREEDOM = 0.01
 FIXED = 1e6
 """Precision of grids that do not take part: their nodes stay at 0."""
 NUGGET = 1e-6
-"""Share of the variance at a node that is its own, so that nodes at one place can be told apart."""
+"""Share of the variance at a node that is its own, so that nodes at one place differ."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A picture of the scene under other light, made by a renderer: how it is told from paint, and its noise.
+"""A picture of the scene under other light, made by a renderer: how it differs from paint, and its noise.
 
 Who paints on a rendering keeps its Monte Carlo noise, also where a filter goes over all of it. A picture that
 was rendered anew has noise of its own. With A the rendering that could have been painted on, B another one of
@@ -22,7 +22,7 @@ DEVIATIONS = 5.0
 """Standard deviations by which the picture must be nearer to A than to B to be painted on A: chance does it
 once in three million pictures."""
 MOST_SAMPLES = 1024
-"""More are not told apart from a picture without noise, such as one that was denoised."""
+"""More look like a picture without noise, such as one that was denoised."""
 _IMMERKAER = np.outer([1, -2, 1], [1, -2, 1]) / 6
 """The filter of Immerkaer (1996), which takes out what is linear in rows or columns; of white noise it leaves
 the standard deviation."""
@@ -35,7 +35,7 @@ def is_rendered_anew(
     another: Callable[[], np.ndarray],
     views: Views = (slice(None),),
 ) -> bool:
-    """Tell whether a picture was rendered under other light, and not painted.
+    """Say whether a picture was rendered under other light, and not painted.
 
     Parameters
     ----------

@@ -199,7 +199,8 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     if picture is not None:
         everywhere = np.ones(shape) if mask is None else mask
         found = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
-        source, asked = "a picture of the scene, given as an array", (picture, *filter(None.__ne__, [mask]))
+        source = "a picture of the scene, given as an array"
+        asked = (picture, *([] if mask is None else [mask]))
     else:
         unnamed = {"tonemap": "srgb"}
         files = zip(chosen.files, chosen.masks or ("",) * len(chosen.files), strict=True)

@@ -10,7 +10,7 @@ import pytest
 from envedit.core import latlong
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
-from envedit.solve import light_search, matching_pursuit, painted_change
+from envedit.solve import light_search, matching_pursuit
 from envedit.transport import texel_sampling
 from envedit.transport.block_transport import Overview
 from envedit.transport.light_transport import LightTransport
@@ -62,15 +62,11 @@ def picture(transport, image):
 class Start:
     """What a search finds for a map and a picture."""
 
-    def __init__(self, transport, image, wanted, weight=None, initial=None):
+    def __init__(self, transport, image, wanted, weight=None):
         layers = Layers((0, HEIGHT))
         encoded = layers.encode(image[:ROWS])
-        asked = light_search.SearchProblem(layers, transport, wanted, weight, image, initial)
-        if initial is None:
-            params, self.notes = light_search.start(asked, encoded)
-        else:
-            params, self.notes = painted_change.start(asked, encoded)
-            assert not any(params[name].numpy().any() for name in params if name.startswith("gain"))
+        asked = light_search.SearchProblem(layers, transport, wanted, weight, image)
+        params, self.notes = light_search.start(asked, encoded)
         assert params.keys() == encoded.keys()
         assert all(params[name].shape == encoded[name].shape for name in params)
         self.count = len(layers.separation.lights)
@@ -352,64 +348,6 @@ def test_refinement_finds_a_light_from_three_texels_off(transport):
     )
     assert degrees_apart(direction, DIRECTIONS[7, 33]) < 0.3 * TEXEL
     np.testing.assert_allclose(factor, 2.5, rtol=0.05)
-
-
-# ---- painted changes -------------------------------------------------------------------------------------
-
-
-def painted(transport, image, wanted):
-    """Return what a search finds for the change from one map's picture to another's."""
-    initial = picture(transport, image)
-    return Start(transport, image, picture(transport, wanted), initial=initial)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", [(6, 52), (5, 62), (9, 0)])
-def test_a_painted_shadow_elsewhere_moves_the_sun(place, transport):
-    found = painted(transport(), sky(SUN), sky(place))
-    assert degrees_apart(found.direction[0], DIRECTIONS[place]) < NEAR
-    np.testing.assert_allclose(found.flux[0], 1, rtol=0.2)
-    assert (found.flux[1:] < 1e-9).all() and len(found.notes) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suns", [(), (SUN,)])
-def test_a_painted_light_is_added_beside_those_that_stay(suns, transport):
-    place = (7, 44)
-    found = painted(transport(), sky(*suns), sky(*suns, place))
-    new = found.count
-    assert degrees_apart(found.direction[new], DIRECTIONS[place]) < NEAR
-    assert found.flux[new].max() > 0.1 and "added a light" in found.notes[-1]
-    for i in range(found.count):
-        assert degrees_apart(found.direction[i], DIRECTIONS[suns[i]]) < 0.5 * TEXEL
-        np.testing.assert_allclose(found.flux[i], 1, atol=0.25)
-
-
-@pytest.mark.slow
-def test_softened_lights_keep_their_flux_and_place(transport):
-    """The loss decides whether a start with lobes in place of the lights is the better one."""
-    image = sky(SUN)
-    layers = Layers((0, HEIGHT))
-    params = layers.encode(image[:ROWS])
-    soft, notes = painted_change.softened(layers, params)
-    dark = soft | {"flux": mi.TensorXf(np.full((layers.lights.count, 3), -40.0, np.float32))}
-    before, after, without = (layers.decode(p).numpy() for p in (params, soft, dark))
-    lobe = after - without  # a glow goes with the light that it is of
-    np.testing.assert_allclose(
-        (lobe * OMEGA[:ROWS, None, None]).sum((0, 1)), layers.lights.flux[0], rtol=0.02
-    )
-    assert lobe.max() < 0.6 * before.max() and len(notes) == 1
-    brightest = np.unravel_index(lobe[..., 1].argmax(), (ROWS, WIDTH))
-    assert degrees_apart(DIRECTIONS[brightest], DIRECTIONS[SUN]) < TEXEL
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("factor", [1.0, 0.5, 1.5])
-def test_paint_that_any_gain_makes_asks_for_no_light(factor, transport):
-    image = sky(SUN)
-    found = painted(transport(), image, factor * image)
-    assert degrees_apart(found.direction[0], DIRECTIONS[SUN]) < 0.5 * TEXEL
-    assert (found.flux[1:] < 1e-9).all() and found.notes == []
 
 
 @pytest.mark.parametrize("width", [2, 4, 8, 16])

@@ -21,8 +21,10 @@ from envedit.solve import added_light, checkpoint, gauss_newton, map_problem
 from envedit.solve.adam_loop import State
 from envedit.solve.derivatives import ANGLE
 from envedit.solve.gauss_newton import Run, solve
+from envedit.solve.likelihood import INDEPENDENT, Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
-from envedit.solve.prior import Prior
+from envedit.solve.prior import PHOTOGRAPHED, Prior, of_paint
+from envedit.targets.target import pixel_weight
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.matrix_renderer import same, without_times
 from tests.oracles.plain import plain_display
@@ -48,11 +50,11 @@ def shown(transport, image):
     return transport.apply(mi.TensorXf(np.asarray(image, np.float32))).numpy()
 
 
-def problem_of(image, transport, target, cycles=3, **options):
+def problem_of(image, transport, target, likelihood=None, cycles=3, **options):
     """Return a problem and the parameters to start from."""
     layers = Layers(cycles=cycles)
     params = layers.encode(image)
-    return Problem(layers, transport, image, target, **options), params
+    return Problem(layers, transport, image, target, likelihood, **options), params
 
 
 def copy(state):
@@ -77,11 +79,25 @@ def moved(problem, state, unknowns, k, h):
 @pytest.fixture(scope="module")
 def case():
     """A sky with a lamp, and a state where every unknown has moved."""
+    return moved_case(lambda weight: Likelihood(on_average_one(weight, FILM)))
+
+
+@pytest.fixture(scope="module")
+def painted():
+    """The same with paint on a quarter of the picture."""
+    coverage = np.zeros((*FILM, 1), np.float32)
+    coverage[2:7, 3:9] = 1
+    weight = pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3)
+    return moved_case(lambda _: Likelihood.of_paint(weight, coverage))
+
+
+def moved_case(likelihood):
+    """Return a problem, its parameters, its start, and the state; ``likelihood`` is given weights."""
     rng = np.random.default_rng(0)
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
     target = shown(transport, image) * np.exp(rng.normal(0, 0.5, (*FILM, 3))).astype(np.float32)
     weight = 0.5 + rng.random((*FILM, 1))
-    problem, params = problem_of(image, transport, target, weight=weight)
+    problem, params = problem_of(image, transport, target, likelihood(weight))
     assert len(problem.layers.separation.lights) == 1 and not problem.layers.lights.glowing
     start = problem.state(params)
     state, centre = copy(start), problem.layers.lights.centres[0]
@@ -111,12 +127,37 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
     point = problem.evaluate(state)
     size = np.sqrt((point.residual**2).mean(axis=2))
     assert (size > sigma).mean() == pytest.approx({0.02: 0.97, 0.1: 0.87, 1.0: 0}[sigma], abs=0.05)
-    normal = problem.normal(point, start, sigma)
+    assert_gradient(problem, start, state, sigma)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.2])
+def test_gradient_of_paint_with_the_mean_of_the_rest_is_that_of_finite_differences(painted, sigma):
+    """Of the misfit, beside which the prior is large here: paint, the pattern of the rest, and its mean."""
+    problem, _, start, state = painted
+    mean = problem.likelihood.mean(problem.evaluate(state).residual)
+    assert np.abs(mean).max() > 1 and problem.likelihood.rest is not None
+    assert_gradient(problem, start, state, sigma, of_prior=False)
+    # Negative control: without the mean the gradient is another one.
+    full = problem.likelihood
+    problem.likelihood = dataclasses.replace(full, rest=None)
+    alone = problem.normal(problem.evaluate(state), start, sigma)
+    problem.likelihood = full
+    with pytest.raises(AssertionError, match="gain"):
+        assert_gradient(problem, start, state, sigma, of_prior=False, normal=alone)
+
+
+def assert_gradient(problem, start, state, sigma, of_prior=True, normal=None):
+    """Compare the gradient with finite differences of F, or of its misfit alone, by every kind of unknown."""
+    normal = normal or problem.normal(problem.evaluate(state), start, sigma)
     names = names_of(problem, normal)
     assert sorted(set(names)) == ["flux", "gain", "size", "turn"]
+    gradient = normal.gradient
+    if not of_prior:
+        gradient = gradient - normal.precision @ problem._from_prior(state, start, normal.unknowns)
 
     def f(x):
-        return problem.misfit(problem.evaluate(x).residual, sigma) + problem.penalty(x, start)
+        penalty = problem.penalty(x, start) if of_prior else 0.0
+        return problem.misfit(problem.evaluate(x).residual, sigma) + penalty
 
     for kind in CLOSE:
         h = STEPS[kind]
@@ -127,7 +168,7 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
         ]
         slope = np.array(slope) / (4 * h)  # of F / 2
         np.testing.assert_allclose(
-            normal.gradient[some], slope, rtol=0, atol=CLOSE[kind] * np.abs(slope).max(), err_msg=kind
+            gradient[some], slope, rtol=0, atol=CLOSE[kind] * np.abs(slope).max(), err_msg=kind
         )
         assert np.abs(slope).max() > 0
 
@@ -151,7 +192,7 @@ def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
     jacobian = np.stack(columns, axis=1)
     size = np.sqrt((point.residual**2).mean(axis=2, keepdims=True))
     # A picture of fewer than 256 pixels: A = 1.
-    huber = np.where(size <= sigma, 1, sigma / size) * problem.weight / sigma**2
+    huber = np.where(size <= sigma, 1, sigma / size) * problem.likelihood.weight / sigma**2
     huber = np.broadcast_to(huber, point.residual.shape).ravel()
     expected = jacobian.T @ (huber[:, None] * jacobian) + plain_precision(problem, names)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -160,6 +201,34 @@ def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
     # Negative control: data and prior both matter.
     assert np.abs(np.diag(expected) / np.diag(plain_precision(problem, names)) - 1).max() > 1
     assert (np.diag(plain_precision(problem, names))[: 3 * n] > 0.1 * np.diag(expected)[: 3 * n]).any()
+
+
+def test_the_mean_of_the_rest_is_three_more_residuals_of_the_hessian(painted):
+    """Of rank three: J' J of finite differences of q, which is without a sigma."""
+    problem, _, start, state = painted
+    point, full = problem.evaluate(state), problem.likelihood
+    with_mean = problem.normal(point, start, 0.1)
+    problem.likelihood = dataclasses.replace(full, rest=None)
+    without = problem.normal(point, start, 0.1)
+    problem.likelihood = full
+    part = with_mean.hessian - without.hessian
+    values = np.linalg.eigvalsh(part)
+    assert values[-3] > 1e-3 * values[-1] and np.abs(values[:-3]).max() < 1e-8 * values[-1]
+    names, columns = names_of(problem, with_mean), []
+    for k, name in enumerate(names):
+        steps = (0.1, 0.0) if name == "size" else (STEPS[name], -STEPS[name])
+        ends = [problem.evaluate(moved(problem, state, with_mean.unknowns, k, h)) for h in steps]
+        means = [(full.share * end.residual).sum(axis=(0, 1)) for end in ends]
+        columns.append((means[0] - means[1]) / (steps[0] - steps[1]))
+    jacobian = np.stack(columns, axis=1)
+    close = np.array([{"gain": 5e-3, "flux": 5e-3}.get(name, 0.2) for name in names])
+    found = with_mean.mean_of_rest.jacobian
+    for kind in CLOSE:
+        some = [k for k, name in enumerate(names) if name == kind]
+        largest = np.abs(jacobian[:, some]).max()
+        assert (np.abs(found - jacobian)[:, some] < close[some] * largest).all(), kind
+    np.testing.assert_allclose(part, found.T @ found, rtol=0, atol=1e-8 * values[-1])
+    np.testing.assert_allclose(with_mean.mean_of_rest.residual, full.mean(point.residual))
 
 
 def test_texture_within_a_block_is_in_the_derivatives(rng):
@@ -242,7 +311,8 @@ def test_misfit_is_hubers_loss_of_a_pixel(case, sigma, rng):
     problem, *_ = case
     residual = rng.normal(0, 0.2, (*FILM, 3))
     size = np.sqrt((residual**2).mean(axis=2))
-    total = sum(w * huber(s, sigma) for w, s in zip(problem.weight.ravel(), size.ravel(), strict=True))
+    weight = problem.likelihood.weight.ravel()
+    total = sum(w * huber(s, sigma) for w, s in zip(weight, size.ravel(), strict=True))
     assert problem.misfit(residual, sigma) == pytest.approx(3 * total / sigma**2, rel=1e-6)
     assert problem.misfit(0 * residual, sigma) == 0
 
@@ -251,7 +321,7 @@ def test_misfit_is_continuous_with_its_slope_at_the_threshold(case):
     problem, *_ = case
     sigma, h = 0.1, 1e-4
     before, at, after = (problem.misfit(np.full((*FILM, 3), sigma + d), sigma) for d in (-h, 0, h))
-    assert at == pytest.approx(3 * problem.weight.sum(), rel=1e-6)
+    assert at == pytest.approx(3 * problem.likelihood.weight.sum(), rel=1e-6)
     slopes = (at - before) / h, (after - at) / h
     assert slopes[0] == pytest.approx(slopes[1], rel=2 * h / sigma)
     far = [problem.misfit(np.full((*FILM, 3), k), sigma) for k in (1.0, 2.0, 3.0)]
@@ -285,6 +355,27 @@ def test_penalty_of_a_node(case, colour, expected):
         state["gain"][first] = colour
         assert problem.penalty(state, start) == pytest.approx(expected * 4**level, rel=1e-9)
         first += rows * columns
+
+
+def test_penalty_and_precision_are_one_where_nodes_go_together(case, rng):
+    """Of the prior of paint: x' K x, its half gradient and K itself; a factor of the whole sky is cheap."""
+    problem, _, start, state = case
+    painted = Problem(problem.layers, problem.transport, problem.envmap, problem.picture, prior=of_paint(0.5))
+    normal = painted.normal(painted.evaluate(state), start, 1.0)
+    x = painted._from_prior(state, start, normal.unknowns)
+    assert painted.penalty(state, start) == pytest.approx(x @ normal.precision @ x, rel=1e-9)
+    pull = normal.precision @ x
+    for k in rng.choice(3 * painted.nodes, 5, replace=False):
+        h = 1e-4
+        ends = [painted.penalty(moved(painted, state, normal.unknowns, k, s * h), start) for s in (1, -1)]
+        assert pull[k] == pytest.approx((ends[0] - ends[1]) / (4 * h), rel=1e-4)
+    whole, one = copy(start), copy(start)
+    first = sum(rows * columns for rows, columns in painted.sizes[:-1])
+    whole["gain"][first:] = 0.3
+    one["gain"][first + 10] = 0.3
+    factor = (np.sqrt(3) * 0.3 / PHOTOGRAPHED[0].whole) ** 2
+    assert painted.penalty(whole, start) == pytest.approx(factor, rel=0.02)
+    assert painted.penalty(one, start) > 5 * factor
 
 
 def test_penalty_of_a_light(case):
@@ -497,7 +588,7 @@ def test_noise_is_under_which_residuals_have_the_misfit_of_independent_ones(case
     problem = case[0]
     residual = rng.normal(0, 0.03, (*FILM, 3))
     found = problem.noise(residual, 1e-3)
-    assert problem.misfit(residual, found) == pytest.approx(3 * map_problem.INDEPENDENT, rel=1e-6)
+    assert problem.misfit(residual, found) == pytest.approx(3 * INDEPENDENT, rel=1e-6)
     assert problem.noise(residual, 0.5) == 0.5  # never below what is known
     assert problem.noise(np.zeros((*FILM, 3)), 1e-3) == 1e-3
     assert problem.noise(4 * residual, 1e-3) == pytest.approx(4 * found)
@@ -550,13 +641,50 @@ def test_no_step_is_longer_than_its_limit(case):
     np.testing.assert_array_equal(found["flux"][1:], state["flux"][1:])
 
 
+def marquardt(normal, damping):
+    """Return the step that is damped by the diagonal of the whole Hessian."""
+    damped = normal.hessian + damping * np.diag(np.diag(normal.hessian))
+    return -np.linalg.solve(damped, normal.gradient)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
+def test_of_a_diagonal_prior_the_step_is_marquardts(case, damping):
+    """But for what the three channels of a node have in common."""
+    problem, _, start, state = case
+    normal = problem.normal(problem.evaluate(state), start, 1.0)
+    n = 3 * problem.nodes
+    of_data = np.diag(np.diag(normal.hessian - normal.precision))
+    damped = normal.hessian + damping * (normal.precision + of_data)
+    expected = -np.linalg.solve(damped, normal.gradient)[:n]
+    gain = (problem.step(state, normal, damping)["gain"] - state["gain"]).T.ravel()
+    assert np.abs(expected).max() < map_problem.LARGEST["gain"]
+    np.testing.assert_allclose(gain, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    if not damping:
+        np.testing.assert_allclose(gain, marquardt(normal, 0.0)[:n], rtol=0, atol=1e-6 * np.abs(gain).max())
+
+
+def test_damping_lets_the_whole_sky_change_in_one_step(rng):
+    """Where nodes go together a diagonal would hold what all of them do: a factor costs next to nothing."""
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID, even=0.8)
+    problem, params = problem_of(image, transport, shown(transport, 1.3 * image), prior=of_paint(0.02))
+    start = problem.state(params)
+    normal = problem.normal(problem.evaluate(start), start, 0.05)
+    first = sum(rows * columns for rows, columns in problem.sizes[:-1])
+    free, damped = (problem.step(start, normal, d)["gain"][first:].mean() for d in (0.0, 0.01))
+    assert free == pytest.approx(np.log(1.3), abs=0.05) and damped == pytest.approx(free, rel=0.05)
+    diagonal = marquardt(normal, 0.01)[: 3 * problem.nodes].reshape(3, -1)[:, first:].mean()
+    assert diagonal < 0.5 * free
+    # It is damped none the less: at last no step is made.
+    assert abs(problem.step(start, normal, 1e6)["gain"]).max() < 1e-3
+
+
 def test_fewest_steps(case):
     problem, params, start, _ = case
     none = solve(problem, params, iterations=0)
     assert none.history == [] and same(problem.state(none.params), start)
     residual = problem.evaluate(start).residual
     noise = problem.noise(residual, map_problem.SIGMA)
-    expected = problem.misfit(residual, noise) + 6 * map_problem.INDEPENDENT * np.log(noise)
+    expected = problem.misfit(residual, noise) + 6 * INDEPENDENT * np.log(noise)
     assert none.loss == pytest.approx(expected)
     assert len(solve(problem, params, iterations=1).history) == 1
 
@@ -857,9 +985,10 @@ def test_a_near_start_stays_unless_path_tracing_says_that_the_solution_is_closer
     assert len(asked) == 2 and ("path-traced" in found.note) == stays
 
 
-def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(case):
-    """Against the larger system, with the light's strength as one more unknown."""
-    problem, _, start, state = case
+@pytest.mark.parametrize("of", ["case", "painted"])
+def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
+    """Against the larger system, with the light's strength as one more unknown; also beside held means."""
+    problem, _, start, state = request.getfixturevalue(of)
     point, sigma = problem.evaluate(state), 0.1
     normal = problem.normal(point, start, sigma)
     found, gain = added_light.best(problem, point, normal)
@@ -875,9 +1004,15 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(case):
         + [normal.pictures.reshape(len(normal.pictures), -1) @ (atom * weights).ravel()]
     )
     power = (weights * atom**2).sum()
+    share = problem.likelihood.share.reshape(-1, 1)
+    mean = (normal.slope.reshape(-1, 3) * share * atom).sum(axis=0)
+    assert mean.any() == (of == "painted")
+    mixed = mixed + mean @ normal.mean_of_rest.jacobian
+    power = power + mean @ mean
     larger = np.block([[normal.hessian, mixed[:, None]], [mixed[None], np.array([[power]])]])
     pulled = (normal.slope * normal.robust * point.residual).reshape(-1, 3)
-    pull = np.append(normal.gradient, (pulled * atom).sum())
+    by_mean = problem.likelihood.mean(point.residual) @ mean
+    pull = np.append(normal.gradient, (pulled * atom).sum() + by_mean)
     strength = -np.linalg.solve(larger, pull)[-1]
     assert np.exp(found["flux"][new]) == pytest.approx(np.full(3, strength), rel=1e-3)
     fall = pull @ np.linalg.solve(larger, pull) - normal.gradient @ np.linalg.solve(
@@ -1044,14 +1179,17 @@ def test_pixels_that_count_are_the_whole_picture(rng):
     mask = np.zeros((*FILM, 1), np.float32)
     mask[: max(1, FILM[0] // 10)] = 0.5
     residual = 0.03 * rng.normal(size=(*FILM, 3))
-    problem, params = problem_of(image, transport, shown(transport, image), weight=mask)
+    counted = Likelihood(on_average_one(mask, FILM))
+    problem, params = problem_of(image, transport, shown(transport, image), counted)
     of_all, _ = problem_of(image, transport, shown(transport, image))
     inside = np.where(mask > 0, residual, 0)
-    assert problem.weight.mean() == pytest.approx(1)
+    assert problem.likelihood.weight.mean() == pytest.approx(1)
     assert of_all.noise(residual, 0.001) == pytest.approx(problem.noise(inside, 0.001), rel=0.3)
     point = problem.evaluate(problem.state(params))
-    aimed = problem.aimed_at(shown(transport, image), 7 * mask, point)
-    assert problem.weight.mean() == pytest.approx(1) and aimed.residual.shape == residual.shape
+    again = Likelihood(on_average_one(7 * mask, FILM))
+    aimed = problem.aimed_at(shown(transport, image), again, point)
+    assert problem.likelihood is again and aimed.residual.shape == residual.shape
+    assert problem.noise(inside, 0.001) == pytest.approx(counted.noise(inside, 0.001), rel=1e-6)
 
 
 def test_problems_of_one_job_share_their_blocks_and_nothing_else(rng):

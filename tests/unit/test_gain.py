@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envedit.core import latlong
 from envedit.representations.layers import gain
 from envedit.representations.layers.gain import Octave
 
@@ -216,3 +217,32 @@ def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):
         for g in (coarse, fine)
     ]
     assert np.array_equal(*(np.array(field) for field in both))
+
+
+# ---- where nodes are ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("share", "top"), [(1.0, True), (0.5, True), (0.5, False)])
+def test_directions_of_nodes_are_where_a_field_has_their_values(share, top):
+    """Splines make a linear field exactly: of nodes with their own colatitude, that of every texel.
+
+    To half a texel, as the first and last row of a map lie on the poles. Around the horizon a field of one
+    cycle keeps its phase.
+    """
+    g, width = gain.GridGain(12, share, top), 96
+    height = round(width / 2 * share)
+    first = 0 if top else width // 2 - height
+    d = latlong.directions(width // 2, width)[first : first + height]
+    rows, columns = g.sizes[2]
+    nodes = g.directions(2)
+    np.testing.assert_allclose(np.linalg.norm(nodes, axis=1), 1)
+    down, across = gain.splines((rows, columns), (height, width))
+    colatitude = np.arccos(np.clip(nodes[:, 1], -1, 1)).reshape(rows, columns)
+    off = down @ colatitude @ across.T - np.arccos(np.clip(d[..., 1], -1, 1))
+    assert np.abs(off).max() < 1.001 * np.pi / width
+    middle = rows // 2  # no pole
+    around = nodes.reshape(rows, columns, 3)[middle][:, [0, 2]] / np.sin(colatitude[middle, 0])
+    found = across @ around
+    texel = d[height // 2][:, [0, 2]] / np.sqrt(1 - d[height // 2, :1, 1] ** 2)
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    assert np.degrees(np.arccos((found * texel).sum(axis=1).clip(-1, 1))).max() < 0.1

@@ -44,9 +44,15 @@ def test_the_weight_has_an_end_whatever_the_picture():
 
 @pytest.mark.parametrize(
     ("target", "after"),
-    [({"paint": 1.0}, 4.0), ({"paint": 1.0, "hold": 3.0}, None), ({"paint": 0.0}, None)],
+    [
+        ({"rest": "keep"}, 4.0),
+        ({"rest": "keep", "hold": 3.0}, None),
+        ({"rest": "keep", "paint": 0.0}, None),
+        ({"rest": "follow"}, None),
+        ({}, None),
+    ],
 )
-def test_only_a_weight_that_the_user_left_open_is_raised(target, after):
+def test_only_a_weight_that_the_user_left_open_is_raised_where_the_rest_keeps_its_values(target, after):
     aim, pixels = np.zeros((1, 2, 3)), np.ones((1, 2, 1))
     rendering = np.full((1, 2, 3), 0.04**2.2)
     coverage = np.array([0.0, 1.0]).reshape(1, 2, 1)

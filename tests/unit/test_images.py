@@ -40,6 +40,26 @@ def test_real_maps(data):
         np.testing.assert_allclose(*energy, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("size", "panorama"),
+    [((8, 16), True), ((8, 17), True), ((8, 15), True), ((8, 18), False), ((9, 9), False), ((9, 16), False)],
+)
+@pytest.mark.parametrize("ending", ["exr", "png"])
+def test_a_panorama_is_twice_as_wide_as_high_to_a_texel(size, panorama, ending, tmp_path, rng):
+    file = tmp_path / f"a.{ending}"
+    if ending == "exr":
+        exr(file, **planes(rng, size=size))
+    else:
+        mi.Bitmap(rng.integers(0, 256, (*size, 3)).astype(np.uint8)).write(str(file))
+    assert images.is_panorama(file) == panorama
+
+
+def test_what_cannot_be_read_is_no_panorama(tmp_path):
+    (tmp_path / "a.exr").write_bytes(b"no image")
+    for name in ("a.exr", "nowhere.png"):
+        with pytest.raises(InputError, match=name):
+            images.is_panorama(tmp_path / name)
+
 def test_load_envmap(tmp_path, rng):
     p = planes(rng, size=(8, 16))
     p["G"][3, 4] = -2

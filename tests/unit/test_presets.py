@@ -219,5 +219,7 @@ def test_painted_targets_have_their_own_defaults(kind):
     assert cfg.loads("").loss.change == 0
     assert cfg.loads(f"[target]\n{kind}").loss.change > 0
     assert cfg.loads(f"[loss]\nchange = 0\n[target]\n{kind}").loss.change == 0
+    rendered = cfg.loads('[target]\nkind = "rendering"\nfile = "p.png"')
+    assert rendered.loss == cfg.loads("").loss
     paper = cfg.loads(f"[target]\n{kind}", preset="paper")
     assert paper.loss.change == 0 and paper.loss.luminance[0] < 1e-4

@@ -120,6 +120,14 @@ def test_an_override_without_key_or_value_is_refused(text):
         ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
         ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
         ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
+        ("[target]\nkind = 'rendering'", ["target.file", "expected the picture of the scene"]),
+        (
+            "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
+            ["target.mask: got 1 masks, expected 2"],
+        ),
+        ("[target]\nrest = 'stay'", ["target.rest: got 'stay'", "follow"]),
+        ("[solve]\nfreedom = 1.5", ["solve.freedom: got 1.5"]),
+        ("[solve]\nfreedom = -0.1", ["solve.freedom: got -0.1"]),
         ("[target]\nkind = 'strokes'", ["target.strokes: got none, expected at least one"]),
         (
             "[[target.strokes]]\ntype = 'contrast'",

@@ -212,6 +212,103 @@ def test_arrays_that_cannot_be_used(ball, seen, picture, mask, says):
         target.make(asking(), ball, seen[0], picture, mask)
 
 
+# ---- a picture of the scene under other light -----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pictured(ball):
+    """A map, and the scene's picture under another one, within what a display shows."""
+    rng = np.random.default_rng(4)
+    envmap, other = sky(rng) + 0.2, sky(rng) + 0.2
+    return 0.1 * envmap, np.minimum(ball.render(0.1 * other, spp=64, seed=11), 0.95)
+
+
+def shown_as_srgb(picture):
+    """Return 8-bit sRGB values by the standard's formula."""
+    low = picture <= 0.0031308
+    return np.round(255 * np.where(low, 12.92 * picture, 1.055 * picture ** (1 / 2.4) - 0.055)).astype("u1")
+
+
+def of_a_picture(ball, pictured, **kwargs):
+    made = target.make(asking(kind="rendering", **kwargs), ball, pictured[0])
+    assert made.envmap is None and made.initial is None and made.coverage is None
+    assert made.spp >= 1 and made.noise.shape == SIZE and made.noise.min() > 0
+    assert made.source.startswith("a picture of the scene") and "samples a pixel" in made.source
+    return made
+
+
+def test_a_picture_of_the_scene_is_read_as_linear_radiance(ball, pictured, tmp_path):
+    """From OpenEXR as it is, from a PNG that says nothing as sRGB, from an array likewise linear."""
+    envmap, picture = pictured
+    made = of_a_picture(ball, pictured, file=str(paint(tmp_path / "a.exr", picture)))
+    np.testing.assert_array_equal(made.picture, picture)
+    assert made.weight is None and made.warnings == () and len(made.asked) == 1
+    srgb = of_a_picture(ball, pictured, file=str(png(tmp_path / "a.png", shown_as_srgb(picture))))
+    step = np.maximum(picture, 0.1) ** (1 - 1 / 2.4) / 255  # a step of 8 bits, and more
+    assert (np.abs(srgb.picture - picture) < 1.5 * step).all()
+    assert srgb.weight is None
+    named = of_a_picture(ball, pictured, file=str(tmp_path / "a.png"), tonemap="gamma")
+    np.testing.assert_allclose(named.picture, (shown_as_srgb(picture) / 255) ** 2.2, rtol=1e-4)
+    array = target.make(asking(kind="rendering", file=images.ARRAY), ball, envmap, picture)
+    np.testing.assert_array_equal(array.picture, picture)
+    assert "given as an array" in array.source and array.weight is None
+
+
+def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictured, tmp_path):
+    values, mask = shown_as_srgb(pictured[1]), np.zeros((*SIZE, 3), np.uint8)
+    values[2, 3:5], mask[1:7] = 255, 255
+    file, masked = (str(png(tmp_path / name, v)) for name, v in (("a.png", values), ("m.png", mask)))
+    clipped = of_a_picture(ball, pictured, file=file)
+    assert not clipped.weight[2, 3:5].any() and clipped.weight.sum() == SIZE[0] * SIZE[1] - 2
+    both = of_a_picture(ball, pictured, file=file, mask=masked)
+    assert both.weight.sum() == 6 * SIZE[1] - 2 and not both.weight[7:].any()
+    array = target.make(
+        asking(kind="rendering", file=images.ARRAY), ball, pictured[0], pictured[1], mask[..., 0] / 255
+    )
+    assert array.weight.sum() == 6 * SIZE[1] and len(array.asked) == 2
+    mask[1:7], mask[2, 3:5] = 0, 255
+    png(tmp_path / "m.png", mask)
+    with pytest.raises(InputError, match=r"a\.png: all .* is clipped"):
+        of_a_picture(ball, pictured, file=file, mask=masked)
+
+
+def test_a_file_of_a_target_map_that_is_no_panorama_is_a_picture(ball, pictured, tmp_path):
+    """A map is 2:1; the source says what the file was taken for."""
+    file = str(paint(tmp_path / "a.exr", pictured[1]))
+    made = target.make(asking(file=file), ball, pictured[0])
+    assert made.envmap is None and "not 2:1" in made.source
+    np.testing.assert_array_equal(made.picture, of_a_picture(ball, pictured, file=file).picture)
+    with pytest.raises(InputError, match=r"b\.exr"):  # 4:3 as the film, of another aspect than it
+        target.make(asking(file=str(paint(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
+
+
+def test_a_painted_image_that_was_rendered_anew_is_solved_as_a_rendering(tmp_path, rng):
+    """And one that was painted all over the rendering is not; a mask says that it was painted."""
+    lit = scene.load("sphere", 48)
+    envmap = 0.2 * (sky(rng, 16, 32) + 0.05)
+    asked = {"kind": "image", "file": str(tmp_path / "a.exr")}
+    initial = initial_rendering.initial(lit, envmap, asking())
+    paint(tmp_path / "a.exr", lit.render(np.roll(envmap, 9, axis=1), spp=16, seed=5))
+    anew = target.make(asking(**asked), lit, envmap)
+    assert anew.coverage is None and anew.noise is not None and "solved as a rendering" in anew.source
+    white = np.full((48, 48, 3), 255, np.uint8)
+    masked = target.make(asking(**asked, mask=str(png(tmp_path / "m.png", white))), lit, envmap)
+    assert masked.coverage.all() and masked.noise is None
+    paint(tmp_path / "a.exr", 0.7 * initial)
+    painted = target.make(asking(**asked), lit, envmap)
+    assert painted.coverage.mean() > 0.9 and painted.noise is None and "painted" in painted.source
+
+
+def test_every_view_of_a_picture_of_the_scene_may_have_its_file(ball, pictured, tmp_path):
+    """Views without one do not count."""
+    views = (scene.View("left", slice(0, 6)), scene.View("right", slice(6, 12)))
+    lit = replace(ball, views=views)
+    file = str(paint(tmp_path / "right.exr", pictured[1][6:]))
+    made = target.make(asking(kind="rendering", file=(file,), view=("right",)), lit, pictured[0])
+    np.testing.assert_array_equal(made.picture[6:], pictured[1][6:])
+    assert (made.weight[6:] == 1).all() and not made.weight[:6].any()
+
+
 # ---- weights ---------------------------------------------------------------------------------------------
 
 
@@ -254,7 +351,10 @@ def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     made = target.make(asking(kind="strokes", strokes=(upper,)), ball, envmap)
     assert not made.coverage[hidden].any() and made.coverage.any() and not made.weight[hidden].any()
     painted = made.coverage[..., 0] > 0
-    assert made.weight[painted].sum() == pytest.approx(made.weight[~painted].sum(), rel=1e-5)
+    for rest, share in (("follow", target.FOLLOWS), ("keep", 1.0)):
+        made = target.make(asking(kind="strokes", strokes=(upper,), rest=rest), ball, envmap)
+        weights = made.weight[~painted].sum(), made.weight[painted].sum()
+        assert weights[0] == pytest.approx(share * weights[1], rel=1e-5)
     held = made.held(1, 3)
     assert held.weight[~painted].sum() == pytest.approx(3 * held.weight[painted].sum(), rel=1e-5)
     with pytest.raises(InputError, match="no surface is seen"):

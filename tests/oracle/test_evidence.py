@@ -1,0 +1,95 @@
+"""-2 log evidence by Laplace's approximation, against a linear problem's, which is Gaussian.
+
+The transport is a dense matrix and the sky so dark that display values are linear: a residual J x - y with
+weights W and x of precision K. Its evidence is that of y, with the covariance M = 1 / W + J K^-1 J'.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import SPARE
+from envedit.solve import search
+from envedit.solve.gauss_newton import Run
+from envedit.solve.likelihood import VISIBLE, Likelihood
+from envedit.solve.map_problem import Problem
+from envedit.solve.prior import of_paint
+from envedit.targets.target import pixel_weight
+from tests.oracles.dense_transport import DenseTransport
+
+GRID, FILM, LEVEL, SIGMA = (24, 48), (10, 12), 4e-4, 2e-5
+SLOPE = 1e-3 ** (1 / 2.2) / 1e-3
+
+
+def gaussian(rng, freedom):
+    """Return a problem, its start, its score at its solution, and the closed form of that."""
+    transport = DenseTransport.random(np.random.default_rng(1), FILM, GRID, even=0.8)
+    image = np.full((*GRID, 3), LEVEL, np.float32)
+    before = np.float64(transport.apply(mi.TensorXf(image)).numpy())
+    change = 1e-3 * (1 + rng.normal(0, 1, (*FILM, 3)))
+    picture = np.float32(before * (1 + change))
+    coverage = np.zeros((*FILM, 1), np.float32)
+    coverage[:4] = 1
+    likelihood = Likelihood.of_paint(pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3), coverage)
+    layers = Layers(cycles=3)
+    params = layers.encode(image)
+    problem = Problem(layers, transport, image, picture, likelihood, of_paint(freedom))
+    start = problem.state(params)
+
+    # ---- J, W and y: pixels, channel after channel, then the means of the rest, in units of what is visible
+    hats = []
+    for level, (rows, columns) in enumerate(problem.sizes):
+        share = np.zeros((GRID[0] * GRID[1], rows * columns))
+        for node, weight in layers.gain.hats(level, GRID):
+            np.add.at(share, (np.arange(len(node)), node), weight)
+        hats.append(share)
+    of_channel = SLOPE * LEVEL * np.float64(transport.weights[0]) @ np.concatenate(hats, axis=1)
+    rest = (coverage.ravel() == 0) / (VISIBLE * np.sqrt((coverage == 0).sum() * coverage.size))
+    jacobian = np.kron(np.eye(3), np.concatenate([of_channel, rest[None] @ of_channel]))
+    y = SLOPE * (np.float64(picture) - before).reshape(-1, 3).T
+    y = np.concatenate([y, y @ rest[:, None]], axis=1).ravel()
+    area = coverage.size / likelihood.independent
+    one = np.append(likelihood.weight.ravel() / (area * SIGMA**2), 1.0)
+    weights = np.tile(one, 3)
+    normal = problem.normal(problem.evaluate(start), start, SIGMA)
+    covariance = np.linalg.inv(normal.precision)
+
+    # ---- The evidence, and the score at the solution
+    of_y = np.diag(1 / weights) + jacobian @ covariance @ jacobian.T
+    expected = y @ np.linalg.solve(of_y, y) + np.linalg.slogdet(of_y)[1] + np.log(weights).sum()
+    x = covariance @ jacobian.T @ np.linalg.solve(of_y, y)
+    state = start | {"gain": x.reshape(3, -1).T}
+    point = problem.evaluate(state)
+    assert problem.noise(point.residual, SIGMA) == SIGMA  # which is then a constant
+    found = search.score(problem, Run(state, start), point, SIGMA)
+    assert y @ np.linalg.solve(of_y, y) > 3  # the paint has its say
+    return problem, start, found, expected + 6 * likelihood.independent * np.log(SIGMA)
+
+
+@pytest.mark.parametrize("freedom", [0.1, 1.0])
+def test_score_of_a_linear_problem_is_its_evidence(freedom, rng):
+    _, _, found, expected = gaussian(rng, freedom)
+    assert found == pytest.approx(expected, abs=0.1)
+
+
+def test_a_light_that_was_added_costs_what_it_says(rng):
+    """So faint that it changes no pixel: beyond its price, its unknowns are as far determined as before."""
+    problem, start, before, _ = gaussian(rng, 0.5)
+    spare = problem.layers.lights.count - SPARE
+    with_light = {name: value.copy() for name, value in start.items()}
+    with_light["flux"][spare] = -25.0
+    scores = []
+    for state in (start, with_light):
+        scores.append(search.score(problem, Run(state, state), problem.evaluate(state), SIGMA))
+    assert problem.added(with_light) == [spare]
+    assert scores[1] - scores[0] == pytest.approx(search.LIGHT, abs=0.05)
+    assert np.isfinite(before)
+
+
+def test_what_is_not_finite_is_no_explanation(rng):
+    problem, start, _, _ = gaussian(rng, 0.5)
+    beyond = start | {"gain": np.full_like(start["gain"], np.nan)}
+    point = problem.evaluate(beyond)
+    assert point.residual is None
+    assert search.score(problem, Run(beyond, start), point, SIGMA) == np.inf

@@ -1,0 +1,128 @@
+"""How likely residuals are: independent values, the most likely noise, the mean of what was not painted."""
+
+import numpy as np
+import pytest
+
+from envedit.solve.likelihood import INDEPENDENT, STATEMENTS, VISIBLE, Likelihood, on_average_one, sizes
+from envedit.targets.target import pixel_weight
+
+FILM = (20, 24)
+
+
+def of_stroke(rows=5, hold=0.3, film=FILM):
+    """Return the likelihood of paint on the first rows, and what was painted."""
+    coverage = np.zeros((*film, 1), np.float32)
+    coverage[:rows] = 1
+    weight = pixel_weight(coverage, np.zeros(film, bool), 1.0, hold)
+    return Likelihood.of_paint(weight, coverage), coverage
+
+
+def formula(one, residual, sigma):
+    """The formula of the module, pixel by pixel."""
+    area, total = one.weight.size / one.independent, 0.0
+    for w, r in zip(one.weight.ravel(), residual.reshape(-1, 3), strict=True):
+        size = np.sqrt((r**2).mean())
+        rho = size**2 if size <= sigma or not one.robust else sigma * (2 * size - sigma)
+        total += 3 * w * rho / (area * sigma**2)
+    if one.rest is None:
+        return total
+    mean = (one.rest * residual).sum(axis=(0, 1)) / one.rest.sum()
+    return total + (mean**2).sum() / VISIBLE**2 * one.rest.sum() / (one.weight > 0).sum()
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.2])
+@pytest.mark.parametrize("painted", [False, True])
+def test_misfit_is_that_of_the_formula(sigma, painted, rng):
+    one = of_stroke()[0] if painted else Likelihood(on_average_one(rng.random((*FILM, 1)), FILM))
+    residual = rng.normal(0.01, 0.1, (*FILM, 3))
+    assert one.misfit(residual, sigma) == pytest.approx(formula(one, residual, sigma), rel=1e-5)
+    assert one.misfit(0 * residual, sigma) == 0
+    assert one.robust != painted
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_weights_are_those_of_the_first_parts_gradient(painted, rng):
+    """By finite differences; of a residual whose mean of the rest is 0, so that the last part has none."""
+    one = of_stroke()[0] if painted else Likelihood(on_average_one(None, FILM))
+    residual, sigma, h = rng.normal(0, 0.1, (*FILM, 3)), 0.1, 1e-5
+    residual -= one.mean(residual) * (one.rest > 0) / max(one.share.sum(), 1e-30) if painted else 0
+    gradient = 2 * one.weights(residual, sigma) * residual
+    for at in ((0, 0, 0), (3, 7, 1), (11, 2, 2), (19, 23, 0)):
+        ends = [residual.copy() for _ in range(2)]
+        ends[0][at] += h
+        ends[1][at] -= h
+        slope = (one.misfit(ends[0], sigma) - one.misfit(ends[1], sigma)) / (2 * h)
+        assert gradient[at] == pytest.approx(slope, rel=1e-4)
+
+
+def test_noise_of_squares_is_the_most_likely(rng):
+    """No other sigma makes the residual likelier, and its square is the weighted mean square."""
+    one, _ = of_stroke()
+    residual = rng.normal(0, 0.07, (*FILM, 3))
+    found = one.noise(residual, 1e-3)
+    assert found == pytest.approx(np.sqrt((one.weight * residual**2).mean()), rel=1e-5)
+
+    def unlikeliness(sigma):
+        return one.misfit(residual, sigma) + 6 * one.independent * np.log(sigma)
+
+    assert one.at_best(residual, 1e-3) == pytest.approx(unlikeliness(found), rel=1e-9)
+    assert min(unlikeliness(found * factor) for factor in (0.5, 0.95, 1.05, 2)) > unlikeliness(found)
+    # What is known is not undercut.
+    assert one.noise(residual, 0.5) == 0.5 and one.noise(0 * residual, 0.01) == 0.01
+
+
+@pytest.mark.parametrize("film", [(6, 8), FILM, (64, 64)])
+def test_noise_with_hubers_loss_makes_the_misfit_that_of_independent_values(film, rng):
+    one = Likelihood(on_average_one(None, film))
+    residual = rng.normal(0, 0.03, (*film, 3)) * np.where(rng.random((*film, 1)) < 0.1, 20, 1)
+    found = one.noise(residual, 1e-4)
+    assert one.misfit(residual, found) == pytest.approx(3 * INDEPENDENT, rel=1e-6)
+    assert one.noise(4 * residual, 1e-4) == pytest.approx(4 * found)
+
+
+@pytest.mark.parametrize("rows", [1, 5, 19, 20])
+def test_all_paint_is_a_few_statements_whatever_its_size(rows):
+    """Its residual of one sigma has the misfit of so many values, and the rest's of 0.3 times as many."""
+    one, coverage = of_stroke(rows, film=(20, 240))
+    residual = np.broadcast_to(0.1 * coverage, (*coverage.shape[:2], 3))
+    assert one.misfit(residual, 0.1) == pytest.approx(3 * STATEMENTS, rel=1e-5)
+    painted = 1 / 1.3 if rows < 20 else 1
+    assert one.independent == pytest.approx(STATEMENTS / painted, rel=1e-5)
+    assert (one.rest is None) == (rows == 20)
+    assert on_average_one(one.weight, (20, 240)).mean() == pytest.approx(1, rel=1e-5)
+    pattern = 0.1 * (1 - coverage) * (-1.0) ** np.arange(240)[:, None]
+    assert one.misfit(np.broadcast_to(pattern, residual.shape), 0.1) == pytest.approx(
+        0.3 * 3 * STATEMENTS * (rows < 20), rel=1e-5
+    )
+
+
+def test_the_mean_of_the_rest_is_known_to_a_visible_change():
+    """A change of all of it by that counts as one, times the share that was not painted; paint does not."""
+    one, coverage = of_stroke(5)
+    residual = VISIBLE * (1 - coverage) * np.array([1, -2, 0])
+    assert one.mean(residual) == pytest.approx(np.sqrt(0.75) * np.array([1, -2, 0]), rel=1e-5)
+    assert not one.mean(coverage * np.ones(3)).any()
+    # Where all is painted there is none.
+    all_painted, coverage = of_stroke(FILM[0])
+    assert all_painted.rest is None and not all_painted.mean(coverage * np.ones(3)).any()
+
+
+def test_pixels_that_do_not_count_are_not_of_the_rest(rng):
+    coverage = np.zeros((*FILM, 1), np.float32)
+    coverage[:5] = 1
+    out = np.zeros(FILM, bool)
+    out[10:] = True
+    one = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.3), coverage)
+    residual = rng.normal(0, 0.1, (*FILM, 3))
+    inside = np.where(out[..., None], 0, residual)
+    assert one.misfit(residual, 0.1) == pytest.approx(one.misfit(inside, 0.1), rel=1e-9)
+    assert one.mean(residual) == pytest.approx(
+        np.sqrt(0.5) * residual[5:10].mean(axis=(0, 1)) / VISIBLE, rel=1e-4
+    )
+    # Where the rest has no weight its mean is not held either.
+    without = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.0), coverage)
+    assert not without.mean(residual).any()
+
+
+def test_size_of_a_residual_is_the_root_mean_square_of_its_channels():
+    assert sizes(np.array([[[3.0, 0, 0], [1, 1, 1]]])).ravel() == pytest.approx([np.sqrt(3), 1])

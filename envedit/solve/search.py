@@ -24,7 +24,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
-from envedit.representations.layers.lights import DARK, LOBE_DEGREES
+from envedit.representations.layers.lights import DARK
 from envedit.solve import gauss_newton
 from envedit.solve.likelihood import Likelihood
 from envedit.solve.map_problem import SIGMA, Problem
@@ -176,7 +176,7 @@ def _changes(problem, state, start, sigma):
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
             turn = rotation_vector(lights.centres[spare[0]], away)
-            size = np.log(SOFT_DEGREES / LOBE_DEGREES)
+            size = np.log(SOFT_DEGREES / lights.lobe_degrees)
             soft = _changed(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = _changed(start, spare[0], turn=turn, flux=flux, size=size)
             yield f"light {k + 1} softened", soft, centre, _unlikeliness(problem, soft, sigma), 0.0

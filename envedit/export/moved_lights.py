@@ -1,5 +1,7 @@
-"""Lights at the resolution of a source: points of those that have moved, shared out among its texels, and lobes
-that were added."""
+"""Lights at the resolution of a source.
+
+Those that have moved are points, shared out among its texels; those that were added are lobes.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,7 @@ class MovedLights:
         """Place a light that was added: radiance that falls off as a Gaussian of the angle."""
         own = self.layers.lights
         centre = rotated(own.centres[light], self.turn[light])
-        radius = float(lights.size_factor(self.size[light, 0])) * math.radians(own.lobe_degrees)
+        radius = float(lights.size_factor(self.size[light, 0])) * math.radians(lights.LOBE_DEGREES)
         radius = math.hypot(radius, NARROWEST * np.pi / max(self.height - 1, 1))
 
         # ---- its sum over the texels, by chord^2 = 4 sin^2(dtheta / 2) + 4 sin sin sin^2(dphi / 2)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from envedit.core import latlong
 from envedit.core.rotations import rotation_vector
 from envedit.representations.layers import lights
-from envedit.representations.layers.lights import DARK, SPARE, Lights
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 from tests.oracles.plain import single
 
@@ -385,21 +385,21 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
                 np.testing.assert_allclose(flux_of(got), np.mean(fluxes, axis=0), rtol=1e-5)
                 d, omega = latlong.directions(64, 128), latlong.lookup_solid_angles(64, 128)[:, None]
                 share = got[..., 0] * omega / (got[..., 0] * omega).sum()
-                reach = 3 * np.hypot(made.lobe_degrees, 0.57 * 180 / (H - 1))
-                near = np.degrees(np.arccos(np.clip(d @ goal, -1, 1))) < reach
+                near = np.degrees(np.arccos(np.clip(d @ goal, -1, 1))) < 4 * LOBE_DEGREES + 2 * 180 / 64
                 assert share[near].sum() > 0.9
 
 
-@pytest.mark.parametrize("degrees", [0.03, 0.5, 6.0])
+@pytest.mark.parametrize("degrees", [0.03, 1.0, 6.0])  # the first: as narrow as it is round
 @pytest.mark.parametrize("width", [256, 1024])
 def test_spare_lights_are_round(width, degrees, rng):
-    """Second moments: the lobe's own, cut at 2.5 radii, and of what spreads it where texels are coarse."""
+    """Second moments: the lobe's own, cut at 2.5 radii, and its points'."""
     shape, texel = (width // 2, width), 360 / width
     made = Lights([], (0, shape[0]), width)
     turn, flux, size = (np.array(p) for p in place(made))
-    flux[0], size[0] = 0, np.log(degrees / made.lobe_degrees)
+    flux[0], size[0] = 0, made.log_size(degrees)
+    degrees = max(degrees, lights.NARROWEST * texel)
     cut = 1 - 3.125 * math.exp(-3.125) / (1 - math.exp(-3.125))
-    expected = cut * (degrees**2 + (lights.NARROWEST * texel) ** 2) + texel**2 / 6
+    expected = cut * degrees**2 + texel**2 / 6
     for elevation in (-70, 5, 40, 80):
         azimuth, tilt = rng.uniform(0, 2 * np.pi), np.radians(elevation + rng.uniform(-2, 2))
         goal = np.array([np.cos(tilt) * np.sin(azimuth), np.sin(tilt), -np.cos(tilt) * np.cos(azimuth)])
@@ -409,7 +409,7 @@ def test_spare_lights_are_round(width, degrees, rng):
         moments = second_moments(got, goal)
         np.testing.assert_allclose(moments, moments.mean(), rtol=0.05)
         # Tents are wider where texels are finer than points lie apart.
-        apart = max(1.0, np.hypot(degrees, lights.NARROWEST * texel) / 4 / texel)
+        apart = max(1.0, degrees / lights.SPACINGS / texel)
         assert 0.95 * expected < moments.mean() < 1.05 * (expected + (apart**2 - 1) * texel**2 / 6)
 
 

@@ -276,14 +276,14 @@ def test_a_light_that_was_added_is_a_round_gaussian(width, degrees):
         new = toward(elevation, 61.3)
         changed = sent(made, params, new)
         changed["flux"][0] = 0.0
-        changed["size"][0] = np.log(degrees / made.lights.lobe_degrees) / layers.SCALES["size"]
+        changed["size"][0] = np.log(degrees / LOBE_DEGREES) / layers.SCALES["size"]
         result, _ = carried(made, changed, small(source), source)
         seen = active(source)
         whole = flux(result) / made.lights.flux[0]
         assert np.ptp(whole) < 1e-5
         if elevation > 20:  # none of it falls on rows that are not edited
             np.testing.assert_allclose(whole, 1, rtol=1e-4)
-        radius = np.hypot(max(degrees, np.exp(-6) * made.lights.lobe_degrees), 0.6 * 180 / (shape[0] - 1))
+        radius = np.hypot(max(degrees, np.exp(-6) * LOBE_DEGREES), 0.6 * 180 / (shape[0] - 1))
         chord = np.degrees(np.linalg.norm(latlong.directions(*shape) - new, axis=2))
         expected = np.exp(-0.5 * np.square(chord / radius)) * seen[:, None]
         expected *= result.max() / expected.max()

@@ -35,14 +35,15 @@ DARK = -30.0
 FAINTEST = 1e-3
 """Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
 LOBE_POINTS = 1024
+SPACINGS = math.sqrt(LOBE_POINTS) / 8
+"""Spacings of its points in the radius of a lobe."""
 LOBE_DEGREES, LOBE_REACH = 0.5, 2.5
 """Points and radius of a lobe of size 1, a sun a little blurred, and where it ends, in radii: farther out
 points would lie singly."""
-SOFT_DEGREES = 4.0
-"""Radius of a lobe of size 1 where the map has no light: a lamp behind clouds, and no sun."""
 NARROWEST = 0.4
-"""Least radius of a lobe in texels. With the tents of its points, of variance 1/6, that makes 0.57: where its
-centre lies between texels changes its second moments by less than 2 %."""
+"""Radius in texels from which a lobe is round. With the tents of its points, of variance 1/6, it makes 0.57:
+where its centre lies between texels changes its second moments by less than 2 %. What is narrower, as a
+target may need, is interpolated as a single texel is."""
 LOG_SIZES = (-6.0, 3.0)
 """Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
 MOST_LOG_FLUX = 30.0
@@ -77,10 +78,8 @@ class Lights:
         Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, at least
         :data:`FAINTEST` of it in every channel, or 1.
     glows : list of ndarray (len(GLOW_DEGREES), 3) or None
-        As of :class:`.separation.Light`, of unmoved lights. Spare ones have that of the strongest light with
-        a glow, in proportion to flux; None where none has.
-    lobe_degrees : float
-        Radius of a spare light of size 1.
+        As of :class:`.separation.Light`, of lights of :attr:`flux`. Spare ones have that of the strongest
+        light with a glow, in proportion to flux; None where none has.
     """
 
     def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
@@ -98,9 +97,8 @@ class Lights:
         own = np.array([f.sum(axis=0) for f in fluxes]).reshape(-1, 3)
         spare = own.mean(axis=0) if len(own) else np.ones(3)
         spare = np.maximum(spare, FAINTEST * spare.max())
-        self.lobe_degrees = LOBE_DEGREES if lights else SOFT_DEGREES
         for i in range(SPARE):
-            d, weight, spacing = lobe(self.lobe_degrees)
+            d, weight, spacing = lobe()
             directions.append(d)
             fluxes.append(weight[:, None] * spare)
             which.append(np.full(len(d), len(lights) + i))
@@ -118,8 +116,7 @@ class Lights:
         self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
         self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
         added = np.concatenate([np.full(n, i >= self.own) for i, n in enumerate(many)])
-        self._added = dr.opaque(mi.Float(added.astype(np.float32)))
-        self._narrowest = NARROWEST * 2 * math.pi / width / math.radians(self.lobe_degrees)
+        self._added = dr.opaque(mi.Bool(added))
         self.glows = [light.glow for light in lights]
         self.glows += [_glow_in_proportion(self.glows, own, spare)] * SPARE
         self._glow = [
@@ -132,10 +129,9 @@ class Lights:
         """Whether any light has a glow."""
         return any(glow is not None for glow in self._glow)
 
-    def _sizes(self, log_size, added):
-        """Return the factor of each point's size; a lobe's is at least :data:`NARROWEST` texels, smoothly."""
-        size = dr.exp(dr.clip(log_size, *LOG_SIZES))
-        return dr.sqrt(dr.square(size) + dr.square(added * dr.opaque(mi.Float, self._narrowest)))
+    def log_size(self, degrees: float) -> float:
+        """Return the log size of a spare light of a radius, at least that from which it is round."""
+        return math.log(max(degrees, NARROWEST * 360 / self.width) / LOBE_DEGREES)
 
     def core(
         self,
@@ -166,13 +162,13 @@ class Lights:
             Linear radiance; what falls on rows that are not wanted is lost.
         """
         centre = dr.gather(mi.Vector3f, self._centre, self._which)
-        size = self._sizes(dr.matmul(self._owner, log_size).array, self._added)
+        size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, *LOG_SIZES))
         turn = dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array)
         flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
         finer = shape[1] / self.width
         spread = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
-        sine, grid = dr.maximum(self._sine * size, self._added), (rows[1], shape[1])
-        places = placed(self._point, centre, turn, size, sine, finer, grid)
+        wide, grid = _widths(self._sine * size, self._added), (rows[1], shape[1])
+        places = placed(self._point, centre, turn, size, wide, finer, grid)
         return shared_out(*places, flux, spread, shape, rows)
 
     def cores_of(
@@ -200,12 +196,11 @@ class Lights:
         point = lane - page * dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
         turns, fluxes, sizes = (np.float32(one) for one in zip(*placements, strict=True))
         turn, flux = (dr.gather(mi.Vector3f, tensor(values).array, page) for values in (turns, fluxes))
-        added = dr.gather(mi.Float, self._added, point)
-        size = self._sizes(dr.gather(mi.Float, tensor(sizes).array, page), added)
+        size = dr.exp(dr.clip(dr.gather(mi.Float, tensor(sizes).array, page), *LOG_SIZES))
         position, sine = dr.gather(mi.Vector3f, self._point, point), dr.gather(mi.Float, self._sine, point)
         centre = dr.gather(mi.Vector3f, self._centre, dr.opaque(mi.UInt32, i))
-        sine = dr.maximum(sine * size, added)
-        places = placed(position, centre, turn, size, sine, 1.0, (self.total, shape[1]))
+        wide = _widths(sine * size, dr.gather(mi.Bool, self._added, point))
+        places = placed(position, centre, turn, size, wide, 1.0, (self.total, shape[1]))
         flux = dr.gather(mi.Color3f, self._flux, point) * _exp(mi.Color3f(flux))
         found = shared_out(*places, flux, 1.0, shape, self._rows, mi.Int32(page), len(placements)).numpy()
         return found.reshape(-1, *shape, 3)
@@ -240,7 +235,7 @@ def placed(
     centre: mi.Vector3f,
     turn: mi.Vector3f,
     size: mi.Float,
-    sine: mi.Float,
+    wide: mi.Float,
     finer: float,
     grid: tuple[int, int],
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -252,7 +247,7 @@ def placed(
         Direction of a point, centre and rotation vector of its light.
     size : Float
         Size of the light over what it was.
-    sine : Float (n,)
+    wide : Float (n,)
         Width that the point is to have, in columns at the equator: size times the sine of the polar angle of
         the texel that it came from.
     finer : float
@@ -270,7 +265,7 @@ def placed(
     column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, width / (2 * math.pi)) - 0.5
     snap = max(_SNAP, _SNAP_SHARE * width)
     row, column = _snapped(row, snap), _snapped(column, snap)
-    half = dr.clip(sine / across * finer, 1, _WIDEST * width)
+    half = dr.clip(wide / across * finer, 1, _WIDEST * width)
     half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
     return row, column, half
 
@@ -324,16 +319,21 @@ def rotate(v: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
     return d * dr.cos(angle) + dr.cross(v, d) * sinc + v * (dr.dot(v, d) * (0.5 * half * half))
 
 
-def lobe(degrees: float) -> tuple[np.ndarray, np.ndarray, float]:
+def lobe() -> tuple[np.ndarray, np.ndarray, float]:
     """Return the points of a cut Gaussian lobe: directions around the zenith, weights, spacing in radians."""
     k = np.arange(LOBE_POINTS) + 0.5
-    radius = math.radians(degrees)
+    radius = math.radians(LOBE_DEGREES)
     inside = 1 - math.exp(-0.5 * LOBE_REACH**2)
     angle = radius * np.sqrt(-2 * np.log(1 - inside * k / LOBE_POINTS))
     turn = k * math.pi * (3 - math.sqrt(5))
     d = np.stack([np.sin(angle) * np.cos(turn), np.cos(angle), np.sin(angle) * np.sin(turn)], axis=1)
     # As far as points lie apart where they are fewest: near a pole single ones would be seen.
-    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), 8 * radius / math.sqrt(LOBE_POINTS)
+    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), radius / SPACINGS
+
+
+def _widths(wide, added):
+    """Return widths of points in columns at the equator: those of a round lobe are a texel wide at least."""
+    return dr.select(added, dr.maximum(wide, dr.minimum(wide * (SPACINGS / NARROWEST), 1)), wide)
 
 
 def _glow_in_proportion(glows, fluxes, flux):

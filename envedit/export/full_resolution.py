@@ -156,7 +156,10 @@ class _LayersAt:
         if self.edge is not None and self.free is not None:
             self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
         own = layers.lights.own
-        self.relit = layers.lights.glowing and bool(turn.any() or flux[:own].any())
+        self._lit = (flux > lights.DARK).any(axis=1)
+        self.relit = layers.lights.glowing and bool(
+            turn[self._lit].any() or flux[:own].any() or self._lit[own:].any()
+        )
         if self.relit:
             none = np.zeros_like(further)
             self.behind = [np.concatenate([f, none]) for f in (layers.behind.offset, layers.behind.slope)]
@@ -167,7 +170,7 @@ class _LayersAt:
         self.strength = flat(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
         self.cores = SourceCores(layers, grid, self.edge)
         self.moved = MovedLights(layers, grid.shape, turn, flux, size)
-        self._leaving, self._lit = np.flatnonzero(moved[:own]), (flux > lights.DARK).any(axis=1)
+        self._leaving = np.flatnonzero(moved[:own])
 
     def collect(self, source):
         """Gather the texels of lights that move, and place them."""
@@ -217,7 +220,7 @@ class _LayersAt:
                     self.grid.smooth_rows(f, start, size, self.edge) for f in (*self.behind, self.by_lights)
                 )
             )
-            before, follow = self.cores.glow(d), self.cores.follow(start, row)
+            before, follow = self.layers.lights.glow_before(d), self.cores.follow(start, row)
             ratio = self.layers.lights.glow(self.placed["turn"], self.placed["flux"], d) / before
             revealed = dr.exp(gone_of(ratio) * (offset + slope * dr.log(base / before + self.faint)))
             ratio = dr.select(follow, dr.exp(by_lights), ratio * revealed)
@@ -233,7 +236,10 @@ class _LayersAt:
             strength = dr.gather(mi.Color3f, self.strength, mi.UInt32(which))
             sky += core * strength
             same &= (strength == 1) | (core == 0)
-        made = as_image(dr.select(same, image, sky), size, self.grid.shape[1])
+        sky = dr.select(same, image, sky)
+        for light in self.moved.lobes_at(d):
+            sky += light
+        made = as_image(sky, size, self.grid.shape[1])
         for light in self.moved.radiance(start, size):
             made += light
         return made.numpy()

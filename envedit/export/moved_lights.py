@@ -1,7 +1,11 @@
-"""Lights that have moved, at the resolution of a source: their points, shared out among its texels."""
+"""Lights at the resolution of a source.
+
+Those that have moved are points, shared out among its texels; those that were added are lobes.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -11,22 +15,27 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import flat
+from envedit.core.rotations import rotated
 from envedit.export.texel_maps import Places
 from envedit.representations.layers import lights
 from envedit.representations.layers.layers import Layers
 
 POINTS_AT_ONCE = 1 << 20
 """Texels of a light that are moved at a time."""
+NARROWEST = 0.6
+"""Least radius of an added light in texels: one that is narrower would vanish between them."""
+REACH = 6.0
+"""Radii at which an added light ends, at 1e-8 of its peak."""
 
 
 @dataclass(frozen=True)
 class _Points:
-    """Points of one light, placed; ``omega`` is the solid angle of each, None of an added light's."""
+    """Points of one light, placed; ``omega`` is the solid angle of each."""
 
     light: int
     places: tuple
     flux: mi.Color3f
-    omega: mi.Color3f | None
+    omega: mi.Color3f
     half_row: float
     first: int
     last: int
@@ -51,6 +60,7 @@ class MovedLights:
         self.layers, (self.height, self.width) = layers, shape
         self.turn, self.flux, self.size = turn, flux, size
         self.points: list[_Points] = []
+        self.lobes: list[tuple[mi.Vector3f, float, mi.Color3f]] = []
         self._level: dict[int, np.ndarray] = {}
 
     def place_texels(
@@ -75,33 +85,48 @@ class MovedLights:
         d = lights.points(row, column, self.height, self.width)
         sine = np.sin(np.pi * row / max(self.height - 1, 1))
         size = float(lights.size_factor(self.size[light, 0]))
-        self._place(light, d, flux, sine, 1.0, max(1.0, size), omega * size**2)
+        self._place(light, d, flux, sine, max(1.0, size), omega * size**2)
 
     def place_lobe(self, light: int) -> None:
-        """Place the points of a light that was added."""
-        d, weight, spacing = lights.lobe()
-        total, width = self.layers.rows[1], self.layers.shape[1]
-        sine = np.full(len(d), spacing / (2 * np.pi / width))
-        half_row = max(1.0, (self.height - 1) / max(total - 1, 1))
-        flux = weight[:, None] * self.layers.lights.flux[light]
-        self._place(light, d, flux, sine, self.width / width, half_row)
+        """Place a light that was added: radiance that falls off as a Gaussian of the angle."""
+        own = self.layers.lights
+        centre = rotated(own.centres[light], self.turn[light])
+        radius = float(lights.size_factor(self.size[light, 0])) * math.radians(lights.LOBE_DEGREES)
+        radius = math.hypot(radius, NARROWEST * np.pi / max(self.height - 1, 1))
 
-    def _place(self, light, d, flux, sine, finer, half_row, omega=None):
-        def vector(v):
-            return dr.opaque(mi.Vector3f(*(float(x) for x in v)))
+        # ---- its sum over the texels, by chord^2 = 4 sin^2(dtheta / 2) + 4 sin sin sin^2(dphi / 2)
+        polar = np.pi * np.arange(self.height) / max(self.height - 1, 1)
+        azimuth = 2 * np.pi * (np.arange(self.width) + 0.5) / self.width
+        across = math.hypot(centre[0], centre[2])
+        away = polar - math.atan2(across, centre[1])
+        around = np.square(np.sin((azimuth - math.atan2(centre[0], -centre[2])) / 2))
+        omega = latlong.lookup_solid_angles(self.height, self.width)
+        total = 0.0
+        for row in np.flatnonzero(np.abs(away) < REACH * radius):
+            chord = 2 * np.sqrt(np.sin(away[row] / 2) ** 2 + np.sin(polar[row]) * across * around)
+            total += omega[row] * float(_lobe(chord / radius, np).sum())
 
+        flux = own.flux[light] * lights.flux_factor(self.flux[light])
+        self.lobes.append((_opaque(mi.Vector3f, centre), radius, _opaque(mi.Color3f, flux / total)))
+
+    def lobes_at(self, d: mi.Vector3f) -> Iterator[mi.Color3f]:
+        """Yield the radiance of each light that was added, at directions."""
+        for centre, radius, peak in self.lobes:
+            yield peak * _lobe(dr.norm(d - centre) * dr.opaque(mi.Float, 1 / radius), dr)
+
+    def _place(self, light, d, flux, sine, half_row, omega):
         scale = lights.flux_factor(self.flux[light])
         point = mi.Vector3f(*(flat(mi.Float, v) for v in d.T.astype(np.float32)))
         flux = mi.Color3f(*(flat(mi.Float, v) for v in (flux * scale).T.astype(np.float32)))
         size = dr.opaque(mi.Float, float(lights.size_factor(self.size[light, 0])))
-        centre, turn = vector(self.layers.lights.centres[light]), vector(self.turn[light])
-        sine = flat(mi.Float, sine.astype(np.float32))
-        places = lights.placed(point, centre, turn, size, sine, finer, (self.height, self.width))
+        centre = _opaque(mi.Vector3f, self.layers.lights.centres[light])
+        turn = _opaque(mi.Vector3f, self.turn[light])
+        sine = flat(mi.Float, sine.astype(np.float32)) * size
+        places = lights.placed(point, centre, turn, size, sine, 1.0, (self.height, self.width))
         dr.eval(places)
         row = places[0].numpy()
         first, last = int(np.floor(row.min() - half_row)), int(np.ceil(row.max() + half_row))
-        if omega is not None:
-            omega = mi.Color3f(flat(mi.Float, omega.astype(np.float32)))
+        omega = mi.Color3f(flat(mi.Float, omega.astype(np.float32)))
         self.points.append(_Points(int(light), places, flux, omega, half_row, first, last))
 
     def level(self, grid: Places) -> None:
@@ -130,12 +155,20 @@ class MovedLights:
 
     def _shared_out(self, light, start, size):
         """Share out the points of a light in a band: radiance, and its density, which should be 1."""
-        total, density = 0, None
+        total, density = 0, 0
         for p in self.points:
             if p.light == light and p.first < start + size and p.last >= start:
                 (row, column, half), shape, rows = p.places, (size, self.width), (start, self.height)
                 total += lights.shared_out(row, column, half, p.flux, p.half_row, shape, rows)
-                if p.omega is not None:
-                    part = lights.shared_out(row, column, half, p.omega, p.half_row, shape, rows)
-                    density = part if density is None else density + part
-        return total, 1 if density is None else dr.clip(density, 0.5, 2)
+                density += lights.shared_out(row, column, half, p.omega, p.half_row, shape, rows)
+        return total, dr.clip(density, 0.5, 2)
+
+
+def _lobe(angle, library):
+    """Return a Gaussian of an angle in radii, in numpy or in Dr.Jit."""
+    where = np.where if library is np else dr.select
+    return where(angle < REACH, library.exp(-0.5 * library.square(angle)), 0)
+
+
+def _opaque(kind, values):
+    return dr.opaque(kind(*(float(v) for v in values)))

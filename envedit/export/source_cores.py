@@ -53,11 +53,6 @@ class SourceCores:
         x, z = (dr.gather(mi.Float, t, column) for t in self._phi)
         return mi.Vector3f(sine * x, cosine, -sine * z)
 
-    def glow(self, d: mi.Vector3f) -> mi.Color3f:
-        """Return the glow of the lights where the map has them, at directions."""
-        count = self.lights.count
-        return self.lights.glow(dr.zeros(mi.TensorXf, (count, 3)), dr.zeros(mi.TensorXf, (count, 3)), d)
-
     def follow(self, start: int, row: mi.UInt32) -> mi.Bool:
         """Say which texels of a band are of rows that follow those above the horizon."""
         return row + dr.opaque(mi.UInt32, start) >= self._follows
@@ -83,7 +78,7 @@ class SourceCores:
         table = flat(mi.Float, at.along_rows(survey.below, start, size))
         below = at.across(mi.Color3f, table, row, column)
         if self.lights.glowing:
-            below *= self.glow(d)
+            below *= self.lights.glow_before(d)
         light = dr.select(self.follow(start, row), -1, light)
         core = dr.select(light >= 0, dr.maximum(image - below, 0) * (1 - share[1]), 0)
         return light, share[0], core

@@ -42,7 +42,8 @@ CANDIDATES = 2
 APART = np.cos(np.radians(15.0))
 """Cosine of the angle between two places of a light that are different explanations."""
 SOFT_DEGREES = 2.0
-"""Radius of the lobe that takes the place of a light where a shadow is to be softer."""
+"""Radius of the lobe that takes the place of a light where a shadow is to be softer, and of a light that is
+added to a map without any."""
 FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
 """Fluxes that a light of the map is tried with elsewhere, over its own."""
 SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
@@ -176,7 +177,7 @@ def _changes(problem, state, start, sigma):
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
             turn = rotation_vector(lights.centres[spare[0]], away)
-            size = np.log(SOFT_DEGREES / LOBE_DEGREES)
+            size = lights.log_size(SOFT_DEGREES)
             soft = _changed(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = _changed(start, spare[0], turn=turn, flux=flux, size=size)
             yield f"light {k + 1} softened", soft, centre, _unlikeliness(problem, soft, sigma), 0.0
@@ -185,11 +186,12 @@ def _changes(problem, state, start, sigma):
             yield f"light {k + 1} removed", dark, start, _unlikeliness(problem, dark, sigma), -LIGHT
 
     # ---- one more
+    size = lights.log_size(LOBE_DEGREES if lights.own else SOFT_DEGREES)
     for k in spare[:1]:
         for direction, flux, unlikeliness in _places(problem, state, k, sigma):
             turn = rotation_vector(lights.centres[k], direction)
-            more = _changed(state, k, turn=turn, flux=flux, size=0.0)
-            centre = _changed(start, k, turn=turn, flux=flux, size=0.0)
+            more = _changed(state, k, turn=turn, flux=flux, size=size)
+            centre = _changed(start, k, turn=turn, flux=flux, size=size)
             yield "light added", more, centre, unlikeliness, LIGHT
 
 

@@ -1024,7 +1024,8 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
 # ---- glow and rows that follow ----------------------------------------------------------------------------
 
 
-def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(rng):
+@pytest.mark.parametrize("added", [False, True])
+def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
     """Where every texel is a cell; a picture that sees no core."""
     d = latlong.directions(*GRID)
     angle = np.degrees(np.arccos(np.clip(d @ d[SUN], -1, 1)))[..., None]
@@ -1035,6 +1036,10 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(rng):
     start = problem.state(params)
     state = copy(start)
     state["flux"][0] = -0.2
+    if added:
+        there = rotated(d[SUN], np.array([0.1, 0.9, 0.2]))
+        state["turn"][1] = rotation_vector(problem.layers.lights.centres[1], there)
+        state["flux"][1] = [-0.4, -0.7, -0.2]
     point = problem.evaluate(state)
     normal, n = problem.normal(point, start, 1.0), problem.nodes
     pictures, named, _ = problem.derivatives._lights(point)

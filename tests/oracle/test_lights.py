@@ -78,6 +78,15 @@ def flux_of(image):
     return (np.float64(image) * omega[:, None, None]).sum(axis=(0, 1))
 
 
+def second_moments(image, centre):
+    """Mean squares in degrees to the east and to the north of a direction, (2,), over luminance."""
+    east = np.cross(UP, centre) / np.linalg.norm(np.cross(UP, centre))
+    d = latlong.directions(*image.shape[:2])
+    share = np.float64(image).sum(axis=2) * latlong.lookup_solid_angles(*image.shape[:2])[:, None]
+    away = np.degrees([d @ east, d @ np.cross(centre, east)])
+    return (np.square(away) * share).sum(axis=(1, 2)) / share.sum()
+
+
 def plain_core(light, turn, flux=0.0, size=0.0, shape=(H, W), of=(H, W)):
     """The core of one light of a map ``of`` some size, in float64 and without snapping."""
     (height, width), (old_height, old_width) = shape, of
@@ -378,6 +387,52 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
                 share = got[..., 0] * omega / (got[..., 0] * omega).sum()
                 near = np.degrees(np.arccos(np.clip(d @ goal, -1, 1))) < 4 * LOBE_DEGREES + 2 * 180 / 64
                 assert share[near].sum() > 0.9
+
+
+@pytest.mark.parametrize("degrees", [0.03, 1.0, 6.0])  # the first: as narrow as it is round
+@pytest.mark.parametrize("width", [256, 1024])
+def test_spare_lights_are_round(width, degrees, rng):
+    """Second moments: the lobe's own, cut at 2.5 radii, and its points'."""
+    shape, texel = (width // 2, width), 360 / width
+    made = Lights([], (0, shape[0]), width)
+    turn, flux, size = (np.array(p) for p in place(made))
+    flux[0], size[0] = 0, made.log_size(degrees)
+    degrees = max(degrees, lights.NARROWEST * texel)
+    cut = 1 - 3.125 * math.exp(-3.125) / (1 - math.exp(-3.125))
+    expected = cut * degrees**2 + texel**2 / 6
+    for elevation in (-70, 5, 40, 80):
+        azimuth, tilt = rng.uniform(0, 2 * np.pi), np.radians(elevation + rng.uniform(-2, 2))
+        goal = np.array([np.cos(tilt) * np.sin(azimuth), np.sin(tilt), -np.cos(tilt) * np.cos(azimuth)])
+        turn[0] = rotation_vector(UP, goal)
+        got = core(made, single(turn), single(flux), single(size), shape=shape)
+        np.testing.assert_allclose(flux_of(got), made.flux[0], rtol=1e-5)
+        moments = second_moments(got, goal)
+        np.testing.assert_allclose(moments, moments.mean(), rtol=0.05)
+        # Tents are wider where texels are finer than points lie apart.
+        apart = max(1.0, degrees / lights.SPACINGS / texel)
+        assert 0.95 * expected < moments.mean() < 1.05 * (expected + (apart**2 - 1) * texel**2 / 6)
+
+
+def test_spare_lights_have_the_glow_of_the_strongest_light_in_proportion_to_flux(rng):
+    table = np.exp(-GLOW_DEGREES / 10)[:, None] * [4.0, 3.0, 2.0] * (GLOW_DEGREES < 60)[:, None]
+    own = [patch(rng, 4, 10, peak=100.0, glow=table), patch(rng, 8, 30, peak=3.0, glow=table / 7)]
+    made = Lights([*own, patch(rng, 15, 40, peak=1000.0)], (0, H), W)
+    turn, flux, _ = (np.array(p) for p in place(made, flux=DARK))
+    d = mi.Vector3f(unit(rng, 200).T.astype(np.float32))
+    np.testing.assert_array_equal(made.glow_of(3, single(turn), single(flux), d).numpy(), 1)
+    strength = np.array([0.3, 1.0, 2.0])
+    turn[3], flux[3] = random_turn(rng), np.log(strength * made.flux[0] / made.flux[3])
+    got = made.glow_of(3, single(turn), single(flux), d).numpy()
+    cosine = d.numpy().T @ turned(turn[3], UP[None])[0]
+    np.testing.assert_allclose(got.T, 1 + strength * glow_at(table, cosine), rtol=1e-3)
+
+
+def test_the_glow_before_an_edit_has_no_spare_light_in_it(rng):
+    table = np.exp(-GLOW_DEGREES / 10)[:, None] * np.array([4.0, 3.0, 2.0])
+    light = patch(rng, 4, 10, glow=table)
+    made, d = Lights([light], (0, H), W), unit(rng, 100)
+    got = made.glow_before(mi.Vector3f(d.T.astype(np.float32))).numpy().T
+    np.testing.assert_allclose(got, 1 + glow_at(table, d @ light.direction), rtol=1e-3)
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------

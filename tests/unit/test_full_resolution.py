@@ -266,6 +266,48 @@ def test_a_light_that_was_added_is_carried(degrees, sunny):
     assert 0.3 < inside.max() < (0.95 if degrees < 2 else 0.6)
 
 
+@pytest.mark.parametrize("degrees", [0.03, 0.5, 3.0])
+@pytest.mark.parametrize("width", [256, 1024])
+def test_a_light_that_was_added_is_a_round_gaussian(width, degrees):
+    shape = width // 2, width
+    source = np.zeros((*shape, 3), np.float32)
+    made, params = encoded(small(source))
+    for elevation in (8.3, 41.7, 79.2):
+        new = toward(elevation, 61.3)
+        changed = sent(made, params, new)
+        changed["flux"][0] = 0.0
+        changed["size"][0] = np.log(degrees / LOBE_DEGREES) / layers.SCALES["size"]
+        result, _ = carried(made, changed, small(source), source)
+        seen = active(source)
+        whole = flux(result) / made.lights.flux[0]
+        assert np.ptp(whole) < 1e-5
+        if elevation > 20:  # none of it falls on rows that are not edited
+            np.testing.assert_allclose(whole, 1, rtol=1e-4)
+        radius = np.hypot(max(degrees, np.exp(-6) * LOBE_DEGREES), 0.6 * 180 / (shape[0] - 1))
+        chord = np.degrees(np.linalg.norm(latlong.directions(*shape) - new, axis=2))
+        expected = np.exp(-0.5 * np.square(chord / radius)) * seen[:, None]
+        expected *= result.max() / expected.max()
+        np.testing.assert_allclose(result[..., 0], expected, atol=2e-4 * result.max())
+
+
+def test_an_added_light_brings_the_glow_of_the_maps_sun(sunny):
+    """As bright as the sun, in its mirror image: the sky around it is as bright as the sun's, and no more."""
+    source, working, made, params = sunny
+    new, added = toward(25, 20), made.lights.own
+    changed = sent(made, params, new, light=added)
+    changed["flux"][added] = 0.0
+    result, edited = carried(made, changed, working, source)
+    for image, before in ((result, source), (edited, working)):
+        away = angle(latlong.directions(*image.shape[:2]), new)
+        for degrees in (10, 20, 40):
+            ring = (np.abs(away - degrees) < 2) & active(image)[:, None]
+            ratio = np.float64(image)[ring].mean() / before[ring].mean()
+            assert ratio == pytest.approx(1 + 4 * np.exp(-degrees / 10), rel=0.12), degrees
+    changed["flux"][added] = DARK
+    result, _ = carried(made, changed, working, source)
+    np.testing.assert_array_equal(result, source)
+
+
 @pytest.mark.parametrize("shape", [(64, 128), (48, 96), (101, 202), (300, 512)])
 def test_sources_of_any_size(sunny, shape):
     source, working, made, params = sunny

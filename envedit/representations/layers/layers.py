@@ -340,7 +340,7 @@ class Layers:
 
         ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.
         """
-        if i >= len(self.separation.lights) or self.separation.lights[i].glow is None:
+        if self.lights.glows[i] is None:
             return None
         factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._at(self.shape)[1])
         found = self._image(dr.log(factor)).numpy()
@@ -371,10 +371,7 @@ class Layers:
             change = behind_glow.BehindGlow(smooth[0], smooth[1], self.behind.faint).log_change(base / glow)
             behind = dr.opaque(mi.Color3f(np.ascontiguousarray(change.reshape(-1, 3).T, np.float32)))
         d = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)))
-        n, before = self.lights.count, mi.Color3f(1)
-        if self.lights.glowing:
-            still = mi.TensorXf(np.zeros((n, 3), np.float32))
-            before = dr.opaque(self.lights.glow(still, still, d))
+        before = dr.opaque(self.lights.glow_before(d)) if self.lights.glowing else mi.Color3f(1)
         base = dr.opaque(mi.Color3f(np.ascontiguousarray(base.reshape(-1, 3).T)))
         free = None
         if self.free is not None:

@@ -24,19 +24,26 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
 from envedit.core.types import ArrayLike
 from envedit.representations.layers.separation import GLOW_DEGREES, Light
 
 SPARE = 2
-"""Lights beside the map's own, dark until one is needed: lobes, without a glow."""
+"""Lights beside the map's own, dark until one is needed: lobes."""
 DARK = -30.0
 """Logarithm of the flux of a light that is not there."""
 FAINTEST = 1e-3
 """Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
 LOBE_POINTS = 1024
+SPACINGS = math.sqrt(LOBE_POINTS) / 8
+"""Spacings of its points in the radius of a lobe."""
 LOBE_DEGREES, LOBE_REACH = 0.5, 2.5
 """Points and radius of a lobe of size 1, a sun a little blurred, and where it ends, in radii: farther out
 points would lie singly."""
+NARROWEST = 0.4
+"""Radius in texels from which a lobe is round. With the tents of its points, of variance 1/6, it makes 0.57:
+where its centre lies between texels changes its second moments by less than 2 %. What is narrower, as a
+target may need, is interpolated as a single texel is."""
 LOG_SIZES = (-6.0, 3.0)
 """Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
 MOST_LOG_FLUX = 30.0
@@ -70,6 +77,9 @@ class Lights:
     flux : ndarray (count, 3)
         Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, at least
         :data:`FAINTEST` of it in every channel, or 1.
+    glows : list of ndarray (len(GLOW_DEGREES), 3) or None
+        As of :class:`.separation.Light`, of lights of :attr:`flux`. Spare ones have that of the strongest
+        light with a glow, in proportion to flux; None where none has.
     """
 
     def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
@@ -105,15 +115,23 @@ class Lights:
         self._owner = tensor(owner)
         self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
         self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
+        added = np.concatenate([np.full(n, i >= self.own) for i, n in enumerate(many)])
+        self._added = dr.opaque(mi.Bool(added))
+        self.glows = [light.glow for light in lights]
+        self.glows += [_glow_in_proportion(self.glows, own, spare)] * SPARE
         self._glow = [
-            None if light.glow is None else dr.opaque(mi.Float(light.glow.astype(np.float32).ravel()))
-            for light in lights
+            None if glow is None else dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
+            for glow in self.glows
         ]
 
     @property
     def glowing(self) -> bool:
         """Whether any light has a glow."""
         return any(glow is not None for glow in self._glow)
+
+    def log_size(self, degrees: float) -> float:
+        """Return the log size of a spare light of a radius, at least that from which it is round."""
+        return math.log(max(degrees, NARROWEST * 360 / self.width) / LOBE_DEGREES)
 
     def core(
         self,
@@ -149,7 +167,8 @@ class Lights:
         flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
         finer = shape[1] / self.width
         spread = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
-        places = placed(self._point, centre, turn, size, self._sine, finer, (rows[1], shape[1]))
+        wide, grid = _widths(self._sine * size, self._added), (rows[1], shape[1])
+        places = placed(self._point, centre, turn, size, wide, finer, grid)
         return shared_out(*places, flux, spread, shape, rows)
 
     def cores_of(
@@ -180,7 +199,8 @@ class Lights:
         size = dr.exp(dr.clip(dr.gather(mi.Float, tensor(sizes).array, page), *LOG_SIZES))
         position, sine = dr.gather(mi.Vector3f, self._point, point), dr.gather(mi.Float, self._sine, point)
         centre = dr.gather(mi.Vector3f, self._centre, dr.opaque(mi.UInt32, i))
-        places = placed(position, centre, turn, size, sine, 1.0, (self.total, shape[1]))
+        wide = _widths(sine * size, dr.gather(mi.Bool, self._added, point))
+        places = placed(position, centre, turn, size, wide, 1.0, (self.total, shape[1]))
         flux = dr.gather(mi.Color3f, self._flux, point) * _exp(mi.Color3f(flux))
         found = shared_out(*places, flux, 1.0, shape, self._rows, mi.Int32(page), len(placements)).numpy()
         return found.reshape(-1, *shape, 3)
@@ -191,13 +211,19 @@ class Lights:
         s_l is the factor of the light's flux: a glow is put out with its light.
         """
         factor = mi.Color3f(1)
-        for i in range(len(self._glow)):
+        for i in range(self.count):
             factor *= self.glow_of(i, turn, log_flux, d)
         return factor
 
+    def glow_before(self, d: mi.Vector3f) -> mi.Color3f:
+        """Evaluate that product where the map has its lights, without spare ones."""
+        log_flux = np.zeros((self.count, 3), np.float32)
+        log_flux[self.own :] = DARK
+        return self.glow(tensor(np.zeros_like(log_flux)), tensor(log_flux), d)
+
     def glow_of(self, i: int, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate 1 + s_i G_i of light ``i`` alone; 1 if it has no glow."""
-        if i >= len(self._glow) or self._glow[i] is None:
+        if self._glow[i] is None:
             return mi.Color3f(1)
         index = dr.opaque(mi.UInt32, i)
         centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
@@ -209,7 +235,7 @@ def placed(
     centre: mi.Vector3f,
     turn: mi.Vector3f,
     size: mi.Float,
-    sine: mi.Float,
+    wide: mi.Float,
     finer: float,
     grid: tuple[int, int],
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -221,8 +247,9 @@ def placed(
         Direction of a point, centre and rotation vector of its light.
     size : Float
         Size of the light over what it was.
-    sine : Float (n,)
-        Sine of the polar angle of the texel that the point came from.
+    wide : Float (n,)
+        Width that the point is to have, in columns at the equator: size times the sine of the polar angle of
+        the texel that it came from.
     finer : float
         Columns of the grid over columns of the map that the points came from.
     grid : (int, int)
@@ -238,7 +265,7 @@ def placed(
     column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, width / (2 * math.pi)) - 0.5
     snap = max(_SNAP, _SNAP_SHARE * width)
     row, column = _snapped(row, snap), _snapped(column, snap)
-    half = dr.clip(sine * size / across * finer, 1, _WIDEST * width)
+    half = dr.clip(wide / across * finer, 1, _WIDEST * width)
     half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
     return row, column, half
 
@@ -301,7 +328,21 @@ def lobe() -> tuple[np.ndarray, np.ndarray, float]:
     turn = k * math.pi * (3 - math.sqrt(5))
     d = np.stack([np.sin(angle) * np.cos(turn), np.cos(angle), np.sin(angle) * np.sin(turn)], axis=1)
     # As far as points lie apart where they are fewest: near a pole single ones would be seen.
-    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), 8 * radius / math.sqrt(LOBE_POINTS)
+    return d, np.full(LOBE_POINTS, 1 / LOBE_POINTS), radius / SPACINGS
+
+
+def _widths(wide, added):
+    """Return widths of points in columns at the equator: those of a round lobe are a texel wide at least."""
+    return dr.select(added, dr.maximum(wide, dr.minimum(wide * (SPACINGS / NARROWEST), 1)), wide)
+
+
+def _glow_in_proportion(glows, fluxes, flux):
+    """Return the glow of a light of ``flux`` (3,), as that of the strongest light that has one."""
+    strength = [0.0 if glow is None else f @ LUMINANCE for glow, f in zip(glows, fluxes, strict=True)]
+    i = int(np.argmax(strength)) if strength else 0
+    if not strength or not strength[i] > 0:
+        return None
+    return glows[i] * (flux / np.maximum(fluxes[i], FAINTEST * fluxes[i].max()))
 
 
 def _vector(tensor, i):

@@ -132,7 +132,7 @@ def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
     painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
     unreachable = np.full((8, 8, 3), 0.5)
     page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, unreachable=unreachable)
-    assert "81 % of the painted change reached · mean change elsewhere 0.012" in page.text
+    assert "81 % of the painted change reached (90 % feasible) · mean change elsewhere 0.012" in page.text
     assert "What was painted" in page.text and "90 % of the painted change is feasible" in page.text
     assert "further from" not in page.text  # the whole picture may well be
     worse = write(tmp_path / "w.html", metrics={"painted": painted | {"towards": -0.2}})

@@ -1037,6 +1037,7 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
     state = copy(start)
     state["flux"][0] = -0.2
     if added:
+        assert problem.layers.lights.glows[1] is not None
         there = rotated(d[SUN], np.array([0.1, 0.9, 0.2]))
         state["turn"][1] = rotation_vector(problem.layers.lights.centres[1], there)
         state["flux"][1] = [-0.4, -0.7, -0.2]

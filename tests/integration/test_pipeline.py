@@ -330,7 +330,7 @@ def test_a_highlight_that_matte_ground_cannot_show_leaves_the_rest(tmp_path):
     }  # fmt: skip
     picture, held = analytic_sky.sunsky(64, 240.0, 45.0), {}
     for weight in ("auto", 1.0):
-        target = {"kind": "strokes", "strokes": [spot], "hold": weight}
+        target = {"kind": "strokes", "strokes": [spot], "hold": weight, "rest": "keep"}
         found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
         held[weight] = found.metrics["painted"]["elsewhere"]
         assert any("target.hold = " in line for line in found.notes) == (weight == "auto")

@@ -56,6 +56,22 @@ def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
     assert pixels(here / "again" / "edited.exr").tobytes() == before.tobytes()
 
 
+def test_a_target_that_is_no_panorama_is_a_picture_of_the_scene(here, capsys):
+    """Which the record of the run says; it is solved as a rendering, and nothing of it is paint."""
+    export = "--export-initial", "wanted.exr", "--quiet"
+    assert call("scene.xml", "--envmap", "other.exr", *small(), *export) == 0
+    assert call("scene.xml", "--target", "wanted.exr", *small(), "--json", "--progress", "json") == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=no_constant)
+    assert found["ok"] and found["metrics"]["painted"] is None and found["metrics"]["ceiling"] is None
+    assert found["metrics"]["envmap"] is None and found["metrics"]["render"]["psnr"] > 0
+    assert "not 2:1" in json.dumps(found) or "not 2:1" in (here / "scene_out" / "report.html").read_text()
+    # A file that is neither is refused by its size.
+    wide = np.full((12, 40, 3), 0.5, np.float32)
+    images.write_exr(here / "wide.exr", wide, panorama=False)
+    assert call("scene.xml", "--target", "wide.exr", *small(), "--json") == 3
+    assert "wide.exr" in json.loads(capsys.readouterr().out)["error"]
+
+
 @pytest.mark.parametrize("named", ["own map", "texture", "include"])
 def test_what_the_scene_names_is_not_moved_out_of_the_folder_of_results(named, here, capsys):
     """Two of the files that a run leaves are what this scene reads."""

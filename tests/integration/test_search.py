@@ -1,0 +1,194 @@
+"""Which lights explain paint: shadows painted elsewhere, lights painted in, and neither."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envedit.core import latlong
+from envedit.representations.layers.layers import Layers
+from envedit.scene import scene
+from envedit.solve import search
+from envedit.solve.gauss_newton import Run
+from envedit.solve.likelihood import VISIBLE, Likelihood
+from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.prior import of_paint
+from envedit.targets.target import FOLLOWS, pixel_weight
+from envedit.transport.light_transport import LightTransport
+from tests.oracles.tiers import slow_but
+
+HEIGHT, WIDTH, ROWS, PIXELS = 32, 64, 16, 64
+SUN = (6, 20)
+DIRECTIONS = latlong.directions(HEIGHT, WIDTH)
+OMEGA = latlong.lookup_solid_angles(HEIGHT, WIDTH)
+FREEDOM = 0.25
+
+
+@pytest.fixture(scope="module")
+def traced(tmp_path_factory):
+    """Return a function that builds the transport of a sphere on a plane, always without exact columns."""
+    lit, folder = scene.load("sphere", PIXELS, PIXELS), tmp_path_factory.mktemp("transport")
+    return lambda: LightTransport.build(lit, HEIGHT, WIDTH, max_depth=4, few=True, folder=folder)
+
+
+@pytest.fixture
+def transport(traced):
+    return traced()
+
+
+def sky(*suns, flux=1.5):
+    """Return a sky with a gradient over a dark ground, and suns of one texel."""
+    image = (0.3 + 0.2 * np.maximum(DIRECTIONS[..., 1:2], 0) + 0.1 * DIRECTIONS[..., :1]) * [0.8, 1.0, 1.3]
+    image[ROWS:] = 0.1
+    for row, column in suns:
+        image[row, column] += flux / OMEGA[row] * np.array([1.2, 1, 0.8])
+    return image.astype(np.float32)
+
+
+def rendered(transport, image):
+    transport.resolve(image)
+    return transport.apply(mi.TensorXf(image)).numpy()
+
+
+def problem_of(transport, image, picture, coverage, prior=None):
+    """Return the problem of a picture painted over the rendering, and the state of the map as it is."""
+    layers = Layers((0, HEIGHT))
+    params = layers.encode(image[:ROWS])
+    weight = pixel_weight(coverage, np.zeros(coverage.shape[:2], bool), 1.0, FOLLOWS)
+    likelihood = Likelihood.of_paint(weight, coverage)
+    problem = Problem(layers, transport, image, picture, likelihood, prior or of_paint(FREEDOM))
+    return problem, problem.state(params)
+
+
+def painted(transport, image, other, share=1.0):
+    """Paint what differs by a third between two maps' renderings, at most a share; picture and coverage."""
+    before, after = (rendered(transport, one) for one in (image, other))
+    change = np.abs(np.log(after.mean(axis=2, keepdims=True) / before.mean(axis=2, keepdims=True)))
+    least = max(np.log(1.3), np.quantile(change, 1 - share))
+    coverage = (change > least).astype(np.float32)
+    return np.where(coverage > 0, after, before), coverage
+
+
+def degrees(a, b):
+    return np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
+
+
+def found_for(problem, start):
+    """Return the likeliest explanation, its lights, and the score of the lights left where they are."""
+    as_it_is = Run(start, start)
+    before = search.score(problem, as_it_is, problem.evaluate(start), SIGMA)
+    calls = []
+    found = search.search(problem, start, after_step=lambda: calls.append(1))
+    state = found.run.state
+    assert found.point.residual is not None and np.isfinite(found.score)
+    return found, {k: problem.direction(state, k) for k in problem.lit(state)}, before, len(calls)
+
+
+# ---- the sun moves -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("row", "column"), slow_but([(6, 40), (8, 62), (4, 8)], 6))
+def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
+    """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
+    image, place = sky(SUN), (row, column)
+    problem, start = problem_of(transport, image, *painted(transport, image, sky(place)))
+    found, lights, before, tried = found_for(problem, start)
+    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[place]) < 5
+    assert found.name == "light 1 moved" and tried >= 1
+    assert found.score < before - search.POSITIVE
+    assert np.exp(found.run.state["flux"][0]) == pytest.approx(np.ones(3), rel=0.35)
+    # The prior is around where it was put.
+    assert problem.penalty(found.run.state, found.run.start) < 5
+
+
+@pytest.mark.slow
+def test_the_new_shadow_alone_says_so_too(transport):
+    """Of the old one nothing was painted: the rest may follow."""
+    image, place = sky(SUN), (6, 40)
+    before, after = (rendered(transport, one) for one in (image, sky(place)))
+    darker = (after.mean(axis=2, keepdims=True) < 0.75 * before.mean(axis=2, keepdims=True)).astype("f4")
+    picture = np.where(darker > 0, after, before)
+    problem, start = problem_of(transport, image, picture, darker)
+    _, lights, _, _ = found_for(problem, start)
+    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[place]) < 10
+
+
+# ---- a light is added --------------------------------------------------------------------------------------
+
+
+def test_a_small_stroke_of_light_adds_a_light(transport):
+    """A twentieth of the picture, as a second sun would light it; the first dims, the rest keeps its mean.
+
+    Where the sky has nothing to dim, the mean of the rest forbids it.
+    """
+    place = (5, 44)
+    image = sky(SUN)
+    picture, coverage = painted(transport, image, sky(SUN, place), share=0.05)
+    problem, start = problem_of(transport, image, picture, coverage)
+    found, lights, before, _ = found_for(problem, start)
+    assert found.name == "light added" and [*lights] == [0, problem.layers.lights.own]
+    assert degrees(lights[1], DIRECTIONS[place]) < 5 and degrees(lights[0], DIRECTIONS[SUN]) < 5
+    assert found.score < before - search.POSITIVE
+    off = found.point.residual[coverage[..., 0] == 0].mean(axis=0)
+    assert np.abs(off).max() < 2 * VISIBLE
+
+
+# ---- lights stay -------------------------------------------------------------------------------------------
+
+
+def test_paint_that_is_there_already_leaves_lights(transport):
+    """No move is promising: nothing else is descended to."""
+    image = sky(SUN)
+    before = rendered(transport, image)
+    coverage = np.zeros((PIXELS, PIXELS, 1), np.float32)
+    coverage[20:40, 20:40] = 1
+    problem, start = problem_of(transport, image, before, coverage)
+    found, lights, _, tried = found_for(problem, start)
+    assert found.name == "lights left where they are" and tried == 0
+    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[SUN]) < 0.5
+    assert np.abs(found.run.state["gain"]).max() < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.6, 1.4])
+def test_paint_that_one_factor_makes_leaves_lights(factor, transport):
+    image = sky(SUN)
+    before = rendered(transport, image)
+    coverage = np.ones((PIXELS, PIXELS, 1), np.float32)
+    problem, start = problem_of(transport, image, np.float32(factor * before), coverage)
+    found, lights, _, _ = found_for(problem, start)
+    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[SUN]) < 3
+    shown = found.point.rendering.mean() / before.mean()
+    assert shown == pytest.approx(factor, rel=0.1)
+
+
+@pytest.mark.slow
+def test_what_is_raised_after_a_step_ends_the_search(transport):
+    image = sky(SUN)
+    problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
+
+    def enough():
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        search.search(problem, start, after_step=enough)
+
+
+def test_a_map_that_is_not_finite_has_no_explanation(transport):
+    """The search returns it as it is; the steps refuse it."""
+    image = sky(SUN)
+    problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
+    start["flux"][0] = np.nan
+    found = search.search(problem, start)
+    assert found.point.residual is None and found.score == np.inf
+
+
+@pytest.mark.slow
+def test_the_same_paint_has_the_same_explanation_to_the_bit(traced):
+    image = sky(SUN)
+    ends = []
+    for transport in (traced(), traced()):
+        problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
+        ends.append(search.search(problem, start))
+    assert ends[0].score == ends[1].score and ends[0].name == ends[1].name
+    for name, value in ends[0].run.state.items():
+        assert value.tobytes() == ends[1].run.state[name].tobytes(), name

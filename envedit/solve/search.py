@@ -143,14 +143,14 @@ def _moves(problem, best, sigma):
     """List the most promising move of each kind from an explanation.
 
     Lights come first: the sky's gain is as in the original. Promising is what raises the likelihood then, all
-    else as it is, so far that the evidence may rise by it.
+    else as it is; steps raise it further.
     """
     state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
     now = _unlikeliness(problem, state, sigma)
     found: dict[str, _Move] = {}
     for name, changed, centre, unlikeliness, cost in _changes(problem, state, best.run.start, sigma):
         move = _Move(name, changed, centre, gain=now - unlikeliness - cost)
-        if move.gain > max(POSITIVE, found[name].gain if name in found else 0.0):
+        if move.gain > (found[name].gain if name in found else 0.0):
             found[name] = move
     return list(found.values())
 

@@ -1,10 +1,10 @@
-"""A painting without server and page: how it is solved for, what is said of it, and shadows that are dragged."""
+"""A painting without server and page: how it is solved for, what is said of it, dragged shadows."""
 
 import numpy as np
 import pytest
 
 from envedit import config
-from envedit.cli.paint import picking, project
+from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Pick, document
 from envedit.cli.paint.session import Session, Tell
 from tests.oracles.painting import SMALL

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -83,15 +82,37 @@ def said(
     return f"{which}: what would make it {wanted} is unlikely for a sky; move or add a light"
 
 
+@dataclass(frozen=True)
+class Better:
+    """A light that reaches more of the paint by itself.
+
+    Attributes
+    ----------
+    light : int
+        Index among those of :func:`.picking.lights`.
+    direction : ndarray (3,)
+        Where it must stand, in the turned map.
+    factor : float
+        Of its flux.
+    share : float
+        What the rendering then has of the painted change.
+    """
+
+    light: int
+    direction: np.ndarray
+    factor: float
+    share: float
+
+
 def moved(
     problem: Problem, start: dict, state: dict, painted: Painted, lights: list[picking.Placed]
-) -> tuple[int, np.ndarray, float] | None:
+) -> Better | None:
     """Find where the map's strongest light would reach more by itself than a solution does.
 
     Parameters
     ----------
     problem : Problem
-        Of the paint.
+        Of the paint, where the rest follows: it does where a light is moved by hand.
     start, state : dict
         The map as it is, and the solution.
     painted : Painted
@@ -101,8 +122,8 @@ def moved(
 
     Returns
     -------
-    int, ndarray (3,), float
-        Index among ``lights``, direction, and the share reached; None where there is no such place.
+    Better or None
+        None where there is no such place.
     """
     own = [k for k in problem.lit(start) if k < problem.layers.lights.own]
     if not own or not lights:
@@ -117,14 +138,14 @@ def moved(
     if now is None:
         return None
     without = _with(start, k, flux=DARK)
-    best: Any = (painted.reached(now), None)
+    most, best = painted.reached(now), None
     for direction, factor, _ in search.places(problem, without, k, SIGMA, problem.direction(state, k)):
         turn = rotation_vector(toward, direction)
         rendering = problem.evaluate(_with(start, k, turn=turn, flux=factor)).rendering
-        if rendering is not None:
-            best = max(best, (painted.reached(rendering), direction), key=lambda one: one[0])
-    share, direction = best
-    return None if direction is None else (i, direction, share)
+        share = -np.inf if rendering is None else painted.reached(rendering)
+        if share > most:
+            most, best = share, Better(i, direction, float(np.exp(factor[0])), share)
+    return best
 
 
 def _with(state, k, **values):

@@ -73,11 +73,10 @@ class Picking:
         flux of those whose shadow it is in; ``point`` is what casts it.
         """
         view = min(asked.view, len(self.lit.rows) - 1)
-        at = self.lit, view, asked.x, asked.y
         if asked.light >= 0:
             found: dict[str, Any] = {"light": asked.light}
             try:
-                toward = self._direction(asked, at)
+                toward = self._direction(asked, view)
             except (highlight.NoHighlightError, shadow.NoShadowError) as reason:
                 return found | {"text": str(reason)}
             row, _ = latlong.texel_position(toward, *self.placed.envmap.shape[:2])
@@ -86,16 +85,16 @@ class Picking:
             return found | place(toward, document)
         if asked.of == "highlight":
             return {"light": self._lit_by(self._seen(view, asked.x, asked.y), document)}
-        return self._shadowed(at, document)
+        return self._shadowed(asked, view, document)
 
-    def _direction(self, asked, at):
+    def _direction(self, asked, view):
         if asked.of == "highlight":
-            return highlight.direction(*at)
+            return highlight.direction(self.lit, view, asked.x, asked.y)
         if not asked.point:
             raise shadow.NoShadowError("no shadow was picked")
-        return shadow.direction(*at, np.array(asked.point))
+        return shadow.direction(self.lit, view, asked.x, asked.y, np.array(asked.point))
 
-    def _shadowed(self, at, document):
+    def _shadowed(self, asked, view, document):
         """Return the light of most flux whose shadow lies at a place, and what casts it."""
         listed = lights(self.placed, document)
         text = "the map has no light"
@@ -103,7 +102,8 @@ class Picking:
             if not listed[i].flux.any():
                 continue
             try:
-                return {"light": i, "point": shadow.occluder(*at, listed[i].direction).tolist()}
+                point = shadow.occluder(self.lit, view, asked.x, asked.y, listed[i].direction)
+                return {"light": i, "point": point.tolist()}
             except shadow.NoShadowError as reason:
                 text = f"light {i + 1}: {reason}" if text == "the map has no light" else text
         return {"light": -1, "text": text}

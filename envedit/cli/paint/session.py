@@ -47,7 +47,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes, working_size
-from envedit.targets.target import first_hold, pixel_weight
+from envedit.targets.target import FOLLOWS, first_hold, pixel_weight
 
 DRAGGED_COLUMNS, COLUMNS = 16, 32
 """Most exact columns of T in one frame while a light is dragged, with the fewest paths, and otherwise."""
@@ -104,6 +104,7 @@ class Session:
         self.project, self.tell = project, tell
         self._saving = self.solving = False
         self.newer = lambda: not self._saving and newer()
+        self.reach: feasibility.Reach | None = None  # of what is painted, once it is known
         self._kept = project.document  # as painted.toml has it
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
@@ -456,14 +457,16 @@ class Session:
             self.advised = False
             self._tell_doing("looking for a better place of the light")
             self._unless_newer()
-            listed = picking.lights(self.placed, document)
+            held, listed = self.problem.likelihood, picking.lights(self.placed, document)
+            weight = pixel_weight(self.coverage, self._hidden, self._chosen.paint, FOLLOWS)
+            self.problem.aimed_at(self.target, Likelihood.of_paint(weight, self.coverage), self.point)
             better = advice.moved(self.problem, self.still, self.run.state, painted, listed)
-            self.point = self.problem.evaluate(self.run.state)  # that has taken its columns
+            there = self.problem.evaluate(self.run.state)  # that has taken its columns
+            self.point = self.problem.aimed_at(self.target, held, there)
             self.advised, self.status["advice"] = True, {"text": text}
             if better is not None:
-                light, toward, share = better
-                where = picking.place(toward, document)
-                self.status["advice"] |= {"light": light, "reaches": share, **where}
+                found = {"light": better.light, "factor": better.factor, "reaches": better.share}
+                self.status["advice"] |= found | picking.place(better.direction, document)
         self.tell_state()
 
     @property

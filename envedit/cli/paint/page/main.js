@@ -146,6 +146,8 @@ const RECEIVED = {
       $("exposure").value = message.exposure;
       look({ stops: message.exposure });
     }
+    $("rest").disabled = message.hold !== "auto";
+    $("rest").title = $("rest").disabled ? `[target] hold = ${message.hold} is given` : "";
     opened = true;
     painting = message.painting;
     if (mine) flush();
@@ -202,14 +204,14 @@ function advise(advice) {
   $("advice").hidden = !advice;
   $("advice-text").textContent = advice?.text ?? "";
   $("advice-do").hidden = advice?.light === undefined;
-  if (!$("advice-do").hidden) $("advice-do").textContent = `Drag light ${advice.light + 1} here: ${percent(advice.reaches)} by itself`;
+  if (!$("advice-do").hidden) $("advice-do").textContent = `Drag light ${advice.light + 1} there: ${percent(advice.reaches)}`;
 }
 $("advice-do").addEventListener("click", () => {
-  const { light, azimuth, elevation } = advised;
+  const { light, azimuth, elevation, factor } = advised, { entry } = lights.list()[light];
   advise(null);
   lights.choose(light);
-  lights.moveTo(light, azimuth, elevation);
-  lights.commit();
+  const moved = lights.changed(light, { azimuth, elevation, flux: entry.flux.map((v) => v * factor) });
+  history.push({ lights: moved, strokes: history.document.strokes.filter((one) => one.type === "hold") });
 });
 
 function state(name, text) {

@@ -11,7 +11,7 @@ from tests.oracles.painting import SMALL
 
 pytestmark = pytest.mark.slow
 ERASED = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
-DARK = {"type": "shadow", "ellipse": [0.25, 0.82, 0.12, 0.08], "softness": 0.03, "amount": 0.8}
+DARK = {"type": "shadow", "ellipse": [0.75, 0.75, 0.2, 0.1], "softness": 0.03, "amount": 0.8}
 DRAGGED = {0.0: ((33, 10), (41, 10)), 40.0: ((40, 8), (31, 8))}
 """Pixels, row and column, from which a shadow is dragged and to which, by the degrees of the sky's turn."""
 
@@ -72,9 +72,17 @@ def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
 def test_what_is_reached_is_said_of_what_is_feasible_and_advice_where_it_is_little(painting):
     status = solved(painting, strokes=[ERASED])
     assert 0 < status["reached"] <= status["reachable"] <= 1
-    status = solved(painting, strokes=[ERASED, DARK], rest="keep", freedom=0.0)
+    assert "advice" not in status or status["reached"] < 0.5
+    session, _ = painting
+    status = solved(painting, strokes=[DARK], rest="keep", freedom=0.0)
     assert status["reached"] < 0.5
-    assert status["advice"]["text"].startswith("stroke ") and "follows" in status["advice"]["text"]
+    told = status["advice"]
+    assert told["text"].startswith("stroke 1 (shadow) stays too bright") and "follows" in told["text"]
+    assert told["light"] == 0 and told["reaches"] > status["reached"] + 0.2
+    asked, flux = session._asked, [told["factor"]] * 3
+    light = {"light": 1, "azimuth": told["azimuth"], "elevation": told["elevation"], "flux": flux}
+    session.update(Edit(document({"lights": [light]})))
+    assert asked.reached(session.base) == pytest.approx(told["reaches"], abs=0.1), "it does something else"
 
 
 def test_a_shadow_is_dragged_by_its_tip(painting):

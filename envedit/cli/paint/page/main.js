@@ -18,7 +18,7 @@ const displays = {
 const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
-window.envedit = { log, displays };
+window.envedit = { log, displays, advise };
 
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [] }; // the last of each view

@@ -188,8 +188,8 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         until(lambda: "rest" not in kept.read_text())
         assert page.page.get_by_test_id("rest").input_value() == "follow"
         # ---- What is done where little is reached
-        page.page.evaluate("() => envedit.advise({ text: 'stroke 1 stays', light: 0, azimuth: 200, elevation: 30,"
-                           " factor: 0.5, reaches: 0.8 })")  # fmt: skip
+        advice = {"text": "", "light": 0, "azimuth": 200, "elevation": 30, "factor": 0.5, "reaches": 0.8}
+        page.page.evaluate("(advice) => envedit.advise(advice)", advice)
         page.page.get_by_test_id("advice-do").click()
         until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
         assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]

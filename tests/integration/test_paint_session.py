@@ -7,6 +7,7 @@ from envedit import config
 from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Pick, document
 from envedit.cli.paint.session import Session, Tell
+from envedit.core.rotations import rotation_vector
 from tests.oracles.painting import SMALL
 
 pytestmark = pytest.mark.slow
@@ -104,4 +105,7 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         assert after[there] < 0.5 * before[there], "the shadow is not where it was dragged to"
         assert after[tip] > before[tip]
         assert "in no shadow" in picked(45, 45)["text"]
+        lights = session.problem.layers.lights
+        session.run.state["turn"][0] = rotation_vector(lights.centres[0], lights.centres[0] * [-1, 1, -1])
+        assert "in no shadow" in picked(*there)["text"], "the light is not where paint has put it"
         assert "no shadow was picked" in picked(45, 45, light=0)["text"]

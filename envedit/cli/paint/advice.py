@@ -17,9 +17,6 @@ from envedit.solve import search
 from envedit.solve.feasibility import HALF, Reach
 from envedit.solve.map_problem import SIGMA, Problem
 
-SAME_LIGHT = np.cos(np.radians(10.0))
-"""Cosine of the angle from where a document has a light up to which one of the layers is that light."""
-
 
 @dataclass(frozen=True)
 class Painted:
@@ -126,16 +123,13 @@ def moved(
         None where there is no such place.
     """
     own = [k for k in problem.lit(start) if k < problem.layers.lights.own]
-    if not own or not lights:
+    if not own:
         return None
     flux = problem.layers.lights.flux
     k = max(own, key=lambda k: flux[k].sum())
     toward = problem.layers.lights.centres[k]
-    i = max(range(len(lights)), key=lambda i: lights[i].direction @ toward)
-    if lights[i].direction @ toward < SAME_LIGHT:
-        return None
-    now = problem.evaluate(state, resolve=False).rendering
-    if now is None:
+    i, now = picking.index_of(lights, toward), problem.evaluate(state, resolve=False).rendering
+    if i is None or now is None:
         return None
     without = _with(start, k, flux=DARK)
     most, best = painted.reached(now), None

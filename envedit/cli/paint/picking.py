@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,9 @@ from envedit.transport.light_transport import LightTransport
 
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
+
+SAME_LIGHT = np.cos(np.radians(10.0))
+"""Cosine of the angle from where a document has a light up to which one of the layers is that light."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,12 @@ def lights(placed: PlacedLights, document: Document) -> list[Placed]:
     found += [((light["azimuth"], light["elevation"]), np.float64(light["flux"])) for light in added]
     turned = document.rotate_degrees
     return [Placed(direction(azimuth - turned, elevation), flux) for (azimuth, elevation), flux in found]
+
+
+def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:
+    """Return the index of the light that stands in a direction (3,), None where none does."""
+    best = max(range(len(listed)), key=lambda i: listed[i].direction @ toward, default=None)
+    return best if best is not None and listed[best].direction @ toward > SAME_LIGHT else None
 
 
 def place(toward: np.ndarray, document: Document) -> dict[str, float]:
@@ -66,11 +76,12 @@ class Picking:
     def __init__(self, lit: Scene, placed: PlacedLights, transport: LightTransport, rows: Rows):
         self.lit, self.placed, self.transport, self.rows = lit, placed, transport, rows
 
-    def answer(self, asked: Pick, document: Document) -> dict[str, Any]:
+    def answer(self, asked: Pick, document: Document, shown: Sequence[Placed]) -> dict[str, Any]:
         """Return ``light``, and where it must stand, or ``text``: why nowhere.
 
         Without a light one is chosen: that of a highlight adds most at the pixel, that of a shadow has most
-        flux of those whose shadow it is in; ``point`` is what casts it.
+        flux of those whose shadow it is in; ``point`` is what casts it. ``shown`` are the document's lights
+        where the rendering that is shown has them.
         """
         view = min(asked.view, len(self.lit.rows) - 1)
         if asked.light >= 0:
@@ -85,7 +96,7 @@ class Picking:
             return found | place(toward, document)
         if asked.of == "highlight":
             return {"light": self._lit_by(self._seen(view, asked.x, asked.y), document)}
-        return self._shadowed(asked, view, document)
+        return self._shadowed(asked, view, shown)
 
     def _direction(self, asked, view):
         if asked.of == "highlight":
@@ -94,9 +105,8 @@ class Picking:
             raise shadow.NoShadowError("no shadow was picked")
         return shadow.direction(self.lit, view, asked.x, asked.y, np.array(asked.point))
 
-    def _shadowed(self, asked, view, document):
+    def _shadowed(self, asked, view, listed):
         """Return the light of most flux whose shadow lies at a place, and what casts it."""
-        listed = lights(self.placed, document)
         text = "the map has no light"
         for i in sorted(range(len(listed)), key=lambda i: -listed[i].flux.sum()):
             if not listed[i].flux.any():

@@ -553,7 +553,12 @@ class Session:
     def pick(self, asked: Pick) -> None:
         """Say whose highlight or shadow a pixel shows, or where its light must go (:mod:`.picking`)."""
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
-        self.tell.say(answer | self.picking.answer(asked, self.document))
+        shown = picking.lights(self.placed, self.document)
+        for k in [] if self._dragged else self.problem.lit(self.still):
+            i = picking.index_of(shown, self.problem.layers.lights.centres[k])
+            if i is not None:  # where paint has put it
+                shown[i] = replace(shown[i], direction=self.problem.direction(self.run.state, k))
+        self.tell.say(answer | self.picking.answer(asked, self.document, shown))
 
     # ---- results -------------------------------------------------------------------------------------------
 

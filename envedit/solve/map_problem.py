@@ -101,11 +101,15 @@ class Problem(Unknowns):
     ):
         super().__init__(layers, saturates)
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
-        self.prior = prior or Prior()
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks)
-        self._precisions = self.prior.gain_precisions(layers.gain, self.ground)
+        self.expect(prior or Prior())
         self._aim(picture, likelihood)
+
+    def expect(self, prior: Prior) -> None:
+        """Take another prior."""
+        self.prior = prior
+        self._precisions = prior.gain_precisions(self.layers.gain, self.ground)
 
     def _aim(self, picture, likelihood):
         self.picture = picture

@@ -168,7 +168,7 @@ def _changes(problem, state, start, sigma):
         dark = _changed(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
-        for direction, flux, unlikeliness in _places(problem, dark, k, sigma, away):
+        for direction, flux, unlikeliness in places(problem, dark, k, sigma, away):
             turn = rotation_vector(lights.centres[k], direction)
             moved = _changed(state, k, turn=turn, flux=flux)
             centre = _changed(start, k, turn=turn) if own else _changed(start, k, turn=turn, flux=flux)
@@ -188,7 +188,7 @@ def _changes(problem, state, start, sigma):
     # ---- one more
     size = lights.log_size(LOBE_DEGREES if lights.own else SOFT_DEGREES)
     for k in spare[:1]:
-        for direction, flux, unlikeliness in _places(problem, state, k, sigma):
+        for direction, flux, unlikeliness in places(problem, state, k, sigma):
             turn = rotation_vector(lights.centres[k], direction)
             more = _changed(state, k, turn=turn, flux=flux, size=size)
             centre = _changed(start, k, turn=turn, flux=flux, size=size)
@@ -211,11 +211,13 @@ def _unlikeliness(problem, state, sigma):
 # ---- Where a light raises the likelihood -------------------------------------------------------------------
 
 
-def _places(problem, state, k, sigma, away=None):
+def places(
+    problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray | None = None
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """List where light ``k``, dark in a state, raises the likelihood most: direction, log flux (3,), -2 log.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
-    the best ones through exact columns. Places differ by :data:`APART`, also from ``away``.
+    the best ones through exact columns. Places differ by :data:`APART`, also from ``away``, (3,).
     """
     lights, blocks, likelihood = problem.layers.lights, problem.blocks, problem.likelihood
     point = problem.evaluate(state, resolve=False)
@@ -296,8 +298,7 @@ class _Seen:
         least = np.full(len(pictures), np.inf)
         found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
-            strength: Any = np.float32(factor * unit)
-            more = pictures * strength[:, None, None]
+            more = pictures * np.asarray(factor * unit, np.float32)[:, None, None]
             off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
             mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)

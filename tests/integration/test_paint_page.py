@@ -154,6 +154,49 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         assert not page.faults, page.faults
 
 
+def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    kept = tmp_path / "edit_out" / "painted.toml"
+    with served(tmp_path / "edit.toml") as server:
+        page = Page(browser, server.url)
+        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
+        # ---- A shadow, by its tip; and where there is none
+        page.page.keyboard.press("9")
+        message = page.page.get_by_test_id("message")
+        page.drag(page.at("#overlay", 0.96, 0.96), page.at("#overlay", 0.9, 0.9))
+        sync_api.expect(message).to_contain_text("in no shadow of the light")
+        x, y = page.at("#overlay", 10.5 / 48, 33.5 / 48)
+        page.page.mouse.move(x, y)
+        page.page.mouse.down()
+        until(lambda: page.page.get_by_test_id("light-panel").get_attribute("disabled") is None)
+        page.page.mouse.move(*page.at("#overlay", 10.5 / 48, 40.5 / 48), steps=4)
+        page.page.mouse.up()
+        until(lambda: kept.exists() and "[[input.lights]]" in kept.read_text())
+        (light,) = config.load(kept).input.lights
+        assert abs((light["azimuth"] - 90 + 180) % 360 - 180) > 20, light  # where its light stood
+        page.page.get_by_test_id("undo").click()
+        until(lambda: "[[input.lights]]" not in kept.read_text())
+        # ---- A stroke, with the sky and the rest as chosen
+        page.page.get_by_test_id("tool-shadow").click()
+        page.drag(*(page.at("#overlay", 0.6 + 0.1 * k, 0.8) for k in range(4)))
+        sync_api.expect(page.status).to_contain_text("% of the paint reached", timeout=120_000)
+        page.page.get_by_test_id("freedom").fill("0.6")
+        page.page.get_by_test_id("rest").select_option("keep")
+        until(lambda: "freedom = 0.6" in kept.read_text() and 'rest = "keep"' in kept.read_text())
+        page.page.get_by_test_id("undo").click()
+        until(lambda: "rest" not in kept.read_text())
+        assert page.page.get_by_test_id("rest").input_value() == "follow"
+        # ---- What is done where little is reached
+        advice = {"text": "", "light": 0, "azimuth": 200, "elevation": 30, "factor": 0.5, "reaches": 0.8}
+        page.page.evaluate("(advice) => envedit.advise(advice)", advice)
+        page.page.get_by_test_id("advice-do").click()
+        until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
+        assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]
+        page.shot("advised")
+        assert not page.faults, page.faults
+
+
 def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
     write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
     (tmp_path / "edit.toml").write_text(OF_TWO)

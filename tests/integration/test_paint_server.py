@@ -145,9 +145,9 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
 
 def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
     stroke = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
-    told = []
+    told, kept = [], {"strokes": [stroke], "rest": "keep"}
     with connected(server) as page:
-        page.send(json.dumps({"type": "document", "number": 20, "document": {"strokes": [stroke]}}))
+        page.send(json.dumps({"type": "document", "number": 20, "document": kept}))
         while not told or told[-1] != "done":
             status = heard(page, "status", lambda m: m.get("number") == 20)
             told.append(status["state"])

@@ -49,7 +49,11 @@ def message(**more):
         (message(document={"lights": [{"azimuth": 1}]}), "azimuth and elevation"),
         (message(document={"lights": [{"azimuth": 1, "elevation": 1}]}), r"input.lights\[0\].flux"),
         (message(document={"lights": [{"light": 1, "colour": 1}]}), "has no key 'colour'"),
+        (message(document={"rest": "stays"}), "document.rest"),
+        (message(document={"freedom": 2}), "document.freedom"),
         ('{"type": "pick", "x": 2, "y": 0}', "pick: expected a number"),
+        ('{"type": "pick", "x": 0, "y": 0, "of": "glint"}', "pick: expected"),
+        ('{"type": "pick", "x": 0, "y": 0, "point": [0, 1]}', "point: .* expected three numbers"),
         ('{"type": "open"}', "open: expected a string"),
         ('{"type": "open", "name": ""}', "expected a scene"),
     ],
@@ -86,6 +90,7 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3]}
     done = protocol.document(
         {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "temperature": 5000}
+        | {"rest": "keep", "freedom": 0.5}
     )
     opened.keep(done)
     again = project.opened(str(file))

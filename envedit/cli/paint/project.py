@@ -27,7 +27,7 @@ class Project:
     Attributes
     ----------
     settings : config.Config
-        Without strokes and lights placed by hand, which the document has.
+        Without what the document has: strokes, lights placed by hand, and how they are solved for.
     folder : Path
         Of the results and ``painted.toml``.
     base : Path
@@ -68,6 +68,10 @@ class Project:
             given["scene"]["parameters"] = {key: self._found(value) for key, value in named.items()}
         own = {"rotate_degrees": document.rotate_degrees} if document.rotate_degrees else {}
         given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
+        if document.rest != settings.target.rest:
+            given["target"]["rest"] = document.rest
+        if document.freedom != settings.solve.freedom:
+            given["solve"]["freedom"] = document.freedom
         given["optimizer"] = given["optimizer"] | ({"start": start} if start else {})
         moved = {"exposure": document.exposure, "temperature": document.temperature}
         given["output"] = given["output"] | {key: value for key, value in moved.items() if value}
@@ -165,6 +169,8 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
         rotate_degrees=settings.input.rotate_degrees,
         exposure=settings.output.exposure,
         temperature=settings.output.temperature,
+        rest=settings.target.rest,
+        freedom=settings.solve.freedom,
     )
     painted = file is not None and file.name == NAME
     folder = file.absolute().parent if file and painted else Path(settings.output.dir)
@@ -185,7 +191,8 @@ def _plain(settings, folder):
         settings,
         input=_without(settings.input, "lights", "rotate_degrees"),
         output=_without(settings.output, "exposure", "temperature", dir=str(folder)),
-        target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees"),
+        target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees", "rest"),
+        solve=_without(settings.solve, "freedom"),
         optimizer=_without(settings.optimizer, "start"),
     )
 

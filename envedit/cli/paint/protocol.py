@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from envedit.config.input_schema import Target
 from envedit.config.key_validators import Kelvin
 from envedit.config.light_schema import LightList
+from envedit.config.method_schema import Solve
 from envedit.config.stroke_schema import StrokeList
-from envedit.config.validators import Number, String, WantedError, show
+from envedit.config.validators import Choice, Number, String, WantedError, show
 from envedit.core.errors import ConfigError
 
 MOST_BYTES = 1 << 20
@@ -28,6 +30,7 @@ SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
 _LARGEST = 65504.0
+_FAR = 1e30
 
 
 class BadMessageError(ValueError):
@@ -48,6 +51,10 @@ class Document:
         ``[input] rotate_degrees``.
     exposure, temperature : float
         As in ``[output]``.
+    rest : str
+        ``[target] rest``.
+    freedom : float
+        ``[solve] freedom``.
     """
 
     strokes: tuple[dict, ...] = ()
@@ -55,6 +62,8 @@ class Document:
     rotate_degrees: float = 0.0
     exposure: float = 0.0
     temperature: float = 0.0
+    rest: str = Target.rest
+    freedom: float = Solve.freedom
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -67,6 +76,8 @@ _CHECKS = {
     "rotate_degrees": Number(-360, 360),
     "exposure": Number(-20, 20),
     "temperature": Kelvin(),
+    "rest": Choice("follow", "keep"),
+    "freedom": Number(0, 1),
 }
 
 
@@ -119,7 +130,7 @@ class Pick:
     """A place on the rendering of a view (shares of width and height) that a light is dragged from, or to.
 
     ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: the server
-    chooses.
+    chooses. ``of`` is what is dragged, a "highlight" or a "shadow", and ``point`` what casts the shadow.
     """
 
     x: float
@@ -128,6 +139,8 @@ class Pick:
     number: int = 0
     client: str = ""
     view: int = 0
+    of: str = "highlight"
+    point: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -169,7 +182,9 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
             x, y = (Number(0, 1)(found.get(name)) for name in "xy")
             light = int(Number(-1, 100)(found.get("light", -1)))
             view = _count(found.get("view", 0))
-            return Pick(x, y, light, _count(found.get("number", 0)), client, view)
+            of = Choice("highlight", "shadow")(found.get("of", "highlight"))
+            number = _count(found.get("number", 0))
+            return Pick(x, y, light, number, client, view, of, _point(found.get("point", [])))
         if kind == "open":
             name, envmap = String()(found.get("name")), String()(found.get("envmap", ""))
             if not name:
@@ -184,6 +199,13 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
 
 def _refused(name):
     raise ValueError(name)
+
+
+def _point(value):
+    """Read a point of the scene; () for none."""
+    if not isinstance(value, list) or len(value) not in (0, 3):
+        raise BadMessageError(f"point: got {show(value)[:80]}, expected three numbers")
+    return tuple(Number(-_FAR, _FAR)(one) for one in value)
 
 
 def _count(value):

@@ -27,6 +27,7 @@ import drjit as dr
 import numpy as np
 
 from envedit import inputs, pipeline, renderers
+from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import SOLUTION, Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
@@ -43,12 +44,11 @@ from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
-from envedit.scene import highlight
 from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes, working_size
-from envedit.targets.target import first_hold, pixel_weight
+from envedit.targets.target import FOLLOWS, first_hold, pixel_weight
 
 DRAGGED_COLUMNS, COLUMNS = 16, 32
 """Most exact columns of T in one frame while a light is dragged, with the fewest paths, and otherwise."""
@@ -61,8 +61,6 @@ PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
 NOT_WHITE = 0.95
 """Share of the pixels of the rendering that the page does not show white when it is opened."""
-PATCH = 1
-"""Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
 
 
 class SupersededError(Exception):
@@ -107,12 +105,12 @@ class Session:
         self.project, self.tell = project, tell
         self._saving = self.solving = False
         self.newer = lambda: not self._saving and newer()
+        self.reach: feasibility.Reach | None = None  # of what is painted, once it is known
         self._kept = project.document  # as painted.toml has it
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
         self._shown: np.ndarray | None = None  # the rendering by T that the pages show
         self.status: dict[str, Any] = {
-            "reachable": None,
             "iterations": 0,
             "steps": 0,
             "number": 0,
@@ -132,6 +130,7 @@ class Session:
         self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
+        self.picking = picking.Picking(self.lit, self.placed, self.transport, self.rows)
         self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
         self._quick = self.transport
         if self.transport.spp > QUICK_SPP:
@@ -173,16 +172,20 @@ class Session:
         began = time.perf_counter()
         before, self.document = self.document, edit.document
         moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
+        # What is feasible under any map does not depend on how far this one may go.
+        reach = self.reach if replace(before, freedom=edit.document.freedom) == edit.document else None
         self.phase, self._rendered, self.resting = edit.phase, None, False
         whose = {"steps": self.status["steps"], "number": edit.number, "client": edit.client}
-        self.status = {"reachable": None, "iterations": 0, **whose}
+        self.status = {"iterations": 0, **whose}
         try:
             if edit.phase == "dragging":
                 self._drag()
             elif moved or self._dragged:
                 self._aim(edit.document)
             else:
+                self.problem.expect(prior.of_paint(edit.document.freedom))
                 self._paint()
+                self.reach = reach
             self._show("transport")
         except Exception:
             self.phase = "done"
@@ -212,8 +215,7 @@ class Session:
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         asked = layers, self.transport, self.origin, self.base
-        freedom = self.project.settings.solve.freedom
-        self.problem = map_problem.Problem(*asked, prior=prior.of_paint(freedom))
+        self.problem = map_problem.Problem(*asked, prior=prior.of_paint(document.freedom))
         self.still = self.start = self.problem.state(params)
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)
@@ -237,9 +239,14 @@ class Session:
         changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
         self._preview = found, np.maximum(self.point.rendering + changed, 0)
 
+    @property
+    def _chosen(self):
+        """The table ``[target]``, with what the document says of it."""
+        return replace(self.project.settings.target, rest=self.document.rest)
+
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
-        chosen, self.reach, self.searched = self.project.settings.target, None, False
+        chosen, self.reach, self.searched, self.advised = self._chosen, None, False, False
         self.hold = first_hold(chosen)
         painted = self._after(list(self.document.strokes), chosen.display_tonemap)
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
@@ -260,7 +267,9 @@ class Session:
         except InputError as error:
             self.notes = [*self.notes, str(error)]
             return
-        self.start, self.hold, self.searched = self.run.start, self.run.hold, True
+        self.start, self.searched = self.run.start, True
+        if self.run.hold > 1:
+            self.hold = self.run.hold
         self.point = self.problem.evaluate(self.run.state)
         self._weigh()
 
@@ -274,7 +283,7 @@ class Session:
 
     def _held_more(self):
         """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
-        chosen = self.project.settings.target
+        chosen = self._chosen
         seen = self.point.rendering, self.target, self.coverage, self.weight
         more = hold.further(chosen, self.hold, *seen)
         if more is None:
@@ -338,6 +347,9 @@ class Session:
             if self.solving and self.reach is None:
                 self._reach()
                 return True
+            if self.solving and not self.advised:
+                self._advise()
+                return True
             return self._render(PASSES)
         except SupersededError:
             return True
@@ -356,7 +368,7 @@ class Session:
             return "moving"
         if self.resting:
             return "done"
-        if self.phase != "done" or not self.converged or (self.solving and self.reach is None):
+        if self.phase != "done" or not self.converged or (self.solving and not self.advised):
             return "solving"
         return "rendering" if self._rendered is None or self._rendered[0] < PASSES else "done"
 
@@ -432,9 +444,36 @@ class Session:
         asked = self.problem.envmap, self.target, self.weight, self.rows, None
         painted, known = self.coverage[..., 0], self.point.edited
         self.reach = feasibility.reachable(self._watched, *asked, painted, self.base, known)
-        self.status["reachable"] = self.reach.share
         self._tell_unreachable()
         self.tell_state()
+
+    def _advise(self):
+        """Say what reaches more, where little is reached; a newer edit ends it."""
+        painted, document, self.advised = self._asked, self.document, True
+        bare = strokes.Painted(self.base, np.zeros_like(self.coverage))
+        tonemap = self._chosen.display_tonemap
+        alone = [self._on_views(bare, [one], tonemap).coverage for one in document.strokes]
+        text = advice.said(document, painted, self.point.rendering, self.reach, alone)
+        if text:
+            self.advised = False
+            self._tell_doing("looking for a better place of the light")
+            self._unless_newer()
+            held, listed = self.problem.likelihood, picking.lights(self.placed, document)
+            weight = pixel_weight(self.coverage, self._hidden, self._chosen.paint, FOLLOWS)
+            self.problem.aimed_at(self.target, Likelihood.of_paint(weight, self.coverage), self.point)
+            better = advice.moved(self.problem, self.still, self.run.state, painted, listed)
+            there = self.problem.evaluate(self.run.state)  # that has taken its columns
+            self.point = self.problem.aimed_at(self.target, held, there)
+            self.advised, self.status["advice"] = True, {"text": text}
+            if better is not None:
+                found = {"light": better.light, "factor": better.factor, "reaches": better.share}
+                self.status["advice"] |= found | picking.place(better.direction, document)
+        self.tell_state()
+
+    @property
+    def _asked(self):
+        """What was painted, and on what."""
+        return advice.Painted(self.base, self.target, self.coverage)
 
     def _tell_unreachable(self):
         """Show what of the paint is not feasible, once that is known."""
@@ -494,9 +533,14 @@ class Session:
         self.tell.say({"type": "lights", "own": own, "found": found})
 
     def tell_state(self) -> None:
-        """Say what goes on, and how good the solution is."""
+        """Say what goes on, and how good the solution is: what is reached of the paint, and feasible."""
+        reached = reachable = None
+        if self.solving:
+            reached = self._asked.reached(self.point.rendering)
+            reachable = None if self.reach is None else max(self.reach.share, reached)
         rendered = self._rendered[0] * PASS if self._rendered else 0
-        self.tell.say({"type": "status", "state": self.state, "samples": rendered, **self.status})
+        share = {"reached": reached, "reachable": reachable}
+        self.tell.say({"type": "status", "state": self.state, "samples": rendered, **share, **self.status})
 
     def _tell_doing(self, text):
         self.tell.say({"type": "doing", "text": text})
@@ -507,58 +551,15 @@ class Session:
     def _progress(self, done, total, text=""):
         self.tell.say({"type": "progress", "done": done, "total": total, "text": text})
 
-    # ---- lights by the rendering ---------------------------------------------------------------------------
-
     def pick(self, asked: Pick) -> None:
-        """Find which light a pixel is lit by most, or where one must go for its highlight to lie there."""
+        """Say whose highlight or shadow a pixel shows, or where its light must go (:mod:`.picking`)."""
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
-        view = min(asked.view, len(self.lit.rows) - 1)
-        if asked.light < 0:
-            answer["light"] = self._lit_by(self._seen(view, asked.x, asked.y))
-        else:
-            answer["light"] = asked.light
-            try:
-                toward = highlight.direction(self.lit, view, asked.x, asked.y)
-                row, _ = latlong.texel_position(toward, *self.map.shape[:2])
-                if not self.rows.first <= round(float(row)) < self.rows.stop:
-                    raise highlight.NoHighlightError("the light would stand where [input] rows keeps the map")
-                azimuth, answer["elevation"] = angles(toward)
-                answer["azimuth"] = (azimuth + self.document.rotate_degrees) % 360
-            except highlight.NoHighlightError as reason:
-                answer["text"] = str(reason)
-        self.tell.say(answer)
-
-    def _seen(self, view, x, y):
-        """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
-        patch = np.zeros(self.base.shape, np.float32)
-        seen = patch[self.lit.rows[view]]
-        height, width = seen.shape[:2]
-        row, column = min(int(y * height), height - 1), min(int(x * width), width - 1)
-        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
-        return self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
-
-    def _lit_by(self, seen):
-        """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
-        degrees, best, most = self.document.rotate_degrees, -1, 0.0
-        dark = [{**light, "flux": [0.0] * 3} for light in self.document.lights if "light" in light]
-        named = {light["light"] for light in dark}
-        dark += [{"light": i + 1, "flux": [0.0] * 3, "size": 1.0} for i in range(len(self.placed.lights))
-                 if i + 1 not in named]  # fmt: skip
-        added = [light for light in self.document.lights if "light" not in light]
-        whole = self.placed.place(self.document.lights)
-        for i in range(len(self.placed.lights) + len(added)):
-            if i < len(self.placed.lights):
-                out = [one for one in dark if one["light"] == i + 1]
-                kept = [one for one in self.document.lights if one.get("light") != i + 1]
-                without = self.placed.place([*kept, *out])
-            else:
-                gone = added[i - len(self.placed.lights)]
-                without = self.placed.place([one for one in self.document.lights if one is not gone])
-            lost = latlong.rotate(whole - without, degrees).mean(axis=2)
-            share = float((seen * lost).sum())
-            if share > most:
-                best, most = i, share
-        return best
+        shown = picking.lights(self.placed, self.document)
+        for k in [] if self._dragged else self.problem.lit(self.still):
+            i = picking.index_of(shown, self.problem.layers.lights.centres[k])
+            if i is not None:  # where paint has put it
+                shown[i] = replace(shown[i], direction=self.problem.direction(self.run.state, k))
+        self.tell.say(answer | self.picking.answer(asked, self.document, shown))
 
     # ---- results -------------------------------------------------------------------------------------------
 

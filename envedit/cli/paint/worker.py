@@ -162,6 +162,7 @@ class Worker(threading.Thread):
                 "height": self.session.lit.height,
                 "notes": self.session.notes,
                 "exposure": self.session.exposure,
+                "hold": opened.settings.target.hold,
             }
         )
         self.session.again()

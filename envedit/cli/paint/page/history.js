@@ -1,4 +1,4 @@
-// The document (what is saved), and what undo and redo go through.
+// The document (what is saved), and what undo and redo go through. What EMPTY lacks, the server says.
 
 export const EMPTY = { strokes: [], lights: [], rotate_degrees: 0, exposure: 0, temperature: 0 };
 

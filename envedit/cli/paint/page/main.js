@@ -18,7 +18,7 @@ const displays = {
 const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
-window.envedit = { log, displays };
+window.envedit = { log, displays, advise };
 
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [] }; // the last of each view
@@ -146,6 +146,8 @@ const RECEIVED = {
       $("exposure").value = message.exposure;
       look({ stops: message.exposure });
     }
+    $("rest").disabled = message.hold !== "auto";
+    $("rest").title = $("rest").disabled ? `[target] hold = ${message.hold} is given` : "";
     opened = true;
     painting = message.painting;
     if (mine) flush();
@@ -158,6 +160,7 @@ const RECEIVED = {
     last = message;
     $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
+    advise(message.advice ?? null);
     if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps, residual: message.residual });
     state(message.state, message.text ?? told(message));
   },
@@ -179,14 +182,37 @@ const RECEIVED = {
 };
 
 function told(message) {
-  const parts = [WORDS[message.state]];
+  const parts = [];
+  if (message.reached != null) {
+    const feasible = message.reachable == null ? "" : `, ${percent(message.reachable)} feasible`;
+    parts.push(`${percent(message.reached)} of the paint reached${feasible}`);
+  }
+  parts.push(WORDS[message.state]);
   if (message.iterations) parts.push(`${message.iterations} iterations`);
   if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
-  if (message.reachable != null) parts.push(`${Math.round(100 * message.reachable)} % of the paint is feasible`);
   if (message.hold) parts.push(`target.hold = ${+message.hold.toPrecision(3)}`);
   if (message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
   return parts.join(" · ");
 }
+
+function percent(share) { return `${Math.round(100 * share)} %`; }
+
+// What reaches more where little is reached, with a button where another place of a light does.
+let advised = null;
+function advise(advice) {
+  advised = advice;
+  $("advice").hidden = !advice;
+  $("advice-text").textContent = advice?.text ?? "";
+  $("advice-do").hidden = advice?.light === undefined;
+  if (!$("advice-do").hidden) $("advice-do").textContent = `Drag light ${advice.light + 1} there: ${percent(advice.reaches)}`;
+}
+$("advice-do").addEventListener("click", () => {
+  const { light, azimuth, elevation, factor } = advised, { entry } = lights.list()[light];
+  advise(null);
+  lights.choose(light);
+  const moved = lights.changed(light, { azimuth, elevation, flux: entry.flux.map((v) => v * factor) });
+  history.push({ lights: moved, strokes: history.document.strokes.filter((one) => one.type === "hold") });
+});
 
 function state(name, text) {
   const status = $("status");
@@ -241,19 +267,20 @@ function viewed(stroke) {
   return named < 0 ? stroke.view ?? 0 : named;
 }
 
-// A highlight is dragged: first ask whose it is, then where that light must go.
-let picked = -1, asked = 0, ended = false;
+// A highlight or a shadow is dragged: first ask whose it is, then where that light must go.
+let picked = -1, point = [], asked = 0, ended = false;
 function pick(phase, x, y) {
-  if (phase === "start") { picked = -1; ended = false; }
+  if (phase === "start") { picked = -1; point = []; ended = false; }
   if (phase === "end") { ended = true; setTimeout(() => { if (ended) lights.commit(); }, 300); return; }
   if (phase === "move" && picked < 0) return;
-  connection.send({ type: "pick", x, y, light: picked, view, number: ++asked });
+  connection.send({ type: "pick", of: tool === "move-shadow" ? "shadow" : "highlight", point, x, y, light: picked, view, number: ++asked });
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
   if (message.text) say(`Light not moved: ${message.text}`);
   else if (message.azimuth === undefined) {
     picked = message.light;
+    point = message.point ?? [];
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
     else lights.choose(picked);
   } else if (!ended || message.number === asked) {
@@ -278,7 +305,7 @@ function refresh() {
   const now = history.document;
   $("undo").disabled = !history.undoable;
   $("redo").disabled = !history.redoable;
-  $("clear").disabled = JSON.stringify(now) === JSON.stringify(EMPTY);
+  $("clear").disabled = Object.keys(EMPTY).every((key) => JSON.stringify(now[key]) === JSON.stringify(EMPTY[key]));
   if (!now.strokes.length) { // nothing is asked for that might not be feasible
     frames.unreachable = [];
     $("unreachable").parentElement.hidden = true;
@@ -286,6 +313,9 @@ function refresh() {
   $("degrees").value = now.rotate_degrees;
   $("map-exposure").value = now.exposure;
   $("map-temperature").value = now.temperature;
+  $("rest").value = now.rest ?? "follow";
+  $("freedom").value = now.freedom ?? 0;
+  valued($("freedom"));
   lights.draft = null;
   lights.draw();
   strokes.draw();
@@ -301,7 +331,7 @@ function choose(name, value) {
   }
   if (AMOUNTS[tool]) [$("amount").max, $("amount").value] = AMOUNTS[tool];
   valued($("amount"));
-  $("shapes").hidden = $("options").hidden = tool === "move";
+  $("shapes").hidden = $("options").hidden = tool.startsWith("move");
   strokes.reset();
   strokes.draw();
 }
@@ -316,6 +346,12 @@ for (const input of document.querySelectorAll("#options input[type=range]")) {
   input.addEventListener("input", () => valued(input));
   valued(input);
 }
+$("rest").addEventListener("change", () => history.push({ rest: $("rest").value }));
+$("freedom").addEventListener("input", () => {
+  valued($("freedom"));
+  history.preview({ freedom: Number($("freedom").value) }, "drawing");
+});
+$("freedom").addEventListener("change", () => history.push({ freedom: Number($("freedom").value) }));
 $("amount").addEventListener("input", () => { AMOUNTS[tool][1] = Number($("amount").value); });
 
 for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => choose("tool", button.dataset.tool));
@@ -380,7 +416,7 @@ window.addEventListener("keydown", (event) => {
     valued($("size"));
     strokes.draw();
   }
-  else if (/^[1-8]$/.test(key)) choose("tool", document.querySelectorAll("[data-tool]")[key - 1].dataset.tool);
+  else if (/^[1-9]$/.test(key)) choose("tool", document.querySelectorAll("[data-tool]")[key - 1].dataset.tool);
   else return;
   event.preventDefault();
 });

@@ -38,7 +38,7 @@ export class Strokes {
 
   begin(place, event) {
     const { type, shape } = this.options();
-    if (type === "move") { this.dragging = true; this.on.drag("start", ...place); return; }
+    if (type.startsWith("move")) { this.dragging = true; this.on.drag("start", ...place); return; }
     if (shape === "polygon") {
       if (!this.corners) { this.reset(); this.corners = true; }
       const last = this.points.at(-1);
@@ -146,7 +146,7 @@ export class Strokes {
     const o = this.options(), place = this.shown ? this.cursor : this.hover;
     const stroke = this.drawing && this.stroke();
     for (const one of [...o.outlined, ...(stroke ? [stroke] : [])]) outline(pen, one, width, height);
-    if (place && o.type !== "move") {
+    if (place && !o.type.startsWith("move")) {
       const radius = o.shape === "brush" || o.shape === "line" ? Math.max(2, (o.size * width) / 2) : 4;
       for (const [color, line] of [["#000", 3], ["#fff", 1.2]]) {
         pen.strokeStyle = color;

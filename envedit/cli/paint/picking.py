@@ -1,0 +1,151 @@
+"""Lights by the rendering: whose highlight or shadow a pixel shows, and where its light must go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from envedit.cli.paint.protocol import Document, Pick
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.rows import Rows
+from envedit.representations.layers.placed_lights import PlacedLights, angles, direction
+from envedit.scene import highlight, shadow
+from envedit.scene.scene import Scene
+from envedit.transport.light_transport import LightTransport
+
+PATCH = 1
+"""Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
+
+SAME_LIGHT = np.cos(np.radians(10.0))
+"""Cosine of the angle from where a document has a light up to which one of the layers is that light."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A light as a document has it: direction (3,) in the turned map, and flux (3,)."""
+
+    direction: np.ndarray
+    flux: np.ndarray
+
+
+def lights(placed: PlacedLights, document: Document) -> list[Placed]:
+    """List the lights of a document: the map's own, then those that were added."""
+    entries = {light["light"]: light for light in document.lights if "light" in light}
+    found = []
+    for i, light in enumerate(placed.lights):
+        entry = entries.get(i + 1, {"flux": (1.0, 1.0, 1.0)})
+        where = (entry["azimuth"], entry["elevation"]) if "azimuth" in entry else angles(light.direction)
+        found.append((where, placed.layers.lights.flux[i] * np.float64(entry["flux"])))
+    added = [light for light in document.lights if "light" not in light]
+    found += [((light["azimuth"], light["elevation"]), np.float64(light["flux"])) for light in added]
+    turned = document.rotate_degrees
+    return [Placed(direction(azimuth - turned, elevation), flux) for (azimuth, elevation), flux in found]
+
+
+def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:
+    """Return the index of the light that stands in a direction (3,), None where none does."""
+    best = max(range(len(listed)), key=lambda i: listed[i].direction @ toward, default=None)
+    return best if best is not None and listed[best].direction @ toward > SAME_LIGHT else None
+
+
+def place(toward: np.ndarray, document: Document) -> dict[str, float]:
+    """Return ``azimuth`` and ``elevation`` of an entry of the document whose light is to stand there."""
+    azimuth, elevation = angles(toward)
+    return {"azimuth": (azimuth + document.rotate_degrees) % 360, "elevation": elevation}
+
+
+class Picking:
+    """Answers what was picked on the rendering.
+
+    Parameters
+    ----------
+    lit : Scene
+        What is seen.
+    placed : PlacedLights
+        The map as it was given.
+    transport : LightTransport
+        Of the scene.
+    rows : Rows
+        Of the map, which may change.
+    """
+
+    def __init__(self, lit: Scene, placed: PlacedLights, transport: LightTransport, rows: Rows):
+        self.lit, self.placed, self.transport, self.rows = lit, placed, transport, rows
+
+    def answer(self, asked: Pick, document: Document, shown: Sequence[Placed]) -> dict[str, Any]:
+        """Return ``light``, and where it must stand, or ``text``: why nowhere.
+
+        Without a light one is chosen: that of a highlight adds most at the pixel, that of a shadow has most
+        flux of those whose shadow it is in; ``point`` is what casts it. ``shown`` are the document's lights
+        where the rendering that is shown has them.
+        """
+        view = min(asked.view, len(self.lit.rows) - 1)
+        if asked.light >= 0:
+            found: dict[str, Any] = {"light": asked.light}
+            try:
+                toward = self._direction(asked, view)
+            except (highlight.NoHighlightError, shadow.NoShadowError) as reason:
+                return found | {"text": str(reason)}
+            row, _ = latlong.texel_position(toward, *self.placed.envmap.shape[:2])
+            if not self.rows.first <= round(float(row)) < self.rows.stop:
+                return found | {"text": "the light would stand where [input] rows keeps the map"}
+            return found | place(toward, document)
+        if asked.of == "highlight":
+            return {"light": self._lit_by(self._seen(view, asked.x, asked.y), document)}
+        return self._shadowed(asked, view, shown)
+
+    def _direction(self, asked, view):
+        if asked.of == "highlight":
+            return highlight.direction(self.lit, view, asked.x, asked.y)
+        if not asked.point:
+            raise shadow.NoShadowError("no shadow was picked")
+        return shadow.direction(self.lit, view, asked.x, asked.y, np.array(asked.point))
+
+    def _shadowed(self, asked, view, listed):
+        """Return the light of most flux whose shadow lies at a place, and what casts it."""
+        text = "the map has no light"
+        for i in sorted(range(len(listed)), key=lambda i: -listed[i].flux.sum()):
+            if not listed[i].flux.any():
+                continue
+            try:
+                point = shadow.occluder(self.lit, view, asked.x, asked.y, listed[i].direction)
+                return {"light": i, "point": point.tolist()}
+            except shadow.NoShadowError as reason:
+                text = f"light {i + 1}: {reason}" if text == "the map has no light" else text
+        return {"light": -1, "text": text}
+
+    def _seen(self, view, x, y):
+        """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
+        patch = np.zeros((self.lit.height, self.lit.width, 3), np.float32)
+        seen = patch[self.lit.rows[view]]
+        height, width = seen.shape[:2]
+        row, column = min(int(y * height), height - 1), min(int(x * width), width - 1)
+        seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1
+        return self.transport.adjoint(tensor(patch)).numpy().mean(axis=2)
+
+    def _lit_by(self, seen, document):
+        """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
+        degrees, best, most = document.rotate_degrees, -1, 0.0
+        dark = [{**light, "flux": [0.0] * 3} for light in document.lights if "light" in light]
+        named = {light["light"] for light in dark}
+        dark += [{"light": i + 1, "flux": [0.0] * 3, "size": 1.0} for i in range(len(self.placed.lights))
+                 if i + 1 not in named]  # fmt: skip
+        added = [light for light in document.lights if "light" not in light]
+        whole = self.placed.place(document.lights)
+        for i in range(len(self.placed.lights) + len(added)):
+            if i < len(self.placed.lights):
+                out = [one for one in dark if one["light"] == i + 1]
+                kept = [one for one in document.lights if one.get("light") != i + 1]
+                without = self.placed.place([*kept, *out])
+            else:
+                gone = added[i - len(self.placed.lights)]
+                without = self.placed.place([one for one in document.lights if one is not gone])
+            lost = latlong.rotate(whole - without, degrees).mean(axis=2)
+            share = float((seen * lost).sum())
+            if share > most:
+                best, most = i, share
+        return best

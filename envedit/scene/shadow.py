@@ -1,0 +1,113 @@
+"""Where a light must stand for a shadow to reach a place of the picture: beyond what casts the shadow."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.scene.scene import Scene
+
+NEAR = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)])
+"""Pixels around a picked one, in rows, of which one may be in the shadow: its edge is hard to hit."""
+PASSED = 16
+"""Most surfaces that a ray goes through without being scattered, such as the holes of a mask."""
+
+
+class NoShadowError(ValueError):
+    """No shadow is found at a place, or can be put there; the text says why."""
+
+
+def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) -> np.ndarray:
+    """Return the point that keeps a light from a place of a view.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its sensors are the views.
+    view : int
+        Index of the view.
+    x, y : float
+        Place on the picture, as shares of its width and height from the upper left corner.
+    toward : ndarray (3,)
+        Direction of the light in the frame of the map.
+
+    Returns
+    -------
+    ndarray (3,) float64
+        The first point, in the scene's own coordinates, that a ray from there towards the light hits.
+
+    Raises
+    ------
+    NoShadowError
+        No surface is seen there, it faces away from the light, or nothing is between both.
+    """
+    rows = scene.rows[view]
+    offset = NEAR / [scene.width, rows.stop - rows.start]
+    offset = offset[np.argsort(np.abs(NEAR).sum(axis=1), kind="stable")]
+    places = np.clip(np.array([x, y]) + offset, 0, 1)
+    seen = _seen(scene, view, places)
+    ahead = mi.Vector3f(scene.to_world @ np.float64(toward))
+    facing = seen.is_valid() & (dr.dot(seen.n, ahead) * dr.dot(seen.n, seen.to_world(seen.wi)) > 0)
+    hit = _first(scene, seen.spawn_ray(ahead), facing)
+    blocked = hit.is_valid().numpy()
+    if blocked.any():
+        return hit.p.numpy().T[int(np.argmax(blocked))].astype(np.float64)
+    if not seen.is_valid().numpy()[0]:
+        raise NoShadowError("no surface is seen there")
+    if not facing.numpy()[0]:
+        raise NoShadowError("the surface faces away from the light there: pick a shadow that is cast")
+    raise NoShadowError("the place is in no shadow of the light")
+
+
+def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) -> np.ndarray:
+    """Return where a light must stand for the shadow of a point to lie at a place of a view.
+
+    Parameters
+    ----------
+    scene, view, x, y
+        As of :func:`occluder`.
+    point : ndarray (3,)
+        What :func:`occluder` returned.
+
+    Returns
+    -------
+    ndarray (3,) float64
+        Unit vector in the frame of the map.
+
+    Raises
+    ------
+    NoShadowError
+        No surface is seen there, or it faces away from the point.
+    """
+    seen = _seen(scene, view, np.array([[x, y]]))
+    if not seen.is_valid().numpy()[0]:
+        raise NoShadowError("no surface is seen there")
+    toward = np.float64(point) - seen.p.numpy()[:, 0]
+    normal, eye = (v.numpy()[:, 0] for v in (seen.n, seen.to_world(seen.wi)))
+    if (toward @ normal) * (eye @ normal) <= 0:
+        raise NoShadowError("the surface faces away from what casts the shadow")
+    found = scene.to_world.T @ toward
+    return found / np.linalg.norm(found)
+
+
+def _seen(scene, view, places):
+    """Return the surfaces that are seen at places (n, 2)."""
+    sensor = scene.mi.sensors()[view]
+    place = mi.Point2f(*(mi.Float(np.float32(v)) for v in places.T))
+    ray = mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
+    return _first(scene, ray, dr.full(mi.Bool, True, len(places)))
+
+
+def _first(scene, ray, active):
+    """Return the first surfaces on rays that do more than let light through."""
+    found = scene.mi.ray_intersect(ray, active)
+    for _ in range(PASSED):
+        bsdf = found.bsdf()
+        alone = dr.mean(mi.Color3f(mi.unpolarized_spectrum(bsdf.eval_null_transmission(found, active))))
+        through = active & found.is_valid() & (alone > 0.5)
+        if not dr.any(through):
+            break
+        ray = dr.select(through, found.spawn_ray(ray.d), ray)
+        found = dr.select(through, scene.mi.ray_intersect(ray, through), found)
+    return found

@@ -1,0 +1,111 @@
+"""A painting without server and page: how it is solved for, what is said of it, dragged shadows."""
+
+import numpy as np
+import pytest
+
+from envedit import config
+from envedit.cli.paint import project
+from envedit.cli.paint.protocol import Edit, Pick, document
+from envedit.cli.paint.session import Session, Tell
+from envedit.core.rotations import rotation_vector
+from tests.oracles.painting import SMALL
+
+pytestmark = pytest.mark.slow
+ERASED = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
+DARK = {"type": "shadow", "ellipse": [0.75, 0.75, 0.2, 0.1], "softness": 0.03, "amount": 0.8}
+DRAGGED = {0.0: ((33, 10), (41, 10)), 40.0: ((40, 8), (31, 8))}
+"""Pixels, row and column, from which a shadow is dragged and to which, by the degrees of the sky's turn."""
+
+
+class Heard(Tell):
+    """Keeps the last message of each kind."""
+
+    def __init__(self):
+        self.last = {}
+
+    def say(self, message):
+        self.last[message["type"]] = message
+
+
+@pytest.fixture(scope="module")
+def painting(tmp_path_factory):
+    file = tmp_path_factory.mktemp("session") / "edit.toml"
+    file.write_text(SMALL)
+    heard = Heard()
+    return Session(project.opened(str(file)), heard), heard
+
+
+def solved(painting, phase="done", **changed):
+    """Solve for a document to its end; returns the last status."""
+    session, heard = painting
+    session.update(Edit(document(changed), phase))
+    while session.advance():
+        pass
+    return heard.last["status"]
+
+
+def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
+    session, _ = painting
+    gains, blocks = [], None
+    for freedom in (1.0, 0.0):
+        solved(painting, "drawing", strokes=[ERASED], freedom=freedom)
+        finest, last = np.prod(session.problem.sizes[-1]), session.problem.nodes - session.problem.ground
+        gains.append(session.run.state["gain"][last - finest : last].std(axis=0).max())
+        assert blocks in (None, session.problem.blocks), "blocks were built anew"
+        blocks = session.problem.blocks
+    assert gains[1] < 0.2 * gains[0], gains
+    assert "freedom" not in session.project.text(session.project.document)
+
+    changes = []
+    for rest in ("follow", "keep"):
+        status = solved(painting, strokes=[ERASED], freedom=0.0, rest=rest)
+        assert ("hold" in status) == (rest == "keep")
+        changes.append(np.abs(session.point.rendering - session.base)[session.coverage[..., 0] == 0].mean())
+    assert changes[1] < changes[0], "the rest does not stay"
+    kept = config.load(session.project.folder / "painted.toml")
+    assert (kept.target.rest, kept.solve.freedom) == ("keep", 0.0)
+    again = project.opened(str(session.project.folder / "painted.toml")).document
+    assert (again.rest, again.freedom) == ("keep", 0.0)
+    project_text = session.project.text(document({"rest": "keep"}))
+    assert config.loads(project_text, session.project.folder, "painted.toml").target.rest == "keep"
+
+
+def test_what_is_reached_is_said_of_what_is_feasible_and_advice_where_it_is_little(painting):
+    status = solved(painting, strokes=[ERASED])
+    assert 0 < status["reached"] <= status["reachable"] <= 1
+    assert "advice" not in status or status["reached"] < 0.5
+    session, _ = painting
+    status = solved(painting, strokes=[DARK], rest="keep", freedom=0.0)
+    assert status["reached"] < 0.5
+    told = status["advice"]
+    assert told["text"].startswith("stroke 1 (shadow) stays too bright") and "follows" in told["text"]
+    assert told["light"] == 0 and told["reaches"] > status["reached"] + 0.2
+    asked, flux = session._asked, [told["factor"]] * 3
+    light = {"light": 1, "azimuth": told["azimuth"], "elevation": told["elevation"], "flux": flux}
+    session.update(Edit(document({"lights": [light]})))
+    assert asked.reached(session.base) == pytest.approx(told["reaches"], abs=0.1), "it does something else"
+
+
+def test_a_shadow_is_dragged_by_its_tip(painting):
+    session, heard = painting
+
+    def picked(row, column, **more):
+        session.pick(Pick((column + 0.5) / 48, (row + 0.5) / 48, of="shadow", **more))
+        return heard.last["picked"]
+
+    for turn, (tip, there) in DRAGGED.items():
+        session.update(Edit(document({"rotate_degrees": turn})))
+        before = session.base[:, :, 1].copy()
+        found = picked(*tip)
+        assert found["light"] == 0 and len(found["point"]) == 3
+        to = picked(*there, light=0, point=tuple(found["point"]))
+        light = {"light": 1, "azimuth": to["azimuth"], "elevation": to["elevation"]}
+        session.update(Edit(document({"rotate_degrees": turn, "lights": [light]})))
+        after = session.base[:, :, 1]
+        assert after[there] < 0.5 * before[there], "the shadow is not where it was dragged to"
+        assert after[tip] > before[tip]
+        assert "in no shadow" in picked(45, 45)["text"]
+        lights = session.problem.layers.lights
+        session.run.state["turn"][0] = rotation_vector(lights.centres[0], lights.centres[0] * [-1, 1, -1])
+        assert "in no shadow" in picked(*there)["text"], "the light is not where paint has put it"
+        assert "no shadow was picked" in picked(45, 45, light=0)["text"]

@@ -295,8 +295,8 @@ class _Seen:
         least = np.full(len(pictures), np.inf)
         found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
-            more = pictures * np.float32(factor * unit)[:, None, None]
-            off: Any = _display(np.float32(self.before) + more) - goal
+            more = np.float32(pictures * (factor * unit)[:, None, None])
+            off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
             mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)
             variance = np.maximum(squares / count, self.sigma**2)

@@ -291,14 +291,15 @@ class _Seen:
     def best(self, pictures: Any, own: bool) -> tuple[Any, Any]:
         """Return the likeliest factor of the flux of each picture (k, n, 3), and -2 log likelihood then."""
         unit: Any = np.ones(len(pictures))
-        if not own:  # of any flux
-            unit = self.before.mean() / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
+        if not own:  # of any flux; on black, as much as was painted
+            light = self.before.mean() or max(float(self.target.mean()), 1e-30)
+            unit = light / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
         goal = _display(self.target)
         count = 3 * self.likelihood.independent
         least = np.full(len(pictures), np.inf)
         found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
-            more = pictures * np.asarray(factor * unit, np.float32)[:, None, None]
+            more = np.float32(pictures * (factor * unit)[:, None, None])
             off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
             mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)

@@ -171,6 +171,7 @@ COUNTS = {
     "layers.old_sun": 12,
     "levels": 24,
     "natural": 680,
+    "natural.skies": 1,
     "paint.figure10": 7,
     "paint.rates": 2,
     "paint.soak": 1,

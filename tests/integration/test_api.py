@@ -86,6 +86,22 @@ def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path
     assert (result.metrics["timing"]["total_s"], result.warnings) == before
 
 
+@pytest.mark.parametrize("kind", ["image", "rendering"])
+def test_a_picture_is_paint_or_with_its_kind_a_rendering_of_the_scene(kind, tmp_path, own_cache):
+    """What is saved says which, and runs to the same map."""
+    sky = np.random.default_rng(5).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
+    scene = envedit.load_scene("sphere", 16)
+    picture = scene.render(np.roll(sky, 9, axis=1), spp=16)
+    asked = {"spp": 8} | ({"kind": kind, "file": "array"} if kind == "rendering" else {})
+    settings = TINY | {"target": asked}
+    result = envedit.edit(settings, scene=scene, envmap=sky, target=picture, mask=np.ones((16, 16)))
+    assert (result.metrics["painted"] is None) == (kind == "rendering")
+    result.save(tmp_path / "out")
+    found = config.load(tmp_path / "out" / "config.toml")
+    assert found.target.kind == kind and found.target.spp == 8
+    assert np.array_equal(pipeline.run(found).envmap, result.envmap)
+
+
 def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(envedit.MachineError, match=r"pip install '\.\[report\]'"):

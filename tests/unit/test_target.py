@@ -351,7 +351,7 @@ def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     made = target.make(asking(kind="strokes", strokes=(upper,)), ball, envmap)
     assert not made.coverage[hidden].any() and made.coverage.any() and not made.weight[hidden].any()
     painted = made.coverage[..., 0] > 0
-    for rest, share in (("follow", target.FOLLOWS), ("keep", 1.0)):
+    for rest, share in (("follow", 1.0), ("keep", 1.0)):
         made = target.make(asking(kind="strokes", strokes=(upper,), rest=rest), ball, envmap)
         weights = made.weight[~painted].sum(), made.weight[painted].sum()
         assert weights[0] == pytest.approx(share * weights[1], rel=1e-5)

@@ -48,7 +48,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes, working_size
-from envedit.targets.target import FOLLOWS, first_hold, pixel_weight
+from envedit.targets.target import first_hold, pixel_weight
 
 DRAGGED_COLUMNS, COLUMNS = 16, 32
 """Most exact columns of T in one frame while a light is dragged, with the fewest paths, and otherwise."""
@@ -459,7 +459,7 @@ class Session:
             self._tell_doing("looking for a better place of the light")
             self._unless_newer()
             held, listed = self.problem.likelihood, picking.lights(self.placed, document)
-            weight = pixel_weight(self.coverage, self._hidden, self._chosen.paint, FOLLOWS)
+            weight = pixel_weight(self.coverage, self._hidden, self._chosen.paint, 1.0)
             self.problem.aimed_at(self.target, Likelihood.of_paint(weight, self.coverage), self.point)
             better = advice.moved(self.problem, self.still, self.run.state, painted, listed)
             there = self.problem.evaluate(self.run.state)  # that has taken its columns

@@ -218,9 +218,8 @@ class Target(Table):
                 "target.file and target.rotate_degrees: got both, expected one: the other map, or the input "
                 'turned; remove one, or set rotate_degrees = "auto"'
             )
-        if self.kind in _PICTURES and not self.file:
-            what = "painted image" if self.kind == "image" else "picture of the scene"
-            raise ConfigError(f'target.file: got "", expected the {what}, as target.kind is "{self.kind}"')
+        if self.kind == "image" and not self.file:
+            raise ConfigError('target.file: got "", expected the painted image, as target.kind is "image"')
         if self.kind == "strokes" and not self.strokes:
             raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
         if self.kind == "none" and (self.file or self.mask):

@@ -145,6 +145,10 @@ def make(
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
     if chosen.kind == "rendering":
+        if picture is None and not chosen.file:  # an array may take its place
+            raise ConfigError(
+                'target.file: got "", expected the picture of the scene, as target.kind is "rendering"'
+            )
         made = _of_rendering(settings, scene, envmap, picture, mask)
         return _seen(made, hidden, settings.output.tonemap)
     shape = scene.height, scene.width

@@ -120,7 +120,6 @@ def test_an_override_without_key_or_value_is_refused(text):
         ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
         ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
         ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
-        ("[target]\nkind = 'rendering'", ["target.file", "expected the picture of the scene"]),
         (
             "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
             ["target.mask: got 1 masks, expected 2"],

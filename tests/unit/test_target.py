@@ -351,11 +351,16 @@ def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     made = target.make(asking(kind="strokes", strokes=(upper,)), ball, envmap)
     assert not made.coverage[hidden].any() and made.coverage.any() and not made.weight[hidden].any()
     painted = made.coverage[..., 0] > 0
-    for rest, share in (("follow", 1.0), ("keep", 1.0)):
-        made = target.make(asking(kind="strokes", strokes=(upper,), rest=rest), ball, envmap)
-        weights = made.weight[~painted].sum(), made.weight[painted].sum()
-        assert weights[0] == pytest.approx(share * weights[1], rel=1e-5)
+    assert made.weight[~painted].sum() == pytest.approx(made.weight[painted].sum(), rel=1e-5)
     held = made.held(1, 3)
     assert held.weight[~painted].sum() == pytest.approx(3 * held.weight[painted].sum(), rel=1e-5)
     with pytest.raises(InputError, match="no surface is seen"):
         target.make(asking(kind="strokes", strokes=(corner,)), ball, envmap)
+
+
+def test_a_picture_of_the_scene_needs_a_file_or_an_array(ball, seen):
+    settings = asking(kind="rendering")
+    with pytest.raises(ConfigError, match="expected the picture of the scene"):
+        target.make(settings, ball, seen[0])
+    made = target.make(settings, ball, seen[0], picture=seen[1])
+    assert made.coverage is None and made.picture.tobytes() == np.float32(seen[1]).tobytes()

@@ -233,6 +233,12 @@ def run(
             f"the result is farther from the target than the input{where}: {after} now, {before} before; "
             f"the edited map is kept anyway: look at it before you use it{rate}"
         )
+    if measured["envmap"] and metrics.worse(measured["envmap"], measured["initial_envmap"]):
+        after_map, before_map = (metrics.score(measured[one], [], 2) for one in ("envmap", "initial_envmap"))
+        warnings.append(
+            f"the edited map is farther from the target's than the input is: {after_map} now, {before_map} "
+            "before: the picture does not determine it"
+        )
     solving = job.settings.optimizer.iterations > 0 and not measured["worse"]
     if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
         warnings.append(

@@ -79,8 +79,9 @@ def white(envmap: np.ndarray) -> float:
 def patches(edited: np.ndarray, original: np.ndarray) -> float:
     """Return the RMS of the log gain of the upper half at scales of 11 to 60 degrees.
 
-    The gain is that of mean luminance in cells, with the brightest :data:`CLIPPED` of each map cut; what is
-    smooth at :data:`COARSE_DEGREES` is taken off.
+    The gain is that of mean luminance in cells, with the brightest :data:`CLIPPED` of each map cut, less its
+    Gaussian mean of :data:`COARSE_DEGREES`: one factor for the sky leaves nothing, a gradient over all of it
+    some 60 % of its own RMS.
     """
     (before, directions, omega), (after, _, _) = cells(original), cells(edited)
     gain = after - before

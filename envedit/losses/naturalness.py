@@ -16,7 +16,7 @@ COARSE_DEGREES = 60.0
 """Scale from which on a change is no patch but another exposure, or a gradient over the whole sky."""
 CLIPPED = 0.01
 """Share of the sky's brightest texels that are cut in cells: the sun moving is no patch."""
-SKIES_PATCHES = 0.53
+SKIES_PATCHES = 0.52
 """RMS of patches between two photographed skies (``python -m experiments natural.skies run``)."""
 MOST_WHITE, MOST_PATCHES = 0.05, 1.0
 """From where on a user is warned of a painted edit: a twentieth of the sky more that is white, and as many

@@ -38,11 +38,11 @@ class SkyDifference:
 DEGREES = 32
 """Highest degree of the fields: beyond the gain's finest grid, which has 12 cycles around the horizon."""
 PHOTOGRAPHED = (
-    SkyDifference(np.sqrt(3) * 0.69, np.sqrt(3) * 0.244, 1.2),
-    SkyDifference(0.37, 0.145, 2.1),
-    SkyDifference(0.078, 0.015, 1.3),
+    SkyDifference(whole=1.17, gradient=0.399, falloff=1.2),
+    SkyDifference(whole=0.356, gradient=0.142, falloff=2.2),
+    SkyDifference(whole=0.076, gradient=0.016, falloff=1.6),
 )
-"""Along luminance, blue-amber and green-magenta; nine maps (``experiments/natural``)."""
+"""Along luminance, blue-amber and green-magenta; nine maps (``python -m experiments natural.skies run``)."""
 LEAST_FREEDOM = 0.01
 """Freedom that 0 stands for: a gain that is the same everywhere, to a hundredth of how skies differ."""
 FIXED = 1e6

@@ -24,6 +24,8 @@ LEAST_AREA = 0.015
 """Share of the picture that a shadow must have to be painted."""
 LEAST_CONTRAST = 1.15
 """Radiance beside a shadow over that in it, below which it is not to be seen."""
+LEAST_COVERAGE = 1 / 255
+"""Coverage below which a pixel is not painted: a step of a mask of 8 bits."""
 LEAST_ELEVATION, MOST_ELEVATION = 0.1, 1.5
 """Elevations of a lowered sun, radians."""
 
@@ -139,6 +141,11 @@ class View:
         smooth = np.fft.irfft2(np.fft.rfft2(padded) * response, s=padded.shape)
         return np.clip(smooth[margin:-margin, margin:-margin], 0, np.max(values))
 
+    def brush(self, mask: np.ndarray, deviation: float, surface: np.ndarray) -> np.ndarray:
+        """Return how much each pixel of a surface is painted by a soft brush over a mask, in [0, 1]."""
+        covered = self.blurred(mask, deviation) * surface
+        return np.where(covered < LEAST_COVERAGE, 0, covered)
+
 
 def turned(direction: np.ndarray, degrees: float, lift: float = 0.0) -> np.ndarray:
     """Return a direction turned about the vertical, and lifted, by degrees."""
@@ -174,8 +181,8 @@ def moved_shadow(view: View, picture: np.ndarray, degrees: float = 0.0, lift: fl
     if old is None or new is None or not (radiance := _of_shadow(view, picture, old, ~old & ~new)):
         return None
     light, dark = radiance
-    erased = (view.blurred(old, 1) * view.floor)[..., None]
-    painted = (view.blurred(new, 1) * view.floor)[..., None]
+    erased = view.brush(old, 1, view.floor)[..., None]
+    painted = view.brush(new, 1, view.floor)[..., None]
     lit = picture * (1 - erased) + erased * light
     shaded = lit * (1 - painted + painted * np.minimum(dark / light, 1))
     return Paint(shaded, np.maximum(erased, painted)[..., 0], sun)
@@ -188,7 +195,7 @@ def softer_shadow(view: View, picture: np.ndarray) -> Paint | None:
         return None
     smooth = view.blurred(shadow, 3)
     edge = view.floor & (smooth > 0.1) & (smooth < 0.9)
-    brush = view.blurred(edge, 1) * view.floor
+    brush = view.brush(edge, 1, view.floor)
     known = np.maximum(view.blurred(view.floor, 5), 0.05)
     soft = np.stack([view.blurred(p * view.floor, 5) / known for p in np.moveaxis(picture, 2, 0)], axis=2)
     return Paint(picture + brush[..., None] * (soft - picture), brush, view.sun)
@@ -200,7 +207,7 @@ def lifted_shadow(view: View, picture: np.ndarray) -> Paint | None:
     if shadow is None or not (radiance := _of_shadow(view, picture, shadow, ~shadow)):
         return None
     light, dark = radiance
-    brush = view.blurred(shadow, 1) * view.floor
+    brush = view.brush(shadow, 1, view.floor)
     factor = np.sqrt(light / np.maximum(dark, 1e-6))
     return Paint(picture * (1 + brush[..., None] * (factor - 1)), brush)
 
@@ -211,7 +218,7 @@ def lifted_shadow(view: View, picture: np.ndarray) -> Paint | None:
 def warm_rim(view: View, picture: np.ndarray) -> Paint | None:
     """Add warm light along the left contour of the object."""
     left = view.column < np.median(view.column[view.object])
-    brush = view.blurred(view.object & (view.facing < 0.45) & left, 0.8) * view.object
+    brush = view.brush(view.object & (view.facing < 0.45) & left, 0.8, view.object)
     return Paint(picture + 0.8 * brush[..., None] * [1.0, 0.8, 0.6], brush) if brush.any() else None
 
 
@@ -230,7 +237,7 @@ def brighter_dark_side(view: View, picture: np.ndarray) -> Paint | None:
     shown = luminance(picture)
     smooth = view.blurred(np.where(view.object, shown, np.median(shown[view.object])), 3)
     dark = view.object & (smooth < np.quantile(smooth[view.object], 0.4))
-    brush = view.blurred(dark, 1.5) * view.object
+    brush = view.brush(dark, 1.5, view.object)
     return Paint(picture * (1 + 0.8 * brush[..., None]), brush)
 
 
@@ -238,7 +245,7 @@ def no_highlight(view: View, picture: np.ndarray) -> Paint | None:
     """Paint over the brightest 6 % of the object, in the colour of its surroundings."""
     shown = luminance(picture)
     bright = view.object & (shown > np.quantile(shown[view.object], 0.94))
-    brush = view.blurred(bright, 1.5) * view.object
+    brush = view.brush(bright, 1.5, view.object)
     ring = view.object & (view.blurred(bright, 4) > 0.03) & (brush < 0.05)
     if not ring.any():
         return None
@@ -264,7 +271,7 @@ def dark_sky(view: View, picture: np.ndarray) -> Paint | None:
 def left_dimmed(view: View, picture: np.ndarray) -> Paint | None:
     """Darken the left of the object by 40 %, as if a window there were dimmed."""
     left = view.column < np.quantile(view.column[view.object], 0.4)
-    brush = view.blurred(view.object & left, 2) * view.object
+    brush = view.brush(view.object & left, 2, view.object)
     return Paint(picture * (1 - 0.4 * brush[..., None]), brush)
 
 

@@ -22,11 +22,13 @@ def picture(view):
 @pytest.mark.parametrize("edit", PAINTERS)
 def test_what_is_not_covered_is_not_painted(view, picture, edit):
     paint = PAINTERS[edit](view, picture)
-    bare = paint.coverage < 1e-6
+    bare = paint.coverage == 0
     assert np.isfinite(paint.picture).all() and (paint.picture >= 0).all()
     assert paint.coverage.min() >= 0
     assert 0.01 < paint.coverage.mean() <= 1 + 1e-9
-    np.testing.assert_allclose(paint.picture[bare], picture[bare], rtol=1e-4)
+    if not edit.startswith(("all", "dark")):
+        assert bare.mean() > 0.5
+    np.testing.assert_allclose(paint.picture[bare], picture[bare], rtol=1e-6)
     assert not np.allclose(paint.picture, picture, rtol=0.02)
 
 

@@ -19,7 +19,10 @@ from experiments.painted_edits.experiment import explanation, percent
 from experiments.painted_edits.painters import PAINTERS, SHADOWS, View
 
 SCENES = ("sphere", "statue", "matpreview", "mesh")
-MAPS = ("kloofendal_48d_partly_cloudy", "sunflowers", "industrial_sunset", "mud_road", *KEPT)
+MAPS = (
+    "kloofendal_48d_partly_cloudy", "sunflowers", "rustig_koppie", "syferfontein_18d_clear", "aristea_wreck",
+    "mud_road", "evening_road_01", "industrial_sunset",
+)  # fmt: skip
 SHADOWLESS = ("mud_road", "evening_road_01")
 """Maps whose suns cast no shadow that is to be seen."""
 WIDTH, MAP_WIDTH = 128, 256

@@ -242,11 +242,11 @@ def brighter_dark_side(view: View, picture: np.ndarray) -> Paint | None:
 
 
 def no_highlight(view: View, picture: np.ndarray) -> Paint | None:
-    """Paint over the brightest 6 % of the object, in the colour of its surroundings."""
+    """Paint over the brightest 6 % of the object, or all that is white, in the colour of its surroundings."""
     shown = luminance(picture)
-    bright = view.object & (shown > np.quantile(shown[view.object], 0.94))
+    bright = view.object & (shown > min(np.quantile(shown[view.object], 0.94), 1))
     brush = view.brush(bright, 1.5, view.object)
-    ring = view.object & (view.blurred(bright, 4) > 0.03) & (brush < 0.05)
+    ring = view.object & (view.blurred(bright, 4) > 0.03) & (brush < 0.05) & (shown < 1)
     if not ring.any():
         return None
     return Paint(picture + brush[..., None] * (np.median(picture[ring], axis=0) - picture), brush)

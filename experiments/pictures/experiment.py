@@ -115,7 +115,8 @@ def write_png(settings, folder, true, file) -> None:
     images.write_exr(folder / "true.exr", true)
     text = scenes.relit(chosen.file, "true.exr", dict(chosen.parameters), None, chosen.up, 1.0)
     (folder / "true.xml").write_text(text, encoding="utf-8")
-    scene = mi.load_file(str(folder / "true.xml"))
+    # With one thread, loading in parallel waits for ever.
+    scene = mi.load_file(str(folder / "true.xml"), parallel=False)
     size = inputs.load_scene(chosen)
     film = mi.traverse(scene)
     key = next(name for name in film if name.endswith("film.size"))

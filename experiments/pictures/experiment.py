@@ -7,6 +7,7 @@ Mitsuba renders of the scene as its author has it, with its filter and other sam
 import itertools
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -115,8 +116,10 @@ def write_png(settings, folder, true, file) -> None:
     images.write_exr(folder / "true.exr", true)
     text = scenes.relit(chosen.file, "true.exr", dict(chosen.parameters), None, chosen.up, 1.0)
     (folder / "true.xml").write_text(text, encoding="utf-8")
-    # With one thread, loading in parallel waits for ever.
-    scene = mi.load_file(str(folder / "true.xml"), parallel=False)
+    threads = dr.thread_count()
+    dr.set_thread_count(max(2, threads))  # with one, Mitsuba's loader waits for ever
+    scene = mi.load_file(str(folder / "true.xml"))
+    dr.set_thread_count(threads)
     size = inputs.load_scene(chosen)
     film = mi.traverse(scene)
     key = next(name for name in film if name.endswith("film.size"))

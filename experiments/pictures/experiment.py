@@ -122,7 +122,7 @@ def write_png(settings, folder, true, file) -> None:
     dr.set_thread_count(threads)
     size = inputs.load_scene(chosen)
     film = mi.traverse(scene)
-    key = next(name for name in film if name.endswith("film.size"))
+    key = next(name for name, *_ in film if name.endswith("film.size"))
     film[key] = mi.ScalarVector2u(size.width, size.height)
     film[key.replace("film.size", "film.crop_size")] = mi.ScalarVector2u(size.width, size.height)
     film.update()

@@ -187,7 +187,8 @@ class Preparation:
             drawn = seeds.turn_check, seeds.target_again
             # A power of four, for as many strata across as down.
             spp = 4 ** (max(1, TURN_PATHS // (self.lit.width * self.lit.height)).bit_length() // 2)
-            spp = spp if target.spp is None else min(spp, target.spp)
+            known = target.spp is not None and target.envmap is not None
+            spp = min(spp, target.spp) if known else spp
             return turning.find(
                 transport,
                 lambda envmap, k: self.lit.render(envmap, spp, drawn[k]),

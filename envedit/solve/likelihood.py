@@ -61,8 +61,10 @@ class Likelihood:
         weight, coverage : ndarray (h, w, 1)
             How much each pixel counts, and was painted.
         """
-        total = weight.sum(dtype=np.float64)
-        painted = float(weight[coverage > 0].sum(dtype=np.float64) / total)
+        # Weights are a c + b (1 - c): b is that of pixels without paint.
+        bare = weight[(coverage <= 0) & (weight > 0)]
+        of_rest = float(bare[0]) * (1 - coverage) if bare.size else 0.0
+        painted = float(np.maximum(weight - of_rest, 0).sum(dtype=np.float64) / weight.sum(dtype=np.float64))
         rest = (1 - coverage) * (weight > 0)
         return cls(
             weight=on_average_one(weight, weight.shape[:2]),

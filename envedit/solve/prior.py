@@ -39,11 +39,11 @@ class SkyDifference:
 DEGREES = 32
 """Highest degree of the fields: beyond the gain's finest grid, which has 12 cycles around the horizon."""
 PHOTOGRAPHED = (
-    SkyDifference(np.sqrt(3) * 0.69, np.sqrt(3) * 0.244, 1.2),
-    SkyDifference(0.37, 0.145, 2.1),
-    SkyDifference(0.078, 0.015, 1.3),
+    SkyDifference(whole=1.17, gradient=0.399, falloff=1.2),
+    SkyDifference(whole=0.356, gradient=0.142, falloff=2.2),
+    SkyDifference(whole=0.076, gradient=0.016, falloff=1.6),
 )
-"""Along luminance, blue-amber and green-magenta; nine maps (``experiments/natural``)."""
+"""Along luminance, blue-amber and green-magenta; nine maps (``python -m experiments natural.skies run``)."""
 FACTOR = 0.25
 """Least freedom of one factor for the whole sky: photographs differ in exposure as their makers chose it."""
 LEAST_FREEDOM = 0.01

@@ -7,6 +7,7 @@ maps. With a turn of the sky allowed and without.
 
 import hashlib
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -77,12 +78,12 @@ def cases(given):
     return found if count is None else evenly(found, count)
 
 
-def evenly(found: list[Case], count: int) -> list[Case]:
-    """Pick cases from all scenes, kinds and turns in the same number, in an order that is always the same."""
+def evenly(found: list[Case], count: int, about: Sequence[str] = ("kind", "turn", "scene")) -> list[Case]:
+    """Pick cases of all kinds, told by ``about``, in the same number, in an order that is always the same."""
     strata: dict[tuple, list[Case]] = {}
     for case in sorted(found, key=lambda c: hashlib.sha256(c.name.encode()).hexdigest()):
-        strata.setdefault(tuple(case.about[key] for key in ("kind", "turn", "scene")), []).append(case)
-    # Neighbours in a round differ in all of scene, kind and turn.
+        strata.setdefault(tuple(case.about[key] for key in about), []).append(case)
+    # Neighbours in a round differ in all of what tells their kinds.
     keys = sorted(strata, key=lambda key: hashlib.sha256(str(key).encode()).hexdigest())
     rounds = itertools.zip_longest(*(strata[key] for key in keys))
     return [case for some in rounds for case in some if case is not None][:count]

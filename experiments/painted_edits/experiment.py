@@ -26,6 +26,7 @@ ABLATION = {
     "change 0.1": ["loss.change=0.1"],
 }
 """What the ablation sets, with Adam: Gauss-Newton has the prior in place of these terms."""
+NOTE = "likeliest explanation of the paint: "
 
 
 def options(parser):
@@ -64,12 +65,25 @@ def regularised(kind: str) -> list[str]:
     return ["optimizer.kind=adam", *ABLATION[kind]] if kind else []
 
 
+def explanation(notes: list[str]) -> str:
+    """Return what a run's notes say of how the paint is explained; a dash where they say nothing."""
+    return next((note.removeprefix(NOTE) for note in notes if note.startswith(NOTE)), "-")
+
+
+def percent(value: float | None, form: str = ".0f") -> str:
+    """Format a share; a dash for None and NaN."""
+    return "-" if value is None or value != value else f"{100 * value:{form}} %"
+
+
 def measure(done: Done) -> dict:
     original, edited, _ = done.maps
     rows, painted = done.rows, done.metrics["painted"]
     before = metrics.high_frequency_energy(original[rows])
     return painted | {
-        "outside": 100 * done.metrics["natural"]["colours_outside"],
+        "outside": done.metrics["natural"]["colours_outside"],
+        "white": done.metrics["natural"]["white"],
+        "patches": done.metrics["natural"]["patches"],
+        "explanation": explanation(done.metrics["choices"]),
         "share": painted["towards"] / painted["reachable"] if painted["reachable"] else float("nan"),
         "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
         "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else float("nan"),
@@ -93,13 +107,16 @@ EXPERIMENT = Experiment(
     {
         "edit": "{edit}",
         "map": "{map}",
-        "towards the paint": lambda m: f"{100 * m['towards']:.0f} %",
-        "feasible": lambda m: f"{100 * m['reachable']:.0f} %",
-        "share of it": lambda m: f"{100 * m['share']:.0f} %",
+        "towards the paint": lambda m: percent(m["towards"]),
+        "feasible": lambda m: percent(m["reachable"]),
+        "share of it": lambda m: percent(m["share"]),
         "change elsewhere": lambda m: number(m["elsewhere"], ".4f"),
-        "colours outside": "{outside:.1f} %",
+        "white": lambda m: percent(m["white"], "+.1f"),
+        "patches": "{patches:.2f}",
+        "colours outside": lambda m: percent(m["outside"], ".1f"),
         "map SSIM": "{ssim:.3f}",
         "high frequencies": lambda m: number(m["sharp"], ".2f"),
+        "explanation": "{explanation}",
         "s": "{seconds:.0f}",
     },
     panels=panels,

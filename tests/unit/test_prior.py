@@ -5,7 +5,7 @@ import pytest
 
 from envedit.representations.layers.gain import GridGain
 from envedit.solve import prior
-from envedit.solve.prior import AXES, DEGREES, PHOTOGRAPHED, Prior
+from envedit.solve.prior import AXES, DEGREES, FACTOR, PHOTOGRAPHED, Prior
 
 UPPER = GridGain(12, 0.5)
 FIRST = sum(rows * columns for rows, columns in UPPER.sizes[:-1])
@@ -16,9 +16,14 @@ def finest(freedom, gain=UPPER):
     return Prior(freedom=freedom).gain_precisions(gain)[:, FIRST:, FIRST:]
 
 
+def whole(skies, freedom):
+    """The deviation of one factor for the whole sky."""
+    return max(freedom, FACTOR) * skies.whole
+
+
 def series(skies, cosine, freedom):
     """The covariance, with Legendre polynomials by their recurrence."""
-    before, now, total = 1.0, cosine, skies.whole**2
+    before, now, total = 1.0, cosine, whole(skies, freedom) ** 2
     for degree in range(1, DEGREES + 1):
         total += (2 * degree + 1) * (freedom * skies.gradient / degree**skies.falloff) ** 2 * now
         before, now = now, ((2 * degree + 1) * cosine * now - degree * before) / (degree + 1)
@@ -31,7 +36,7 @@ def test_covariance_is_the_series_of_legendre_polynomials(skies, freedom):
     cosines = np.array([-1.0, -0.3, 0.0, 0.5, 0.99, 1.0])
     expected = [series(skies, cosine, freedom) for cosine in cosines]
     np.testing.assert_allclose(skies.covariance(cosines, freedom), expected, rtol=1e-10)
-    assert skies.covariance(cosines, 0.0) == pytest.approx(skies.whole**2)
+    assert skies.covariance(cosines, 0.0) == pytest.approx(whole(skies, 0.0) ** 2)
 
 
 @pytest.mark.parametrize("freedom", [0.01, 0.25, 1.0])
@@ -47,15 +52,15 @@ def test_precision_is_the_inverse_of_a_positive_definite_covariance_at_the_nodes
         assert np.linalg.eigvalsh((precision + precision.T) / 2).min() > 0
         expected = [[series(skies, c, freedom) for c in row] for row in cosine[:: len(cosine) // 4]]
         got = np.linalg.inv(precision)[:: len(cosine) // 4]
-        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4 * skies.whole**2)
+        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4 * whole(skies, freedom) ** 2)
 
 
-def test_a_factor_for_the_whole_sky_costs_its_square_whatever_the_freedom():
+def test_a_factor_for_the_whole_sky_costs_its_square():
     """At most, as a gradient may do a part of it on half a sphere, and nearly that."""
     change = 0.5 * np.ones(len(UPPER.directions(2)))
     for freedom in (0.0, 0.25, 1.0):
         for precision, skies in zip(finest(freedom), PHOTOGRAPHED, strict=True):
-            cost = change @ precision @ change / (0.5 / skies.whole) ** 2
+            cost = change @ precision @ change / (0.5 / whole(skies, freedom)) ** 2
             assert (0.999 if freedom == 0 else 0.8) < cost < 1 + 1e-6, (freedom, skies)
 
 
@@ -89,7 +94,7 @@ def test_coarser_grids_stay_where_the_finest_has_all_and_ground_changes_as_a_sky
     for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
         np.testing.assert_array_equal(precision[:FIRST, :FIRST], prior.FIXED * np.eye(FIRST))
         assert not precision[:FIRST, FIRST:].any() and not precision[-1, :-1].any()
-        assert precision[-1, -1] == pytest.approx(skies.whole**-2)
+        assert precision[-1, -1] == pytest.approx(whole(skies, 0.25) ** -2)
 
 
 def test_of_a_rendering_every_node_has_a_deviation_of_its_own():

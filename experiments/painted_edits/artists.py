@@ -1,0 +1,157 @@
+"""Carry out the twelve edits that lighting artists make, painted by functions: four scenes, eight maps.
+
+Four of the maps are kept out of every choice (``experiments.natural.skies.KEPT``).
+"""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+import envedit
+from envedit import inputs
+from envedit.core.color import tonemap
+from envedit.targets import initial_rendering
+from experiments import puresky
+from experiments.harness import Case, Done, Experiment, calling, number
+from experiments.natural.skies import KEPT
+from experiments.painted_edits.experiment import explanation, percent
+from experiments.painted_edits.painters import PAINTERS, SHADOWS, View
+
+SCENES = ("sphere", "statue", "matpreview", "mesh")
+MAPS = (
+    "kloofendal_48d_partly_cloudy", "sunflowers", "rustig_koppie", "syferfontein_18d_clear", "aristea_wreck",
+    "mud_road", "evening_road_01", "industrial_sunset",
+)  # fmt: skip
+SHADOWLESS = ("mud_road", "evening_road_01")
+"""Maps whose suns cast no shadow that is to be seen."""
+WIDTH, MAP_WIDTH = 128, 256
+MATPREVIEW_SCALE = 0.5
+"""Factor of the map in place of the scene's own, 3, by which its picture is white under most skies."""
+MATPREVIEW_TURN = 60.0
+"""Degrees by which its maps are turned: their suns are behind its camera, and cast no shadow that is seen."""
+SUN = 0.25
+"""Share of the brightest light's flux from which on another light is a sun as well."""
+EDIT = "edit"
+"""Folder of the edit in that of a case."""
+
+
+def options(parser):
+    parser.add_argument("--count", type=int, help="so many cases, evenly from all edits")
+
+
+def cases(given):
+    data, maps = puresky.data(), puresky.find()
+    files = {
+        "matpreview": {
+            "file": str(data / "scenes" / "matpreview" / "matpreview.xml"),
+            "scale": MATPREVIEW_SCALE,
+        },
+        "mesh": {"file": "mesh", "parameters": {"mesh": str(data / "meshes" / "spot.obj")}},
+    }
+    turns = {"matpreview": {"rotate_degrees": MATPREVIEW_TURN}}
+    found = []
+    for edit, scene, name in itertools.product(PAINTERS, SCENES, filter(maps.__contains__, MAPS)):
+        if name in SHADOWLESS and edit in SHADOWS:
+            continue
+        tables = {
+            "input": {"envmap": str(maps[name]), "width": MAP_WIDTH, **turns.get(scene, {})},
+            "scene": {"width": WIDTH, **files.get(scene, {"file": scene})},
+        }
+        about = {"edit": edit, "scene": scene, "map": name}
+        function = "experiments.painted_edits.artists:carry_out"
+        found.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), function, tables, about, edit=edit))
+    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
+    return found if given.count is None else evenly(found, given.count)
+
+
+def evenly(found: list[Case], count: int) -> list[Case]:
+    """Pick cases of all edits in the same number; scene and map change from one edit to the next."""
+
+    def late(case):
+        edit, scene, name = (case.about[key] for key in ("edit", "scene", "map"))
+        i = list(PAINTERS).index(edit)
+        return (MAPS.index(name) - i) % len(MAPS), (SCENES.index(scene) - i) % len(SCENES)
+
+    of_edits = [sorted((c for c in found if c.about["edit"] == edit), key=late) for edit in PAINTERS]
+    rounds = itertools.zip_longest(*of_edits)
+    return [case for some in rounds for case in some if case is not None][:count]
+
+
+def carry_out(settings, folder, edit: str) -> dict:
+    """Paint, and edit the map; returns {} where there is nothing to paint on."""
+    # ---- Paint
+    scene = inputs.load_scene(settings.scene)
+    envmap, _ = inputs.load_map(settings.input, scene)
+    view = View(scene, envmap)
+    paint = PAINTERS[edit](view, initial_rendering.initial(scene, envmap, settings))
+    if paint is None:
+        return {}
+
+    # ---- Edit
+    result = envedit.edit(settings, target=paint.picture, mask=paint.coverage)
+    result.save(folder / EDIT)
+
+    # ---- Measures
+    found = result.metrics
+    lights = result.lights["after"]
+    flux = [sum(light["flux"]) for light in lights]
+    off = None
+    if paint.sun is not None and lights:
+        cosine = np.dot(lights[int(np.argmax(flux))]["direction"], scene.to_world @ paint.sun)
+        off = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return {
+        **found["painted"],
+        **found["natural"],
+        "explanation": explanation(result.notes),
+        "sun_off": off,
+        "suns": sum(f >= SUN * max(flux) for f in flux),
+        "seconds": found["timing"]["total_s"],
+    }
+
+
+def measure(done: Done) -> list[dict]:
+    """Return the row of a case; none where there was nothing to paint on."""
+    kept = " (kept out)" if done.case.about["map"] in KEPT else ""
+    return [{"kept": kept, **done.metrics}] if done.metrics else []
+
+
+def edit_of(done: Done) -> Done:
+    """Return the edit of a case as one that ``envedit run`` did."""
+    return Done(replace(done.case, result="metrics.json"), done.folder / EDIT)
+
+
+def panels(done: Done):
+    """Return initial, painted and edited rendering, original and edited map."""
+    if not done.metrics:
+        return []
+    edit = edit_of(done)
+    pictures = [edit.picture(f"render_{name}") for name in ("initial", "target", "edited")]
+    original, edited, _ = edit.maps
+    return [tonemap(one, "gamma") for one in (*pictures, original, edited)]
+
+
+EXPERIMENT = Experiment(
+    "painted_edits.artists",
+    "Carry out the twelve edits that lighting artists make, in four scenes under eight maps.",
+    cases,
+    measure,
+    {
+        "edit": "{edit}",
+        "scene": "{scene}",
+        "map": "{map}{kept}",
+        "towards the paint": lambda m: percent(m["towards"]),
+        "feasible": lambda m: percent(m["reachable"]),
+        "change elsewhere": lambda m: number(m["elsewhere"], ".3f"),
+        "white": lambda m: percent(m["white"], "+.1f"),
+        "patches": "{patches:.2f}",
+        "colours outside": lambda m: percent(m["colours_outside"], ".1f"),
+        "explanation": "{explanation}",
+        "sun off, degrees": lambda m: number(m["sun_off"]),
+        "suns": "{suns}",
+        "s": "{seconds:.0f}",
+    },
+    panels=panels,
+    sheet=lambda case: f"artists_{case.about['scene']}.jpg",
+    options=options,
+)

@@ -1,0 +1,178 @@
+"""Edit towards the same light given as a map, as a linear picture, and as an 8-bit picture of plain Mitsuba.
+
+Each case is three edits: the target is the map; the picture that envedit renders under it; an sRGB PNG that
+Mitsuba renders of the scene as its author has it, with its filter and other samples.
+"""
+
+import itertools
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import envedit
+from envedit import config, inputs
+from envedit.core.color import tonemap
+from envedit.images import images
+from envedit.scene import scene as scenes
+from experiments import puresky
+from experiments.harness import Done, Experiment, calling, markdown, number
+from experiments.natural.experiment import evenly, psnr
+
+SCENES = ("sphere", "statue", "matpreview")
+TURNS = {
+    "kloofendal_48d_partly_cloudy": 60,
+    "mud_road": 140,
+    "rustig_koppie": 220,
+    "industrial_sunset": 300,
+}
+"""Maps, and how far they are turned, degrees."""
+PAIRS = (
+    ("kloofendal_48d_partly_cloudy", "sunflowers"),
+    ("mud_road", "kloofendal_48d_partly_cloudy"),
+    ("sunflowers", "overcast_soil"),
+    ("industrial_sunset", "wasteland_clouds"),
+    ("rustig_koppie", "aristea_wreck"),
+    ("syferfontein_18d_clear", "evening_road_01"),
+    ("evening_road_01", "rustig_koppie"),
+    ("overcast_soil", "syferfontein_18d_clear"),
+)
+"""Map and target."""
+WIDTH, MAP_WIDTH = 128, 256
+MATPREVIEW_SCALE = 0.5
+"""Factor of the map in place of the scene's own, 3, by which its picture is white under most skies."""
+PNG_SPP, PNG_SEED = 512, 4711
+"""Samples a pixel, and seed, of the PNG."""
+WAYS = {"by_map": "map", "by_picture": "linear picture", "by_png": "PNG"}
+"""How the target is given, by the name of its files."""
+
+
+def options(parser):
+    parser.add_argument("--count", type=int, help="so many cases, evenly from scenes, pairs and turns")
+
+
+def cases(given):
+    maps, data = puresky.find(), puresky.data()
+    matpreview = data / "scenes" / "matpreview" / "matpreview.xml"
+    files = {"matpreview": {"file": str(matpreview), "scale": MATPREVIEW_SCALE}}
+    targets = [(name, f"turned by {turn}", {"rotate_degrees": float(turn)}) for name, turn in TURNS.items()]
+    targets += [(name, other, {"file": str(maps[other])}) for name, other in PAIRS if other in maps]
+    found = []
+    for scene, (name, label, target) in itertools.product(SCENES, targets):
+        if name not in maps:
+            continue
+        tables = {
+            "input": {"envmap": str(maps[name]), "width": MAP_WIDTH},
+            "scene": {"width": WIDTH, **files.get(scene, {"file": scene})},
+            "target": target,
+        }
+        kind = "turned" if "rotate_degrees" in target else "another map"
+        about = {"scene": scene, "map": name, "target": label, "kind": kind}
+        title = f"{scene}-{name}-{label}".replace(" ", "_")
+        found.append(calling(title, "experiments.pictures.experiment:three_ways", tables, about))
+    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
+    return found if given.count is None else evenly(found, given.count, ("kind", "scene"))
+
+
+def three_ways(settings, folder) -> dict:
+    """Edit towards a map, its picture, and a PNG of it; returns PSNR of maps and renderings, by way."""
+    # ---- The map, and the pictures that it makes
+    results = {"by_map": envedit.edit(settings)}
+    original, true = (results["by_map"].maps[name] for name in ("initial", "target"))
+    picture = folder / "picture.exr"
+    images.write_exr(picture, results["by_map"].renders["target"])
+    png = folder / "picture.png"
+    write_png(settings, folder, true, png)
+
+    # ---- The pictures as targets
+    for way, file in (("by_picture", picture), ("by_png", png)):
+        target = config.Target(file=str(file))
+        results[way] = envedit.edit(replace(settings, target=target))
+
+    # ---- Measures, on display values of the maps
+    for name, shown in (("original", original), ("true", true)):
+        images.write_exr(folder / f"{name}.exr", shown)
+    found = {"unedited": psnr(original, true)}
+    for way, result in results.items():
+        images.write_exr(folder / f"{way}.exr", result.maps["edited"])
+        images.write_exr(folder / f"render_{way}.exr", result.renders["edited"])
+        found[way] = {
+            "psnr": psnr(result.maps["edited"], true),
+            "render": result.metrics["render"]["psnr"],
+            "turn": result.metrics["turn_degrees"],
+            "seconds": result.metrics["timing"]["total_s"],
+            "target": next((n for n in result.notes if n.startswith("a picture of the scene")), ""),
+        }
+    return found
+
+
+def write_png(settings, folder, true, file) -> None:
+    """Render the scene of plain Mitsuba under a map, as 8 bits of sRGB.
+
+    The map is in the units of the radiance that reaches the scene.
+    """
+    chosen = settings.scene
+    images.write_exr(folder / "true.exr", true)
+    text = scenes.relit(chosen.file, "true.exr", dict(chosen.parameters), None, chosen.up, 1.0)
+    (folder / "true.xml").write_text(text, encoding="utf-8")
+    threads = dr.thread_count()
+    dr.set_thread_count(max(2, threads))  # with one, Mitsuba's loader waits for ever
+    scene = mi.load_file(str(folder / "true.xml"))
+    dr.set_thread_count(threads)
+    size = inputs.load_scene(chosen)
+    film = mi.traverse(scene)
+    key = next(name for name, *_ in film if name.endswith("film.size"))
+    film[key] = mi.ScalarVector2u(size.width, size.height)
+    film[key.replace("film.size", "film.crop_size")] = mi.ScalarVector2u(size.width, size.height)
+    film.update()
+    rendering = mi.Bitmap(mi.render(scene, spp=PNG_SPP, seed=PNG_SEED))
+    shown = rendering.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    shown.write(str(file))
+
+
+def measure(done: Done) -> dict:
+    return done.metrics
+
+
+def summary(rows) -> str:
+    """Return means of maps, differences to the target as map, and how many are worse than unedited."""
+    lines = []
+    for way, name in WAYS.items():
+        maps = np.array([row[way]["psnr"] for row in rows])
+        off = maps - [row["by_map"]["psnr"] for row in rows]
+        worse = int((maps < [row["unedited"] for row in rows]).sum())
+        render = np.mean([row[way]["render"] for row in rows])
+        numbers = maps.mean(), off.mean(), off.min(), render
+        lines.append([name, str(len(rows)), *(number(one, ".1f") for one in numbers), str(worse)])
+    numbers = "map, dB", "over the map as target", "least", "rendering, dB"
+    head = "target", "runs", *numbers, "worse than unedited"
+    return markdown(head, lines)
+
+
+def panels(done: Done):
+    """Return original and true map, the edited ones, and the renderings."""
+    maps = [done.picture(name) for name in ("original", "true", *WAYS)]
+    return [tonemap(one, "gamma") for one in (*maps, *(done.picture(f"render_{way}") for way in WAYS))]
+
+
+EXPERIMENT = Experiment(
+    "pictures",
+    "Edit towards the same light given as a map, as a picture, and as an 8-bit picture of plain Mitsuba.",
+    cases,
+    measure,
+    {
+        "scene": "{scene}",
+        "map": "{map}",
+        "target": "{target}",
+        "unedited, dB": "{unedited:.1f}",
+        **{f"by {name}, dB": f"{{{way}[psnr]:.1f}}" for way, name in WAYS.items()},
+        "picture over map": lambda m: number(m["by_picture"]["psnr"] - m["by_map"]["psnr"], "+.1f"),
+        "PNG over map": lambda m: number(m["by_png"]["psnr"] - m["by_map"]["psnr"], "+.1f"),
+        "turns, degrees": lambda m: ", ".join(number(m[way]["turn"]) for way in WAYS),
+    },
+    summary=summary,
+    panels=panels,
+    sheet=lambda case: f"{case.about['scene']}.jpg",
+    options=options,
+)

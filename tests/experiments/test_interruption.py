@@ -149,7 +149,7 @@ def test_a_run_without_a_step_is_resumed_where_it_was_killed_as_it_wrote(tmp_pat
     folder = tmp_path / "out"
     with pytest.raises(Killed), killed_at(monkeypatch, seen.index("render_target.exr")):
         call(path, "--quiet", "--out", folder)
-    assert {"edited.exr", checkpoint.NAME} < names(folder)
+    assert "edited.exr" in names(folder)
     assert call(path, "--quiet", "--resume", "--out", folder) == 0
     assert names(folder) == names(tmp_path / "whole")
     assert differing(folder, tmp_path / "whole") == set()

@@ -92,6 +92,8 @@ def test_memory_does_not_grow_over_400_iterations(monkeypatch):
             *SMALL,
             "representation.kind=siren",
             "representation.hidden=16",
+            "representation.turn=false",
+            "target.spp=256",
             "optimizer.iterations=400",
         ],
     )

@@ -61,7 +61,7 @@ MAPS = {
     "range of 1e12": ramp(),
     "width 2": sunny(1, 2),
     "width 3": sunny(2, 3),
-    "width 5": sunny(3, 5),
+    "width 5": sunny(4, 5),
     "width 4096": sunny(16, 4096),
 }
 """A texel of that value in a smooth sky of 16 x 32 unless said otherwise; 4096 is 16 rows of such a map."""
@@ -135,8 +135,8 @@ def _declare():
         cells[name, "transport"] = refused(InputError, small.format(size))
         cells[name, "edit loop"] = refused(InputError, small.format(size))
     cells["width 2", "read"] = refused(InputError, "2 x 1 texels are too few for a map; use at least 6 x 3")
-    cells["width 3", "read"] = refused(InputError, "a lat-long map is 2:1, this is 3 x 2")
-    cells["width 5", "read"] = refused(InputError, "a lat-long map is 2:1, this is 5 x 3")
+    cells["width 3", "read"] = refused(InputError, "3 x 2 texels are too few for a map; use at least 6 x 3")
+    cells["width 5", "read"] = refused(InputError, "a lat-long map is 2:1, this is 5 x 4")
     return cells
 
 

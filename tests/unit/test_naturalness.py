@@ -116,5 +116,5 @@ def test_a_user_is_warned_of_much_white_and_of_patches():
     assert naturalness.warning(fine) == ""
     white = naturalness.warning(fine | {"white": 0.08})
     assert "8 % more of it is white" in white and "patches" not in white and "solve.freedom" in white
-    both = naturalness.warning({"white": 0.08, "patches": 1.5})
-    assert "white and its patches are 1.5 times" in both
+    both = naturalness.warning({"white": 0.08, "patches": 1.9})
+    assert "white and its patches are 1.9 times" in both

@@ -439,7 +439,7 @@ def test_weights_in_the_folder_of_all_runs_are_found(tmp_path, monkeypatch):
     folder.mkdir()
     settings = of_siren()
     assert installed.files(settings) == {}
-    assert "`envedit weights` (" + str(folder) in installed.missing(settings)
+    assert "`envedit weights`" in installed.missing(settings)
     plain = installed.settled(settings)
     assert (plain.loss.dists, plain.optimizer.iterations) == (0, 600)
     (folder / "vgg16_features.npz").touch()  # one of a pair is none

@@ -69,6 +69,4 @@ def missing(settings: config.Config) -> str:
         asked = settings.representation.kind == "siren"
     if settings.target.kind == "none" or not asked or "vgg" in files(settings):
         return ""
-    place = folder()
-    where = " DIR` and [perceptual] weights = DIR" if place is None else f"` ({place})"
-    return f"DISTS is off: no trained weights; to fetch them once, 64 MB: `envedit weights{where}"
+    return "DISTS is off: no trained weights; to fetch them once, 64 MB: `envedit weights`"

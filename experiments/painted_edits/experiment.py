@@ -83,7 +83,7 @@ def measure(done: Done) -> dict:
         "outside": done.metrics["natural"]["colours_outside"],
         "white": done.metrics["natural"]["white"],
         "patches": done.metrics["natural"]["patches"],
-        "explanation": explanation(done.metrics["choices"]),
+        "explanation": explanation(done.metrics.get("choices", [])),
         "share": painted["towards"] / painted["reachable"] if painted["reachable"] else float("nan"),
         "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
         "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else float("nan"),

@@ -48,11 +48,16 @@ def threads_stay():
 
 
 @pytest.fixture(autouse=True)
-def no_weights(monkeypatch):
-    """Keep trained weights that this machine may have out of every run."""
+def no_weights():
+    """Keep trained weights that this machine may have out of every run.
+
+    By a patch of its own: ``monkeypatch`` would begin before the fixtures of modules, and end after them.
+    """
     from envedit.losses.perceptual import installed
 
-    monkeypatch.setattr(installed, "cache_folder", lambda kind: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(installed, "cache_folder", lambda kind: None)
+        yield
 
 
 @pytest.fixture

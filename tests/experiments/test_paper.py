@@ -309,7 +309,7 @@ def finish(
             },
             "active_rows": [0, 3],
             "painted": {"towards": 0.8, "elsewhere": None, "reachable": 0.9},
-            "natural": {"colours_outside": 0.25, "seam": 1.0, "high_frequency": 0.9, "white": 0, "patches": 0.1},
+            "natural": {"colours_outside": 0.25, "seam": 1, "high_frequency": 0.9, "white": 0, "patches": 0},
         }
         (folder / "metrics.json").write_text(json.dumps(about))
         (folder / "done.json").write_text(json.dumps({"resumed": resumed}))

@@ -280,10 +280,14 @@ class Problem(Unknowns):
 
     def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
         """Return the state after a damped step; None if the step is not finite."""
-        # Of the prior all is damped: off the diagonal it has what makes nodes go together.
-        damped = normal.hessian + damping * normal.precision
-        diagonal = np.diag_indices_from(damped)
-        damped[diagonal] += damping * (normal.hessian - normal.precision)[diagonal]
+        # Marquardt's diagonal; where the prior makes nodes go together, all of the prior is damped: with its
+        # diagonal alone the sky as a whole would hardly move.
+        diagonal = np.diag_indices_from(normal.hessian)
+        damped = normal.hessian.copy()
+        damped[diagonal] *= 1 + damping
+        if self.prior.freedom is not None:
+            damped += damping * normal.precision
+            damped[diagonal] -= damping * normal.precision[diagonal]
         try:
             step = -solved(np.linalg.cholesky(damped), normal.gradient)
             if self.saturates:

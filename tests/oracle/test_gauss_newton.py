@@ -648,13 +648,11 @@ def marquardt(normal, damping):
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
-def test_of_a_diagonal_prior_the_step_is_marquardts(case, damping):
-    """But for what the three channels of a node have in common."""
+def test_of_a_rendering_the_step_is_marquardts(case, damping):
     problem, _, start, state = case
     normal = problem.normal(problem.evaluate(state), start, 1.0)
     n = 3 * problem.nodes
-    of_data = np.diag(np.diag(normal.hessian - normal.precision))
-    damped = normal.hessian + damping * (normal.precision + of_data)
+    damped = normal.hessian + damping * np.diag(np.diag(normal.hessian))
     expected = -np.linalg.solve(damped, normal.gradient)[:n]
     gain = (problem.step(state, normal, damping)["gain"] - state["gain"]).T.ravel()
     assert np.abs(expected).max() < map_problem.LARGEST["gain"]

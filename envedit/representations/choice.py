@@ -28,7 +28,9 @@ def make(
     kind = settings.representation.kind
     if kind == "layers":
         cycles = settings.representation.cycles
-        return Layers(rows, CYCLES if isinstance(cycles, str) else cycles, horizon)
+        # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
+        painted = settings.target.kind in ("image", "strokes")
+        return Layers(rows, CYCLES if isinstance(cycles, str) else cycles, horizon, aureoles=painted)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":

@@ -28,11 +28,11 @@ class SkyDifference:
     gradient: float
     falloff: float
 
-    def covariance(self, cosine: np.ndarray, freedom: float) -> np.ndarray:
+    def covariance(self, cosine: np.ndarray, freedom: float, factor: float | None = None) -> np.ndarray:
         """Return freedom^2 C at angles given by cosines; of ``whole`` at least :data:`FACTOR` counts."""
         degree = np.arange(1, DEGREES + 1)
         series = (2 * degree + 1) * (freedom * self.gradient * degree**-self.falloff) ** 2
-        whole = max(freedom, FACTOR) * self.whole
+        whole = (max(freedom, FACTOR) if factor is None else factor) * self.whole
         return np.polynomial.legendre.legval(cosine, np.append(whole**2, series))
 
 
@@ -82,6 +82,8 @@ class Prior:
     freedom : float or None
         How far the gain may go, in units of how photographed skies differ (:data:`PHOTOGRAPHED`); None: as
         ``luminance``, ``chroma`` and ``tint`` say, node by node.
+    factor : float or None
+        The same of one factor for the whole sky; None: freedom, at least :data:`FACTOR`.
     """
 
     luminance: float = 1.0
@@ -94,6 +96,7 @@ class Prior:
     added_size: float = 1.0
     saturation: float = 1.0
     freedom: float | None = None
+    factor: float | None = None
 
     def gain_precisions(self, gain: GridGain, ground: bool = False) -> np.ndarray:
         """Return the inverse covariance of the nodes' log gain along luminance, chroma and tint: (3, n, n).
@@ -119,11 +122,11 @@ class Prior:
         first, last = sum(coarse[:-1]), sum(coarse)
         found = np.zeros((3, last + ground, last + ground))
         for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
-            covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM))
+            covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM), self.factor)
             covariance[np.diag_indices_from(covariance)] *= 1 + NUGGET
             precision[first:last, first:last] = np.linalg.inv(covariance)
             precision[np.arange(first), np.arange(first)] = FIXED
-            precision[last:, last:] = (max(self.freedom, FACTOR) * skies.whole) ** -2.0
+            precision[last:, last:] = ((self.factor or max(self.freedom, FACTOR)) * skies.whole) ** -2.0
         return found
 
     @property
@@ -133,10 +136,18 @@ class Prior:
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-def of_paint(freedom: float) -> Prior:
+def of_paint(freedom: float, painted: float = 0.0) -> Prior:
     """Return the prior of painted targets.
 
     Paint that asks for another brightness is no reason for another colour of a light: a third of what a
-    rendered target may change.
+    rendered target may change. One factor for the whole sky is as free as the picture is painted.
+
+    Parameters
+    ----------
+    freedom : float
+        How far the gain may go, in units of how photographed skies differ.
+    painted : float
+        Share of the picture that is painted.
     """
-    return Prior(tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3, freedom=freedom)
+    factor = max(FACTOR, freedom, painted)
+    return Prior(tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3, freedom=freedom, factor=factor)

@@ -47,10 +47,15 @@ def problem(
         envmap,
         target.aim,
         likelihood(target),
-        prior.of_paint(settings.solve.freedom) if painted else prior.Prior(),
+        prior.of_paint(settings.solve.freedom, _painted(target)) if painted else prior.Prior(),
         saturates=not painted,
         blocks=blocks,
     )
+
+
+def _painted(target):
+    """Return the share of the picture that is painted."""
+    return 0.0 if target.coverage is None else float(target.coverage.mean())
 
 
 def sigma(target: Target) -> float:

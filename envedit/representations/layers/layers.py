@@ -53,6 +53,9 @@ class Layers:
         What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
         ``below_horizon.py``, or "free": edited as those above.
 
+    aureoles : bool
+        Lights that are added have the glow of the map's strongest, as for :class:`.Lights`.
+
     Attributes
     ----------
     separation : Separation
@@ -80,8 +83,14 @@ class Layers:
     models_edit, fitted = True, None
     Gain = GridGain
 
-    def __init__(self, rows: tuple[int, int] | None = None, cycles: int = CYCLES, horizon: Horizon = "free"):
-        self.rows, self._cycles, self._horizon = rows, cycles, horizon
+    def __init__(
+        self,
+        rows: tuple[int, int] | None = None,
+        cycles: int = CYCLES,
+        horizon: Horizon = "free",
+        aureoles: bool = True,
+    ):
+        self.rows, self._cycles, self._horizon, self._aureoles = rows, cycles, horizon, aureoles
         self.below: Below | None = None
         self.separation: Separation | None = None
         self.free: np.ndarray | None = None
@@ -102,7 +111,7 @@ class Layers:
             up = sky_rows(len(image))
             image, low = np.ascontiguousarray(image[:up]), image[up:]
         self.separation = separate(image, self.rows, MOVABLE)
-        self.lights = Lights(self.separation.lights, self.rows, image.shape[1])
+        self.lights = Lights(self.separation.lights, self.rows, image.shape[1], self._aureoles)
         self.shape = image.shape[:2]
         core = self.separation.core
         base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)

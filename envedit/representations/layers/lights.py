@@ -67,6 +67,8 @@ class Lights:
         First row of the image that the lights' texels refer to in its map, and the rows of that map.
     width : int
         Its columns.
+    aureoles : bool
+        Spare lights have a glow; without it what surrounds a light that is added is left to the gain.
 
     Attributes
     ----------
@@ -82,7 +84,7 @@ class Lights:
         light with a glow, in proportion to flux; None where none has.
     """
 
-    def __init__(self, lights: list[Light], rows: tuple[int, int], width: int):
+    def __init__(self, lights: list[Light], rows: tuple[int, int], width: int, aureoles: bool = True):
         first, total = rows
         self.own, self.count, self.width, self.total = len(lights), len(lights) + SPARE, width, total
         self._rows = rows
@@ -118,7 +120,7 @@ class Lights:
         added = np.concatenate([np.full(n, i >= self.own) for i, n in enumerate(many)])
         self._added = dr.opaque(mi.Bool(added))
         self.glows = [light.glow for light in lights]
-        self.glows += [_glow_in_proportion(self.glows, own, spare)] * SPARE
+        self.glows += [_glow_in_proportion(self.glows, own, spare) if aureoles else None] * SPARE
         self._glow = [
             None if glow is None else dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
             for glow in self.glows

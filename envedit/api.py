@@ -113,7 +113,8 @@ def edit(
         arguments = (given.get(name) for name in ("envmap", "target_map", "target", "mask"))
         memory = inputs.Given(lit, *arguments)
         result = run(_of_arrays(chosen, given), base=base or found, watch=watch, memory=memory)
-    result.warnings[:0] = filter(None, codes)
+    if any(codes):
+        result.warnings[:0] = filter(None, codes)
     return result
 
 

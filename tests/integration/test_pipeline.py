@@ -684,7 +684,9 @@ def test_a_checkpoint_of_another_scene_is_refused(tmp_path, rng):
     folder = tmp_path / "run"
     folder.mkdir()
     images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
-    tables = {"target": {"kind": "image", "file": "painted.exr"}, "optimizer": {"iterations": 3}}
+    images.write_exr(tmp_path / "mask.exr", np.ones((18, 24, 3), np.float32))
+    painted = {"kind": "image", "file": "painted.exr", "mask": "mask.exr"}
+    tables = {"target": painted, "optimizer": {"iterations": 3}}
     settings = settings_of(tmp_path, sunny(rng), **tables)
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=folder, watch=interrupting())

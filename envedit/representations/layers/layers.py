@@ -9,6 +9,8 @@ gone (``behind_glow.py``), k is the saturation of the sky's colours (``saturatio
 (``below_horizon.py``), or are edited like them. Where f = exp(g) is above 1, E f is read as
 E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`.brightened`. Unmoved lights, no gain and k = 1 give the
 original back, bit for bit outside the cores: the sky's own detail is kept, and the map has any resolution.
+
+Longer than 400 lines: the terms of one formula, and what each is at other resolutions.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ from envedit.targets.working_size import at_size
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
 LEAST_GAIN = 0.05
-"""Share of the residual below which an edit has achieved nothing: 0.45 dB."""
+"""Share of the residual below which an edit has achieved nothing, or made nothing worse: 0.45 dB."""
 
 
 @dataclass
@@ -233,8 +233,9 @@ def run(
             f"the result is farther from the target than the input{where}: {after} now, {before} before; "
             f"the edited map is kept anyway: look at it before you use it{rate}"
         )
-    if measured["envmap"] and metrics.worse(measured["envmap"], measured["initial_envmap"]):
-        after_map, before_map = (metrics.score(measured[one], [], 2) for one in ("envmap", "initial_envmap"))
+    of_maps = [measured.get(name) for name in ("envmap", "initial_envmap")]
+    if all(of_maps) and metrics.gained(*of_maps) < -LEAST_GAIN:
+        after_map, before_map = (metrics.score(one, [], 2) for one in of_maps)
         warnings.append(
             f"the edited map is farther from the target's than the input is: {after_map} now, {before_map} "
             "before: the picture does not determine it"

@@ -28,11 +28,11 @@ class SkyDifference:
     gradient: float
     falloff: float
 
-    def covariance(self, cosine: np.ndarray, freedom: float, factor: float | None = None) -> np.ndarray:
-        """Return freedom^2 C at angles given by cosines; of ``whole`` at least :data:`FACTOR` counts."""
+    def covariance(self, cosine: np.ndarray, freedom: float, factor: float) -> np.ndarray:
+        """Return freedom^2 C at angles given by cosines; ``whole`` is multiplied by ``factor`` instead."""
         degree = np.arange(1, DEGREES + 1)
         series = (2 * degree + 1) * (freedom * self.gradient * degree**-self.falloff) ** 2
-        whole = (max(freedom, FACTOR) if factor is None else factor) * self.whole
+        whole = factor * self.whole
         return np.polynomial.legendre.legval(cosine, np.append(whole**2, series))
 
 
@@ -82,8 +82,8 @@ class Prior:
     freedom : float or None
         How far the gain may go, in units of how photographed skies differ (:data:`PHOTOGRAPHED`); None: as
         ``luminance``, ``chroma`` and ``tint`` say, node by node.
-    factor : float or None
-        The same of one factor for the whole sky; None: freedom, at least :data:`FACTOR`.
+    factor : float
+        The same of one factor for the whole sky, where ``freedom`` is set.
     """
 
     luminance: float = 1.0
@@ -96,7 +96,7 @@ class Prior:
     added_size: float = 1.0
     saturation: float = 1.0
     freedom: float | None = None
-    factor: float | None = None
+    factor: float = FACTOR
 
     def gain_precisions(self, gain: GridGain, ground: bool = False) -> np.ndarray:
         """Return the inverse covariance of the nodes' log gain along luminance, chroma and tint: (3, n, n).
@@ -126,7 +126,7 @@ class Prior:
             covariance[np.diag_indices_from(covariance)] *= 1 + NUGGET
             precision[first:last, first:last] = np.linalg.inv(covariance)
             precision[np.arange(first), np.arange(first)] = FIXED
-            precision[last:, last:] = ((self.factor or max(self.freedom, FACTOR)) * skies.whole) ** -2.0
+            precision[last:, last:] = (self.factor * skies.whole) ** -2.0
         return found
 
     @property
@@ -136,7 +136,7 @@ class Prior:
         return AXES.T @ (sd[:, None] ** -2.0 * AXES)
 
 
-def of_paint(freedom: float, painted: float = 0.0) -> Prior:
+def of_paint(freedom: float, coverage: np.ndarray | None = None) -> Prior:
     """Return the prior of painted targets.
 
     Paint that asks for another brightness is no reason for another colour of a light: a third of what a
@@ -146,8 +146,9 @@ def of_paint(freedom: float, painted: float = 0.0) -> Prior:
     ----------
     freedom : float
         How far the gain may go, in units of how photographed skies differ.
-    painted : float
-        Share of the picture that is painted.
+    coverage : ndarray (h, w, 1), optional
+        How much each pixel was painted; None: nothing was.
     """
+    painted = 0.0 if coverage is None else float(coverage.mean(dtype=np.float64))
     factor = max(FACTOR, freedom, painted)
     return Prior(tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3, freedom=freedom, factor=factor)

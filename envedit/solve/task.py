@@ -41,21 +41,17 @@ def problem(
         As for :class:`.Problem`.
     """
     painted = target.coverage is not None
+    expected = prior.of_paint(settings.solve.freedom, target.coverage) if painted else prior.Prior()
     return Problem(
         layers,
         transport,
         envmap,
         target.aim,
         likelihood(target),
-        prior.of_paint(settings.solve.freedom, _painted(target)) if painted else prior.Prior(),
+        expected,
         saturates=not painted,
         blocks=blocks,
     )
-
-
-def _painted(target):
-    """Return the share of the picture that is painted."""
-    return 0.0 if target.coverage is None else float(target.coverage.mean())
 
 
 def sigma(target: Target) -> float:

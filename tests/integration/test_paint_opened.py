@@ -74,8 +74,8 @@ def test_save_goes_on_from_what_is_shown_and_tells_what_differs(rest, tmp_path):
         heard(page, "opened")
         hold = server.worker.session.hold
         assert hold > 1 if rest == "keep" else hold == 1, "the saved solution is not what is opened"
-        page.send(json.dumps({"type": "document", "document": {"strokes": [erased, erased]}}))
-        heard(page, "status", lambda m: m["iterations"] > 0)
+        page.send(json.dumps({"type": "document", "number": 2, "document": {"strokes": [erased, erased]}}))
+        heard(page, "status", lambda m: m.get("number") == 2)
         assert "start" not in kept.read_text(), "a solution of other strokes is gone on from"
 
 

@@ -60,6 +60,8 @@ def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
     for rest in ("follow", "keep"):
         status = solved(painting, strokes=[ERASED], freedom=0.0, rest=rest)
         assert ("hold" in status) == (rest == "keep")
+        assert 0 < status["reached"] <= status["reachable"] <= 1
+        assert "advice" not in status or status["reached"] < 0.5
         changes.append(np.abs(session.point.rendering - session.base)[session.coverage[..., 0] == 0].mean())
     assert changes[1] < changes[0], "the rest does not stay"
     kept = config.load(session.project.folder / "painted.toml")
@@ -70,10 +72,7 @@ def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
     assert config.loads(project_text, session.project.folder, "painted.toml").target.rest == "keep"
 
 
-def test_what_is_reached_is_said_of_what_is_feasible_and_advice_where_it_is_little(painting):
-    status = solved(painting, strokes=[ERASED])
-    assert 0 < status["reached"] <= status["reachable"] <= 1
-    assert "advice" not in status or status["reached"] < 0.5
+def test_advice_is_given_where_little_is_reached(painting):
     session, _ = painting
     status = solved(painting, strokes=[DARK], rest="keep", freedom=0.0)
     assert status["reached"] < 0.5

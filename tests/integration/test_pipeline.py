@@ -947,7 +947,7 @@ def test_turned_and_unturned_edits_are_compared_where_they_end(monkeypatch):
     after[6:9, 40:43] += 15  # lamps
     after[9:11, 10:12] += 7.5
     after[4:6, 20:22] += 7.5
-    api.edit({"scene": {"file": "pair", "width": 48}, "output": {"spp": 16}}, envmap=before, target_map=after)
+    api.edit({"scene": {"file": "pair", "width": 32}, "output": {"spp": 16}}, envmap=before, target_map=after)
     turned, still, taken, corrected = steps
     assert taken in (turned, still) and min(steps) > 0 and corrected >= taken
 
@@ -960,7 +960,7 @@ def test_the_map_does_not_make_up_for_what_the_transport_misses(monkeypatch):
     after = before.copy()
     after[4:8, 50:56] = 6
     settings = {
-        "scene": {"file": "sphere", "width": 48},
+        "scene": {"file": "sphere", "width": 32},
         "renderer": {"spp": 64},
         "representation": {"turn": False},
         "target": {"spp": 1024},

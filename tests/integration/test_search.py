@@ -16,7 +16,7 @@ from envedit.targets.target import pixel_weight
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.tiers import slow_but
 
-HEIGHT, WIDTH, ROWS, PIXELS = 32, 64, 16, 64
+HEIGHT, WIDTH, ROWS, PIXELS = 32, 64, 16, 48
 SUN = (6, 20)
 DIRECTIONS = latlong.directions(HEIGHT, WIDTH)
 OMEGA = latlong.lookup_solid_angles(HEIGHT, WIDTH)
@@ -86,7 +86,7 @@ def found_for(problem, start):
 # ---- the sun moves -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("row", "column"), slow_but([(6, 40), (8, 62), (4, 8)], 6))
+@pytest.mark.parametrize(("row", "column"), slow_but([(6, 40), (4, 8)], 6))
 def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
     """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
     image, place = sky(SUN), (row, column)
@@ -115,14 +115,18 @@ def test_the_new_shadow_alone_says_so_too(transport):
 # ---- a light is added --------------------------------------------------------------------------------------
 
 
-def test_a_small_stroke_of_light_adds_a_light(transport):
-    """A twentieth of the picture, as a second sun would light it; the first dims, the rest keeps its mean.
+def test_light_painted_beside_light_that_holds_adds_a_light(transport):
+    """A twentieth of the picture, as a second sun of a third would light it; the first sun's light is painted as it is.
 
-    Where the sky has nothing to dim, the mean of the rest forbids it.
+    Without what holds, the sun elsewhere is the simpler explanation.
     """
     place = (5, 44)
     image = sky(SUN)
-    picture, coverage = painted(transport, image, sky(SUN, place), share=0.05)
+    both = image + sky(place, flux=0.5) - sky()
+    picture, coverage = painted(transport, image, both, share=0.05)
+    of_sun = (rendered(transport, image) - rendered(transport, sky())).mean(axis=2, keepdims=True)
+    held = (of_sun > np.quantile(of_sun, 0.8)) & (coverage == 0)
+    coverage = np.maximum(coverage, held.astype(np.float32))
     problem, start = problem_of(transport, image, picture, coverage)
     found, lights, before, _ = found_for(problem, start)
     assert found.name == "light added" and [*lights] == [0, problem.layers.lights.own]

@@ -13,7 +13,7 @@ FIRST = sum(rows * columns for rows, columns in UPPER.sizes[:-1])
 
 def finest(freedom, gain=UPPER):
     """Return the precisions of the finest grid's nodes, (3, n, n)."""
-    return Prior(freedom=freedom).gain_precisions(gain)[:, FIRST:, FIRST:]
+    return prior.of_paint(freedom).gain_precisions(gain)[:, FIRST:, FIRST:]
 
 
 def whole(skies, freedom):
@@ -35,8 +35,9 @@ def series(skies, cosine, freedom):
 def test_covariance_is_the_series_of_legendre_polynomials(skies, freedom):
     cosines = np.array([-1.0, -0.3, 0.0, 0.5, 0.99, 1.0])
     expected = [series(skies, cosine, freedom) for cosine in cosines]
-    np.testing.assert_allclose(skies.covariance(cosines, freedom), expected, rtol=1e-10)
-    assert skies.covariance(cosines, 0.0) == pytest.approx(whole(skies, 0.0) ** 2)
+    factor = max(freedom, FACTOR)
+    np.testing.assert_allclose(skies.covariance(cosines, freedom, factor), expected, rtol=1e-10)
+    assert skies.covariance(cosines, 0.0, FACTOR) == pytest.approx(whole(skies, 0.0) ** 2)
 
 
 @pytest.mark.parametrize("freedom", [0.01, 0.25, 1.0])
@@ -44,7 +45,7 @@ def test_covariance_is_the_series_of_legendre_polynomials(skies, freedom):
 def test_precision_is_the_inverse_of_a_positive_definite_covariance_at_the_nodes(freedom, share):
     gain = GridGain(6, share)
     first = sum(rows * columns for rows, columns in gain.sizes[:-1])
-    found = Prior(freedom=freedom).gain_precisions(gain)[:, first:, first:]
+    found = prior.of_paint(freedom).gain_precisions(gain)[:, first:, first:]
     directions = gain.directions(2)
     cosine = np.clip(directions @ directions.T, -1, 1)
     for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
@@ -89,7 +90,7 @@ def test_without_freedom_the_sky_has_one_factor():
 
 
 def test_coarser_grids_stay_where_the_finest_has_all_and_ground_changes_as_a_sky():
-    found = Prior(freedom=0.25).gain_precisions(UPPER, ground=True)
+    found = prior.of_paint(0.25).gain_precisions(UPPER, ground=True)
     assert found.shape == (3, *(2 * [FIRST + len(UPPER.directions(2)) + 1]))
     for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
         np.testing.assert_array_equal(precision[:FIRST, :FIRST], prior.FIXED * np.eye(FIRST))

@@ -183,7 +183,6 @@ class Session:
             elif moved or self._dragged:
                 self._aim(edit.document)
             else:
-                self.problem.expect(prior.of_paint(edit.document.freedom))
                 self._paint()
                 self.reach = reach
             self._show("transport")
@@ -215,7 +214,7 @@ class Session:
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         asked = layers, self.transport, self.origin, self.base
-        self.problem = map_problem.Problem(*asked, prior=prior.of_paint(document.freedom))
+        self.problem = map_problem.Problem(*asked)
         self.still = self.start = self.problem.state(params)
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)
@@ -278,6 +277,7 @@ class Session:
         paint = self.project.settings.target.paint
         self.weight = pixel_weight(self.coverage, self._hidden, paint, self.hold)
         likelihood = Likelihood.of_paint(self.weight, self.coverage)
+        self.problem.expect(prior.of_paint(self.document.freedom, self.coverage))
         self.point = self.problem.aimed_at(self.target, likelihood, self.point)
         self.run, self._rendered = gauss_newton.Run(self.run.state, self.start), None
 

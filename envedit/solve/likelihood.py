@@ -3,17 +3,18 @@
 With r_p the root mean square over the channels of a pixel's residual of display values, minus twice the
 logarithm of the likelihood is, but for a constant,
 
-    3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  6 n log(sigma)  +  |q|^2
+    3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  6 n log(sigma)  +  3 rho_1(q)
 
 * A is the number of pixels whose errors go together, n = pixels / A the number of independent values of a
   channel. A rendering has :data:`INDEPENDENT`. A stroke is no measurement of each pixel that it covers, but a
   few statements (:data:`STATEMENTS`) of somebody who cannot paint physics.
-* rho_s is Huber's loss for a rendering: quadratic up to s = sigma, linear beyond, so that pixels which no
+* rho_s is Huber's loss: quadratic up to s, linear beyond. Of a rendering s = sigma, so that pixels which no
   light can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts
   by its square: a large one is the change that is asked for.
 * What was not painted makes two statements. Its pattern (shading, highlights, shadows) has weights w that
   are as small as those of paint, and may follow it. Its mean, which is its exposure and colour as a whole,
-  stays to :data:`VISIBLE`: q is the mean residual of each channel over that, (3,), times the root of the
+  stays to :data:`VISIBLE`, farther only where paint gains by it: a light that is painted lights the rest as
+  well. q is the root mean square over the channels of the mean residual over that, times the root of the
   share of pixels that were not painted.
 """
 
@@ -88,18 +89,22 @@ class Likelihood:
         return (np.sqrt(total / counted) / (VISIBLE * total) * self.rest).astype(np.float32)
 
     def mean(self, residual: np.ndarray) -> np.ndarray:
-        """Return q of a residual (h, w, 3): (3,)."""
+        """Return what q is the size of, of a residual (h, w, 3): (3,)."""
         return (residual * self.share).sum(axis=(0, 1))
+
+    def linear_mean(self, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return :attr:`share` and :meth:`mean`, so scaled that |mean|^2 has the last part's gradient."""
+        mean = self.mean(residual)
+        scale = np.minimum(1, 1 / max(_size(mean), 1e-12)) ** 0.5
+        return scale * self.share, scale * mean
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
         """Return the first and the last part of the formula above."""
-        return self._pixels(residual, sigma) + float(np.square(self.mean(residual)).sum())
+        return self._pixels(residual, sigma) + float(of_mean(self.mean(residual)))
 
     def _pixels(self, residual, sigma):
         size = sizes(residual)
-        loss = size**2
-        if self.robust:
-            loss = np.where(size <= sigma, loss, sigma * (2 * size - sigma))
+        loss = huber(size, sigma) if self.robust else size**2
         return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
 
     def weights(self, residual: np.ndarray, sigma: float) -> np.ndarray:
@@ -149,4 +154,18 @@ def on_average_one(weight: np.ndarray | None, shape: tuple[int, int]) -> np.ndar
 
 def sizes(residual: np.ndarray) -> np.ndarray:
     """Return the root mean square over the channels of every pixel, (h, w, 1)."""
-    return np.sqrt((residual**2).mean(axis=2, keepdims=True))
+    return _size(residual)[..., None]
+
+
+def huber(size: np.ndarray, limit: float) -> np.ndarray:
+    """Return Huber's loss of sizes: their squares up to a limit, linear beyond."""
+    return np.where(size <= limit, size**2, limit * (2 * size - limit))
+
+
+def of_mean(mean: np.ndarray) -> np.ndarray:
+    """Return the last part of the formula above, of means (..., 3) as of :meth:`Likelihood.mean`."""
+    return 3 * huber(_size(mean), 1.0)
+
+
+def _size(values):
+    return np.sqrt(np.square(values).mean(axis=-1))

@@ -182,8 +182,7 @@ class Problem(Unknowns):
         """
         state, n = point.state, self.nodes
         robust = self.likelihood.weights(point.residual, sigma)
-        share = self.likelihood.share
-        mean = self.likelihood.mean(point.residual)
+        share, mean = self.likelihood.linear_mean(point.residual)
         slope = display_curve.slope(point.rendering)
         blocks, linear = self.blocks, self.derivatives.at(point)
         pictures, profile = linear.pictures, linear.profile

@@ -26,7 +26,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import gauss_newton
-from envedit.solve.likelihood import Likelihood
+from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import SIGMA, Problem
 from envedit.solve.unknowns import Point
 
@@ -302,7 +302,7 @@ class _Seen:
             more = np.float32(pictures * (factor * unit)[:, None, None])
             off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
-            mean = np.square(np.einsum("knc,n->kc", off, self.share)).sum(axis=1)
+            mean = of_mean(np.einsum("knc,n->kc", off, self.share))
             variance = np.maximum(squares / count, self.sigma**2)
             unlikeliness = squares / variance + count * np.log(variance) + mean
             better = unlikeliness < least

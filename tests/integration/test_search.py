@@ -116,24 +116,32 @@ def test_the_new_shadow_alone_says_so_too(transport):
 
 
 def test_light_painted_beside_light_that_holds_adds_a_light(transport):
-    """A twentieth of the picture, as a second sun of a third would light it; the first sun's light is painted as it is.
+    """A tenth of the picture, as a second sun would light it; the first sun's light is painted as it is.
 
     Without what holds, the sun elsewhere is the simpler explanation.
     """
-    place = (5, 44)
+    place = (8, 44)
     image = sky(SUN)
-    both = image + sky(place, flux=0.5) - sky()
-    picture, coverage = painted(transport, image, both, share=0.05)
+    picture, coverage = painted(transport, image, image + sky(place) - sky(), share=0.1)
     of_sun = (rendered(transport, image) - rendered(transport, sky())).mean(axis=2, keepdims=True)
-    held = (of_sun > np.quantile(of_sun, 0.8)) & (coverage == 0)
-    coverage = np.maximum(coverage, held.astype(np.float32))
-    problem, start = problem_of(transport, image, picture, coverage)
+    held = (of_sun > np.quantile(of_sun, 0.9)) & (coverage == 0)
+    problem, start = problem_of(transport, image, picture, np.maximum(coverage, held.astype(np.float32)))
     found, lights, before, _ = found_for(problem, start)
     assert found.name == "light added" and [*lights] == [0, problem.layers.lights.own]
-    assert degrees(lights[1], DIRECTIONS[place]) < 5 and degrees(lights[0], DIRECTIONS[SUN]) < 5
+    assert degrees(lights[1], DIRECTIONS[place]) < 8 and degrees(lights[0], DIRECTIONS[SUN]) < 8
     assert found.score < before - search.POSITIVE
-    off = found.point.residual[coverage[..., 0] == 0].mean(axis=0)
+    off = problem.likelihood.mean(found.point.residual) * VISIBLE
     assert np.abs(off).max() < 2 * VISIBLE
+
+
+def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_lights_the_rest(transport):
+    place, image = (8, 44), sky()
+    problem, start = problem_of(transport, image, *painted(transport, image, sky(place), share=0.05))
+    found, lights, _, _ = found_for(problem, start)
+    assert found.name == "light added" and [*lights] == [0]
+    assert degrees(lights[0], DIRECTIONS[place]) < 8
+    off = problem.likelihood.mean(found.point.residual) * VISIBLE
+    assert off.max() > 2 * VISIBLE
 
 
 # ---- lights stay -------------------------------------------------------------------------------------------

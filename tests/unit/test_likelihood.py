@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from envedit.solve.likelihood import INDEPENDENT, STATEMENTS, VISIBLE, Likelihood, on_average_one, sizes
+from envedit.solve.likelihood import (
+    INDEPENDENT,
+    STATEMENTS,
+    VISIBLE,
+    Likelihood,
+    of_mean,
+    on_average_one,
+    sizes,
+)
 from envedit.targets.target import pixel_weight
 
 FILM = (20, 24)
@@ -27,14 +35,15 @@ def formula(one, residual, sigma):
     if one.rest is None:
         return total
     mean = (one.rest * residual).sum(axis=(0, 1)) / one.rest.sum()
-    return total + (mean**2).sum() / VISIBLE**2 * one.rest.sum() / (one.weight > 0).sum()
+    q = np.sqrt((mean**2).mean() * one.rest.sum() / (one.weight > 0).sum()) / VISIBLE
+    return total + 3 * (q**2 if q <= 1 else 2 * q - 1)
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
-@pytest.mark.parametrize("painted", [False, True])
-def test_misfit_is_that_of_the_formula(sigma, painted, rng):
+@pytest.mark.parametrize(("painted", "mean"), [(False, 0.01), (True, 0.01), (True, 0.1)])
+def test_misfit_is_that_of_the_formula(sigma, painted, mean, rng):
     one = of_stroke()[0] if painted else Likelihood(on_average_one(rng.random((*FILM, 1)), FILM))
-    residual = rng.normal(0.01, 0.1, (*FILM, 3))
+    residual = rng.normal(mean, 0.1, (*FILM, 3))
     assert one.misfit(residual, sigma) == pytest.approx(formula(one, residual, sigma), rel=1e-5)
     assert one.misfit(0 * residual, sigma) == 0
     assert one.robust != painted
@@ -53,6 +62,17 @@ def test_weights_are_those_of_the_first_parts_gradient(painted, rng):
         ends[1][at] -= h
         slope = (one.misfit(ends[0], sigma) - one.misfit(ends[1], sigma)) / (2 * h)
         assert gradient[at] == pytest.approx(slope, rel=1e-4)
+
+
+@pytest.mark.parametrize("change", [0.2, 3.0])
+def test_the_mean_is_scaled_to_have_the_gradient_of_its_loss(change):
+    one, coverage = of_stroke()
+    residual, h = VISIBLE * (1 - coverage) * change * np.array([1.0, -0.5, 0.2]), 1e-6
+    share, mean = one.linear_mean(residual)
+    for c in range(3):
+        ends = [residual + sign * h * (np.arange(3) == c) * (1 - coverage) for sign in (1, -1)]
+        slope = np.subtract(*(of_mean(one.mean(end)) for end in ends)) / (2 * h)
+        assert 2 * (share * (1 - coverage)).sum() * mean[c] == pytest.approx(slope, rel=1e-4, abs=1e-6)
 
 
 def test_noise_of_squares_is_the_most_likely(rng):

@@ -170,6 +170,8 @@ COUNTS = {
     "layers.large_map": 1,
     "layers.old_sun": 12,
     "levels": 24,
+    "light_estimation": 6,
+    "light_estimation.port": 1,
     "natural": 680,
     "natural.skies": 1,
     "paint.figure10": 7,

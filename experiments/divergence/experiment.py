@@ -31,7 +31,7 @@ FRESH = 1_000_000
 METHODS = {
     "path tracing, 1 sample": {"spp": 1},
     "path tracing, 16 samples": {"spp": 16},
-    "path tracing, 16 samples, map kept at 0 or above": {"spp": 16, "least": 0.0},
+    "path tracing, 16 samples, map at least 0": {"spp": 16, "least": 0.0},
     "stored transport": {"spp": 0},
 }
 
@@ -49,7 +49,7 @@ def estimate(settings, folder, spp, least=None) -> dict:
     Returns
     -------
     dict
-        ``losses``: of every step. ``judged``: rows of :func:`judge`. ``step_s``: median seconds of a step.
+        ``losses`` of every step, ``judged``: rows of :func:`judge`, ``step_s``: median seconds of a step.
     """
     scene = inputs.load_scene(settings.scene)
     true = sky()
@@ -71,7 +71,7 @@ def estimate(settings, folder, spp, least=None) -> dict:
         if step % JUDGED_EVERY == 0 or step == steps:
             judged.append({"step": step, **judge(scene, render, dr.detach(adam["map"]), true, target)})
         if step in (*SHOWN, steps):
-            images.write_exr(folder / f"{name_of(step)}.exr", adam["map"].numpy())
+            images.write_exr(folder / f"map_{step}.exr", adam["map"].numpy())
         if step < steps:
             began = time.perf_counter()
             loss = squared_error(render(adam["map"], step), target)
@@ -88,11 +88,6 @@ def sky() -> np.ndarray:
     """Return the map to be found: Mitsuba's analytic sky without its sun, mean radiance 1."""
     radiance = sunsky(WIDTH, azimuth=230, elevation=40, sun_scale=0)
     return radiance / radiance.mean()
-
-
-def name_of(step: int) -> str:
-    """Return the name of the file of a step's map."""
-    return f"map_{step}"
 
 
 def path_tracing(scene, spp):
@@ -122,10 +117,10 @@ def judge(scene, render, envmap, true, target, first=FRESH) -> dict:
     Returns
     -------
     dict
-        ``loss``: product of the errors of two independent renderings, which has no bias by their variance.
-        ``variance``: of the pictures of a step, mean over pixels. ``noise``: of the squared length of a
-        step's gradient, the share that two gradients of the same map do not have in common. ``psnr`` and
-        ``least`` of the map.
+        ``loss``: mean product of the errors of two independent renderings, which their variance does not
+        bias. ``variance`` of the pictures of a step, mean over pixels. ``noise``: of the squared length of a
+        step's gradient, the share that two gradients of the same map do not have in common. ``psnr`` of the
+        upper half of the map, as the ground hides the other. ``least`` radiance of the map.
     """
     reference = path_tracing(scene, JUDGE_SPP)
     one, other = (reference(envmap, first + k).numpy() - target.numpy() for k in (1, 2))
@@ -142,7 +137,7 @@ def judge(scene, render, envmap, true, target, first=FRESH) -> dict:
         "loss": float(np.mean(one * other, dtype=float)),
         "variance": float(np.mean((pictures[0] - pictures[1]) ** 2, dtype=float) / 2),
         "noise": 1 - 2 * np.sum(g * h) / np.sum(g**2 + h**2),
-        "psnr": metrics.psnr(envmap.numpy(), true, float(true.max())),
+        "psnr": metrics.psnr(envmap.numpy()[: len(true) // 2], true[: len(true) // 2], float(true.max())),
         "least": float(envmap.numpy().min()),
     }
 
@@ -177,28 +172,26 @@ def combine(rows):
 def draw(made, out, to, given):
     """Draw losses and map over steps, and the maps of some steps below: ``divergence.png``."""
     done = done_of(made, out)
-    ratios = [2.4, *[1] * len(done)]
-    size = 11, 3.2 + 1.5 * len(done)
+    titles = {"loss": "loss, judged by Mitsuba", "psnr": "map PSNR, dB", "noise": "noise of the gradient"}
+    size, ratios = (11, 3.4 + 0.95 * len(done)), [3.4, *[1] * len(done)]
     with figure(to / "divergence.png", 1 + len(done), 4, size, height_ratios=ratios) as panels:
         for row, one in enumerate(done, 1):
-            found, name = one.metrics, one.case.name
-            steps = [point["step"] for point in found["judged"]]
-            panels[0, 0].plot(found["losses"], label=name, linewidth=0.8)
-            for panel, key in zip(panels[0, 1:], ("loss", "psnr", "noise"), strict=True):
-                panel.plot(steps, [point[key] for point in found["judged"]])
-            last = steps[-1]
-            shown = {f"step {step}": one.picture(name_of(step)) for step in (*SHOWN[:2], last)}
-            shown["true map"] = sky()
-            for panel, (label, image) in zip(panels[row], shown.items(), strict=True):
+            judged = one.metrics["judged"]
+            label = one.case.name.removeprefix("path tracing, ")
+            steps = [point["step"] for point in judged]
+            panels[0, 0].plot(one.metrics["losses"], linewidth=0.8)
+            for panel, key in zip(panels[0, 1:], titles, strict=True):
+                panel.plot(steps, [point[key] for point in judged], label=label)
+            shown = {f"step {step}": one.picture(f"map_{step}") for step in (*SHOWN[:2], steps[-1])}
+            for panel, (name, image) in zip(panels[row], {**shown, "true map": sky()}.items(), strict=True):
                 colours = tonemap(image / 3, "gamma")
                 colours[image.min(axis=2) < 0] = 1, 0, 1
-                panel.imshow(colours, interpolation="nearest")
-                panel.set(xticks=[], yticks=[], xlabel=label)
-            panels[row, 0].set_title(name, loc="left", fontsize="small")
-        titles = "loss of the step", "loss, judged", "map PSNR, dB", "noise of the gradient"
-        for panel, title in zip(panels[0], titles, strict=True):
+                panel.imshow(colours[: len(image) // 2], interpolation="nearest")
+                panel.set(xticks=[], yticks=[], xlabel=name)
+            panels[row, 0].set_title(one.case.name, loc="left", fontsize="small")
+        for panel, title in zip(panels[0], ("loss of the step", *titles.values()), strict=True):
             panel.set(xlabel="steps", title=title, yscale="log" if "loss" in title else "linear")
-        panels[0, 0].legend(fontsize="xx-small")
+        panels[0, 1].legend(fontsize="xx-small")
     return [to / "divergence.png"]
 
 
@@ -217,7 +210,7 @@ EXPERIMENT = Experiment(
         "best map, dB": "{best:.1f} at {best_at}",
         "last map, dB": "{end[psnr]:.1f}",
         "its least radiance": "{end[least]:.1f}",
-        "a step": "{ratio:.1f}",
+        "seconds a step, ratio": "{ratio:.0f}",
     },
     combine=combine,
     draw=draw,

@@ -21,8 +21,12 @@ from experiments.harness import Experiment, calling, done_of, figure
 
 WIDTH = 32
 """Texels across the map, and pixels across the picture."""
-STEPS, RATE, DEPTH = 800, 0.02, 6
-TARGET_SPP, JUDGE_SPP = 4096, 512
+STEPS = 800
+RATE = 0.02
+"""Learning rate of the tutorial."""
+DEPTH = 6
+TARGET_SPP = 4096
+JUDGE_SPP = 512
 JUDGED_EVERY = 25
 SHOWN = 50, 200, STEPS
 """Steps whose maps are kept for the figure."""
@@ -66,7 +70,9 @@ def estimate(settings, folder, spp, least=None) -> dict:
     adam = mi.ad.Adam(lr=settings.optimizer.lr)
     adam["map"] = mi.TensorXf(np.ones_like(true))
     steps = settings.optimizer.iterations
-    losses, judged, seconds = [], [], []
+    losses = []
+    judged = []
+    seconds = []
     for step in range(steps + 1):
         if step % JUDGED_EVERY == 0 or step == steps:
             judged.append({"step": step, **judge(scene, render, dr.detach(adam["map"]), true, target)})
@@ -124,7 +130,8 @@ def judge(scene, render, envmap, true, target, first=FRESH) -> dict:
     """
     reference = path_tracing(scene, JUDGE_SPP)
     one, other = (reference(envmap, first + k).numpy() - target.numpy() for k in (1, 2))
-    pictures, gradients = [], []
+    pictures = []
+    gradients = []
     for k in (3, 4):
         leaf = mi.TensorXf(envmap)
         dr.enable_grad(leaf)
@@ -149,7 +156,8 @@ def cases(given):
 
 
 def measure(done) -> dict:
-    losses, judged = np.array(done.metrics["losses"]), done.metrics["judged"]
+    losses = np.array(done.metrics["losses"])
+    judged = done.metrics["judged"]
     smooth = np.convolve(losses, np.ones(JUDGED_EVERY) / JUDGED_EVERY, "valid")
     best = max(judged, key=lambda row: row["psnr"])
     return {
@@ -173,7 +181,8 @@ def draw(made, out, to, given):
     """Draw losses and map over steps, and the maps of some steps below: ``divergence.png``."""
     done = done_of(made, out)
     titles = {"loss": "loss, judged by Mitsuba", "psnr": "map PSNR, dB", "noise": "noise of the gradient"}
-    size, ratios = (11, 3.4 + 0.95 * len(done)), [3.4, *[1] * len(done)]
+    ratios = [3.4, *[1] * len(done)]
+    size = 11, 3.4 + 0.95 * len(done)
     with figure(to / "divergence.png", 1 + len(done), 4, size, height_ratios=ratios) as panels:
         for row, one in enumerate(done, 1):
             judged = one.metrics["judged"]

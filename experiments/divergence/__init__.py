@@ -1,0 +1,1 @@
+"""Why Adam on a path-traced environment map diverges, and the same on stored transport."""

@@ -152,7 +152,7 @@ class Preparation:
 
         # ---- Edits of the turned and of the unturned map
         always = self.settings.representation.turn is True
-        if not always and turn.error >= TURNED * turn.still:
+        if not always and turn.left >= TURNED:
             return self._prepared(target, 0.0, [])
         turned = self._prepared(target, turn.degrees, [said], search=False)
         if always or not turned.job.newton:

@@ -41,11 +41,19 @@ class Turn:
         As for :func:`.latlong.rotate`.
     error, still : float
         Display residual, as of :func:`apart`, with the turn alone and without.
+    blocks : float
+        The share of the residual of blocks that the turn leaves, beyond what the block transport errs by.
     """
 
     degrees: float
     error: float
     still: float
+    blocks: float = np.inf
+
+    @property
+    def left(self) -> float:
+        """Share of the residual that the turn leaves: by pixels, or by blocks where noise hides it there."""
+        return min(self.error / max(self.still, 1e-30), self.blocks)
 
 
 def find(
@@ -113,7 +121,8 @@ def find(
     part = min(max(part, 0.0), 1.0)
     texels += side * (part if abs(part - round(part)) > WHOLE * deviation else round(part))
     texels = round(texels / FINEST) * FINEST % width
-    return Turn(360 * texels / width, error(texels), error(0.0))
+    left = np.sqrt(max(misfit.min() - least, 0) / max(misfit[0] - least, 1e-30))
+    return Turn(360 * texels / width, error(texels), error(0.0), float(left))
 
 
 def _fraction(render, maps, picture, weight):

@@ -135,6 +135,13 @@ def trace(
 
 
 @dr.syntax
+def rays_through(scene: mi.Scene, view: int, places: np.ndarray) -> mi.Ray3f:
+    """Return the camera's rays through places (n, 2) of a view, as shares of its width and height."""
+    sensor = scene.sensors()[view]
+    place = mi.Point2f(*(mi.Float(np.float32(share)) for share in places.T))
+    return mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
+
+
 def _to_their_end(scene, ray, throughput, bounces, seed):
     """Follow paths from the last ray that met a surface until they leave the scene; returns their Escape.
 

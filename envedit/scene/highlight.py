@@ -77,12 +77,11 @@ def _followed(scene, view, x, y):
     toward : ndarray (paths, 3) float64
         Its last direction in the world.
     """
-    sensor, path = scene.mi.sensors()[view], dr.arange(mi.UInt32, PATHS)
+    path = dr.arange(mi.UInt32, PATHS)
     context = mi.BSDFContext()
     passed = mi.BSDFFlags.Null
     context.type_mask = int(passed | mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.DeltaReflection)
-    place = mi.Point2f(dr.opaque(mi.Float, x, PATHS), dr.opaque(mi.Float, y, PATHS))
-    ray = mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
+    ray = camera_paths.rays_through(scene.mi, view, np.tile([x, y], (PATHS, 1)))
     active = dr.full(mi.Bool, True, PATHS)
     value, specular = np.ones(PATHS), np.ones(PATHS, bool)
     bounces, leaves = np.zeros(PATHS, int), np.zeros(PATHS, bool)

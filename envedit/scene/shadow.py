@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.scene import camera_paths
 from envedit.scene.scene import Scene
 
 NEAR = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)])
@@ -93,9 +94,7 @@ def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) ->
 
 def _seen(scene, view, places):
     """Return the surfaces that are seen at places (n, 2)."""
-    sensor = scene.mi.sensors()[view]
-    place = mi.Point2f(*(mi.Float(np.float32(v)) for v in places.T))
-    ray = mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
+    ray = camera_paths.rays_through(scene.mi, view, places)
     return _first(scene, ray, dr.full(mi.Bool, True, len(places)))
 
 

@@ -23,7 +23,7 @@ from experiments.paint.browser import browsing, opened, place, prepared
 MAP = "kloofendal_48d_partly_cloudy"
 CORNER_S, SETTING_S = 0.4, 1.0
 STATUS = "() => document.querySelector('[data-testid=status]').textContent.includes"
-FEASIBLE, RENDERED = f"{STATUS}('is feasible')", f"{STATUS}('with 256 samples')"
+FEASIBLE, RENDERED = f"{STATUS}('% feasible')", f"{STATUS}('with 256 samples')"
 SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
 TITLES = {
     "move_shadow": "Moving the shadow",

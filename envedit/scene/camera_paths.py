@@ -134,7 +134,6 @@ def trace(
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
 
 
-@dr.syntax
 def rays_through(scene: mi.Scene, view: int, places: np.ndarray) -> mi.Ray3f:
     """Return the camera's rays through places (n, 2) of a view, as shares of its width and height."""
     sensor = scene.sensors()[view]
@@ -142,6 +141,7 @@ def rays_through(scene: mi.Scene, view: int, places: np.ndarray) -> mi.Ray3f:
     return mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
 
 
+@dr.syntax
 def _to_their_end(scene, ray, throughput, bounces, seed):
     """Follow paths from the last ray that met a surface until they leave the scene; returns their Escape.
 

@@ -78,10 +78,8 @@ def test_the_script_measures_a_step_in_a_process_of_its_own(tmp_path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
 def test_steps_measure_at_tiny_sizes():
-    found = {step: gpu.one(step, "llvm_ad_rgb", True) for step in ("engine", "solver", "fit")}
+    found = {step: gpu.one(step, "llvm_ad_rgb", True) for step in ("engine", "fit")}
     assert not any("error" in one for one in found.values()), found
-    solved = found["solver"]
-    assert solved["iterations"] > 0 and solved["psnr"]["render"] > solved["psnr"]["initial"]
     assert found["fit"]["epochs"] == 6
     assert found["engine"]["transport"]["adjointness"] < 1e-5
     assert all(seconds > 0 for seconds in found["engine"]["seconds"].values())

@@ -95,7 +95,7 @@ class Likelihood:
     def linear_mean(self, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return :attr:`share` and :meth:`mean`, so scaled that |mean|^2 has the last part's gradient."""
         mean = self.mean(residual)
-        scale = np.minimum(1, 1 / max(_size(mean), 1e-12)) ** 0.5
+        scale = max(1.0, float(_size(mean))) ** -0.5
         return scale * self.share, scale * mean
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:

@@ -53,7 +53,7 @@ class Turn:
     @property
     def left(self) -> float:
         """Share of the residual that the turn leaves: by pixels, or by blocks where noise hides it there."""
-        return min(self.error / max(self.still, 1e-30), self.blocks)
+        return min(self.error / self.still, self.blocks) if 0 < self.still < np.inf else np.inf
 
 
 def find(
@@ -121,8 +121,10 @@ def find(
     part = min(max(part, 0.0), 1.0)
     texels += side * (part if abs(part - round(part)) > WHOLE * deviation else round(part))
     texels = round(texels / FINEST) * FINEST % width
-    left = np.sqrt(max(misfit.min() - least, 0) / max(misfit[0] - least, 1e-30))
-    return Turn(360 * texels / width, error(texels), error(0.0), float(left))
+    blocks = np.inf
+    if least < misfit[0] < np.inf:
+        blocks = float(np.sqrt(max(misfit.min() - least, 0) / (misfit[0] - least)))
+    return Turn(360 * texels / width, error(texels), error(0.0), blocks)
 
 
 def _fraction(render, maps, picture, weight):

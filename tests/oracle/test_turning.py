@@ -71,6 +71,11 @@ def test_a_sky_that_is_not_there_under_any_turn(traced, rng):
     assert found.left > 0.5
 
 
+@pytest.mark.parametrize("still", [0.0, np.inf])
+def test_a_turn_explains_nothing_where_there_is_no_residual_or_none_that_is_finite(still):
+    assert turning.Turn(90.0, error=still, still=still).left == np.inf
+
+
 def test_what_noise_hides_in_pixels_is_seen_in_blocks(rng, tmp_path):
     image = sky(rng)
     lit = scene.load("sphere", 32, 32)

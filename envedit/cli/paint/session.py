@@ -213,8 +213,7 @@ class Session:
         params = layers.encode(self.origin[self.rows.slice])
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
-        asked = layers, self.transport, self.origin, self.base
-        self.problem = map_problem.Problem(*asked)
+        self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
         self.still = self.start = self.problem.state(params)
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -161,7 +162,9 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         page = Page(browser, server.url)
         sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
-        # ---- A shadow, by its tip; and where there is none
+        # ---- A shadow, by its tip; and where there is none. Answers come late, and a drag is one step all the same.
+        answered = server.worker.session.pick
+        server.worker.session.pick = lambda asked: (time.sleep(0.4), answered(asked))
         page.page.keyboard.press("9")
         message = page.page.get_by_test_id("message")
         page.drag(page.at("#overlay", 0.96, 0.96), page.at("#overlay", 0.9, 0.9))
@@ -177,6 +180,7 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         assert abs((light["azimuth"] - 90 + 180) % 360 - 180) > 20, light  # where its light stood
         page.page.get_by_test_id("undo").click()
         until(lambda: "[[input.lights]]" not in kept.read_text())
+        server.worker.session.pick = answered
         # ---- A stroke, with the sky and the rest as chosen
         page.page.get_by_test_id("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.6 + 0.1 * k, 0.8) for k in range(4)))

@@ -267,27 +267,42 @@ function viewed(stroke) {
   return named < 0 ? stroke.view ?? 0 : named;
 }
 
-// A highlight or a shadow is dragged: first ask whose it is, then where that light must go.
-let picked = -1, point = [], asked = 0, ended = false;
+// A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
+// history: it ends with the answer to the last question, or after UNANSWERED where none comes.
+const UNANSWERED = 5000;
+let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false;
 function pick(phase, x, y) {
-  if (phase === "start") { picked = -1; point = []; ended = false; }
-  if (phase === "end") { ended = true; setTimeout(() => { if (ended) lights.commit(); }, 300); return; }
-  if (phase === "move" && picked < 0) return;
+  if (phase === "start") { picked = -1; point = []; place = null; ended = false; }
+  if (phase === "end") {
+    ended = true;
+    if (answered === asked) lights.commit();
+    else setTimeout(() => { if (ended) lights.commit(); }, UNANSWERED);
+    return;
+  }
+  if (phase === "move") place = [x, y];
+  if (phase === "move" && picked < 0) return; // asked once it is known whose it is
+  ask(x, y);
+}
+function ask(x, y) {
   connection.send({ type: "pick", of: tool === "move-shadow" ? "shadow" : "highlight", point, x, y, light: picked, view, number: ++asked });
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
+  answered = message.number;
   if (message.text) say(`Light not moved: ${message.text}`);
   else if (message.azimuth === undefined) {
     picked = message.light;
     point = message.point ?? [];
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
-    else lights.choose(picked);
-  } else if (!ended || message.number === asked) {
+    else {
+      lights.choose(picked);
+      if (place) ask(...place);
+    }
+  } else {
     say("");
     lights.moveTo(message.light, message.azimuth, message.elevation);
-    if (ended) lights.commit();
   }
+  if (ended && answered === asked) lights.commit();
 };
 
 const lights = new Lights($("map-stack"), $("handles"), {

@@ -162,8 +162,9 @@ class Target(Table):
     hold: float | str = key(
         "auto",
         OrAuto(Number(0)),
-        "weight of all pixels that were not painted; auto: 1, and where they keep their values, with "
-        "Gauss-Newton steps, as much more as keeps their mean change of display values below 0.02",
+        "weight of all pixels that were not painted, beside that of paint; auto: 1, but with Gauss-Newton "
+        "steps 0.1 where they follow, and where they keep their values as much more than 1 as keeps their "
+        "mean change of display values below 0.02",
         when=_PAINTED,
     )
     spp: int | str = key(

@@ -113,6 +113,12 @@ class Config(Table):
     def _name(self, key: str) -> str:
         return key
 
+    @property
+    def newton(self) -> bool:
+        """Whether Gauss-Newton steps can solve it: layers, through a stored transport."""
+        chosen = self.representation.kind, self.renderer.kind
+        return chosen == ("layers", "transport") and self.optimizer.kind != "adam"
+
     def _check_together(self) -> None:
         """Put the preset's defaults in the place of what was not given, however the tables were made."""
         tables = {name: getattr(self, name) for name in FIELDS}
@@ -120,8 +126,7 @@ class Config(Table):
         chosen = presets.defaults(self.preset, given)
         for name, table in tables.items():
             object.__setattr__(self, name, table.with_defaults(chosen.get(name, {})))
-        able = self.representation.kind == "layers" and self.renderer.kind == "transport"
-        if self.optimizer.kind == "gauss-newton" and not able:
+        if self.optimizer.kind == "gauss-newton" and not self.newton:
             raise ConfigError(
                 'optimizer.kind: got "gauss-newton", expected adam or auto: it solves for layers '
                 "(representation.kind) through a stored transport (renderer.kind)"

@@ -3,16 +3,18 @@
 With r_p the root mean square over the channels of a pixel's residual of display values, minus twice the
 logarithm of the likelihood is, but for a constant,
 
-    3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  6 n log(sigma)  +  3 rho_1(q)
+    3 / (A sigma^2) sum_p w_p rho_s(r_p)  +  6 n log(sigma)  +  3 N rho_1(q)
 
 * A is the number of pixels whose errors go together, n = pixels / A the number of independent values of a
   channel. A rendering has :data:`INDEPENDENT`. A stroke is no measurement of each pixel that it covers, but a
   few statements (:data:`STATEMENTS`) of somebody who cannot paint physics.
+* sigma is the most likely one; of paint at most :data:`PAINT_NOISE` times the change that was painted, or
+  paint that can be followed in part only would be taken for noise.
 * rho_s is Huber's loss: quadratic up to s, linear beyond. Of a rendering s = sigma, so that pixels which no
   light can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts
   by its square: a large one is the change that is asked for.
 * What was not painted makes two statements. Its pattern (shading, highlights, shadows) has weights w that
-  are as small as those of paint, and may follow it. Its mean, which is its exposure and colour as a whole,
+  are smaller than those of paint, and may follow it. Its mean, which is its exposure and colour as a whole,
   stays to :data:`VISIBLE`, farther only where paint gains by it: a light that is painted lights the rest as
   well. q is the root mean square over the channels of the mean residual over that, times the root of the
   share of pixels that were not painted.
@@ -24,10 +26,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envedit.core.arrays import tensor
+from envedit.losses import display_curve
+
 INDEPENDENT = 256
 """Residuals of a rendering that count as independent, per channel: neighbouring pixels err together."""
 STATEMENTS = 3.0
 """Independent values, per channel, that all paint together states."""
+PAINT_NOISE = 0.3
+"""Largest standard error of paint, as a share of the change that it asks for: no map makes all of what is
+painted (``experiments/painted_edits`` has what other values do)."""
 VISIBLE = 0.02
 """Mean change of display values from which on a change of what was not painted counts as visible."""
 
@@ -42,37 +50,47 @@ class Likelihood:
         How much each pixel counts beside the others; 1 on average (:func:`on_average_one`).
     independent : float
         Independent values of a channel among the pixels.
-    robust : bool
-        Huber's loss in place of squares.
+    paint_noise : float or None
+        Largest standard error of paint, of display values; None: a rendering.
     rest : ndarray (h, w, 1) or None
         How much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none.
     """
 
     weight: np.ndarray
     independent: float = INDEPENDENT
-    robust: bool = True
+    paint_noise: float | None = None
     rest: np.ndarray | None = None
 
     @classmethod
-    def of_paint(cls, weight: np.ndarray, coverage: np.ndarray) -> Likelihood:
+    def of_paint(
+        cls, weight: np.ndarray, coverage: np.ndarray, initial: np.ndarray, picture: np.ndarray
+    ) -> Likelihood:
         """Return the likelihood of a painted picture; its rest counts for as much as it weighs beside paint.
 
         Parameters
         ----------
         weight, coverage : ndarray (h, w, 1)
             How much each pixel counts, and was painted.
+        initial, picture : ndarray (h, w, 3)
+            What was painted on, and the painted picture, linear radiance.
         """
         # Weights are a c + b (1 - c): b is that of pixels without paint.
         bare = weight[(coverage <= 0) & (weight > 0)]
         of_rest = float(bare[0]) * (1 - coverage) if bare.size else 0.0
-        painted = float(np.maximum(weight - of_rest, 0).sum(dtype=np.float64) / weight.sum(dtype=np.float64))
+        of_paint = np.maximum(weight - of_rest, 0).astype(np.float64)
+        painted = float(of_paint.sum() / weight.sum(dtype=np.float64))
         rest = (1 - coverage) * (weight > 0)
         return cls(
             weight=on_average_one(weight, weight.shape[:2]),
             independent=STATEMENTS / painted if painted > 0 else STATEMENTS,
-            robust=False,
+            paint_noise=PAINT_NOISE * _painted_change(of_paint, initial, picture),
             rest=rest if rest.any() else None,
         )
+
+    @property
+    def robust(self) -> bool:
+        """Huber's loss in place of squares."""
+        return self.paint_noise is None
 
     @property
     def area(self) -> float:
@@ -95,7 +113,7 @@ class Likelihood:
     def linear_mean(self, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return :attr:`share` and :meth:`mean`, so scaled that |mean|^2 has the last part's gradient."""
         mean = self.mean(residual)
-        scale = max(1.0, float(_size(mean))) ** -0.5
+        scale = np.sqrt(STATEMENTS) * max(1.0, float(_size(mean))) ** -0.5
         return scale * self.share, scale * mean
 
     def misfit(self, residual: np.ndarray, sigma: float) -> float:
@@ -118,13 +136,13 @@ class Likelihood:
         """Return the standard error under which the first part is what independent values of it have, 3 n.
 
         The most likely one: for squares exactly, with Huber's loss as an M-estimate of scale (not his
-        proposal 2). At least ``least``.
+        proposal 2). At least ``least``, of paint at most :attr:`paint_noise`.
         """
         found = self._pixels(residual, least) / (3 * self.independent)
         if found <= 1:
             return least
-        if not self.robust:
-            return least * float(np.sqrt(found))
+        if self.paint_noise is not None:
+            return max(least, min(self.paint_noise, least * float(np.sqrt(found))))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)
@@ -141,6 +159,16 @@ class Likelihood:
         """Return the formula above at the most likely noise."""
         sigma = self.noise(residual, least)
         return self.misfit(residual, sigma) + 6 * self.independent * float(np.log(sigma))
+
+
+
+def _painted_change(weight, initial, picture):
+    """Return the root mean square change of display values, where it is visible; at least what is."""
+    shown = (display_curve.to_display(tensor(np.float32(one))).numpy() for one in (initial, picture))
+    size = sizes(np.subtract(*shown, dtype=np.float64))
+    weight = np.where(size > VISIBLE, weight, 0)
+    total = weight.sum()
+    return float(np.sqrt((weight * size**2).sum() / total)) if total > 0 else VISIBLE
 
 
 def on_average_one(weight: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
@@ -164,7 +192,7 @@ def huber(size: np.ndarray, limit: float) -> np.ndarray:
 
 def of_mean(mean: np.ndarray) -> np.ndarray:
     """Return the last part of the formula above, of means (..., 3) as of :meth:`Likelihood.mean`."""
-    return 3 * huber(_size(mean), 1.0)
+    return 3 * STATEMENTS * huber(_size(mean), 1.0)
 
 
 def _size(values):

@@ -309,9 +309,18 @@ class Problem(Unknowns):
         found["size"][own:] = np.clip(found["size"][own:], *LOBE_SIZES)
         for i, turn in turns.items():
             turn = turn * min(1.0, LARGEST["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
-            there = rotated(self.direction(state, i), turn)
+            there = self._in_sky(rotated(self.direction(state, i), turn), self.direction(state, i))
             found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
         return found
+
+    def _in_sky(self, there, here):
+        """Return a direction, raised to the horizon where a light would leave the sky by it."""
+        edge = np.cos(np.pi * (self.rows.start + self.layers.shape[0]) / len(self.envmap))
+        lowest = min(edge, here[1])
+        if there[1] >= lowest:
+            return there
+        along = there[[0, 2]] * np.sqrt(max(0.0, 1 - lowest**2)) / max(np.hypot(there[0], there[2]), 1e-12)
+        return np.array([along[0], lowest, along[1]])
 
     def _within(self, step, now, damped, normal):
         """Return a step, solved anew for all else where it takes the saturation out of its bounds."""
@@ -341,4 +350,3 @@ class Problem(Unknowns):
         whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
         whole[:, self.rows] = spread
         return Posterior(*whole)
-

@@ -18,7 +18,7 @@ def likelihood(target: Target) -> Likelihood:
     """Return the likelihood of a target's residuals: of a rendering, or of paint where it has coverage."""
     if target.coverage is None:
         return Likelihood(on_average_one(target.weight, target.picture.shape[:2]))
-    return Likelihood.of_paint(target.weight, target.coverage)
+    return Likelihood.of_paint(target.weight, target.coverage, target.initial, target.picture)
 
 
 def problem(

@@ -31,6 +31,9 @@ FOUND_ANEW = (
     "if it was painted, give a mask)"
 )
 
+FOLLOWING = 0.1
+"""Weight, beside paint, of what was not painted and follows: its pattern, as its mean has a term of its own
+(``experiments/painted_edits`` has what other values do)."""
 MOST_WHITE = 0.1
 """Share of the target's pixels that may be white without a warning."""
 
@@ -182,7 +185,7 @@ def make(
             "target: all paint lies where no surface is seen (hide_emitters): paint on a surface"
         )
     uncounted = found.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
-    hold = first_hold(chosen)
+    hold = first_hold(settings)
     weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
@@ -318,9 +321,15 @@ def _seen(target, hidden, curve):
     return replace(target, weight=weight, source=f"{target.source}; {share}")
 
 
-def first_hold(chosen: config.Target) -> float:
-    """Return the weight of what was not painted that an edit begins with."""
-    return 1.0 if chosen.hold == "auto" else float(chosen.hold)
+def first_hold(settings: config.Config) -> float:
+    """Return the weight of what was not painted that an edit begins with.
+
+    Only Gauss-Newton steps keep the mean of what was not painted by itself: with them its pattern may follow.
+    """
+    chosen = settings.target
+    if chosen.hold != "auto":
+        return float(chosen.hold)
+    return FOLLOWING if chosen.rest == "follow" and settings.newton else 1.0
 
 
 def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:

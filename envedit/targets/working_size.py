@@ -34,8 +34,7 @@ def most_pixels(settings: config.Config) -> int | None:
         return asked
     chosen = settings.representation
     smooth = isinstance(chosen.cycles, str) or chosen.cycles <= CYCLES
-    solved = chosen.kind == "layers" and settings.optimizer.kind != "adam"
-    return PIXELS if smooth and solved and settings.renderer.kind == "transport" else None
+    return PIXELS if smooth and settings.newton else None
 
 
 def smaller(settings: config.Config, lit: Scene) -> Scene:
@@ -96,7 +95,7 @@ def worked_on(
     picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))
     coverage = np.where(hidden[..., None], 0, at_size(target.coverage, lit, small))
     uncounted = at_size((target.weight == 0).astype(np.float32), lit, small)[..., 0] > 0.5
-    weight = pixel_weight(coverage, uncounted | hidden, chosen.paint, first_hold(chosen))
+    weight = pixel_weight(coverage, uncounted | hidden, chosen.paint, first_hold(settings))
     return replace(target, picture=picture, initial=initial, coverage=coverage, weight=weight)
 
 

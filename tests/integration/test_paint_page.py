@@ -162,7 +162,7 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         page = Page(browser, server.url)
         sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
-        # ---- A shadow, by its tip; and where there is none. Answers come late, and a drag is one step all the same.
+        # ---- A shadow, by its tip; and where there is none; a drag is one step, however late answers come
         answered = server.worker.session.pick
         server.worker.session.pick = lambda asked: (time.sleep(0.4), answered(asked))
         page.page.keyboard.press("9")

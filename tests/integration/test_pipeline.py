@@ -14,12 +14,20 @@ import numpy as np
 import pytest
 
 from envedit import api, config, inputs, pipeline, representations
-from envedit.core import interrupts, latlong
+from envedit.core import color, interrupts, latlong
 from envedit.core.errors import InputError
 from envedit.images import analytic_sky, images
 from envedit.representations.layers import gain
 from envedit.scene import scene
-from envedit.solve import adam_loop, checkpoint, edit_job, gauss_newton, transport_error, turning
+from envedit.solve import (
+    adam_loop,
+    checkpoint,
+    edit_job,
+    gauss_newton,
+    likelihood,
+    transport_error,
+    turning,
+)
 from envedit.targets import target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
@@ -319,18 +327,23 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_highlight_that_matte_ground_cannot_show_leaves_the_rest(tmp_path):
-    """As bright as painted, the ground takes a sky that makes all of it bright; the mean stays."""
+def test_a_highlight_that_matte_ground_cannot_show_leaves_the_mean_of_the_rest(tmp_path):
+    """As bright as painted, the ground takes a sky that makes all of it bright; what is to stay stays."""
     spot = {"type": "light", "ellipse": [0.5, 0.4, 0.06, 0.06, 0.0], "amount": 3.0, "units": "fraction"}
     tables = {
         "input": {"width": 64, "rows": "all"}, "scene": {"width": 48}, "output": {"spp": 64},
         "renderer": {"spp": 64, "max_depth": 3}, "optimizer": {"iterations": 60},
     }  # fmt: skip
     picture = analytic_sky.sunsky(64, 240.0, 45.0)
-    for rest in ("follow", "keep"):
-        target = {"kind": "strokes", "strokes": [spot], "rest": rest}
+    for chosen in ("follow", "keep"):
+        target = {"kind": "strokes", "strokes": [spot], "rest": chosen}
         found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
-        assert found.metrics["painted"]["elsewhere"] < 0.025
+        shown = {name: color.tonemap(found.renders[name]) for name in ("initial", "target", "edited")}
+        rest = (shown["initial"] == shown["target"]).all(axis=2)
+        change = (shown["edited"] - shown["initial"])[rest]
+        assert np.abs(change.mean(axis=0)).max() < 1.5 * likelihood.VISIBLE
+        if chosen == "keep":
+            assert np.abs(change).mean() < 0.025
 
 
 @pytest.mark.slow

@@ -88,7 +88,8 @@ def painted():
     coverage = np.zeros((*FILM, 1), np.float32)
     coverage[2:7, 3:9] = 1
     weight = pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3)
-    return moved_case(lambda _: Likelihood.of_paint(weight, coverage))
+    initial = np.full((*FILM, 3), 0.2, np.float32)
+    return moved_case(lambda _: Likelihood.of_paint(weight, coverage, initial, initial + 0.3 * coverage))
 
 
 def moved_case(likelihood):

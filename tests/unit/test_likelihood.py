@@ -1,10 +1,13 @@
 """How likely residuals are: independent values, the most likely noise, the mean of what was not painted."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
+from envedit.losses import display_curve
 from envedit.solve.likelihood import (
     INDEPENDENT,
+    PAINT_NOISE,
     STATEMENTS,
     VISIBLE,
     Likelihood,
@@ -22,7 +25,13 @@ def of_stroke(rows=5, hold=0.3, film=FILM):
     coverage = np.zeros((*film, 1), np.float32)
     coverage[:rows] = 1
     weight = pixel_weight(coverage, np.zeros(film, bool), 1.0, hold)
-    return Likelihood.of_paint(weight, coverage), coverage
+    return Likelihood.of_paint(weight, coverage, *pictures(coverage)), coverage
+
+
+def pictures(coverage, before=0.2, after=0.5):
+    """Return what was painted on, and the painted picture."""
+    initial = np.full((*coverage.shape[:2], 3), before, np.float32)
+    return initial, np.where(coverage > 0, np.float32(after), initial)
 
 
 def formula(one, residual, sigma):
@@ -36,7 +45,7 @@ def formula(one, residual, sigma):
         return total
     mean = (one.rest * residual).sum(axis=(0, 1)) / one.rest.sum()
     q = np.sqrt((mean**2).mean() * one.rest.sum() / (one.weight > 0).sum()) / VISIBLE
-    return total + 3 * (q**2 if q <= 1 else 2 * q - 1)
+    return total + 3 * STATEMENTS * (q**2 if q <= 1 else 2 * q - 1)
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
@@ -78,7 +87,7 @@ def test_the_mean_is_scaled_to_have_the_gradient_of_its_loss(change):
 def test_noise_of_squares_is_the_most_likely(rng):
     """No other sigma makes the residual likelier, and its square is the weighted mean square."""
     one, _ = of_stroke()
-    residual = rng.normal(0, 0.07, (*FILM, 3))
+    residual = rng.normal(0, 0.05, (*FILM, 3))
     found = one.noise(residual, 1e-3)
     assert found == pytest.approx(np.sqrt((one.weight * residual**2).mean()), rel=1e-5)
 
@@ -89,6 +98,22 @@ def test_noise_of_squares_is_the_most_likely(rng):
     assert min(unlikeliness(found * factor) for factor in (0.5, 0.95, 1.05, 2)) > unlikeliness(found)
     # What is known is not undercut.
     assert one.noise(residual, 0.5) == 0.5 and one.noise(0 * residual, 0.01) == 0.01
+
+
+def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
+    """However much is painted that changes nothing, as strokes that hold."""
+    one, coverage = of_stroke()
+    shown = display_curve.to_display(mi.TensorXf([0.2, 0.5])).numpy()
+    most = pytest.approx(PAINT_NOISE * (shown[1] - shown[0]), rel=1e-5)
+    residual = np.full((*FILM, 3), 0.5)
+    assert one.noise(residual, 1e-3) == most
+    assert one.at_best(residual, 1e-3) == pytest.approx(
+        one.misfit(residual, one.paint_noise) + 6 * one.independent * np.log(one.paint_noise), rel=1e-9
+    )
+    all_painted = np.ones_like(coverage)
+    assert Likelihood.of_paint(all_painted, all_painted, *pictures(coverage)).noise(residual, 1e-3) == most
+    nothing = Likelihood.of_paint(one.weight, coverage, *pictures(coverage, 0.2, 0.2))
+    assert nothing.noise(residual, 1e-3) == pytest.approx(PAINT_NOISE * VISIBLE)
 
 
 @pytest.mark.parametrize("film", [(6, 8), FILM, (64, 64)])
@@ -132,7 +157,7 @@ def test_pixels_that_do_not_count_are_not_of_the_rest(rng):
     coverage[:5] = 1
     out = np.zeros(FILM, bool)
     out[10:] = True
-    one = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.3), coverage)
+    one = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.3), coverage, *pictures(coverage))
     residual = rng.normal(0, 0.1, (*FILM, 3))
     inside = np.where(out[..., None], 0, residual)
     assert one.misfit(residual, 0.1) == pytest.approx(one.misfit(inside, 0.1), rel=1e-9)
@@ -140,7 +165,7 @@ def test_pixels_that_do_not_count_are_not_of_the_rest(rng):
         np.sqrt(0.5) * residual[5:10].mean(axis=(0, 1)) / VISIBLE, rel=1e-4
     )
     # Where the rest has no weight its mean is not held either.
-    without = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.0), coverage)
+    without = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.0), coverage, *pictures(coverage))
     assert not without.mean(residual).any()
 
 

@@ -104,7 +104,7 @@ def test_paint_keeps_its_change_and_its_weight():
     assert found.coverage.mean() == pytest.approx(wanted.coverage.mean(), rel=1e-5)
     for one in (wanted, found):
         paint = float((one.weight * (one.coverage > 0.5)).sum() / one.weight.sum())
-        assert paint == pytest.approx(1 / (1 + 1.0), abs=0.02)
+        assert paint == pytest.approx(1 / (1 + target.FOLLOWING), abs=0.02)
 
 
 @pytest.mark.slow

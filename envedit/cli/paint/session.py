@@ -239,14 +239,15 @@ class Session:
 
     @property
     def _chosen(self):
-        """The table ``[target]``, with what the document says of it."""
-        return replace(self.project.settings.target, rest=self.document.rest)
+        """The configuration, with what the document says of the rest."""
+        settings = self.project.settings
+        return replace(settings, target=replace(settings.target, rest=self.document.rest))
 
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
-        chosen, self.reach, self.searched, self.advised = self._chosen, None, False, False
-        self.hold = first_hold(chosen)
-        painted = self._after(list(self.document.strokes), chosen.display_tonemap)
+        self.reach, self.searched, self.advised = None, False, False
+        self.hold = first_hold(self._chosen)
+        painted = self._after(list(self.document.strokes), self._chosen.target.display_tonemap)
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
         self.solving = bool(coverage is not None and coverage.any())
         if not self.solving:
@@ -275,14 +276,14 @@ class Session:
         """Aim the solution at the paint, with the present weight of what was not painted."""
         paint = self.project.settings.target.paint
         self.weight = pixel_weight(self.coverage, self._hidden, paint, self.hold)
-        likelihood = Likelihood.of_paint(self.weight, self.coverage)
+        likelihood = Likelihood.of_paint(self.weight, self.coverage, self.base, self.target)
         self.problem.expect(prior.of_paint(self.document.freedom, self.coverage))
         self.point = self.problem.aimed_at(self.target, likelihood, self.point)
         self.run, self._rendered = gauss_newton.Run(self.run.state, self.start), None
 
     def _held_more(self):
         """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
-        chosen = self._chosen
+        chosen = self._chosen.target
         seen = self.point.rendering, self.target, self.coverage, self.weight
         more = hold.further(chosen, self.hold, *seen)
         if more is None:
@@ -450,7 +451,7 @@ class Session:
         """Say what reaches more, where little is reached; a newer edit ends it."""
         painted, document, self.advised = self._asked, self.document, True
         bare = strokes.Painted(self.base, np.zeros_like(self.coverage))
-        tonemap = self._chosen.display_tonemap
+        tonemap = self._chosen.target.display_tonemap
         alone = [self._on_views(bare, [one], tonemap).coverage for one in document.strokes]
         text = advice.said(document, painted, self.point.rendering, self.reach, alone)
         if text:
@@ -458,8 +459,10 @@ class Session:
             self._tell_doing("looking for a better place of the light")
             self._unless_newer()
             held, listed = self.problem.likelihood, picking.lights(self.placed, document)
-            weight = pixel_weight(self.coverage, self._hidden, self._chosen.paint, 1.0)
-            self.problem.aimed_at(self.target, Likelihood.of_paint(weight, self.coverage), self.point)
+            paint = self.project.settings.target.paint
+            weight = pixel_weight(self.coverage, self._hidden, paint, first_hold(self._chosen))
+            likelihood = Likelihood.of_paint(weight, self.coverage, self.base, self.target)
+            self.problem.aimed_at(self.target, likelihood, self.point)
             better = advice.moved(self.problem, self.still, self.run.state, painted, listed)
             there = self.problem.evaluate(self.run.state)  # that has taken its columns
             self.point = self.problem.aimed_at(self.target, held, there)

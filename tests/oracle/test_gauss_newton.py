@@ -642,6 +642,26 @@ def test_no_step_is_longer_than_its_limit(case):
     np.testing.assert_array_equal(found["flux"][1:], state["flux"][1:])
 
 
+def test_no_step_takes_a_light_below_the_horizon(rng):
+    """Of a map whose lower half keeps its values: pushed down, a light stays at the edge of the sky."""
+    image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
+    layers = Layers((0, GRID[0]), cycles=3)
+    params = layers.encode(image[: GRID[0] // 2])
+    problem = Problem(layers, transport, image, shown(transport, image))
+    start = state = problem.state(params)
+    heights = [problem.direction(start, 0)[1]]
+    for _ in range(10):
+        normal = problem.normal(problem.evaluate(state), start, 0.01)
+        down = np.zeros_like(normal.gradient)
+        for k, (name, _, axis) in enumerate(normal.unknowns, 3 * problem.nodes):
+            if name == "turn":
+                lower = problem.direction(state, 0) + 0.01 * np.cross(axis, problem.direction(state, 0))
+                down[k] = 1e9 * np.sign(lower[1] - problem.direction(state, 0)[1])
+        state = problem.step(state, dataclasses.replace(normal, gradient=down), 1e-3)
+        heights.append(problem.direction(state, 0)[1])
+    assert heights[0] > 0.2 and min(heights) > -1e-9 and heights[-1] == pytest.approx(0, abs=1e-6)
+
+
 def marquardt(normal, damping):
     """Return the step that is damped by the diagonal of the whole Hessian."""
     damped = normal.hessian + damping * np.diag(np.diag(normal.hessian))

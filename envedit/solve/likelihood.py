@@ -161,7 +161,6 @@ class Likelihood:
         return self.misfit(residual, sigma) + 6 * self.independent * float(np.log(sigma))
 
 
-
 def _painted_change(weight, initial, picture):
     """Return the root mean square change of display values, where it is visible; at least what is."""
     shown = (display_curve.to_display(tensor(np.float32(one))).numpy() for one in (initial, picture))

@@ -25,15 +25,13 @@ from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
+from envedit.targets.pixel_weights import first_hold, pixel_weight
 
 FOUND_ANEW = (
     " (its noise is not that of the initial rendering: it is solved as a rendering under other light; "
     "if it was painted, give a mask)"
 )
 
-FOLLOWING = 0.1
-"""Weight, beside paint, of what was not painted and follows: its pattern, as its mean has a term of its own
-(``experiments/painted_edits`` has what other values do)."""
 MOST_WHITE = 0.1
 """Share of the target's pixels that may be white without a warning."""
 
@@ -319,36 +317,6 @@ def _seen(target, hidden, curve):
         raise InputError("target: no pixel counts: none that is asked for sees a surface (hide_emitters)")
     share = f"{100 * hidden.mean():.3g} % of the pixels see no surface (hide_emitters) and do not count"
     return replace(target, weight=weight, source=f"{target.source}; {share}")
-
-
-def first_hold(settings: config.Config) -> float:
-    """Return the weight of what was not painted that an edit begins with.
-
-    Only Gauss-Newton steps keep the mean of what was not painted by itself: with them its pattern may follow.
-    """
-    chosen = settings.target
-    if chosen.hold != "auto":
-        return float(chosen.hold)
-    return FOLLOWING if chosen.rest == "follow" and settings.newton else 1.0
-
-
-def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:
-    """Share the weights of paint and rest among their pixels: (h, w, 1) float32, 1 on average.
-
-    weight = paint c / sum(c) + hold (1 - c) / sum(1 - c), where c is coverage, over the pixels that are not
-    ``excluded``.
-    """
-    counted = ~np.asarray(excluded, bool)[..., None]
-    weight = np.zeros(counted.shape)
-    for share, part in ((paint, coverage * counted), (hold, (1 - coverage) * counted)):
-        total = part.sum(dtype=np.float64)
-        if total > 0:
-            weight += share * part / total
-    if not weight.any():
-        raise InputError(
-            "target: no pixel counts: set target.paint above 0, or target.hold if pixels are left unpainted"
-        )
-    return (weight / weight.mean()).astype(np.float32)
 
 
 def _rendered(settings, scene, envmap, other):

@@ -17,7 +17,8 @@ from envedit.core.resampling import fit
 from envedit.representations.layers.gain import CYCLES
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, rendered_anew
-from envedit.targets.target import Target, first_hold, pixel_weight, with_noise
+from envedit.targets.pixel_weights import first_hold, pixel_weight
+from envedit.targets.target import Target, with_noise
 
 PIXELS = 128 * 128
 """Pixels that an edit is solved on with "auto": of pictures of 256x256 pixels, three edits on two scenes, it

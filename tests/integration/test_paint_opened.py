@@ -13,7 +13,7 @@ import pytest
 from envedit import config, pipeline
 from envedit.cli.paint import protocol
 from envedit.images import images
-from envedit.targets.target import FOLLOWING
+from envedit.targets.pixel_weights import FOLLOWING
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, served
 

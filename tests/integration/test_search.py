@@ -12,7 +12,7 @@ from envedit.solve.gauss_newton import Run
 from envedit.solve.likelihood import VISIBLE, Likelihood
 from envedit.solve.map_problem import SIGMA, Problem
 from envedit.solve.prior import of_paint
-from envedit.targets.target import FOLLOWING, pixel_weight
+from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.tiers import slow_but
 

@@ -17,7 +17,7 @@ from envedit.solve.gauss_newton import Run
 from envedit.solve.likelihood import VISIBLE, Likelihood
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
-from envedit.targets.target import pixel_weight
+from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport
 
 GRID, FILM, LEVEL, SIGMA = (24, 48), (10, 12), 4e-4, 2e-5

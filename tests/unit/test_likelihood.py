@@ -15,7 +15,7 @@ from envedit.solve.likelihood import (
     on_average_one,
     sizes,
 )
-from envedit.targets.target import pixel_weight
+from envedit.targets.pixel_weights import pixel_weight
 
 FILM = (20, 24)
 

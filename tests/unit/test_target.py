@@ -13,7 +13,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene import scene
-from envedit.targets import initial_rendering, target
+from envedit.targets import initial_rendering, pixel_weights, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 from tests.oracles.users_scenes import HIDDEN
 
@@ -316,7 +316,7 @@ def test_paint_and_rest_have_their_weights_whatever_their_size():
     coverage = np.zeros((10, 10, 1))
     coverage[0, :2] = 1
     coverage[0, 2] = 0.5
-    weight = target.pixel_weight(coverage, np.zeros((10, 10), bool), paint=3, hold=1)
+    weight = pixel_weights.pixel_weight(coverage, np.zeros((10, 10), bool), paint=3, hold=1)
     assert weight.mean() == pytest.approx(1, rel=1e-6)
     painted_part = 3 * coverage / coverage.sum()
     np.testing.assert_allclose(
@@ -327,13 +327,13 @@ def test_paint_and_rest_have_their_weights_whatever_their_size():
 def test_what_tells_nothing_has_no_weight():
     excluded = np.zeros((4, 5), bool)
     excluded[1] = True
-    weight = target.pixel_weight(np.ones((4, 5, 1)), excluded, paint=1, hold=1)
+    weight = pixel_weights.pixel_weight(np.ones((4, 5, 1)), excluded, paint=1, hold=1)
     assert not weight[1].any() and (weight[[0, 2, 3]] == weight[0, 0]).all()
 
 
 def test_a_target_without_weight_is_refused():
     with pytest.raises(InputError, match="no pixel counts"):
-        target.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
+        pixel_weights.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
     with pytest.raises(ConfigError, match=r"target\.paint"):
         asking(kind="strokes", strokes=(a_stroke(),), paint=0.0, hold=0.0)
 
@@ -351,7 +351,7 @@ def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     made = target.make(asking(kind="strokes", strokes=(upper,)), ball, envmap)
     assert not made.coverage[hidden].any() and made.coverage.any() and not made.weight[hidden].any()
     painted = made.coverage[..., 0] > 0
-    wanted = target.FOLLOWING * made.weight[painted].sum()
+    wanted = pixel_weights.FOLLOWING * made.weight[painted].sum()
     assert made.weight[~painted].sum() == pytest.approx(wanted, rel=1e-5)
     held = made.held(1, 3)
     assert held.weight[~painted].sum() == pytest.approx(3 * held.weight[painted].sum(), rel=1e-5)

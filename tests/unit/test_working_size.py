@@ -9,7 +9,7 @@ import envedit
 from envedit import config
 from envedit.images import images
 from envedit.scene import scene
-from envedit.targets import target, working_size
+from envedit.targets import pixel_weights, target, working_size
 from tests.oracles.builders import LIGHT, write_scene
 
 SKY = envedit.sunsky(32)
@@ -104,7 +104,7 @@ def test_paint_keeps_its_change_and_its_weight():
     assert found.coverage.mean() == pytest.approx(wanted.coverage.mean(), rel=1e-5)
     for one in (wanted, found):
         paint = float((one.weight * (one.coverage > 0.5)).sum() / one.weight.sum())
-        assert paint == pytest.approx(1 / (1 + target.FOLLOWING), abs=0.02)
+        assert paint == pytest.approx(1 / (1 + pixel_weights.FOLLOWING), abs=0.02)
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes, working_size
-from envedit.targets.target import first_hold, pixel_weight
+from envedit.targets.pixel_weights import first_hold, pixel_weight
 
 DRAGGED_COLUMNS, COLUMNS = 16, 32
 """Most exact columns of T in one frame while a light is dragged, with the fewest paths, and otherwise."""

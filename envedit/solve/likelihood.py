@@ -23,6 +23,7 @@ logarithm of the likelihood is, but for a constant,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -141,8 +142,8 @@ class Likelihood:
         found = self._pixels(residual, least) / (3 * self.independent)
         if found <= 1:
             return least
-        if self.paint_noise is not None:
-            return max(least, min(self.paint_noise, least * float(np.sqrt(found))))
+        if not self.robust:
+            return float(np.sqrt(self.variance(found * least**2, least)))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)
@@ -154,6 +155,10 @@ class Likelihood:
         sigma = (b + np.sqrt(b * b + (d + c) * a)) / (d + c)
         inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
         return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
+
+    def variance(self, square: Any, least: float) -> Any:
+        """Return the most likely squared standard error of paint, given the mean square of its residuals."""
+        return np.clip(square, least**2, max(least, self.paint_noise or np.inf) ** 2)
 
     def at_best(self, residual: np.ndarray, least: float) -> float:
         """Return the formula above at the most likely noise."""

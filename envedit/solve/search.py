@@ -296,7 +296,6 @@ class _Seen:
             unit = light / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
         goal = _display(self.target)
         count = 3 * self.likelihood.independent
-        most = max(self.likelihood.paint_noise or np.inf, self.sigma)
         least = np.full(len(pictures), np.inf)
         found = np.ones(len(pictures))
         for factor in FACTORS if own else SHARES:
@@ -304,7 +303,7 @@ class _Seen:
             off = _display(np.float32(self.before) + more) - goal
             squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
             mean = of_mean(np.einsum("knc,n->kc", off, self.share))
-            variance = np.clip(squares / count, self.sigma**2, most**2)
+            variance = self.likelihood.variance(squares / count, self.sigma)
             unlikeliness = squares / variance + count * np.log(variance) + mean
             better = unlikeliness < least
             least = np.where(better, unlikeliness, least)

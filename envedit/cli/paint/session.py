@@ -245,9 +245,9 @@ class Session:
 
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
-        self.reach, self.searched, self.advised = None, False, False
-        self.hold = first_hold(self._chosen)
-        painted = self._after(list(self.document.strokes), self._chosen.target.display_tonemap)
+        chosen, self.reach, self.searched, self.advised = self._chosen, None, False, False
+        self.hold = first_hold(chosen)
+        painted = self._after(list(self.document.strokes), chosen.target.display_tonemap)
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
         self.solving = bool(coverage is not None and coverage.any())
         if not self.solving:

@@ -270,13 +270,13 @@ function viewed(stroke) {
 // A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
 // history: it ends with the answer to the last question, or after UNANSWERED where none comes.
 const UNANSWERED = 5000;
-let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false;
+let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0;
 function pick(phase, x, y) {
-  if (phase === "start") { picked = -1; point = []; place = null; ended = false; }
+  if (phase === "start") { clearTimeout(unanswered); picked = -1; point = []; place = null; ended = false; }
   if (phase === "end") {
     ended = true;
     if (answered === asked) lights.commit();
-    else setTimeout(() => { if (ended) lights.commit(); }, UNANSWERED);
+    else unanswered = setTimeout(() => lights.commit(), UNANSWERED);
     return;
   }
   if (phase === "move") place = [x, y];
@@ -302,7 +302,9 @@ RECEIVED.picked = (message) => {
     say("");
     lights.moveTo(message.light, message.azimuth, message.elevation);
   }
-  if (ended && answered === asked) lights.commit();
+  if (!ended || answered !== asked) return;
+  clearTimeout(unanswered); // what is dragged meanwhile by its handle is not at its end
+  lights.commit();
 };
 
 const lights = new Lights($("map-stack"), $("handles"), {

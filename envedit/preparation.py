@@ -22,11 +22,10 @@ from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
-from envedit.representations.layers.lights import SPARE
 from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.scene.renderings import rendered
-from envedit.solve import initialization, likelihood, turning
+from envedit.solve import initialization, turning
 from envedit.solve.edit_job import Job, Watch
 from envedit.targets.target import Target
 
@@ -41,8 +40,6 @@ there, and a small change of the light is not. 256 residuals, as in :data:`.map_
 TURN_PATHS = 2**20
 """Paths of a rendering that is compared to find a turn, all pixels together, up to a factor of two; at most
 as many as the target's."""
-PREFERRED = 0.05
-"""The unturned sky is chosen only if its residual is smaller by this share: a turn adds no content."""
 
 
 @dataclass(frozen=True)
@@ -154,16 +151,18 @@ class Preparation:
         always = self.settings.representation.turn is True
         if not always and turn.left >= TURNED:
             return self._prepared(target, 0.0, [])
-        turned = self._prepared(target, turn.degrees, [said], search=False)
-        if always or not turned.job.newton:
+        turned = self._prepared(target, turn.degrees, [said])
+        if always or turned.job.begun is None:
             return turned
         still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
-            loss, other = _loss(turned), _loss(still)
-        chosen = still if other < loss - 6 * likelihood.INDEPENDENT * np.log1p(PREFERRED) else turned
+            score, other = (one.job.settle(one.params) for one in (turned, still))
+        # As many turns as the map has columns could have been the best one.
+        score += 2 * np.log(self.original.shape[1])
+        chosen = still if other < score else turned
         chosen.notes.append(
-            f"Akaike criterion (lower is better): {loss:.5g} with the sky turned, {other:.5g} without"
+            f"-2 log evidence (lower is likelier): {score:.5g} with the sky turned, {other:.5g} without"
         )
         return chosen
 
@@ -267,21 +266,48 @@ class Preparation:
             watch=self.watch,
             dists=self.dists,
         )
-        frozen, smooth = None, None
-        if recordings:
-            if recordings.octaves and search and traced and job.newton:
-                smooth = self._smooth(job, params, recordings, crop)
-            params = representation.refine(params, recordings.octaves)
+        # ---- Which texels keep their value: none for Gauss-Newton, whose prior holds what is not determined
+        octaves, frozen = recordings.octaves if recordings else [], None
         if traced:
             frozen = np.zeros(original.shape[:2], bool)
-            if not job.newton:  # its prior holds what the picture does not determine
+            if octaves or not job.newton:
                 known = traced.determined(rows, settings.renderer.influence_threshold)
                 frozen[rows] = ~known[rows]
             job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
-            params, found = self._started(job, params, recordings, crop, search, smooth)
-            notes += found
+            representation.keep(job.free)
+            job.free = None  # the gain keeps to them, while a light may move across the others
+            notes += recordings.notes
+        # ---- Which lights, and where
+        if recordings and search and (settings.optimizer.iterations or not job.newton):
+            with self.clock("start_s"):
+                params = self._explained(job, params, octaves, notes, recordings.transport)
+            if octaves:
+                began = original.copy()
+                began[representation.active] = representation.decode(params).numpy()
+                job.target, said = initialization.trusted(began, recordings, target)
+                notes += said
+        params = representation.refine(params, octaves) if octaves else params
         return Edit(job, params, crop, degrees, frozen, notes)
+
+    def _explained(self, job, params, octaves, notes, transport):
+        """Find the lights that explain the target, and for Adam the sky; returns parameters."""
+        self.watch.stage("searching for lights")
+        explanation = job.explain(params, transport)
+        said = "the target" if job.target.coverage is None else "the paint"
+        notes.append(
+            f"likeliest explanation of {said}: {explanation.name} (-2 log evidence {explanation.score:.1f})"
+        )
+        if job.newton and not octaves:
+            job.begun = explanation.run
+            return params
+        self.watch.stage("solving for lights and coarse gain")
+        try:
+            solved = job.solved(params, explanation.run, transport)
+        except NumericalError:  # a start that goes nowhere is no reason to stop
+            return params
+        # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
+        return params | {name: solved[name] for name in solved if name != "ground"}
 
     def _recorded(self, representation, target):
         """Return what is looked through for where layers start; None for what is fitted."""
@@ -294,46 +320,6 @@ class Preparation:
             if traced:
                 self.renderer = self._recordings.transport
         return self._recordings
-
-    def _smooth(self, job, params, recordings, crop):
-        """Solve by Gauss-Newton for lights and coarse grids, where finer grids go on; None if it fails."""
-        with self.clock("start_s"):
-            self.watch.stage("solving for lights and coarse gain")
-            alone = replace(recordings, octaves=[])
-            found = initialization.find(
-                job.representation, params, alone, job.target, job.original, only_own=True
-            )
-            try:
-                return job.solved(job.best(found.starts, crop)[0])
-            except NumericalError:  # a start that goes nowhere is no reason to stop
-                return None
-
-    def _started(self, job, params, recordings, crop, search, smooth=None):
-        """Find where layers start, or from the ``smooth`` solution; without a search, from what is there."""
-        with self.clock("start_s"):
-            job.representation.keep(job.free)
-            job.free = None  # the gain keeps to them, while a light may move across the others
-            if not search:
-                return params, recordings.notes
-            self.watch.stage("searching for lights")
-            if job.target.coverage is not None:
-                params, explanation = initialization.explained(
-                    self.settings, job.representation, params, recordings, job.target, job.original
-                )
-                job.begun = explanation.run if job.newton else None
-                note = f"likeliest explanation of the paint: {explanation.name}"
-                return params, [*recordings.notes, f"{note} (-2 log evidence {explanation.score:.1f})"]
-            ready = initialization.find(
-                job.representation, params, recordings, job.target, job.original, only_own=job.newton
-            )
-            job.target = ready.target
-            if smooth is not None:
-                # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
-                kept = {name: value for name, value in smooth.items() if name != "ground"}
-                said = ["lights and coarse gain solved for by Gauss-Newton"]
-                ready.starts.insert(0, (params | kept, said))
-            params, placed = job.best(ready.starts, crop)
-            return params, ready.notes + placed
 
     def _horizon(self):
         """Return what the rows below the horizon do."""
@@ -354,11 +340,3 @@ def _misfits(rendering, picture, weight):
     height, width, _ = off.shape
     parts = off, fitted(off, min(AREAS, height), min(AREAS, width))
     return [float(np.sqrt(np.square(part).mean(axis=2)).mean()) for part in parts]
-
-
-def _loss(edit: Edit) -> float:
-    """Return the loss where an edit ends, with every light that it adds; inf if it cannot begin."""
-    try:
-        return edit.job.tried(edit.params, edit.crop, SPARE, ended=True)
-    except NumericalError:
-        return np.inf

@@ -18,11 +18,14 @@ def to_display(radiance: mi.TensorXf) -> mi.TensorXf:
     x^(1/2.2) as the metrics' tonemap, but linear below :data:`LOW`, and 1 + log(x) / 2.2 above 1, where a
     clip would leave a highlight no way back. Continuous, at 1 with its first derivative.
     """
-    x = radiance.array
+    return mi.TensorXf(shown(radiance.array), radiance.shape)
+
+
+def shown(x: mi.Float) -> mi.Float:
+    """Return the values of :func:`to_display` of plain arrays."""
     middle = dr.power(dr.clip(x, LOW, 1), 1 / 2.2)
     toe = LOW ** (1 / 2.2) / LOW
-    y = dr.select(x <= LOW, x * toe, dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
-    return mi.TensorXf(y, radiance.shape)
+    return dr.select(x <= LOW, x * toe, dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)) / 2.2, middle))
 
 
 def slope(radiance: ArrayLike) -> np.ndarray:

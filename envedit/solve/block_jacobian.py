@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
@@ -100,10 +101,9 @@ class BlockJacobian:
         size = np.maximum(self._total[self._used[cells]], 1e-30)
         return [tensor(m[:, cells] / np.float32(size)) for m in self._matrix]
 
-    def of_cells(self, flux: np.ndarray) -> np.ndarray:
-        """Return pictures in blocks of a flux (3,) in each cell of :attr:`sky`, (n, blocks, 3)."""
-        columns = [m.numpy() * np.float32(f) for m, f in zip(self._lit, flux, strict=True)]
-        return np.stack(columns, axis=2).transpose(1, 0, 2)
+    def of_cells(self, flux: np.ndarray) -> list[mi.TensorXf]:
+        """Return pictures in blocks of a flux (3,) in each cell of :attr:`sky`, (blocks, n) per channel."""
+        return [m * mi.Float(np.float32(f)) for m, f in zip(self._lit, flux, strict=True)]
 
     def seen(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
         """Return, per channel, products of pictures (blocks, k) with those of :attr:`sky`'s cells: (k, n).

@@ -6,10 +6,10 @@ Longer than 400 lines: the ways in which Adam and Gauss-Newton go on after an in
 from __future__ import annotations
 
 import contextlib
-import functools
+import itertools
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from envedit.losses import display_curve, optimizer
 from envedit.losses.perceptual import distances
 from envedit.renderers import Renderer
 from envedit.representations.layers.gain import LEVELS
-from envedit.representations.layers.lights import SPARE
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene import scene
 from envedit.solve import (
@@ -34,23 +33,16 @@ from envedit.solve import (
     checkpoint,
     gauss_newton,
     hold,
-    likelihood,
+    search,
     task,
     transport_error,
 )
 from envedit.solve.map_problem import Posterior
 from envedit.targets.target import Target
+from envedit.transport.light_transport import LightTransport
 
 CHECKED_SPP = 64
 """Samples a pixel of renderings by which start and solution are compared."""
-TRIAL_STEPS, NEWTON_TRIAL = 30, 6
-"""Steps of Adam and of Gauss-Newton after which the better of two starts is chosen."""
-TRIAL_GAIN, LIKELIER = 0.05, gauss_newton.WORTH
-"""By which share of the loss it must be better with Adam, and by how much lower with Gauss-Newton: twice the
-logarithm of the places that a light could have had, some 20,000."""
-CLEARLY = 6 * likelihood.INDEPENDENT * np.log(1.1)
-"""By how much lower with Gauss-Newton for a rendered target, where lights that are moved may stand in for one
-another: as for a residual 10 % smaller."""
 RISEN = 2.0
 """Largest ratio of the last loss to the first where a user has raised Adam's rate. Measured on
 quickstart, four representations at rates of 0.1 to 1e38: it is 0.02 to 1.7, or the loss runs away, to 7 to
@@ -122,7 +114,9 @@ class Job:
     note : str
         What the solver has to say.
     begun : gauss_newton.Run, optional
-        Of the last trial: :meth:`optimise` goes on from there.
+        Where :meth:`optimise` goes on from.
+    likelier : list of str
+        Explanations that were found to be likelier on the way.
     """
 
     settings: config.Config
@@ -139,6 +133,8 @@ class Job:
     posterior: Posterior | None = None
     note: str = ""
     begun: gauss_newton.Run | None = None
+    likelier: list[str] = field(default_factory=list)
+    _blocks: dict = field(default_factory=dict, repr=False)
 
     @property
     def newton(self) -> bool:
@@ -176,69 +172,48 @@ class Job:
                 adam.take_back()
         return self.original.copy()
 
-    def best(self, starts: list[tuple[Params, list[str]]], crop: np.ndarray) -> tuple[Params, list[str]]:
-        """Return the start, (parameters, notes), that gets farthest in a few steps."""
-        if len(starts) == 1:
-            return starts[0]
-        begun: list[gauss_newton.Run | None] = []
-        reached, trials = [], self.trials
-        for params, _ in starts:
-            self.begun = None
-            try:
-                loss = self.tried(params, crop, SPARE if self.newton and self._rendered else 0)
-                loss += LIKELIER * self._moved(params)
-            except NumericalError:  # a start that goes nowhere is no reason to stop
-                loss = np.inf
-            reached.append(loss if np.isfinite(loss) else np.inf)
-            begun.append(self.begun)
-        least = int(np.argmin(reached)) if self.better(min(reached), reached[0]) else 0
-        self.begun = begun[least]
-        found = ", ".join(f"{loss:.3g}" for loss in reached)
-        said = f"start {least + 1} of {len(starts)} chosen; criterion after {trials} steps, lower is better: "
-        return starts[least][0], [*starts[least][1], said + found]
-
-    @property
-    def trials(self) -> int:
-        """Steps after which two starts are compared."""
-        return min(NEWTON_TRIAL, self.settings.optimizer.iterations) if self.newton else TRIAL_STEPS
-
-    def better(self, loss: float, usual: float) -> bool:
-        """Say whether one start is so much better than the usual one that it is to be taken."""
-        if not self.newton:
-            return loss < (1 - TRIAL_GAIN) * usual
-        return loss < usual - (CLEARLY if self._rendered else LIKELIER)
-
-    def _moved(self, params):
-        """Count the lights that a start has moved, of a rendered target: each could have had many places."""
-        return np.any(params["turn"].numpy(), axis=1).sum() if self.newton and self._rendered else 0
-
     @property
     def _rendered(self):
         """Whether the target is a rendering, and not painted."""
         return self.target.coverage is None
 
-    def tried(self, params: Params, crop: np.ndarray, most_added: int = 0, ended: bool = False) -> float:
-        """Return the loss after some steps from a start, beside which so many lights may be added.
+    def explain(self, params: Params, transport: LightTransport) -> search.Explanation:
+        """Return the likeliest explanation of the target through T; the parameters are those of the map."""
+        problem, tried = self._problem(transport), itertools.count(1)
+        steps = min(search.STEPS, self.settings.optimizer.iterations) if self.newton else search.STEPS
 
-        ``ended``: where no further step, and no further light, lowers F; otherwise after :attr:`trials`.
+        with ctrl_c() as interrupt:
+
+            def after_step():
+                done = next(tried)
+                self.watch.progress(done, done, "trying lights")
+                if interrupt.is_set():
+                    raise Interrupted(self.original.copy(), 0)
+
+            return search.search(problem, problem.state(params), self._sigma, after_step, steps)
+
+    def solved(self, params: Params, begun: gauss_newton.Run, transport: LightTransport) -> Params:
+        """Return where Gauss-Newton steps end, for what Adam goes on from.
+
+        Raises
+        ------
+        NumericalError
+            If they cannot begin.
         """
-        steps = self.settings.optimizer.iterations if ended else self.trials
-        if self.newton:
-            asked = self._problem(), params, self._sigma, steps
-            found = gauss_newton.solve(*asked, trial=not ended, most_added=most_added)
-            self.begun = found.run
-            return found.loss
-        few = replace(self.settings.optimizer, iterations=steps)
-        target = self.target.aim, self.target.weight
-        objective = adam_loop.Objective(self.settings.loss, *target, crop, steps, self.dists, self.lit.rows)
-        return self._loop(params, objective, few)[1].history[-1]["loss"]
+        more: dict[str, Any] = {"sparing": False}
+        if self._rendered:
+            more = {"judge": self._display_error}
+        return gauss_newton.solve(self._problem(transport), params, self._sigma, run=begun, **more).params
 
-    def solved(self, params: Params) -> Params:
-        """Return where Gauss-Newton steps towards a rendered target end, lights added and moved."""
-        more: dict[str, Any] = {"most_added": SPARE, "judge": self._display_error, "run": self.begun}
-        found = gauss_newton.solve(self._problem(), params, self._sigma, **more)
-        self.begun = None
-        return found.params
+    def settle(self, params: Params) -> float:
+        """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
+        most, problem = self.settings.optimizer.iterations, self._problem()
+        while self.begun is not None:
+            made = gauss_newton.solve(problem, params, self._sigma, most, run=self.begun, sparing=False)
+            self.begun = self._another(made)
+        point = problem.evaluate(made.run.state, resolve=False)
+        self.begun = made.run
+        return search.score(problem, made.run, point, self._sigma)
 
     def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
         """Optimise from the start, or from the checkpoint; returns parameters and state."""
@@ -286,17 +261,14 @@ class Job:
         """Let :meth:`optimise` go on from a solution on disk; InputError if it is not of these layers."""
         self.begun = checkpoint.load_solution(file, self._problem().state(params))
 
-    def _problem(self):
-        transport = self.renderer.transport
-        return task.problem(
-            self.settings, self.target, self.representation, transport, self.original, self._blocks
-        )
-
-    @functools.cached_property
-    def _blocks(self):
-        """The blocks of all problems of this job: they depend on layers and transport alone."""
-        shape = self.original.shape[:2]
-        return block_jacobian.BlockJacobian(self.representation, self.renderer.transport, shape)
+    def _problem(self, transport=None):
+        """Return what is minimised through T, by default the renderer's."""
+        traced = transport or self.renderer.transport
+        if traced not in self._blocks:
+            shape = self.original.shape[:2]
+            self._blocks = {traced: block_jacobian.BlockJacobian(self.representation, traced, shape)}
+        given = self.settings, self.target, self.representation, traced, self.original
+        return task.problem(*given, self._blocks[traced])
 
     @property
     def _sigma(self):
@@ -312,20 +284,15 @@ class Job:
             self.target = replace(self.target, picture=picture, compared=arrays.pop("aim"))
             run = gauss_newton.Run.of_arrays(arrays, state.history)
         elif run is not None:
-            self._problem().evaluate(run.state)  # another trial may have taken the columns of its lights
+            self._problem().evaluate(run.state)  # another explanation may have taken its columns
         saved, most = time.perf_counter(), min(chosen.iterations, gauss_newton.ITERATIONS)
-        done, reached = 0, self.original
+        done = 0
 
         with ctrl_c() as interrupt:
 
             def after_step(run, point):
-                nonlocal saved, done, reached
-                if run is None:  # of a state that may be rejected
-                    self.watch.progress(done, max(most, done), "trying lights")
-                    if interrupt.is_set():
-                        raise Interrupted(reached.copy(), done)
-                    return
-                done, reached = len(run.history), point.edited
+                nonlocal saved, done
+                done = len(run.history)
                 if done:
                     self.watch.progress(done, max(most, done), f"loss {run.history[-1]['loss']:.4g}")
                 due = time.perf_counter() - saved >= chosen.checkpoint_s
@@ -345,13 +312,16 @@ class Job:
                 # Paint is no noisy picture, and asks for what it shows.
                 more: dict[str, Any] = {"sparing": False}
                 if self._rendered and not (run and run.corrected):
-                    more = {"most_added": SPARE, "judge": self._display_error}
+                    more = {"judge": self._display_error}
                 made = gauss_newton.solve(self._problem(), *asked, run, **more)
-                further = self._corrected(made) if self._rendered else self._held_more(made.run)
+                if self._rendered:
+                    further = self._another(made, interrupt) or self._corrected(made)
+                else:
+                    further = self._held_more(made.run)
                 if further is None:
                     break
                 run = further
-        self.posterior, said = made.posterior, [made.note] if made.note else []
+        self.posterior, said = made.posterior, [made.note] if made.note else self.likelier
         if made.run.hold > 1:
             said.append(hold.said(made.run.hold, hold.change(*self._without_paint(made.run))))
         if "saturation" in made.params and not made.note:
@@ -362,6 +332,23 @@ class Job:
             said.append(f"{missed} was taken off the target for the last steps")
         self.note = "; ".join(said)
         return made.params, adam_loop.State(step=len(made.history), history=made.history)
+
+    def _another(self, made, interrupt=None):
+        """Return a run that goes on from a likelier explanation than a solution; None where there is none."""
+        run, most = made.run, self.settings.optimizer.iterations
+        if made.note or run.corrected or not 0 < len(run.history) < most:
+            return None
+
+        def after_step():
+            self.watch.progress(len(run.history), len(run.history), "trying lights")
+            if interrupt and interrupt.is_set():
+                raise Interrupted(self.decode(made.params), len(run.history))
+
+        found = search.further(self._problem(), run, self._sigma, after_step)
+        if found is None:
+            return None
+        self.likelier.append(f"then likelier: {found.name} (-2 log evidence {found.score:.1f})")
+        return replace(found.run, most=len(found.run.history) + gauss_newton.ITERATIONS)
 
     def _corrected(self, made):
         """Return a run that goes on towards the target without T's error; None where it need not."""

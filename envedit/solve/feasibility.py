@@ -35,7 +35,7 @@ from envedit.core.color import tonemap
 from envedit.core.errors import InputError, place_of
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
-from envedit.solve import light_search, matching_pursuit
+from envedit.solve import point_light
 from envedit.transport.block_transport import CELLS, tiles
 from envedit.transport.light_transport import LightTransport
 
@@ -57,6 +57,8 @@ TOE = 1e-3
 """Least difference of radiance over which the display curve's slope is taken: finite at black."""
 HALF = 0.5
 """Below this share :attr:`Reach.warning` warns."""
+SMOOTH = 2
+"""Order of the products of coordinates that the sky around a light may take on."""
 FULL = 0.25
 """Difference of display values that :func:`unreachable` shows in full colour."""
 
@@ -433,7 +435,7 @@ def _around_light(question, model, x, found):
     beyond = _around(light, 2 * size) - _around(light, 4 * size) / 4  # the surroundings taken off
     row, column = (int(i) for i in np.unravel_index(np.argmax(beyond), beyond.shape))
     room = transport.capacity - len(transport.columns)
-    if not beyond[row, column] > LIGHT * total or room < 2 * light_search.PROBES:
+    if not beyond[row, column] > LIGHT * total or room < 2 * point_light.PROBES:
         return model, x
     # ---- Its place, by exact columns
     directions, omega = latlong.directions(height, width), latlong.lookup_solid_angles(height, width)
@@ -447,7 +449,7 @@ def _around_light(question, model, x, found):
     mixed = np.stack([*sky, question.initial - model.base]).reshape(len(sky) + 1, -1, 3)
     aim, known = np.minimum(question.target, 1), question.target.reshape(-1, 3)
     first, last = np.flatnonzero(active.any(axis=1))[[0, -1]]
-    place, flux = light_search.refine(
+    place, flux = point_light.refine(
         transport, (aim - model.base).reshape(-1, 3), known, question.weight.reshape(-1, 1), mixed,
         towards, np.ones(3), int(first), int(last),
     )  # fmt: skip
@@ -472,7 +474,7 @@ def _around_light(question, model, x, found):
 def _smooth(directions):
     """Products of the direction's coordinates up to second order, not negative: (n, H, W)."""
     height, width, _ = directions.shape
-    products = matching_pursuit.products(directions.reshape(-1, 3), matching_pursuit.GAIN_ORDER).T
+    products = point_light.products(directions.reshape(-1, 3), SMOOTH).T
     return (products - products.min(axis=1, keepdims=True) + 1e-3).reshape(-1, height, width)
 
 

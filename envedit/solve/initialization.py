@@ -1,8 +1,8 @@
-"""Where an edit with layers starts: how fine its gain is, which pixels count, where lights are looked for.
+"""How fine the gain of an edit with layers is, and which pixels count.
 
 Two recordings of T, independent of each other, separate what is seen from noise. Where they show that
 detail of the sky is identifiable, as a mirror does, the gain gets finer grids, and pixels that are mostly
-noise are down-weighted. Then lights are searched for, in the picture or in what was painted on it.
+noise are down-weighted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from envedit.core.types import Progress
 from envedit.representations.layers.gain import CYCLES, Octave
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
-from envedit.solve import gain_bandwidth, light_search, pixel_confidence, search, task
+from envedit.solve import gain_bandwidth, pixel_confidence
 from envedit.targets.target import Target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
@@ -32,7 +32,7 @@ grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that 
 
 @dataclass(frozen=True)
 class Recordings:
-    """What :func:`find` looks through.
+    """What lights are looked for through.
 
     Attributes
     ----------
@@ -55,25 +55,6 @@ class Recordings:
     views: tuple[slice, ...] = ()
 
 
-@dataclass(frozen=True)
-class Starts:
-    """What :func:`find` found.
-
-    Attributes
-    ----------
-    starts : list of (dict, list of str)
-        Parameters, and notes on them; one is to be taken (:meth:`.edit_job.Job.best`).
-    target : Target
-        The target; its pixels may be weighed.
-    notes : list of str
-        What was chosen, whichever start is taken.
-    """
-
-    starts: list[tuple[dict, list[str]]]
-    target: Target
-    notes: list[str] = field(default_factory=list)
-
-
 def recordings(
     settings: config.Config,
     lit: scene.Scene,
@@ -83,7 +64,7 @@ def recordings(
     traced: LightTransport | None,
     progress: Progress | None = None,
 ) -> Recordings:
-    """Trace what :func:`find` looks through: T, and a second recording where detail is asked about.
+    """Trace what lights are looked for through: T, and a second recording where detail is asked about.
 
     Where detail is identifiable, a gain fine enough for it follows the noise of T: a large picture, whose
     pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the
@@ -146,44 +127,18 @@ def recordings(
     return Recordings(transport, second, octaves, notes, lit.rows)
 
 
-def find(
-    layers: Layers,
-    params: dict,
-    recordings: Recordings,
-    target: Target,
-    original: np.ndarray,
-    only_own: bool = False,
-) -> Starts:
-    """Find where to start.
+def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple[Target, list[str]]:
+    """Weigh a rendered target's pixels by what is known of them under a map; returns the target and notes.
 
     Parameters
     ----------
-    layers, params : Layers, dict
-        The representation, with its finer grids, and its parameters.
+    envmap : ndarray (H, W, 3)
+        The map as far as it is solved: images of lights, and caustics, are where the lights now are.
     recordings : Recordings
-        Of :func:`recordings`; their bright columns may change.
+        Of :func:`recordings`, with a second one; their bright columns may change.
     target : Target
         What the picture should be.
-    original : ndarray (H, W, 3)
-        The map.
-    only_own : bool
-        As of :func:`.light_search.start`.
     """
-    transport, notes = recordings.transport, list(recordings.notes)
-    starts = _searched(layers, params, transport, target, original, only_own)
-    if recordings.octaves:  # a mirror: images of lights, and caustics, are where the lights are now found
-        began = original.copy()
-        began[layers.active] = layers.decode(starts[0][0]).numpy()
-        weight, said = _trusted(began, recordings, target)
-        if weight is not None:
-            notes.append(said)
-            target = replace(target, weight=weight)
-            starts = _searched(layers, params, transport, target, original, only_own)
-    return Starts(starts, target, notes)
-
-
-def _trusted(envmap, recordings, target):
-    """Weigh a rendered target's pixels by what is known of them; returns weights, or None, and a note."""
     pictures = []
     for one in (recordings.transport, recordings.second):
         one.resolve(envmap)
@@ -193,42 +148,10 @@ def _trusted(envmap, recordings, target):
     asked = target.picture, target.noise, recordings.views
     weight = pixel_confidence.weights(first, second, share, *asked)
     if weight is None:
-        return None, ""
+        return target, []
     noisy = 100 * float((weight < 0.5).mean())
     said = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
     weight = weight if target.weight is None else weight * target.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
-        return None, ""
-    return (weight / max(float(weight.mean()), 1e-30)).astype(np.float32), said
-
-
-def _searched(layers, params, transport, target, original, only_own=False):
-    """List the starts of the search for lights, (parameters, notes)."""
-    problem = light_search.SearchProblem(layers, transport, target.picture, target.weight, original)
-    searched = light_search.start(problem, params, only_own)
-    several = only_own and len(layers.separation.lights) > 1 and searched[0]["turn"].numpy().any()
-    # Of several lights one may have changed, and the search have moved others to make up for it.
-    still = (params, ["all lights initialised at their places in the map"])
-    return [still, searched] if several else [searched]
-
-
-def explained(
-    settings: config.Config,
-    layers: Layers,
-    params: dict,
-    recordings: Recordings,
-    target: Target,
-    original: np.ndarray,
-) -> tuple[dict, search.Explanation]:
-    """Find the likeliest explanation of a painted picture; returns its parameters and itself.
-
-    Parameters
-    ----------
-    settings : config.Config
-        Of the run.
-    layers, params, recordings, target, original
-        As for :func:`find`.
-    """
-    problem = task.problem(settings, target, layers, recordings.transport, original)
-    found = search.search(problem, problem.state(params), task.sigma(target))
-    return problem.found(found.run.state), found
+        return target, []
+    return replace(target, weight=(weight / max(float(weight.mean()), 1e-30)).astype(np.float32)), [said]

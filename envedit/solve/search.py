@@ -1,55 +1,50 @@
-"""Which explanation of a painted picture is likeliest: moves of lights, compared by their evidence.
+"""Which explanation of a picture is likeliest: moves of lights, compared by their evidence.
 
 An explanation is a local maximum of the posterior: the lights where they are, one of them elsewhere, softer
-or out, one more. No small step leads from one to the other. Each is begun where a search over all directions
-puts the light, descended to by a few Gauss-Newton steps, and judged by one number, -2 log evidence in
-Laplace's approximation (MacKay 1992),
+or out, one more. No small step leads from one to the other. Each is begun with the sky's gain as in the
+original and the light where it promises most, descended to by a few Gauss-Newton steps, and judged by one
+number, -2 log evidence in Laplace's approximation (MacKay 1992),
 
     F(x) + 6 n log(sigma) + log det H - log det K,
 
 with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2. What an unknown
 gains in misfit it pays for by how far it is determined beyond its prior. The best explanation is kept if its
 number is lower by :data:`POSITIVE`, and the search goes on from there.
+
+Under a rendered target all of the sky may have changed: where a light promises most is asked beside what the
+sky can do (``light_places.py``). Of paint lights come first: it is asked under the sky of the original.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from envedit.core import latlong
-from envedit.core.arrays import tensor
 from envedit.core.rotations import rotation_vector
-from envedit.losses import display_curve
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
-from envedit.solve import gauss_newton
-from envedit.solve.likelihood import Likelihood, of_mean
+from envedit.solve import gauss_newton, painted_places
+from envedit.solve.light_places import Places
+from envedit.solve.likelihood import INDEPENDENT
 from envedit.solve.map_problem import SIGMA, Problem
 from envedit.solve.unknowns import Point
 
+MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"
 POSITIVE = 2.0
 """By how much -2 log evidence must be lower for another explanation: "positive" evidence by Kass and Raftery
 (1995), below which it is "not worth more than a bare mention"."""
 LIGHT = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
+
 STEPS = 5
-"""Gauss-Newton steps after which explanations are compared."""
-CANDIDATES = 2
-"""Best places of one light that are refined."""
-APART = np.cos(np.radians(15.0))
-"""Cosine of the angle between two places of a light that are different explanations."""
+"""Most Gauss-Newton steps after which explanations are compared."""
+FADED, FAINT = -1.0, 6 * INDEPENDENT * np.log(1.1)
+"""Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
+rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
 SOFT_DEGREES = 2.0
 """Radius of the lobe that takes the place of a light where a shadow is to be softer, and of a light that is
 added to a map without any."""
-FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
-"""Fluxes that a light of the map is tried with elsewhere, over its own."""
-SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
-"""Fluxes that an added light is tried with, as shares of the light in the picture."""
-SPACINGS = (2, 1)
-"""Distances in texels of the places that are tried around the best cell, one after the other."""
 
 
 @dataclass(frozen=True)
@@ -58,28 +53,41 @@ class Explanation:
 
     Attributes
     ----------
-    name : str
-        What was done to the map's lights, for a note.
+    done : dict of int to str
+        What was done to lights, by their numbers.
     run, point : Run, Point
         Where the solution goes on.
     score : float
         -2 log evidence, but for a constant.
     """
 
-    name: str
+    done: dict[int, str]
     run: gauss_newton.Run
     point: Point
     score: float
+
+    @property
+    def name(self) -> str:
+        """What was done to the map's lights, for a note."""
+        said = [what if what == ADDED else f"light {k + 1} {what}" for k, what in sorted(self.done.items())]
+        return ", ".join(said) or "lights left where they are"
 
 
 @dataclass(frozen=True)
 class _Move:
     """A state to descend from, the centre of its prior, and what it is expected to lower the score by."""
 
-    name: str
+    light: int
+    what: str
     state: dict
     centre: dict
     gain: float
+
+    def after(self, done: dict[int, str], own: int) -> dict[int, str]:
+        """Return what is done to lights with this move beside earlier ones; ``own`` lights are the map's."""
+        if self.light < own or self.what == ADDED:
+            return done | {self.light: self.what}
+        return {k: what for k, what in done.items() if k != self.light or self.what != REMOVED}
 
 
 def search(
@@ -87,32 +95,68 @@ def search(
     start: dict,
     sigma: float = SIGMA,
     after_step: Callable[[], None] | None = None,
+    steps: int = STEPS,
 ) -> Explanation:
     """Find the likeliest explanation.
 
     Parameters
     ----------
     problem : Problem
-        Of a painted picture.
+        Of a rendered or a painted target.
     start : dict
         State of the map as it is.
     sigma : float
         Least standard error of display values.
     after_step : callable, optional
         Called now and then; what it raises ends the search.
+    steps : int
+        Gauss-Newton steps after which explanations are compared.
     """
-    best = _descended(problem, "lights left where they are", start, start, sigma)
+    best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
     while best.point.residual is not None:
-        found = []
-        for move in _moves(problem, best, sigma):
-            found.append(_descended(problem, move.name, move.state, move.centre, sigma))
-            if after_step:
-                after_step()
-        least = min(found, key=lambda one: one.score, default=best)
-        if not least.score < best.score - POSITIVE:
+        cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
+        found = _better(problem, best, sigma, after_step, steps, cleared)
+        if found is None:
             break
-        best = least
+        best = found
     return best
+
+
+def further(
+    problem: Problem, run: gauss_newton.Run, sigma: float, after_step: Callable[[], None] | None = None
+) -> Explanation | None:
+    """Find an explanation that is likelier than a solution, whose sky it begins with; None if there is none.
+
+    Parameters
+    ----------
+    problem, sigma, after_step
+        As for :func:`search`.
+    run : Run
+        Where no step leads further.
+    """
+    point = problem.evaluate(run.state, resolve=False)
+    best = Explanation({}, run, point, score(problem, run, point, sigma))
+    return _better(problem, best, sigma, after_step, STEPS, {})
+
+
+def _better(problem, best, sigma, after_step, steps, sky):
+    """Return the likeliest explanation one move from another, begun under a sky; None if none is likelier."""
+    least = best
+    for move in _moves(problem, best, sigma):
+        history = list(best.run.history) if not sky else []
+        run = gauss_newton.Run(move.state | sky, move.centre, history=history)
+        done = move.after(best.done, problem.layers.lights.own)
+        found = _descended(problem, done, run, sigma, steps)
+        if after_step:
+            after_step()
+        least = found if found.score < least.score else least
+    return least if least.score < best.score - POSITIVE else None
+
+
+def of_light(problem: Problem) -> float:
+    """Return what an added light costs, :data:`LIGHT`; of a rendering, also that it could be in any cell."""
+    _, directions = problem.blocks.sky
+    return LIGHT + 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
 
 
 def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -> float:
@@ -123,42 +167,94 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     normal = problem.normal(point, run.start, noise, descent=False)
     (_, known), (_, expected) = np.linalg.slogdet(normal.hessian), np.linalg.slogdet(normal.precision)
     likelihood = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
-    found = float(likelihood + known - expected + LIGHT * len(problem.added(run.state)))
+    found = float(likelihood + known - expected + of_light(problem) * len(problem.added(run.state)))
+    if problem.likelihood.robust:
+        found += FAINT * len(_faded(problem, run.state))
     return found if np.isfinite(found) else np.inf
 
 
-def _descended(problem, name, state, centre, sigma):
-    """Return the explanation that a few steps from a state lead to."""
-    run = gauss_newton.Run(state, centre)
-    point = problem.evaluate(state)
+def _faded(problem, state):
+    """List the map's own lights that have faded."""
+    own = problem.layers.lights.own
+    return [k for k in problem.lit(state) if k < own and state["flux"][k].mean() < FADED]
+
+
+def _descended(problem, done, run, sigma, steps):
+    """Return the explanation that a few steps from where a run is lead to."""
+    point = problem.evaluate(run.state)
     if point.residual is not None:
-        point = gauss_newton.descended(problem, run, point, sigma, STEPS)
-    return Explanation(name, run, point, score(problem, run, point, sigma))
+        point = gauss_newton.descended(problem, run, point, sigma, steps)
+    return Explanation(done, run, point, score(problem, run, point, sigma))
 
 
 # ---- Moves -------------------------------------------------------------------------------------------------
 
 
 def _moves(problem, best, sigma):
-    """List the most promising move of each kind from an explanation.
-
-    Lights come first: the sky's gain is as in the original. Promising is what raises the likelihood then, all
-    else as it is; steps raise it further.
-    """
-    state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
-    now = _unlikeliness(problem, state, sigma)
-    found: dict[str, _Move] = {}
-    for name, changed, centre, unlikeliness, cost in _changes(problem, state, best.run.start, sigma):
-        move = _Move(name, changed, centre, gain=now - unlikeliness - cost)
-        if move.gain > (found[name].gain if name in found else 0.0):
-            found[name] = move
+    """List the most promising move of each kind from an explanation."""
+    painted = not problem.likelihood.robust
+    found: dict[tuple[int, str], _Move] = {}
+    for move in (_under_the_original if painted else _beside_the_sky)(problem, best, sigma):
+        kind = move.light, move.what
+        if move.gain > (found[kind].gain if kind in found else 0.0):
+            found[kind] = move
     return list(found.values())
 
 
-def _changes(problem, state, start, sigma):
-    """Yield what can be done to the lights: (str, dict, dict, float, float).
+def _beside_the_sky(problem, best, sigma):
+    """Yield moves that lower F together with one step of all else."""
+    lights, state, start = problem.layers.lights, best.run.state, best.run.start
+    for k in problem.lit(state):
+        own, dark = k < lights.own, _changed(state, k, flux=DARK)
+        places = _places_of(problem, dark, start, sigma, k)
+        if places is None:
+            continue
+        stays = places.fall(best.point.rendering)
+        # ---- out
+        worth = LIGHT if own else of_light(problem)
+        if k in _faded(problem, state):
+            worth = FAINT
+        yield _Move(k, REMOVED, dark, start, gain=worth - stays)
+        # ---- elsewhere: where it is, it explains as much
+        for there in places.best():
+            turn = rotation_vector(lights.centres[k], there.direction)
+            flux = start["flux"][k] if own else there.flux
+            moved, centre = (_changed(one, k, turn=turn, flux=flux) for one in (state, start))
+            yield _Move(k, MOVED, moved, centre, gain=there.fall - stays - POSITIVE)
 
-    Its name, state, centre of the prior, -2 log likelihood, and what it costs to add the light.
+    # ---- one more
+    spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
+    for k in spare[:1]:
+        places = _places_of(problem, state, start, sigma, k)
+        for there in places.best() if places else []:
+            turn = rotation_vector(lights.centres[k], there.direction)
+            more, centre = (_changed(one, k, turn=turn, flux=there.flux, size=0.0) for one in (state, start))
+            yield _Move(k, ADDED, more, centre, gain=there.fall - of_light(problem))
+
+
+def _places_of(problem, state, start, sigma, k):
+    """Return the places of a light that is dark in a state; None where F has no value there."""
+    point = problem.evaluate(state, resolve=False)
+    if point.residual is None:
+        return None
+    try:
+        return Places(problem, point, problem.normal(point, start, problem.noise(point.residual, sigma)), k)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _under_the_original(problem, best, sigma):
+    """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
+    state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
+    now = _unlikeliness(problem, state, sigma)
+    for k, what, changed, centre, unlikeliness, cost in _changes(problem, state, best.run.start, sigma):
+        yield _Move(k, what, changed, centre, gain=now - unlikeliness - cost)
+
+
+def _changes(problem, state, start, sigma):
+    """Yield what can be done to the lights: (int, str, dict, dict, float, float).
+
+    Which light, what, state, centre of the prior, -2 log likelihood, and what it costs to add the light.
     """
     lights = problem.layers.lights
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
@@ -168,11 +264,11 @@ def _changes(problem, state, start, sigma):
         dark = _changed(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
-        for direction, flux, unlikeliness in places(problem, dark, k, sigma, away):
+        for direction, flux, unlikeliness in painted_places.best(problem, dark, k, sigma, away):
             turn = rotation_vector(lights.centres[k], direction)
             moved = _changed(state, k, turn=turn, flux=flux)
             centre = _changed(start, k, turn=turn) if own else _changed(start, k, turn=turn, flux=flux)
-            yield f"light {k + 1} moved", moved, centre, unlikeliness, 0.0
+            yield k, MOVED, moved, centre, unlikeliness, 0.0
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
@@ -180,19 +276,19 @@ def _changes(problem, state, start, sigma):
             size = lights.log_size(SOFT_DEGREES)
             soft = _changed(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = _changed(start, spare[0], turn=turn, flux=flux, size=size)
-            yield f"light {k + 1} softened", soft, centre, _unlikeliness(problem, soft, sigma), 0.0
+            yield k, SOFTENED, soft, centre, _unlikeliness(problem, soft, sigma), 0.0
         # ---- out, if it was added
         if not own:
-            yield f"light {k + 1} removed", dark, start, _unlikeliness(problem, dark, sigma), -LIGHT
+            yield k, REMOVED, dark, start, _unlikeliness(problem, dark, sigma), -LIGHT
 
     # ---- one more
     size = lights.log_size(LOBE_DEGREES if lights.own else SOFT_DEGREES)
     for k in spare[:1]:
-        for direction, flux, unlikeliness in places(problem, state, k, sigma):
+        for direction, flux, unlikeliness in painted_places.best(problem, state, k, sigma):
             turn = rotation_vector(lights.centres[k], direction)
             more = _changed(state, k, turn=turn, flux=flux, size=size)
             centre = _changed(start, k, turn=turn, flux=flux, size=size)
-            yield "light added", more, centre, unlikeliness, LIGHT
+            yield k, ADDED, more, centre, unlikeliness, LIGHT
 
 
 def _changed(state, k, **values):
@@ -206,110 +302,3 @@ def _changed(state, k, **values):
 def _unlikeliness(problem, state, sigma):
     point = problem.evaluate(state)
     return np.inf if point.residual is None else problem.likelihood.at_best(point.residual, sigma)
-
-
-# ---- Where a light raises the likelihood -------------------------------------------------------------------
-
-
-def places(
-    problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray | None = None
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """List where light ``k``, dark in a state, raises the likelihood most: direction, log flux (3,), -2 log.
-
-    All cells of the sky are tried through the block transport, with several fluxes each, and texels around
-    the best ones through exact columns. Places differ by :data:`APART`, also from ``away``, (3,).
-    """
-    lights, blocks, likelihood = problem.layers.lights, problem.blocks, problem.likelihood
-    point = problem.evaluate(state, resolve=False)
-    _, directions = blocks.sky
-    if point.residual is None or not len(directions):
-        return []
-    own, flux = k < lights.own, lights.flux[k]
-    pixels = np.maximum(np.bincount(blocks.block_of, minlength=blocks.count), 1)[:, None]
-    seen = _Seen(
-        likelihood=likelihood,
-        sigma=sigma,
-        before=blocks.summed(point.rendering) / pixels,
-        target=blocks.summed(problem.picture) / pixels,
-        weight=blocks.summed(likelihood.weight)[:, 0],
-        share=blocks.summed(likelihood.share)[:, 0],
-    )
-    factors, unlikeliness = seen.best(blocks.of_cells(flux), own)
-    if away is not None:
-        unlikeliness = np.where(directions @ away > APART, np.inf, unlikeliness)
-    found = []
-    for _ in range(CANDIDATES):
-        at = int(np.argmin(unlikeliness))
-        if not np.isfinite(unlikeliness[at]):
-            break
-        unlikeliness = np.where(directions @ directions[at] > APART, np.inf, unlikeliness)
-        found.append(_refined(problem, point, flux, own, directions[at], sigma))
-    return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in found]
-
-
-def _refined(problem, point, flux, own, direction, sigma):
-    """Look around a direction through exact columns; returns direction, factor of the flux, and -2 log."""
-    transport, likelihood = problem.transport, problem.likelihood
-    height, width = problem.envmap.shape[:2]
-    omega = latlong.lookup_solid_angles(height, width)
-    seen = _Seen(
-        likelihood=likelihood,
-        sigma=sigma,
-        before=point.rendering.reshape(-1, 3),
-        target=problem.picture.reshape(-1, 3),
-        weight=likelihood.weight.ravel(),
-        share=likelihood.share.ravel(),
-    )
-    row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
-    for spacing in SPACINGS:
-        steps = spacing * np.arange(-1, 2)
-        first = problem.rows.start
-        rows = np.unique(np.clip(row + steps, first, first + problem.layers.shape[0] - 1))
-        texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
-        unit = (flux / omega[texels // width][:, None]).astype(np.float32)
-        factors, unlikeliness = seen.best(transport.probe(texels) * unit[:, None, :], own)
-        at = int(np.argmin(unlikeliness))
-        row, column = divmod(int(texels[at]), width)
-    return latlong.directions(height, width)[row, column], factors[at], float(unlikeliness[at])
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Pixels or blocks of them, by which pictures of a light are compared.
-
-    ``before`` and ``target`` are linear radiance (n, 3); ``weight`` (n,) and ``share`` (n,) those of the
-    likelihood.
-    """
-
-    likelihood: Likelihood
-    sigma: float
-    before: np.ndarray
-    target: np.ndarray
-    weight: np.ndarray
-    share: np.ndarray
-
-    def best(self, pictures: Any, own: bool) -> tuple[Any, Any]:
-        """Return the likeliest factor of the flux of each picture (k, n, 3), and -2 log likelihood then."""
-        unit: Any = np.ones(len(pictures))
-        if not own:  # of any flux; on black, as much as was painted
-            light = self.before.mean() or max(float(self.target.mean()), 1e-30)
-            unit = light / np.maximum(pictures.mean(axis=(1, 2)), 1e-30)
-        goal = _display(self.target)
-        count = 3 * self.likelihood.independent
-        least = np.full(len(pictures), np.inf)
-        found = np.ones(len(pictures))
-        for factor in FACTORS if own else SHARES:
-            more = np.float32(pictures * (factor * unit)[:, None, None])
-            off = _display(np.float32(self.before) + more) - goal
-            squares = np.einsum("knc,knc,n->k", off, off, self.weight) / self.likelihood.area
-            mean = of_mean(np.einsum("knc,n->kc", off, self.share))
-            variance = self.likelihood.variance(squares / count, self.sigma)
-            unlikeliness = squares / variance + count * np.log(variance) + mean
-            better = unlikeliness < least
-            least = np.where(better, unlikeliness, least)
-            found = np.where(better, factor * unit, found)
-        return found, least
-
-
-def _display(radiance):
-    return display_curve.to_display(tensor(np.float32(radiance))).numpy()

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from envedit.core.arrays import tensor
-from envedit.core.color import LUMINANCE
-from envedit.core.rotations import rotated, rotation_vector
+from envedit.core.rotations import rotated
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
 
@@ -93,35 +92,6 @@ class Unknowns:
         if not state["saturation"].any():
             params.pop("saturation", None)
         return params
-
-    def clear(self, state: dict) -> None:
-        """Reset what the search found without a prior.
-
-        The gain becomes zero, own lights get their colour back and at most a factor of e of their flux.
-        """
-        state["gain"][:], state["saturation"][:] = 0, 0
-        own = [i for i in self.lit(state) if i < self.layers.lights.own]
-        state["flux"][own] = np.clip(state["flux"][own].mean(axis=1, keepdims=True), -1, 1)
-
-    def beyond(self, state: dict) -> dict | None:
-        """Return a state with a spare light where the map's own would need a flux that :meth:`clear` cuts.
-
-        A hazy light that is to be a sun stays what it is, with the sun beside it. None where no light does.
-        """
-        own = self.layers.lights.own
-        mean = {i: state["flux"][i].mean() for i in self.lit(state) if i < own}
-        i = max(mean, key=mean.get, default=None)
-        if i is None or mean[i] <= 1:
-            return None
-        found = {name: value.copy() for name, value in state.items()}
-        self.clear(found)
-        fluxes = self.layers.lights.flux @ LUMINANCE
-        more = (np.exp(mean[i]) - np.exp(1.0)) * fluxes[i] / fluxes[own]
-        if not more > 0:
-            return None
-        found["turn"][own] = rotation_vector(self.layers.lights.centres[own], self.direction(state, i))
-        found["flux"][own], found["size"][own] = np.log(more), 0.0
-        return found
 
     def added(self, state: dict) -> list[int]:
         """List the spare lights that are lit."""

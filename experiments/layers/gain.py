@@ -17,7 +17,7 @@ from envedit.losses import metrics
 from envedit.representations.layers.gain import GridGain
 from envedit.representations.layers.layers import Layers
 from envedit.representations.siren import network as siren
-from envedit.solve import adam_loop, light_search
+from envedit.solve import adam_loop, map_problem, search
 from envedit.transport.light_transport import LightTransport
 from experiments import puresky
 from experiments.harness import Experiment, calling
@@ -93,8 +93,8 @@ def compare(settings, folder, variant) -> dict:
     crop, rows = original[: height // 2], (0, height)
     plain = Layers(rows)
     encoded = plain.encode(crop)
-    asked = light_search.SearchProblem(plain, transport, picture, None, original)
-    begun, _ = light_search.start(asked, encoded)
+    problem = map_problem.Problem(plain, transport, original, picture)
+    begun = problem.found(search.search(problem, problem.state(encoded)).run.state)
     layers = type("Variant", (Layers,), {"Gain": VARIANTS.get(variant, GridGain)})(rows)
     params = layers.encode(crop)
     params |= {k: v for k, v in begun.items() if variant == SEARCHED or not k.startswith("gain")}

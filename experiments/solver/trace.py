@@ -12,7 +12,7 @@ import numpy as np
 from envedit import inputs, renderers
 from envedit.losses import metrics
 from envedit.representations import Layers
-from envedit.solve import adam_loop, gauss_newton, light_search, map_problem
+from envedit.solve import adam_loop, gauss_newton, map_problem, search
 from envedit.targets import target
 from experiments import puresky
 from experiments.engine.floors import bandwidth
@@ -30,8 +30,10 @@ def trace(settings, folder) -> dict:
     rows = active.slice
     layers = Layers(active.place)
     params = layers.encode(original[rows])
-    asked = light_search.SearchProblem(layers, transport, wanted.picture, None, original)
-    params, _ = light_search.start(asked, params)
+    problem = map_problem.Problem(layers, transport, original, wanted.picture)
+    lights = search.search(problem, problem.state(params)).run.state
+    # Both start from the lights that were found, under the sky of the original.
+    params = problem.found(lights | {name: 0 * lights[name] for name in ("gain", "saturation")})
 
     curves = {}
     for name in ("Gauss-Newton", "Adam"):

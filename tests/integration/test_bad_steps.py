@@ -20,7 +20,7 @@ from envedit.images import images
 from envedit.losses import losses, optimizer
 from envedit.report import manifest
 from envedit.scene import scene
-from envedit.solve import adam_loop, edit_job
+from envedit.solve import adam_loop
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import users_scenes
 from tests.oracles.matrix_renderer import arrays, case, same
@@ -205,61 +205,6 @@ def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
 
 
 # ---- an edit in progress ---------------------------------------------------------------------------------
-
-
-def test_a_trial_that_ends_in_nan_is_not_the_best(monkeypatch):
-    """Neither is one that stops, nor the first by default if it is they."""
-    lost = object()
-    ends = {0: 100.0, 1: math.nan, 2: 50.0, 3: lost}
-    monkeypatch.setattr(adam_loop, "Objective", lambda *_: None)
-
-    def ended(self, params, *_):
-        if ends[params] is lost:
-            raise NumericalError("it stopped")
-        return None, adam_loop.State(history=[{"loss": ends[params]}])
-
-    monkeypatch.setattr(edit_job.Job, "_loop", ended)
-    wanted = types.SimpleNamespace(aim=None, weight=None, coverage=None)
-    fake = types.SimpleNamespace(models_edit=False)
-    lit = types.SimpleNamespace(rows=None)
-    work = edit_job.Job(config.Config(), lit, None, 0, None, wanted, fake, None, None, edit_job.Watch())
-    assert not work.newton
-    check_trials(work)
-
-    def solved(problem, params, *_, trial, most_added):
-        if ends[params] is lost:
-            raise NumericalError("it cannot begin")
-        return types.SimpleNamespace(loss=ends[params], run=None)
-
-    wanted.coverage = np.ones((1, 1, 1))  # of paint several starts are tried
-
-    monkeypatch.setattr(edit_job.Job, "newton", True)
-    monkeypatch.setattr(edit_job.Job, "_sigma", 0.01)
-    monkeypatch.setattr(edit_job.Job, "_problem", lambda self: None)
-    monkeypatch.setattr(edit_job.gauss_newton, "solve", solved)
-    check_trials(work)
-
-
-@pytest.mark.parametrize(("loss", "taken"), [(-100.0, 1), (-160.0, 1), (-190.0, 2)])
-def test_moved_lights_must_explain_more_than_those_that_stay(loss, taken, monkeypatch):
-    """A residual 10 % smaller, 146, and 20 for each light that has moved: here two."""
-    ends = iter((0.0, loss))
-    wanted = types.SimpleNamespace(coverage=None)
-    work = edit_job.Job(config.Config(), None, None, 0, None, wanted, None, None, None, edit_job.Watch())
-    found = lambda *_, **more: types.SimpleNamespace(loss=next(ends), run=None)  # noqa: E731
-    monkeypatch.setattr(edit_job.Job, "newton", True)
-    monkeypatch.setattr(edit_job.Job, "_sigma", 0.01)
-    monkeypatch.setattr(edit_job.Job, "_problem", lambda self: None)
-    monkeypatch.setattr(edit_job.gauss_newton, "solve", found)
-    turns = np.zeros((3, 3), np.float32), np.float32([[0, 1, 0], [0, 0, 0], [1, 0, 0]])
-    _, notes = work.best([({"turn": mi.TensorXf(turn)}, []) for turn in turns], None)
-    assert f"start {taken} of 2" in notes[-1]
-
-
-def check_trials(work):
-    for order, best in (((0, 1, 2, 3), 2), ((1, 0, 2), 2), ((3, 1, 0), 0), ((1, 3), 1), ((0, 1, 3), 0)):
-        params, notes = work.best([(i, [f"start {i}"]) for i in order], None)
-        assert params == best and f"start {order.index(best) + 1} of {len(order)}" in notes[-1]
 
 
 @pytest.fixture

@@ -22,9 +22,9 @@ from envedit.scene import scene
 from envedit.solve import (
     adam_loop,
     checkpoint,
-    edit_job,
     gauss_newton,
     likelihood,
+    search,
     transport_error,
     turning,
 )
@@ -42,12 +42,12 @@ ADAM = {"optimizer": {"iterations": 20, "kind": "adam"}}
 STROKES = [{"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}]
 
 
-def interrupting():
-    """Return a Watch that sends Ctrl-C with each progress of the edit."""
+def interrupting(stage="editing"):
+    """Return a Watch that sends Ctrl-C with each progress of the edit, or of another stage."""
     stages = []
 
     def progress(done, total, text):
-        if stages[-1] == "editing":
+        if stages[-1] == stage:
             signal.raise_signal(signal.SIGINT)
 
     return pipeline.Watch(stages.append, progress)
@@ -567,7 +567,6 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
     if name == "a sun of 1e6":
         picture[2, 5] = 1e6
     tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
-    monkeypatch.setattr(edit_job, "SPARE", 0)
     monkeypatch.setattr(gauss_newton, "NEAR", 0)  # a solution that is no better stays, too
     settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
@@ -578,7 +577,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
 
     folder = tmp_path / "run"
     folder.mkdir()
-    tried = min(steps, edit_job.NEWTON_TRIAL) if name == "painted" else 1  # from where the best start goes on
+    tried = min(steps, search.STEPS)  # from where the best explanation goes on
     for step in sorted({tried, max(tried, steps // 2), steps}):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
             pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))
@@ -661,17 +660,16 @@ def as_tables(settings):
 
 def test_what_is_only_tried_is_not_the_map_so_far(tmp_path, rng):
     """Ctrl-C while lights are tried, before the first step: the map is as it was, and nothing is stored."""
-    settings = settings_of(tmp_path, sunny(rng))
+    settings = settings_of(tmp_path, sunny(rng), target={"rotate_degrees": 150.0})
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted, match="iteration 0") as stop:
-        pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
+        pipeline.run(settings, folder=tmp_path / "run", watch=interrupting("searching for lights"))
     assert stop.value.step == 0 and not list((tmp_path / "run").iterdir())
     original = images.load_envmap(settings.input.envmap, stop.value.envmap.shape[1])[0]
     assert stop.value.envmap.tobytes() == original.tobytes()
 
 
 def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr(edit_job, "SPARE", 0)  # nothing is saved while lights are tried
     folder = tmp_path / "run"
     folder.mkdir()
     picture = sunny(rng)

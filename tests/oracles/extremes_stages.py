@@ -20,7 +20,8 @@ from envedit.losses.display_curve import to_display
 from envedit.representations.layers.layers import Layers
 from envedit.representations.siren import fit
 from envedit.scene import scene
-from envedit.solve import adam_loop, light_search
+from envedit.solve import adam_loop, search
+from envedit.solve.map_problem import Problem
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.plain import IDENTICAL
 
@@ -358,7 +359,7 @@ def _traced(height, width):
 
 
 def edited(m, folder):
-    """Layers from the search's start towards the turned map: finite, no step lost, a lower loss.
+    """Layers towards the turned map: lights are searched for; finite, no step lost, a lower loss.
 
     Where the turned map is the same map, not one bit changes in the loop.
     """
@@ -371,7 +372,9 @@ def edited(m, folder):
     settle(traced, m, turned)
     wanted = traced.apply(single(turned)).numpy()
     if not same:
-        params, _ = light_search.start(light_search.SearchProblem(made, traced, wanted, None, m), params)
+        problem = Problem(made, traced, m, wanted)
+        lights = search.search(problem, problem.state(params))
+        assert np.isfinite(made.decode(problem.found(lights.run.state)).numpy()).all()
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
     objective = adam_loop.Objective(weights, wanted, None, m, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.01)

@@ -13,7 +13,7 @@ from envedit.core.color import tonemap
 from envedit.core.rotations import rotation_vector
 from envedit.losses import metrics
 from envedit.representations.layers.lights import DARK
-from envedit.solve import search
+from envedit.solve import painted_places
 from envedit.solve.feasibility import HALF, Reach
 from envedit.solve.map_problem import SIGMA, Problem
 
@@ -133,7 +133,7 @@ def moved(
         return None
     without = _with(start, k, flux=DARK)
     most, best = painted.reached(now), None
-    for direction, factor, _ in search.places(problem, without, k, SIGMA, problem.direction(state, k)):
+    for direction, factor, _ in painted_places.best(problem, without, k, SIGMA, problem.direction(state, k)):
         turn = rotation_vector(toward, direction)
         rendering = problem.evaluate(_with(start, k, turn=turn, flux=factor)).rendering
         share = -np.inf if rendering is None else painted.reached(rendering)

@@ -222,8 +222,8 @@ class Layers:
         *_, gain, free, _ = self._at(shape)
         sky = _coloured(real, lit)
         if "gain.0" in real:
-            factor = dr.exp(self.gain.evaluate(real, gain))
-            sky = brightened(sky, factor if free is None else dr.select(free, factor, 1))
+            sky = brightened(sky, dr.exp(self.gain.evaluate(real, gain)))
+        sky = sky if free is None else dr.select(free, sky, lit)
         return mi.TensorXf(dr.ravel(sky), (*shape, 3))
 
     def log_below(self, params: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -1,89 +1,114 @@
-"""Where a light that the map does not have would lower F most, and by how much.
+"""Where a light lowers F most, and by how much, beside all other unknowns.
 
 With a the picture of a light in display values, r the residual, W its weights, H and g those of the normal
 equations and c the mixed part of the larger Hessian, F falls by
 
     (a' W r - c' H^-1 g)^2 / (a' W a - c' H^-1 c)
 
-for the best strength of the light, beside all other unknowns.
+for the best strength of the light (Tipping and Faul 2003).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.rotations import rotation_vector
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
 
 SPACINGS, REACH = (2, 1), (2, 1)
 """Distances in texels of the exact columns around the best cell, and how many of them to each side."""
+CANDIDATES = 2
+"""Best places of one light that are refined."""
+APART = np.cos(np.radians(15.0))
+"""Cosine of the angle between two places of a light that are different explanations."""
 LEAST_REST = 1e-4
 """Share of a light's squared picture that other unknowns must leave unexplained for it to be a candidate."""
 
 
-def best(
-    problem: Problem, point: Point, normal: Normal, light: int | None = None
-) -> tuple[dict, float] | None:
-    """Light a spare light where F falls most; ``light`` if given, or else the first that is dark.
+@dataclass(frozen=True)
+class Place:
+    """A direction (3,), log flux (3,) of a light there over that of the map's, and by how much F falls."""
 
-    Candidates are the cells of the block transport, then texels around the best one, through exact columns.
+    direction: np.ndarray
+    flux: np.ndarray
+    fall: float
 
-    Returns
-    -------
-    state : dict
-        The point's, with the light.
-    fall : float
-        By how much F falls.
-        None in place of both where no light lowers F, or none is spare.
+
+class Places:
+    """Places of one light that is dark at a point.
+
+    Parameters
+    ----------
+    problem, point, normal : Problem, Point, Normal
+        What is minimised, where, and its normal equations there.
+    light : int
+        Its number.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the normal equations have no solution.
     """
-    layers, transport = problem.layers, problem.transport
-    spare = range(layers.lights.own, layers.lights.count)
-    dark = [i for i in spare if i not in problem.added(point.state)] if light is None else [light]
-    if not dark:
-        return None
-    try:
-        model = _Model(problem, normal)
-    except np.linalg.LinAlgError:
-        return None
-    i, flux = dark[0], np.float64(layers.lights.flux[dark[0]])
-    scale = flux.max()
-    if not scale > 0:
-        return None
-    flux = flux / scale  # of any strength, in single precision
-    _, directions = problem.blocks.sky
-    if not len(directions):  # so few rows are edited that they fill no cell by half
-        return None
-    strength, fall = model.of_cells(flux)
-    found = int(np.argmax(fall))
-    if not fall[found] > 0:
-        return None
-    direction, strength, fall = directions[found], strength[found], fall[found]
-    height, width = problem.envmap.shape[:2]
-    omega = latlong.lookup_solid_angles(height, width)
-    row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
-    for spacing, reach in zip(SPACINGS, REACH, strict=True):
-        if transport.capacity < (2 * reach + 1) ** 2:
-            break  # memory leaves no exact columns to refine
-        steps = spacing * np.arange(-reach, reach + 1)
-        first = problem.rows.start
-        rows = np.unique(np.clip(row + steps, first, first + layers.shape[0] - 1))
-        texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
-        unit = (flux / omega[texels // width][:, None]).astype(np.float32)
-        strengths, falls = model.of_pixels(transport.probe(texels) * unit[:, None, :])
-        found = int(np.argmax(falls))
-        if not falls[found] > 0:
-            return None
-        row, column = divmod(int(texels[found]), width)
-        strength, fall = strengths[found], falls[found]
-        direction = latlong.directions(height, width)[row, column]
-    state = {name: value.copy() for name, value in point.state.items()}
-    state["turn"][i] = rotation_vector(layers.lights.centres[i], direction)
-    state["flux"][i], state["size"][i] = np.log(strength) - np.log(scale), 0.0
-    return state, float(fall)
+
+    def __init__(self, problem: Problem, point: Point, normal: Normal, light: int):
+        self.problem, self.point = problem, point
+        self._model = _Model(problem, normal)
+        flux = np.float64(problem.layers.lights.flux[light])
+        self._scale = flux.max()  # of any strength, in single precision
+        self._flux = flux / self._scale if self._scale > 0 else flux
+
+    def best(self) -> list[Place]:
+        """List the :data:`CANDIDATES` best places, :data:`APART`.
+
+        They are the best texels, through exact columns, around the best cells of the block transport.
+        """
+        _, directions = self.problem.blocks.sky
+        if not self._scale > 0 or not len(directions):  # so few rows that they fill no cell by half
+            return []
+        strengths, falls = self._model.of_cells(self._flux)
+        found: list[Place] = []
+        for _ in range(CANDIDATES):
+            at = int(np.argmax(falls))
+            if not falls[at] > 0:
+                break
+            found.append(self._refined(self._place(directions[at], strengths[at], falls[at])))
+            falls = np.where(directions @ directions[at] > APART, 0, falls)
+        return found
+
+    def _refined(self, place):
+        transport, rows = self.problem.transport, self.problem.rows
+        height, width = self.problem.envmap.shape[:2]
+        last, omega = (
+            rows.start + self.problem.layers.shape[0] - 1,
+            latlong.lookup_solid_angles(height, width),
+        )
+        row, column = (round(float(x)) for x in latlong.texel_position(place.direction, height, width))
+        for spacing, reach in zip(SPACINGS, REACH, strict=True):
+            if transport.capacity < (2 * reach + 1) ** 2:
+                break  # memory leaves no exact columns to refine
+            steps = spacing * np.arange(-reach, reach + 1)
+            around = np.unique(np.clip(row + steps, rows.start, last))
+            texels = (around[:, None] * width + np.unique((column + steps) % width)).ravel()
+            unit = (self._flux / omega[texels // width][:, None]).astype(np.float32)
+            strengths, falls = self._model.of_pixels(transport.probe(texels) * unit[:, None, :])
+            at = int(np.argmax(falls))
+            if not falls[at] > 0:
+                break
+            row, column = divmod(int(texels[at]), width)
+            place = self._place(latlong.directions(height, width)[row, column], strengths[at], falls[at])
+        return place
+
+    def fall(self, rendering: np.ndarray) -> float:
+        """Return by how much F falls with the light that makes another rendering of the point's."""
+        picture = np.float32(rendering - self.point.rendering).reshape(1, -1, 3)
+        return float(self._model.of_pixels(picture)[1][0])
+
+    def _place(self, direction, strength, fall):
+        return Place(direction, np.full(3, np.log(strength / self._scale)), float(fall))
 
 
 class _Model:

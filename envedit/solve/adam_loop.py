@@ -31,11 +31,6 @@ MOST_BAD_STEPS = 20
 """Non-finite steps in a row after which the loop gives up."""
 RECOVERY = 10
 """Good steps after which one halving of the learning rate is undone, as bad samples may be rare."""
-DISTS_EVERY = 1
-"""Of so many steps one has the DISTS term, as many times heavier: it costs more than all else together, and
-what it asks for changes slowly."""
-_BESIDE = ("iteration", "loss", "lr", "step_ms")
-"""Columns of the history that are no terms."""
 READ_EVERY, READ_SECONDS = 10, 1.0
 """Losses become rows of the history, and the caller hears of them, after so many steps or seconds."""
 
@@ -92,10 +87,9 @@ class Objective:
         Returns
         -------
         total : Float
-            What is minimised at this step, a size-1 array: the sum of the terms, DISTS :data:`DISTS_EVERY`
-            times where it is evaluated.
+            The weighted sum, a size-1 array.
         terms : dict
-            The weighted terms that were evaluated by name, size-1 arrays.
+            Its weighted terms by name, size-1 arrays.
         """
         terms = {}
         shown = to_display(rendering)
@@ -103,15 +97,13 @@ class Objective:
             if name == "ssim":
                 term = self._ssim(shown)
             elif name == "dists":
-                if step % DISTS_EVERY:
-                    continue
                 term = self._dists(to_display(crop))
             elif name in ("image_l1", "image_l2"):
                 term = losses.LOSSES[name](shown, self._target, self._weight)
             else:
                 term = losses.LOSSES[name](crop, self._original)
             terms[name] = term * dr.opaque(mi.Float, optimizer.ramp(start, end, step, self.iterations))
-        return sum(DISTS_EVERY * term if name == "dists" else term for name, term in terms.items()), terms
+        return sum(terms.values()), terms
 
 
 @dataclass
@@ -300,6 +292,7 @@ def optimise(
         waiting.append(
             (
                 state.step,
+                dr.detach(total),
                 {k: dr.detach(v) for k, v in terms.items()},
                 rate,
                 1000 * (time.perf_counter() - start),
@@ -316,13 +309,11 @@ def optimise(
 
 
 def _read_back(waiting, state):
-    """Make rows of the history; a term that was not evaluated has its last value."""
-    for step, evaluated, lr, ms in waiting:
-        terms = {name: float(term[0]) for name, term in evaluated.items()}
-        if state.history:
-            last = state.history[-1]
-            kept = {name: last[name] for name in last if name not in _BESIDE and np.isfinite(last[name])}
-            terms = kept | terms
-        row = {"iteration": step, "loss": sum(terms.values()), **terms}
+    for step, total, terms, lr, ms in waiting:
+        row = {
+            "iteration": step,
+            "loss": float(total[0]),
+            **{name: float(term[0]) for name, term in terms.items()},
+        }
         state.history.append({**row, "lr": lr, "step_ms": round(ms, 3)})
     waiting.clear()

@@ -229,7 +229,7 @@ def _beside_the_sky(problem, best, sigma):
         for there in places.best() if places else []:
             turn = rotation_vector(lights.centres[k], there.direction)
             more, centre = (_changed(one, k, turn=turn, flux=there.flux, size=0.0) for one in (state, start))
-            yield _Move(k, ADDED, more, centre, gain=there.fall - of_light(problem))
+            yield _Move(k, ADDED, more, centre, gain=there.fall - LIGHT)
 
 
 def _places_of(problem, state, start, sigma, k):

@@ -1,4 +1,4 @@
-"""An edit in progress: its loop with checkpoints, Ctrl-C, and which of several starts to take.
+"""An edit in progress: its loop with checkpoints and Ctrl-C.
 
 Longer than 400 lines: the ways in which Adam and Gauss-Newton go on after an interruption stand side by side.
 """
@@ -180,7 +180,7 @@ class Job:
     def explain(self, params: Params, transport: LightTransport) -> search.Explanation:
         """Return the likeliest explanation of the target through T; the parameters are those of the map."""
         problem, tried = self._problem(transport), itertools.count(1)
-        steps = min(search.STEPS, self.settings.optimizer.iterations) if self.newton else search.STEPS
+        most = self.settings.optimizer.iterations if self.newton else search.RENDERED_STEPS
 
         with ctrl_c() as interrupt:
 
@@ -190,7 +190,7 @@ class Job:
                 if interrupt.is_set():
                     raise Interrupted(self.original.copy(), 0)
 
-            return search.search(problem, problem.state(params), self._sigma, after_step, steps)
+            return search.search(problem, problem.state(params), self._sigma, after_step, most)
 
     def solved(self, params: Params, begun: gauss_newton.Run, transport: LightTransport) -> Params:
         """Return where Gauss-Newton steps end, for what Adam goes on from.

@@ -37,8 +37,9 @@ POSITIVE = 2.0
 LIGHT = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
-STEPS = 5
-"""Most Gauss-Newton steps after which explanations are compared."""
+STEPS, RENDERED_STEPS = 5, 8
+"""Most Gauss-Newton steps after which explanations of paint, and of a rendering, are compared: under another
+sky the flux of a light may have to change by more than five steps do."""
 FADED, FAINT = -1.0, 6 * INDEPENDENT * np.log(1.1)
 """Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
 rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
@@ -95,7 +96,7 @@ def search(
     start: dict,
     sigma: float = SIGMA,
     after_step: Callable[[], None] | None = None,
-    steps: int = STEPS,
+    most: int = RENDERED_STEPS,
 ) -> Explanation:
     """Find the likeliest explanation.
 
@@ -109,9 +110,10 @@ def search(
         Least standard error of display values.
     after_step : callable, optional
         Called now and then; what it raises ends the search.
-    steps : int
-        Gauss-Newton steps after which explanations are compared.
+    most : int
+        Most Gauss-Newton steps after which explanations are compared.
     """
+    steps = min(most, RENDERED_STEPS if problem.likelihood.robust else STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
     while best.point.residual is not None:
         cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}

@@ -576,7 +576,9 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
 
     folder = tmp_path / "run"
     folder.mkdir()
-    tried = min(steps, search.STEPS)  # from where the best explanation goes on
+    tried = min(
+        steps, search.STEPS if name == "painted" else search.RENDERED_STEPS
+    )  # from where the best explanation goes on
     for step in sorted({tried, max(tried, steps // 2), steps}):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
             pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))
@@ -957,8 +959,8 @@ def test_turned_and_unturned_edits_are_compared_where_they_end(monkeypatch):
     after = before.copy()
     after[6:9, 40:43] += 15  # a lamp
     api.edit({"scene": {"file": "pair", "width": 32}, "output": {"spp": 16}}, envmap=before, target_map=after)
-    turned, still, taken, corrected = steps
-    assert taken in (turned, still) and min(steps) > 0 and corrected >= taken
+    *compared, taken, corrected = steps  # a light that is found later is one more solution
+    assert len(compared) >= 2 and taken in compared and min(steps) > 0 and corrected >= taken
 
 
 @pytest.mark.slow

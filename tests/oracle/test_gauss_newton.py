@@ -893,16 +893,17 @@ def test_a_light_is_added_where_the_target_has_one(rng):
     state = found.run.state
     strongest = max(lit, key=lambda k: (problem.layers.lights.flux[k] * np.exp(state["flux"][k])).sum())
     assert degrees_off(problem, state, strongest, place) < 12  # a cell is 15 degrees wide
-    assert [row["iteration"] for row in found.run.history] == list(range(search.STEPS))
+    assert [row["iteration"] for row in found.run.history] == list(range(len(found.run.history)))
 
 
 def test_the_maps_light_moves_where_no_step_leads(rng):
-    """None is added beside it, and steps alone do not get there."""
+    """Or goes out there for one that is added; steps alone do not get there."""
     image, transport, place = clouds(rng), DenseTransport.random(rng, FILM, GRID, even=0.8), (9, 34)
     target = shown(transport, image + lamp(place))
     problem, found, lit = searched(image + lamp(), transport, target)
-    assert found.name == "light 1 moved" and lit == [0]
-    assert degrees_off(problem, found.run.state, 0, place) < 8  # half a texel
+    state = found.run.state
+    strongest = max(lit, key=lambda k: (problem.layers.lights.flux[k] * np.exp(state["flux"][k])).sum())
+    assert degrees_off(problem, state, strongest, place) < 8  # half a texel
     problem, params = problem_of(image + lamp(), transport, target)
     alone = problem.state(solve(problem, params, 0.01).params)
     assert degrees_off(problem, alone, 0, place) > 20

@@ -1,7 +1,8 @@
 """One variant for all tests, and the way to real data.
 
-Real maps, meshes and weights are found through ``ENVEDIT_DATA``; a test that needs them asks for the
-``data`` fixture and is skipped by name where the variable is not set.
+The variant is ``llvm_ad_rgb``, or what ``ENVEDIT_VARIANT`` names. Real maps, meshes and weights are found
+through ``ENVEDIT_DATA``; a test that needs them asks for the ``data`` fixture and is skipped by name where
+the variable is not set.
 """
 
 import os
@@ -17,7 +18,7 @@ pytest.register_assert_rewrite("tests.oracles")
 def pytest_configure(config):
     import mitsuba as mi
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(os.environ.get("ENVEDIT_VARIANT", "llvm_ad_rgb"))
 
 
 @pytest.fixture(scope="session")

@@ -95,7 +95,7 @@ class Config(Table):
     variant: str = key(
         "llvm_ad_rgb",
         Choice("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"),
-        "Mitsuba variant: by LLVM on the CPU, or on a GPU of NVIDIA or of Apple, both untried",
+        "Mitsuba variant: by LLVM on the CPU, or on a GPU of NVIDIA, or of Apple (untried)",
     )
     input: Input = table_key(Input)
     scene: Scene = table_key(Scene)

@@ -221,7 +221,7 @@ class _LayersAt:
                 )
             )
             before, follow = self.layers.lights.glow_before(d), self.cores.follow(start, row)
-            ratio = self.layers.lights.glow(self.placed["turn"], self.placed["flux"], d) / before
+            ratio = self.layers.lights.glow_ratio(self.placed["turn"], self.placed["flux"], d, before)
             revealed = dr.exp(gone_of(ratio) * (offset + slope * dr.log(base / before + self.faint)))
             ratio = dr.select(follow, dr.exp(by_lights), ratio * revealed)
             colours = base * ratio

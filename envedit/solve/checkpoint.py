@@ -24,7 +24,7 @@ from envedit.solve import gauss_newton
 from envedit.solve.adam_loop import State
 
 NAME = "checkpoint.npz"
-_FORMAT = 7  # raise when what is stored, or what the loop makes of it, changes
+_FORMAT = 8  # raise when what is stored, or what the loop makes of it, changes
 
 
 def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:

@@ -200,18 +200,25 @@ class Job:
         NumericalError
             If they cannot begin.
         """
-        more: dict[str, Any] = {"sparing": False}
-        if self._rendered:
-            more = {"judge": self._display_error}
-        return gauss_newton.solve(self._problem(transport), params, self._sigma, run=begun, **more).params
+        problem = self._problem(transport)
+        problem.evaluate(begun.state)  # another explanation may have taken its columns of T
+        return gauss_newton.solve(
+            problem,
+            params,
+            self._sigma,
+            run=begun,
+            sparing=self._rendered,
+            judge=self._display_error if self._rendered else None,
+        ).params
 
     def settle(self, params: Params) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
         most, problem = self.settings.optimizer.iterations, self._problem()
+        problem.evaluate(self.begun.state)  # another edit may have taken its columns of T
         while self.begun is not None:
             made = gauss_newton.solve(problem, params, self._sigma, most, run=self.begun, sparing=False)
             self.begun = self._another(made)
-        point = problem.evaluate(made.run.state, resolve=False)
+        point = problem.evaluate(made.run.state)  # what was tried since may have taken its columns
         self.begun = made.run
         return search.score(problem, made.run, point, self._sigma)
 
@@ -267,8 +274,14 @@ class Job:
         if traced not in self._blocks:
             shape = self.original.shape[:2]
             self._blocks = {traced: block_jacobian.BlockJacobian(self.representation, traced, shape)}
-        given = self.settings, self.target, self.representation, traced, self.original
-        return task.problem(*given, self._blocks[traced])
+        return task.problem(
+            self.settings,
+            self.target,
+            self.representation,
+            traced,
+            self.original,
+            self._blocks[traced],
+        )
 
     @property
     def _sigma(self):

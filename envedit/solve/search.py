@@ -27,7 +27,7 @@ from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
 from envedit.solve.likelihood import INDEPENDENT
-from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.map_problem import LARGEST, SIGMA, Problem
 from envedit.solve.unknowns import Point
 
 MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"
@@ -37,7 +37,7 @@ POSITIVE = 2.0
 LIGHT = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
-STEPS, RENDERED_STEPS = 5, 8
+STEPS, RENDERED_STEPS = 5, 5
 """Most Gauss-Newton steps after which explanations of paint, and of a rendering, are compared: under another
 sky the flux of a light may have to change by more than five steps do."""
 FADED, FAINT = -1.0, 6 * INDEPENDENT * np.log(1.1)
@@ -206,23 +206,27 @@ def _moves(problem, best, sigma):
 def _beside_the_sky(problem, best, sigma):
     """Yield moves that lower F together with one step of all else."""
     lights, state, start = problem.layers.lights, best.run.state, best.run.start
+    problem.evaluate(state)  # what was tried since may have taken its columns of T
     for k in problem.lit(state):
         own, dark = k < lights.own, _changed(state, k, flux=DARK)
         places = _places_of(problem, dark, start, sigma, k)
         if places is None:
             continue
-        stays = places.fall(best.point.rendering)
+        # With the columns of T that the dark sky was rendered with.
+        stays = places.fall(problem.evaluate(state, resolve=False).rendering)
         # ---- out
         worth = LIGHT if own else of_light(problem)
         if k in _faded(problem, state):
             worth = FAINT
         yield _Move(k, REMOVED, dark, start, gain=worth - stays)
-        # ---- elsewhere: where it is, it explains as much
+        # ---- elsewhere: farther than a step goes
         for there in places.best():
+            if there.direction @ problem.direction(state, k) > np.cos(LARGEST["turn"]):
+                continue
             turn = rotation_vector(lights.centres[k], there.direction)
             flux = start["flux"][k] if own else there.flux
             moved, centre = (_changed(one, k, turn=turn, flux=flux) for one in (state, start))
-            yield _Move(k, MOVED, moved, centre, gain=there.fall - stays - POSITIVE)
+            yield _Move(k, MOVED, moved, centre, gain=there.fall - stays)
 
     # ---- one more
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]

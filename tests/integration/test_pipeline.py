@@ -576,9 +576,8 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
 
     folder = tmp_path / "run"
     folder.mkdir()
-    tried = min(
-        steps, search.STEPS if name == "painted" else search.RENDERED_STEPS
-    )  # from where the best explanation goes on
+    compared = search.STEPS if name == "painted" else search.RENDERED_STEPS
+    tried = min(steps, compared)  # from where the best explanation goes on
     for step in sorted({tried, max(tried, steps // 2), steps}):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
             pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))

@@ -16,6 +16,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE
 from envedit.scene import scene
 from tests.oracles.builders import grey
+from tests.oracles.devices import on_cpu
 
 WORKING, ROWS = (64, 128), (0, 32)
 
@@ -392,6 +393,7 @@ def test_means_are_those_of_the_edited_map(edit, rng):
     assert np.abs(small(source) - edited).max() > 0.1  # negative control
 
 
+@on_cpu
 @pytest.mark.slow
 @pytest.mark.parametrize("row", range(8, 12))
 def test_bands_do_not_show_beside_a_lamp_that_is_put_out(row, monkeypatch):

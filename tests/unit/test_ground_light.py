@@ -13,6 +13,7 @@ from envedit.representations.layers import ground_light
 from envedit.representations.layers.below_horizon import Below, sky_rows
 from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.layers import Layers
+from tests.oracles.devices import on_cpu
 
 DARK = np.zeros((1, 1, 3), np.float32)
 
@@ -44,6 +45,7 @@ def test_irradiance_of_a_uniform_sky_is_pi_times_its_radiance():
     assert light.albedo == pytest.approx(0.25, rel=2e-3) and light.plausible
 
 
+@on_cpu
 def test_light_of_cores_counts_and_that_below_the_horizon_does_not(rng):
     above, ground = halves(rng.uniform(0.5, 1, (32, 64, 3)))
     light = GroundLight(above, ground)

@@ -33,8 +33,11 @@ def test_lookup_is_mitsuba_s(rng, size):
     special = [[0, 1, 1e-7], [0, -1, 1e-7], [1, 0, 0], [0, 0, 1]]
     d = np.concatenate([random_directions(rng, 2000), seam, special])
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    # float32 directions: the row position carries an error of about 1e-3 (H - 1) near the poles
-    np.testing.assert_allclose(latlong.lookup(image, d), mitsuba_eval(image, d), atol=2e-4 * size[0])
+    # float32 directions: the row position carries an error of about 1e-3 (H - 1) near the poles.
+    # CUDA's textures interpolate with weights of eight bits.
+    coarse = 2 / 256 if mi.variant().startswith("cuda") else 0
+    found = mitsuba_eval(image, d)
+    np.testing.assert_allclose(latlong.lookup(image, d), found, atol=2e-4 * size[0] + coarse)
 
 
 def test_directions_are_texel_centres(rng):

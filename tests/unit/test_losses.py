@@ -7,6 +7,7 @@ import pytest
 
 from envedit.core.errors import InputError
 from envedit.losses.losses import LOSSES, luminance, tv
+from tests.oracles.devices import on_cpu
 from tests.oracles.plain import double, gradient, plain_ssim_loss, single
 
 REC709 = np.array([0.2126, 0.7152, 0.0722])
@@ -68,6 +69,7 @@ def test_gradient_is_the_finite_difference(name, weighted, rng):
     np.testing.assert_allclose(np.sum(g * d), slope, rtol=1e-6)
 
 
+@on_cpu
 @pytest.mark.parametrize("name", LOSSES)
 def test_equal_images_are_a_stationary_point(name, rng):
     x = single(rng.random((12, 12, 3)) * (name != "l1"))

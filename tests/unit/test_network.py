@@ -9,6 +9,7 @@ import pytest
 
 from envedit.core import latlong
 from envedit.representations.siren import network as siren
+from tests.oracles.devices import on_cpu
 from tests.oracles.kernels import launched, own
 from tests.oracles.plain import numpy_forward, numpy_layers
 from tests.oracles.tiers import slow_but
@@ -301,6 +302,7 @@ def test_no_new_kernel_after_the_third_step(count, through_the_graph):
     assert first and launched(lambda: training.steps(4)) <= first
 
 
+@on_cpu
 @pytest.mark.slow
 @pytest.mark.parametrize("through_the_graph", [False, True])
 def test_memory_does_not_grow(through_the_graph):

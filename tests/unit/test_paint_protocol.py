@@ -16,6 +16,7 @@ from envedit.cli import paint
 from envedit.cli.paint import project, protocol, session, worker
 from envedit.cli.paint.session import Tell
 from envedit.core.errors import ConfigError, InputError
+from tests.oracles.devices import on_cpu
 
 STROKE = {"type": "shadow", "points": [[0.1, 0.2], [0.3, 0.4]], "width": 0.1}
 
@@ -106,6 +107,7 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
 
 
 def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):
+    pytest.importorskip("starlette")
     file = tmp_path / "edit.toml"
     file.write_text('[input]\nenvmap = "sunsky"\n')
     opened = project.opened(str(file))
@@ -139,6 +141,7 @@ def test_memory_is_given_back_when_nothing_is_left_to_do(monkeypatch):
     assert given == ["done"], "while a light is dragged the next frame needs the buffers"
 
 
+@on_cpu
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
 def test_what_is_given_back_leaves_the_process():
     def resident():

@@ -9,6 +9,7 @@ from envedit.core.errors import ConfigError
 from envedit.export import file_resolution
 from envedit.images import images
 from envedit.representations.layers.placed_lights import PlacedLights, add, angles, direction, missing
+from tests.oracles.devices import on_cpu
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,7 @@ def test_a_light_goes_where_it_is_put_with_its_flux(sky):
     assert out.max() < 0.2 * sky.max() and np.isfinite(out).all()
 
 
+@on_cpu
 @pytest.mark.parametrize("horizon", ["mirror", "keep", "free"])
 def test_lights_are_placed_as_without_any_gain(horizon, sky):
     placed = PlacedLights(sky, horizon)

@@ -14,6 +14,7 @@ from envedit.core.primaries import ACES_AP0, ACES_AP1, P3_D65, REC709, REC2020
 from envedit.images import images
 from tests.oracles import users_scenes
 from tests.oracles.builders import exr, planes, stacked
+from tests.oracles.devices import on_cpu
 from tests.oracles.runs import TINY, call, changed, pixels
 
 
@@ -117,6 +118,7 @@ def test_chromaticities_that_are_no_primaries_are_refused(space, tmp_path, rng):
         images.read(exr(tmp_path / "a.exr", {"chromaticities": space}, **planes(rng)))
 
 
+@on_cpu
 def test_acescg_goes_out_if_it_came_in(tmp_path, isolated, capsys, monkeypatch):
     """An edit of an ACEScg map is written in ACEScg; texels that are not edited keep their bits."""
     parts = users_scenes.PATH, users_scenes.SENSOR, users_scenes.BALL, users_scenes.light(0.7)

@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor
+from envedit.core.arrays import settled, tensor
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.ground_light import GroundLight
@@ -233,7 +233,7 @@ class Below:
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
         sharp = dr.log((now.sky.array + self._faint) / (was.sky.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
-        factor = dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3))
+        factor = settled(dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3)), 0)
         if self._behind is None or gone is None:
             return factor
         gone = dr.gather(mi.Float, gone, self._mirrored // 3)

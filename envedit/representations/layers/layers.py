@@ -213,7 +213,7 @@ class Layers:
         _, d, base, before, _, _, behind = self._at(shape)
         if not self.lights.glowing:
             return base, None
-        ratio = self.lights.glow(real["turn"], real["flux"], d) / before
+        ratio = self.lights.glow_ratio(real["turn"], real["flux"], d, before)
         gone = behind_glow.gone_of(ratio)
         return base * ratio * dr.exp(gone * behind), gone
 

@@ -180,7 +180,7 @@ class Job:
     def explain(self, params: Params, transport: LightTransport) -> search.Explanation:
         """Return the likeliest explanation of the target through T; the parameters are those of the map."""
         problem, tried = self._problem(transport), itertools.count(1)
-        most = self.settings.optimizer.iterations if self.newton else search.RENDERED_STEPS
+        most = self.settings.optimizer.iterations if self.newton else search.STEPS
 
         with ctrl_c() as interrupt:
 
@@ -220,6 +220,8 @@ class Job:
             self.begun = self._another(made)
         point = problem.evaluate(made.run.state)  # what was tried since may have taken its columns
         self.begun = made.run
+        if point.residual is not None:  # what T errs by may have been fitted
+            point = replace(point, residual=np.float64(self._missed(point.edited)))
         return search.score(problem, made.run, point, self._sigma)
 
     def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
@@ -398,11 +400,15 @@ class Job:
         return seen, self.target.aim, self.target.coverage, self.target.weight
 
     def _display_error(self, envmap):
-        """Return the mean squared display error of Mitsuba's rendering of a map, which T had no part in."""
+        """Return the mean square of :meth:`_missed`, weighed as the target."""
+        weight = 1 if self.target.weight is None else self.target.weight
+        return float((np.square(self._missed(envmap)) * weight).mean())
+
+    def _missed(self, envmap):
+        """Return display values of Mitsuba's rendering of a map less the target's; T has no part in it."""
         seed = Seeds.of(self.settings.seed).step_check
         shown = display_curve.to_display(tensor(self.lit.render(envmap, CHECKED_SPP, seed)))
-        off = shown.numpy() - display_curve.to_display(tensor(self.target.picture)).numpy()
-        return float((np.square(off) * (1 if self.target.weight is None else self.target.weight)).mean())
+        return shown.numpy() - display_curve.to_display(tensor(self.target.picture)).numpy()
 
     def _look_at_the_last(self, adam, state):
         """Take the last step back if it led to no map: the loop sees only what a next step starts from."""

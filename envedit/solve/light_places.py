@@ -10,7 +10,7 @@ for the best strength of the light (Tipping and Faul 2003).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,22 +31,20 @@ LEAST_REST = 1e-4
 
 @dataclass(frozen=True)
 class Place:
-    """A direction (3,), log flux (3,) of a light there over that of the map's, and by how much F falls."""
+    """A direction (3,), what the flux of a light is multiplied by there, and by how much F falls."""
 
     direction: np.ndarray
-    flux: np.ndarray
+    factor: float
     fall: float
 
 
 class Places:
-    """Places of one light that is dark at a point.
+    """Places of lights that are dark at a point.
 
     Parameters
     ----------
     problem, point, normal : Problem, Point, Normal
         What is minimised, where, and its normal equations there.
-    light : int
-        Its number.
 
     Raises
     ------
@@ -54,32 +52,33 @@ class Places:
         If the normal equations have no solution.
     """
 
-    def __init__(self, problem: Problem, point: Point, normal: Normal, light: int):
+    def __init__(self, problem: Problem, point: Point, normal: Normal):
         self.problem, self.point = problem, point
         self._model = _Model(problem, normal)
-        flux = np.float64(problem.layers.lights.flux[light])
-        self._scale = flux.max()  # of any strength, in single precision
-        self._flux = flux / self._scale if self._scale > 0 else flux
 
-    def best(self) -> list[Place]:
-        """List the :data:`CANDIDATES` best places, :data:`APART`.
+    def best(self, light: int) -> list[Place]:
+        """List the :data:`CANDIDATES` best places of a light, :data:`APART`.
 
         They are the best texels, through exact columns, around the best cells of the block transport.
         """
         _, directions = self.problem.blocks.sky
-        if not self._scale > 0 or not len(directions):  # so few rows that they fill no cell by half
+        flux = np.float64(self.problem.layers.lights.flux[light])
+        scale = flux.max()
+        if not scale > 0 or not len(directions):  # so few rows that they fill no cell by half
             return []
-        strengths, falls = self._model.of_cells(self._flux)
+        flux = flux / scale  # of any strength, in single precision
+        strengths, falls = self._model.of_cells(flux)
         found: list[Place] = []
         for _ in range(CANDIDATES):
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
-            found.append(self._refined(self._place(directions[at], strengths[at], falls[at])))
+            place = self._refined(Place(directions[at], float(strengths[at]), float(falls[at])), flux)
+            found.append(replace(place, factor=place.factor / scale))
             falls = np.where(directions @ directions[at] > APART, 0, falls)
         return found
 
-    def _refined(self, place):
+    def _refined(self, place, flux):
         transport, rows = self.problem.transport, self.problem.rows
         height, width = self.problem.envmap.shape[:2]
         last, omega = (
@@ -93,22 +92,20 @@ class Places:
             steps = spacing * np.arange(-reach, reach + 1)
             around = np.unique(np.clip(row + steps, rows.start, last))
             texels = (around[:, None] * width + np.unique((column + steps) % width)).ravel()
-            unit = (self._flux / omega[texels // width][:, None]).astype(np.float32)
+            unit = (flux / omega[texels // width][:, None]).astype(np.float32)
             strengths, falls = self._model.of_pixels(transport.probe(texels) * unit[:, None, :])
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
             row, column = divmod(int(texels[at]), width)
-            place = self._place(latlong.directions(height, width)[row, column], strengths[at], falls[at])
+            there = latlong.directions(height, width)[row, column]
+            place = Place(there, float(strengths[at]), float(falls[at]))
         return place
 
     def fall(self, rendering: np.ndarray) -> float:
         """Return by how much F falls with the light that makes another rendering of the point's."""
         picture = np.float32(rendering - self.point.rendering).reshape(1, -1, 3)
         return float(self._model.of_pixels(picture)[1][0])
-
-    def _place(self, direction, strength, fall):
-        return Place(direction, np.full(3, np.log(strength / self._scale)), float(fall))
 
 
 class _Model:

@@ -37,9 +37,8 @@ POSITIVE = 2.0
 LIGHT = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
-STEPS, RENDERED_STEPS = 5, 5
-"""Most Gauss-Newton steps after which explanations of paint, and of a rendering, are compared: under another
-sky the flux of a light may have to change by more than five steps do."""
+STEPS = 5
+"""Most Gauss-Newton steps after which explanations are compared."""
 FADED, FAINT = -1.0, 6 * INDEPENDENT * np.log(1.1)
 """Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
 rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
@@ -96,7 +95,7 @@ def search(
     start: dict,
     sigma: float = SIGMA,
     after_step: Callable[[], None] | None = None,
-    most: int = RENDERED_STEPS,
+    most: int = STEPS,
 ) -> Explanation:
     """Find the likeliest explanation.
 
@@ -113,10 +112,10 @@ def search(
     most : int
         Most Gauss-Newton steps after which explanations are compared.
     """
-    steps = min(most, RENDERED_STEPS if problem.likelihood.robust else STEPS)
+    steps = min(most, STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
+    cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     while best.point.residual is not None:
-        cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
         found = _better(problem, best, sigma, after_step, steps, cleared)
         if found is None:
             break
@@ -209,7 +208,7 @@ def _beside_the_sky(problem, best, sigma):
     problem.evaluate(state)  # what was tried since may have taken its columns of T
     for k in problem.lit(state):
         own, dark = k < lights.own, _changed(state, k, flux=DARK)
-        places = _places_of(problem, dark, start, sigma, k)
+        places = _places(problem, dark, start, sigma)
         if places is None:
             continue
         # With the columns of T that the dark sky was rendered with.
@@ -220,31 +219,31 @@ def _beside_the_sky(problem, best, sigma):
             worth = FAINT
         yield _Move(k, REMOVED, dark, start, gain=worth - stays)
         # ---- elsewhere: farther than a step goes
-        for there in places.best():
+        for there in places.best(k):
             if there.direction @ problem.direction(state, k) > np.cos(LARGEST["turn"]):
                 continue
             turn = rotation_vector(lights.centres[k], there.direction)
-            flux = start["flux"][k] if own else there.flux
+            flux = start["flux"][k] if own else np.log(there.factor)
             moved, centre = (_changed(one, k, turn=turn, flux=flux) for one in (state, start))
             yield _Move(k, MOVED, moved, centre, gain=there.fall - stays)
 
     # ---- one more
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
     for k in spare[:1]:
-        places = _places_of(problem, state, start, sigma, k)
-        for there in places.best() if places else []:
-            turn = rotation_vector(lights.centres[k], there.direction)
-            more, centre = (_changed(one, k, turn=turn, flux=there.flux, size=0.0) for one in (state, start))
+        places = _places(problem, state, start, sigma)
+        for there in places.best(k) if places else []:
+            turn, flux = rotation_vector(lights.centres[k], there.direction), np.log(there.factor)
+            more, centre = (_changed(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=there.fall - LIGHT)
 
 
-def _places_of(problem, state, start, sigma, k):
-    """Return the places of a light that is dark in a state; None where F has no value there."""
+def _places(problem, state, start, sigma):
+    """Return the places of lights that are dark in a state; None where F has no value there."""
     point = problem.evaluate(state, resolve=False)
     if point.residual is None:
         return None
     try:
-        return Places(problem, point, problem.normal(point, start, problem.noise(point.residual, sigma)), k)
+        return Places(problem, point, problem.normal(point, start, problem.noise(point.residual, sigma)))
     except np.linalg.LinAlgError:
         return None
 

@@ -947,7 +947,7 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
     point, sigma = problem.evaluate(state), 0.1
     normal = problem.normal(point, start, sigma)
     new = next(k for k in range(problem.layers.lights.count) if k not in problem.lit(state))
-    found = light_places.Places(problem, point, normal, new).best()[0]
+    found = light_places.Places(problem, point, normal).best(new)[0]
     d = latlong.directions(*GRID)
     row, column = np.unravel_index(np.argmax(d @ found.direction), GRID)
     atom = problem.transport.probe(np.array([row * GRID[1] + column]))[0] * problem.layers.lights.flux[new]
@@ -969,14 +969,14 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
     by_mean = problem.likelihood.mean(point.residual) @ mean
     pull = np.append(normal.gradient, (pulled * atom).sum() + by_mean)
     strength = -np.linalg.solve(larger, pull)[-1]
-    assert np.exp(found.flux) == pytest.approx(np.full(3, strength), rel=1e-3)
+    assert found.factor == pytest.approx(strength, rel=1e-3)
     fall = pull @ np.linalg.solve(larger, pull) - normal.gradient @ np.linalg.solve(
         normal.hessian, normal.gradient
     )
     assert found.fall == pytest.approx(fall, rel=1e-3)
     # The same of the light's picture, as of one that is there.
     there = point.rendering + np.float32(strength * atom).reshape(*FILM, 3)
-    assert light_places.Places(problem, point, normal, new).fall(there) == pytest.approx(fall, rel=2e-3)
+    assert light_places.Places(problem, point, normal).fall(there) == pytest.approx(fall, rel=2e-3)
 
 
 # ---- glow and rows that follow ----------------------------------------------------------------------------

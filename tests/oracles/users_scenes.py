@@ -240,8 +240,9 @@ that are refused or replaced are tried one by one, the others are Mitsuba's own 
   one of them a picture, and one map is found for all; without it the first sensor is used. Views need the
   same width, which `[scene] width` gives to all; `renderer.kind = "path"` is refused with more than one.
 - **Variants.** Everything runs in `llvm_ad_rgb` and, on an NVIDIA GPU, in `cuda_ad_rgb`; `metal_ad_rgb` can
-  be chosen and was not tried. Spectra are converted to RGB when a scene is loaded, as Mitsuba does. Spectral and
-  polarised rendering are not supported: polarising materials act on unpolarised light, which is said.
+  be chosen and was not tried. Spectra are converted to RGB when a scene is loaded, as Mitsuba does.
+  Spectral and polarised rendering are not supported: polarising materials act on unpolarised light, which
+  is said.
 - **Measured** ([experiments/scenes](../experiments/scenes/README.md)): `python -m experiments scenes run
   FOLDER` loads, renders and edits every Mitsuba scene of a folder, such as a clone of
   [mitsuba-data](https://github.com/mitsuba-renderer/mitsuba-data). Of the six shipped scenes five are edited,

@@ -44,6 +44,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
         "optimizer": {"kind": "adam", "iterations": 400, "lr": 5e-6, "beta2": 0.999, "schedule": "constant"},
         "renderer": {"kind": "path", "spp": 16, "refresh": 1},
+        "perceptual": {"dists_every": 1},
     },
 }  # fmt: skip
 

@@ -52,6 +52,9 @@ class Objective:
         Length of the run, over which ramps are walked.
     dists : distances.Dists, optional
         The term of that name, between display values of the map and the original; None: it is off.
+    every : int
+        Steps from one evaluation of it to the next: a convolutional network takes longer than all the rest.
+        Its gradient counts so many times then; in between the loss has its last value.
     views : sequence of slice
         Rows of each view, where the picture is of several.
     """
@@ -64,6 +67,7 @@ class Objective:
         original: np.ndarray,
         iterations: int,
         dists: distances.Dists = None,
+        every: int = 1,
         views: Views = (),
     ):
         self.iterations = iterations
@@ -78,6 +82,7 @@ class Objective:
         shown = self._target, self._weight
         self._ssim = StackedSsim(*shown, views) if len(views) > 1 else Ssim(*shown)
         self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
+        self._every, self._last = every, None
 
     def __call__(
         self, rendering: mi.TensorXf, crop: mi.TensorXf, step: int
@@ -91,9 +96,12 @@ class Objective:
         terms : dict
             Its weighted terms by name, size-1 arrays.
         """
-        terms = {}
+        terms, counted = {}, {}
         shown = to_display(rendering)
         for name, (start, end) in self.ramps.items():
+            if name == "dists" and step % self._every and self._last is not None:
+                terms[name] = self._last
+                continue
             if name == "ssim":
                 term = self._ssim(shown)
             elif name == "dists":
@@ -103,7 +111,16 @@ class Objective:
             else:
                 term = losses.LOSSES[name](crop, self._original)
             terms[name] = term * dr.opaque(mi.Float, optimizer.ramp(start, end, step, self.iterations))
-        return sum(terms.values()), terms
+            if name == "dists":
+                value = dr.detach(terms[name])
+                counted[name] = terms[name] + (self._every - 1) * (terms[name] - value)
+                self._last = dr.select(dr.isfinite(value), value, 0 if self._last is None else self._last)
+        return sum((terms | counted).values()), terms
+
+    def resume(self, history: list[dict]) -> None:
+        """Go on from a run's last step."""
+        if history and "dists" in history[-1]:
+            self._last = dr.opaque(mi.Float, history[-1]["dists"])
 
 
 @dataclass

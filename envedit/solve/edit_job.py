@@ -237,8 +237,17 @@ class Job:
             self.renderer.restore(traced)
             # Rendered anew, the target may differ in its last bits: Mitsuba's film adds in any order.
             target = self.target = target.aimed_at(picture)
-        asked = target.aim, target.weight, crop, chosen.iterations, self.dists, self.lit.rows
-        objective = adam_loop.Objective(self.settings.loss, *asked)
+        objective = adam_loop.Objective(
+            self.settings.loss,
+            target.aim,
+            target.weight,
+            crop,
+            chosen.iterations,
+            dists=self.dists,
+            every=self.settings.perceptual.dists_every,
+            views=self.lit.rows,
+        )
+        objective.resume(state.history)
         saved = time.perf_counter()
 
         with ctrl_c() as interrupt:

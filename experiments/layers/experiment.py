@@ -59,12 +59,18 @@ def measure(done: Done) -> dict:
         "psnr": found["envmap"]["psnr"],
         "ssim": found["envmap"]["ssim"],
         "gain": found["envmap"]["psnr"] - found["initial_envmap"]["psnr"],
+        "lpips": found["envmap"]["lpips"],
         "off": found["sun_offset_texels"],
         "flux": flux[0] / flux[1],
         "sharp": sharp[0] / sharp[1],
         "true_sharp": sharp[2] / sharp[1],
         "seconds": found["timing"]["total_s"],
     }
+
+
+def lpips(m) -> str:
+    """Return LPIPS of the edited map, and of the unedited one in brackets; - without weights."""
+    return "-" if m["lpips"] is None else f"{m['lpips']:.4f} ({m['unedited_lpips']:.3f})"
 
 
 COLUMNS = {
@@ -75,6 +81,7 @@ COLUMNS = {
     "map PSNR (unedited)": "{psnr:.1f} ({unedited_psnr:.1f})",
     "gain": "{gain:+.1f}",
     "SSIM (unedited)": "{ssim:.3f} ({unedited_ssim:.3f})",
+    "LPIPS (unedited)": lpips,
     "light off, texels": lambda m: f"{m['off']:.1f}" if m["sunny"] else "-",
     "flux": lambda m: f"{m['flux']:.2f}" if m["sunny"] else "-",
     "high frequencies (true map)": "{sharp:.2f} ({true_sharp:.2f})",
@@ -91,6 +98,7 @@ def summary(rows) -> str:
         keys = "render", "render_ssim", "psnr", "gain", "ssim", "off", "flux", "sharp", "seconds"
         of = {key: np.array([m[key] for m in some], float) for key in keys}
         light = ["-", "-"]
+        seen = [m["lpips"] for m in some if m["lpips"] is not None]
         if what == "sunny":
             light = [f"at most {of['off'].max():.1f}", f"{of['flux'].min():.2f} to {of['flux'].max():.2f}"]
         lines.append(
@@ -102,6 +110,7 @@ def summary(rows) -> str:
                 f"{of['psnr'].mean():.1f}",
                 f"mean {of['gain'].mean():+.1f}, worst {of['gain'].min():+.1f}",
                 f"{of['ssim'].mean():.3f}",
+                f"{np.mean(seen):.4f}, worst {np.max(seen):.3f}" if seen else "-",
                 *light,
                 f"{of['sharp'].min():.2f} to {of['sharp'].max():.2f}",
                 f"median {np.median(of['seconds']):.0f}",

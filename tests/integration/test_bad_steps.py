@@ -431,3 +431,54 @@ def test_no_file_of_results_takes_what_is_not_finite():
     lost = []
     assert manifest.plain({"a": [1.0, math.nan], "b": math.inf}, "", lost) == {"a": [1.0, None], "b": None}
     assert lost == ["a[1]", "b"]
+
+
+def test_dists_is_evaluated_now_and_then_and_counts_as_often(rng):
+    """Its gradient is that of the steps it stands for; a run that is resumed goes on with its last value."""
+    calls = []
+
+    class Counted(FakeDists):
+        def against(self, reference):
+            distance = super().against(reference)
+            return lambda shown: (calls.append(1), distance(shown))[1]
+
+    picture, original = rng.random((4, 4, 3)), np.float32(rng.random((3, 6, 3)))
+    weights = config.Loss(ssim=0.0, image_l1=0.0, image_l2=1.0, dists=0.5)
+
+    def seen(objective, step):
+        crop = mi.TensorXf(original + np.float32(0.1 * (step + 1)))
+        dr.enable_grad(crop)
+        total, terms = objective(mi.TensorXf(np.float32(picture)), crop, step)
+        if dr.grad_enabled(total):
+            dr.backward(total)
+        return float(total[0]), float(terms["dists"][0]), dr.grad(crop).numpy()
+
+    often = adam_loop.Objective(weights, picture, None, original, 8, Counted())
+    rarely = adam_loop.Objective(weights, picture, None, original, 8, Counted(), every=4)
+    every = [seen(often, step) for step in range(8)]
+    assert len(calls) == 8
+    found = [seen(rarely, step) for step in range(8)]
+    assert len(calls) == 10
+    for step in range(8):
+        total, term, gradient = found[step]
+        last = every[step - step % 4]
+        assert total == pytest.approx(last[0], rel=1e-6) and term == pytest.approx(last[1], rel=1e-6)
+        np.testing.assert_allclose(gradient, 4 * last[2] if step % 4 == 0 else 0 * gradient, rtol=1e-5)
+
+    resumed = adam_loop.Objective(weights, picture, None, original, 8, Counted(), every=4)
+    resumed.resume([{"dists": found[4][1]}])
+    assert seen(resumed, 5)[:2] == found[5][:2] and len(calls) == 10
+
+
+def test_a_bad_value_of_dists_spoils_one_step_alone(rng):
+    values = iter([1.0, math.nan, 2.0])
+
+    class Fake:
+        def against(self, reference):
+            return lambda shown: dr.mean(shown.array) * 0 + next(values)
+
+    picture, original = rng.random((4, 4, 3)), np.float32(rng.random((3, 6, 3)))
+    objective = adam_loop.Objective(config.Loss(dists=1.0), picture, None, original, 6, Fake(), every=2)
+    shown, crop = mi.TensorXf(np.float32(picture)), mi.TensorXf(original)
+    terms = [float(objective(shown, crop, step)[1]["dists"][0]) for step in range(6)]
+    assert terms[:2] == [1, 1] and math.isnan(terms[2]) and terms[3:] == [1, 2, 2]

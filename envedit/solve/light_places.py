@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from envedit.core import latlong
+from envedit.representations.layers.lights import FAINTEST
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
 
@@ -26,15 +27,16 @@ CANDIDATES = 2
 APART = np.cos(np.radians(15.0))
 """Cosine of the angle between two places of a light that are different explanations."""
 LEAST_REST = 1e-4
-"""Share of a light's squared picture that other unknowns must leave unexplained for it to be a candidate."""
+"""Share of a light's squared picture that other unknowns must leave unexplained for it to be a candidate;
+by this share its channels are held to 0 where their strengths are found."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A direction (3,), what the flux of a light is multiplied by there, and by how much F falls."""
+    """A direction (3,), what the flux (3,) of a light is multiplied by there, and by how much F falls."""
 
     direction: np.ndarray
-    factor: float
+    factor: np.ndarray
     fall: float
 
 
@@ -73,7 +75,8 @@ class Places:
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
-            place = self._refined(Place(directions[at], float(strengths[at]), float(falls[at])), flux)
+            place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
+            place = self._refined(place, flux)
             found.append(replace(place, factor=place.factor / scale))
             falls = np.where(directions @ directions[at] > APART, 0, falls)
         return found
@@ -93,13 +96,15 @@ class Places:
             around = np.unique(np.clip(row + steps, rows.start, last))
             texels = (around[:, None] * width + np.unique((column + steps) % width)).ravel()
             unit = (flux / omega[texels // width][:, None]).astype(np.float32)
-            strengths, falls = self._model.of_pixels(transport.probe(texels) * unit[:, None, :])
+            pictures = transport.probe(texels) * unit[:, None, :]
+            strengths, falls = self._model.of_pixels(pictures)
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
             row, column = divmod(int(texels[at]), width)
             there = latlong.directions(height, width)[row, column]
-            place = Place(there, float(strengths[at]), float(falls[at]))
+            factor = self._model.of_channels(pictures[at], strengths[at])
+            place = Place(there, factor, float(falls[at]))
         return place
 
     def fall(self, rendering: np.ndarray) -> float:
@@ -131,6 +136,26 @@ class _Model:
 
     def of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
+        return self._best(*self._products(pictures))
+
+    def of_channels(self, picture, strength):
+        """Return the best strengths (3,) of a picture (pixels, 3) that has one in each channel.
+
+        At least :data:`FAINTEST` of the strongest; ``strength`` in all, where they have no solution.
+        """
+        mixed, along, power = self._reduced(*self._products(np.float32(picture * np.eye(3)[:, None])))
+        half = forward(self._lower, mixed)
+        rest = np.diag((1 + LEAST_REST) * power) - half.T @ half
+        try:
+            found = np.linalg.solve(rest, along)
+        except np.linalg.LinAlgError:
+            found = np.zeros(3)
+        if not (np.isfinite(found).all() and found.max() > 0):
+            return np.full(3, strength)
+        return np.maximum(found, FAINTEST * found.max())
+
+    def _products(self, pictures):
+        """Return products of pictures (n, pixels, 3) with the columns of J, the residual, and themselves."""
         normal, count = self.normal, len(pictures)
         known = normal.pictures.reshape(len(normal.pictures), pictures.shape[1], 3)
         mixed: list[np.ndarray] = []
@@ -150,16 +175,23 @@ class _Model:
             power = power + np.einsum("np,np->n", mine, weighted)
         by_pixels = normal.mean_of_rest.by_pixels.reshape(-1, 3)
         mean = np.stack([pictures[..., c] @ by_pixels[:, c] for c in range(3)])
-        return self._best(np.concatenate([*mixed, seen]), pull, power, mean)
+        return np.concatenate([*mixed, seen]), pull, power, mean
 
-    def _best(self, mixed, pull, power, mean):
-        """Return strengths and falls; ``mean`` (3, n) is what the pictures do to the mean of the rest."""
+    def _reduced(self, mixed, pull, power, mean):
+        """Return the mixed part, the slope beside the other unknowns, and the power.
+
+        ``mean`` (3, n) is what the pictures do to the mean of the rest.
+        """
         rest = self.normal.mean_of_rest
         mixed = mixed + rest.jacobian.T @ mean
         pull = pull + rest.residual @ mean
-        power = power + np.square(mean).sum(axis=0)
+        along = forward(self._lower, mixed).T @ self._gradient - pull
+        return mixed, along, power + np.square(mean).sum(axis=0)
+
+    def _best(self, *products):
+        """Return strengths and falls of single pictures."""
+        mixed, along, power = self._reduced(*products)
         half = forward(self._lower, mixed)
-        along = half.T @ self._gradient - pull
         rest = power - np.square(half).sum(axis=0)
         strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_REST * power)
         fall = np.maximum(strength, 0) * along

@@ -370,6 +370,32 @@ def test_a_sun_at_the_horizon_that_rises_loses_its_colour_and_not_the_sky(tmp_pa
 
 
 @pytest.mark.slow
+def test_a_setting_sun_without_blue_is_replaced_by_a_white_one(tmp_path):
+    """No factor makes its light white; an added light that had its colour would leave the blue to the sky."""
+
+    def made(row, column, sun, colour):
+        picture = np.broadcast_to(np.float32(colour), (32, 64, 3)).copy()
+        picture[16:] = 0.1
+        picture[row, column] = sun
+        return picture
+
+    images.write_exr(tmp_path / "day.exr", made(8, 20, [2000, 1900, 1800], [0.3, 0.4, 0.6]))
+    settings = settings_of(
+        tmp_path, made(14, 40, [200, 30, 0], [0.4, 0.35, 0.3]), input={"width": 64, "rows": "all"},
+        target={"file": "day.exr", "rotate_degrees": 0.0, "spp": 256}, scene={"file": "pair", "width": 32},
+        renderer={"spp": 64}, representation={"turn": False}, output={"spp": 256},
+        optimizer={"iterations": 60},
+    )  # fmt: skip
+    found = pipeline.run(settings)
+    (light,) = found.lights["after"]
+    assert (
+        light["azimuth"] == pytest.approx(360 * 20.5 / 64, abs=3)
+        and light["flux"][2] > 0.8 * light["flux"][0]
+    )
+    assert found.metrics["render"]["psnr"] > found.metrics["ceiling"]["psnr"] - 3
+
+
+@pytest.mark.slow
 def test_paint_that_asks_for_another_brightness_leaves_the_sky_its_colours():
     """With a rendered target's prior, 30 % of this sky turn a darker blue; a colour that is painted comes."""
     edits, towards = Path(__file__).parents[2] / "scenes" / "edits", {}

@@ -959,17 +959,51 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
         + [normal.pictures.reshape(len(normal.pictures), -1) @ (atom * weights).ravel()]
     )
     power = (weights * atom**2).sum()
-    share = problem.likelihood.share.reshape(-1, 1)
+    share, mean_now = problem.likelihood.linear_mean(point.residual)
+    share = share.reshape(-1, 1)
     mean = (normal.slope.reshape(-1, 3) * share * atom).sum(axis=0)
     assert mean.any() == (of == "painted")
     mixed = mixed + mean @ normal.mean_of_rest.jacobian
     power = power + mean @ mean
     larger = np.block([[normal.hessian, mixed[:, None]], [mixed[None], np.array([[power]])]])
     pulled = (normal.slope * normal.robust * point.residual).reshape(-1, 3)
-    by_mean = problem.likelihood.mean(point.residual) @ mean
+
+    def by_mean_of(one):
+        return mean_now @ (normal.slope.reshape(-1, 3) * share * one).sum(axis=0)
+
+    by_mean = by_mean_of(atom)
     pull = np.append(normal.gradient, (pulled * atom).sum() + by_mean)
     strength = -np.linalg.solve(larger, pull)[-1]
-    assert found.factor == pytest.approx(strength, rel=1e-3)
+    # ---- one strength a channel
+    apart = atom * np.eye(3)[:, None]
+    columns = [
+        np.concatenate(
+            [
+                j.T @ w
+                for j, w in zip(
+                    normal.blocks.jacobian,
+                    problem.blocks.summed((one * weights).reshape(*FILM, 3)).T,
+                    strict=True,
+                )
+            ]
+            + [normal.pictures.reshape(len(normal.pictures), -1) @ (one * weights).ravel()]
+        )
+        + (normal.slope.reshape(-1, 3) * share * one).sum(axis=0) @ normal.mean_of_rest.jacobian
+        for one in apart
+    ]
+    own = [
+        (weights * one**2).sum() + np.square((normal.slope.reshape(-1, 3) * share * one).sum())
+        for one in apart
+    ]
+    of_channels = np.block(
+        [
+            [normal.hessian, np.array(columns).T],
+            [np.array(columns), np.diag(own) * (1 + light_places.LEAST_REST)],
+        ]
+    )
+    pulls = [(pulled * one).sum() + by_mean_of(one) for one in apart]
+    strengths = -np.linalg.solve(of_channels, np.append(normal.gradient, pulls))[-3:]
+    np.testing.assert_allclose(found.factor, np.maximum(strengths, 1e-3 * strengths.max()), rtol=3e-3)
     fall = pull @ np.linalg.solve(larger, pull) - normal.gradient @ np.linalg.solve(
         normal.hessian, normal.gradient
     )

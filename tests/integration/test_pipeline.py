@@ -498,7 +498,11 @@ class Stub:
 
 def test_perceptual_terms_are_used_where_their_weights_are_named(tmp_path, rng, monkeypatch):
     monkeypatch.setattr(pipeline, "_perceptual", lambda settings: (Stub(), Stub()))
-    short = {"optimizer": {"iterations": 3}, "loss": {"dists": 5.0, "change": 0.0}}
+    short = {
+        "optimizer": {"iterations": 3},
+        "loss": {"dists": 5.0, "change": 0.0},
+        "perceptual": {"dists_every": 1},
+    }
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **PIXELS, **short))
     assert all(row["dists"] >= 0 for row in found.history) and found.history[-1]["dists"] > 0
     assert not any("dists" in line for line in found.warnings)

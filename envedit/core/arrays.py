@@ -10,7 +10,7 @@ from envedit.core.types import ArrayLike, DrArray
 
 ROUNDING = 1e-6
 """What differs by less is the same: a formula is rounded otherwise in every kernel of a GPU, where products
-and sums are fused. In the tests a factor that is 1 was 1.6e-7 off, a logarithm that is 0 8e-8."""
+and sums are fused: a factor of 1 is up to 1.6e-7 off, a logarithm of 0 8e-8."""
 
 
 def tensor(values: ArrayLike) -> mi.TensorXf:

@@ -96,7 +96,7 @@ class Objective:
         terms : dict
             Its weighted terms by name, size-1 arrays.
         """
-        terms, counted = {}, {}
+        terms, more = {}, 0.0
         shown = to_display(rendering)
         for name, (start, end) in self.ramps.items():
             if name == "dists" and step % self._every and self._last is not None:
@@ -113,9 +113,9 @@ class Objective:
             terms[name] = term * dr.opaque(mi.Float, optimizer.ramp(start, end, step, self.iterations))
             if name == "dists":
                 value = dr.detach(terms[name])
-                counted[name] = terms[name] + (self._every - 1) * (terms[name] - value)
+                more = (self._every - 1) * (terms[name] - value)  # 0, with the gradient of the steps between
                 self._last = dr.select(dr.isfinite(value), value, 0 if self._last is None else self._last)
-        return sum((terms | counted).values()), terms
+        return sum(terms.values()) + more, terms
 
     def resume(self, history: list[dict]) -> None:
         """Go on from a run's last step."""

@@ -89,6 +89,7 @@ class Places:
             latlong.lookup_solid_angles(height, width),
         )
         row, column = (round(float(x)) for x in latlong.texel_position(place.direction, height, width))
+        picture = None
         for spacing, reach in zip(SPACINGS, REACH, strict=True):
             if transport.capacity < (2 * reach + 1) ** 2:
                 break  # memory leaves no exact columns to refine
@@ -103,9 +104,10 @@ class Places:
                 break
             row, column = divmod(int(texels[at]), width)
             there = latlong.directions(height, width)[row, column]
-            factor = self._model.of_channels(pictures[at], strengths[at])
-            place = Place(there, factor, float(falls[at]))
-        return place
+            place, picture = Place(there, np.full(3, strengths[at]), float(falls[at])), pictures[at]
+        if picture is None:
+            return place
+        return replace(place, factor=self._model.of_channels(picture, place.factor))
 
     def fall(self, rendering: np.ndarray) -> float:
         """Return by how much F falls with the light that makes another rendering of the point's."""
@@ -138,20 +140,19 @@ class _Model:
         """Return the same for pictures (n, pixels, 3)."""
         return self._best(*self._products(pictures))
 
-    def of_channels(self, picture, strength):
+    def of_channels(self, picture, strengths):
         """Return the best strengths (3,) of a picture (pixels, 3) that has one in each channel.
 
-        At least :data:`FAINTEST` of the strongest; ``strength`` in all, where they have no solution.
+        At least :data:`FAINTEST` of the strongest; those given, where they have no solution.
         """
-        mixed, along, power = self._reduced(*self._products(np.float32(picture * np.eye(3)[:, None])))
-        half = forward(self._lower, mixed)
+        half, along, power = self._reduced(*self._products(np.float32(picture * np.eye(3)[:, None])))
         rest = np.diag((1 + LEAST_REST) * power) - half.T @ half
         try:
             found = np.linalg.solve(rest, along)
         except np.linalg.LinAlgError:
             found = np.zeros(3)
         if not (np.isfinite(found).all() and found.max() > 0):
-            return np.full(3, strength)
+            return strengths
         return np.maximum(found, FAINTEST * found.max())
 
     def _products(self, pictures):
@@ -178,20 +179,20 @@ class _Model:
         return np.concatenate([*mixed, seen]), pull, power, mean
 
     def _reduced(self, mixed, pull, power, mean):
-        """Return the mixed part, the slope beside the other unknowns, and the power.
+        """Return L^-1 times the mixed part, the slope beside the other unknowns, and the power.
 
         ``mean`` (3, n) is what the pictures do to the mean of the rest.
         """
         rest = self.normal.mean_of_rest
         mixed = mixed + rest.jacobian.T @ mean
         pull = pull + rest.residual @ mean
-        along = forward(self._lower, mixed).T @ self._gradient - pull
-        return mixed, along, power + np.square(mean).sum(axis=0)
+        half = forward(self._lower, mixed)
+        along = half.T @ self._gradient - pull
+        return half, along, power + np.square(mean).sum(axis=0)
 
     def _best(self, *products):
         """Return strengths and falls of single pictures."""
-        mixed, along, power = self._reduced(*products)
-        half = forward(self._lower, mixed)
+        half, along, power = self._reduced(*products)
         rest = power - np.square(half).sum(axis=0)
         strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_REST * power)
         fall = np.maximum(strength, 0) * along

@@ -8,6 +8,12 @@ use, so that ``import envedit`` is quick and works without LLVM.
 
 from __future__ import annotations
 
+import os
+
+# Before numpy is imported. Dr.Jit has the cores. OpenBLAS, which numpy brings, waits for its own threads in
+# loops: beside other work a factorisation of 700 unknowns took 1.1 s with two threads and 6 ms with one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 __version__ = "0.2.0"
 _PUBLIC = {
     "Config": "envedit.config",

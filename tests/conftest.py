@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-import envedit.cli  # noqa: F401 -- as many threads of numpy as the command line has
+import envedit  # noqa: F401 -- before numpy, whose threads it limits
 
 pytest.register_assert_rewrite("tests.oracles")
 

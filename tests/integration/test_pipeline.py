@@ -982,18 +982,20 @@ def test_turned_and_unturned_edits_are_compared_where_they_end(monkeypatch):
         return found
 
     monkeypatch.setattr(gauss_newton, "solve", solved)
+    monkeypatch.setattr(search, "_moves", lambda *_: [])
     before = np.full((32, 64, 3), 0.3, np.float32)
     before[:, :32] = 0.2
     after = before.copy()
     after[6:9, 40:43] += 15  # a lamp
     api.edit({"scene": {"file": "pair", "width": 32}, "output": {"spp": 16}}, envmap=before, target_map=after)
-    *compared, taken, corrected = steps  # a light that is found later is one more solution
+    *compared, taken, corrected = steps
     assert len(compared) >= 2 and taken in compared and min(steps) > 0 and corrected >= taken
 
 
 @pytest.mark.slow
 def test_the_map_does_not_make_up_for_what_the_transport_misses(monkeypatch):
     """Few samples, and a large bright window: T errs by far more than the target's noise."""
+    monkeypatch.setattr(search, "_moves", lambda *_: [])
     before = np.full((32, 64, 3), 0.3, np.float32)
     after = before.copy()
     before[10:14, 30:40] = 8

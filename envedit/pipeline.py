@@ -26,6 +26,7 @@ from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances, installed
 from envedit.preparation import Preparation
+from envedit.report import variants
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
@@ -201,8 +202,19 @@ def run(
         alike = _alike(settings, lit, target, original, judged)
         lights, core = light_list.of_edit(given, edited, lit.to_world, by_hand, edit.degrees)
 
+    # ---- Other explanations of paint
+    others = []
+    with clock("judge_s"), in_file_units(), keeping(edited):
+        for other in job.others:
+            watch.stage("rendering other explanations")
+            changed, _ = adjustments.adjust(job.map_of(other), settings.lights, settings.output, given.scale)
+            in_file = given.as_stored(changed, edit.degrees)
+            others.append(variants.seen(other, changed, in_file, lit, target, seed))
+
     # ---- Notes
     notes += [job.note] if job.note else []
+    if others:
+        notes.append(f"other explanations: {', '.join(one.said for one in others)}")
     notes += [said_of] if (said_of := light_list.summary(lights, height)) else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows.slice].all(axis=2).mean())
@@ -218,6 +230,7 @@ def run(
         measured = _measure(settings, renders, maps, rows, alike, target.coverage, within, lpips, lit, noise)
     if measured["painted"] and measured["painted"]["towards"] is None:
         notes.append("the painted change is below the noise of the renderings: no share of it is measured")
+    measured["variants"] = [one.measures for one in others]
     if measured["painted"] and (unnatural := naturalness.warning(measured["natural"])):
         warnings.append(unnatural)
     rate = "; lower optimizer.lr" if job.raised_rate else ""
@@ -287,6 +300,7 @@ def run(
         reach=within,
         found=Found(representation, params, job.free, edit.degrees, found_map),
         posterior=job.posterior,
+        variants=others,
         settings=settings,
         memory=memory,
         base=base,

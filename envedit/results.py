@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from envedit.export import file_resolution
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import preview
+from envedit.report.variants import Variant
 from envedit.representations.layers.separation import Separation
 from envedit.scene.scene import View
 from envedit.solve.feasibility import Reach
@@ -71,6 +72,8 @@ class Result:
         Share of each pixel that sees a surface, where the scene hides what lights it.
     found : file_resolution.Found, optional
         What the map was decoded from, for :func:`.file_resolution.at_full_resolution`.
+    variants : list of Variant
+        Other explanations of paint, likeliest first.
     settings : config.Config, optional
         What was carried out; None: nothing but defaults.
     memory : inputs.Given, optional
@@ -99,6 +102,7 @@ class Result:
     alpha: np.ndarray | None = None
     found: file_resolution.Found | None = None
     posterior: Posterior | None = None
+    variants: list[Variant] = field(default_factory=list)
     settings: config.Config | None = None
     memory: inputs.Given | None = None
     base: Path | None = None

@@ -353,7 +353,7 @@ def _note_results(arguments, folder):
     from envedit.report import output_folder
 
     names = output_folder.names(folder)
-    here = {name: str((folder / name).resolve()) for name in names if (folder / name).exists()}
+    here = {name: str((folder / name).resolve()) for name in names if (folder / name).is_file()}
     measured = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     arguments.facts |= {"folder": str(folder.resolve()), "files": here, "metrics": measured}
 

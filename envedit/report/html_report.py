@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from envedit.report.curves import curves_svg, escape, normalised, number
 from envedit.report.html_parts import (
     STYLE,
     difference_figure,
+    figure,
     figure_of,
     grid,
     identified_figure,
@@ -30,6 +31,7 @@ from envedit.report.html_parts import (
     lights_figure,
     listing,
     separation_figures,
+    shrunk,
     unreachable_figure,
 )
 from envedit.report.manifest import plain
@@ -68,6 +70,8 @@ class Report:
         Lights and background of the rows that were edited.
     unreachable : array (h, w, 3), optional
         Display values of `envedit.solve.feasibility.unreachable`.
+    variants : sequence of variants.Variant
+        Other explanations of paint.
     warnings, notes : sequence of str
         What the user should know, and the choices made for settings left at "auto".
     tonemap : str
@@ -91,6 +95,7 @@ class Report:
     lights: Mapping[str, list[dict]] = field(default_factory=dict)
     separation: Separation | None = None
     unreachable: np.ndarray | None = None
+    variants: Sequence[Any] = ()
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     tonemap: str = "gamma"
@@ -117,7 +122,7 @@ class Report:
 
 _OF_RESULT = (
     "metrics", "history", "renders", "maps", "views", "influence", "frozen", "lights", "separation",
-    "warnings", "notes",
+    "variants", "warnings", "notes",
 )  # fmt: skip
 """What a report shows as the result has it."""
 
@@ -151,6 +156,7 @@ def write_report(path: FilePath, report: Report) -> None:
         _section("", separation_figures(report.separation, report.tonemap)),
         _section("What this view determines", _determined(report)),
         _section("What was painted", _painted(report, metrics, shown.parts)),
+        _section("Other explanations", _variants(report)),
         f"<h2>Losses</h2>{_curves(report)}",
         tables.quality(metrics, report.tonemap),
         tables.numbers(metrics),
@@ -192,6 +198,14 @@ def _painted(report: Report, metrics: dict, parts: list[_Part]) -> list[str]:
         return []
     reachable = (metrics.get("painted") or {}).get("reachable")
     return [unreachable_figure(report.unreachable[part.rows], reachable) for part in parts]
+
+
+def _variants(report: Report) -> list[str]:
+    """Draw the renderings of other explanations of the paint."""
+    return [
+        figure(shrunk(one.render, report.tonemap), f"{one.said}, -2 log evidence {one.evidence:.1f}")
+        for one in report.variants
+    ]
 
 
 def _curves(report: Report) -> str:

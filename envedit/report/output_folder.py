@@ -25,10 +25,10 @@ RESULTS = (
     "edited_sky.exr", "edited_lights.exr", "lights.json", "edited.xml", "render_initial.exr",
     "render_target.exr", "render_edited.exr", "influence.exr", "influence.png", "unreachable.png",
     "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "given_envmap.exr",
-    "given_target_map.exr", "given_target.exr", "given_mask.exr", "checkpoint.npz",
+    "given_target_map.exr", "given_target.exr", "given_mask.exr", "variants", "checkpoint.npz",
 )  # fmt: skip
-"""The files that a run may leave in its folder, beside those of single views (:func:`names`); the last only
-while it runs.
+"""What a run may leave in its folder, beside the files of single views (:func:`names`); the last only while
+it runs.
 
 The first says that a run is complete: whoever moves them away moves it first of all.
 """
@@ -154,6 +154,7 @@ def prepare_folder(
     try:
         old = [folder / name for name in names if (folder / name).exists()]
         read = {os.path.realpath(path) for path in inputs} if old else set()
+        read |= {os.path.dirname(path) for path in read}  # a result may be a folder
         if mine := [path for path in old if os.path.realpath(path) in read]:
             raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
         if keep and {folder / names[0], folder / names[-1]} & set(old):

@@ -16,7 +16,7 @@ from envedit.core.errors import InputError, NumericalError
 from envedit.export import file_resolution
 from envedit.images import images, layered_exr
 from envedit.losses.perceptual import installed
-from envedit.report import html_report, manifest, map_files, output_folder, preview
+from envedit.report import html_report, manifest, map_files, output_folder, preview, variants
 from envedit.solve import checkpoint, feasibility
 
 if TYPE_CHECKING:
@@ -141,6 +141,7 @@ def _maps(settings, folder, result):
     if result.posterior is not None:
         layers["deviation"] = result.posterior.deviation
     layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=given.chromaticities)
+    result.warnings += variants.write(folder / variants.FOLDER, result.variants, settings.output, given)
     if result.reach is not None:
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
     if settings.output.full:

@@ -117,6 +117,8 @@ class Job:
         Where :meth:`optimise` goes on from.
     likelier : list of str
         Explanations that were found to be likelier on the way.
+    others : tuple of search.Explanation
+        Of paint: explanations that are less likely than the one that is solved for.
     """
 
     settings: config.Config
@@ -134,6 +136,7 @@ class Job:
     note: str = ""
     begun: gauss_newton.Run | None = None
     likelier: list[str] = field(default_factory=list)
+    others: tuple[search.Explanation, ...] = ()
     _blocks: dict = field(default_factory=dict, repr=False)
 
     @property
@@ -190,7 +193,13 @@ class Job:
                 if interrupt.is_set():
                     raise Interrupted(self.original.copy(), 0)
 
-            return search.search(problem, problem.state(params), self._sigma, after_step, most)
+            found = search.search(problem, problem.state(params), self._sigma, after_step, most)
+        self.others = () if self._rendered else found.others
+        return found
+
+    def map_of(self, explanation: search.Explanation) -> np.ndarray:
+        """Return the map of an explanation, as :meth:`decode` does."""
+        return self.decode(self._problem().found(explanation.run.state))
 
     def solved(self, params: Params, begun: gauss_newton.Run, transport: LightTransport) -> Params:
         """Return where Gauss-Newton steps end, for what Adam goes on from.

@@ -18,7 +18,7 @@ sky can do (``light_places.py``). Of paint lights come first: it is asked under 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,8 @@ LIGHT = 2 * np.log(20.0)
 
 STEPS = 5
 """Most Gauss-Newton steps after which explanations are compared."""
+OTHERS = 3
+"""Most explanations that are kept beside the likeliest."""
 FADED, FAINT = -1.0, 6 * INDEPENDENT * np.log(1.1)
 """Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
 rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
@@ -59,12 +61,15 @@ class Explanation:
         Where the solution goes on.
     score : float
         -2 log evidence, but for a constant.
+    others : tuple of Explanation
+        Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`.
     """
 
     done: dict[int, str]
     run: gauss_newton.Run
     point: Point
     score: float
+    others: tuple[Explanation, ...] = ()
 
     @property
     def name(self) -> str:
@@ -115,12 +120,14 @@ def search(
     steps = min(most, STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
-    while best.point.residual is not None:
-        found = _better(problem, best, sigma, after_step, steps, cleared)
-        if found is None:
-            break
-        best = found
-    return best
+    seen, better = [best], best.point.residual is not None
+    while better:
+        found = _beside(problem, best, sigma, after_step, steps, cleared)
+        seen += found
+        likeliest = min([best, *found], key=lambda one: one.score)
+        better = likeliest.score < best.score - POSITIVE
+        best = likeliest if better else best
+    return replace(best, others=_others(best, seen))
 
 
 def further(
@@ -137,21 +144,31 @@ def further(
     """
     point = problem.evaluate(run.state, resolve=False)
     best = Explanation({}, run, point, score(problem, run, point, sigma))
-    return _better(problem, best, sigma, after_step, STEPS, {})
+    found = _beside(problem, best, sigma, after_step, STEPS, {})
+    likeliest = min([best, *found], key=lambda one: one.score)
+    return likeliest if likeliest.score < best.score - POSITIVE else None
 
 
-def _better(problem, best, sigma, after_step, steps, sky):
-    """Return the likeliest explanation one move from another, begun under a sky; None if none is likelier."""
-    least = best
+def _others(best, seen):
+    """List the likeliest explanation of each other name, likeliest first."""
+    others: dict[str, Explanation] = {}
+    for one in sorted(seen, key=lambda one: one.score):
+        if one.name != best.name and np.isfinite(one.score):
+            others.setdefault(one.name, one)
+    return tuple(others.values())[:OTHERS]
+
+
+def _beside(problem, best, sigma, after_step, steps, sky):
+    """List the explanations one move from another, begun under a sky."""
+    found = []
     for move in _moves(problem, best, sigma):
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)
-        found = _descended(problem, done, run, sigma, steps)
+        found.append(_descended(problem, done, run, sigma, steps))
         if after_step:
             after_step()
-        least = found if found.score < least.score else least
-    return least if least.score < best.score - POSITIVE else None
+    return found
 
 
 def of_light(problem: Problem) -> float:

@@ -61,7 +61,6 @@ _GUARD = (
     "if os.getppid() != int(sys.argv[1]): os._exit(1)\n"
     "os.execvp(sys.argv[2], sys.argv[2:])"
 )
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ def _write(path, about):
 
 def _supervise(argv, folder, threads, stop, lock):
     """Run a process; return its exit code, "stopped" or "held", and the last line of its stderr."""
-    environment = os.environ | dict.fromkeys(_THREADS, str(threads)) | {"PYTHONUNBUFFERED": "1"}
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1"}
     with open(folder / LOG, "ab", buffering=0) as log:
         where = f"{time.strftime('%Y-%m-%d %H:%M:%S')} {socket.gethostname()}"
         log.write(f"--- {where}: {shlex.join(argv)}\n".encode())

@@ -1,6 +1,7 @@
 """envedit from Python: arrays, dicts and built scenes in, a result that shows and saves itself out."""
 
 import inspect
+import os
 import runpy
 import subprocess
 import sys
@@ -289,6 +290,13 @@ def test_the_public_names_are_what_dir_shows_and_explain_themselves():
             for member, found in inspect.getmembers(public, inspect.isroutine):
                 if not member.startswith("_"):
                     assert inspect.getdoc(found), (name, member)
+
+
+@pytest.mark.parametrize(("given", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_importing_envedit_limits_the_threads_of_numpy_but_not_against_the_user(given, threads):
+    code = f"import os, envedit; assert os.environ['OPENBLAS_NUM_THREADS'] == '{threads}'"
+    rest = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, env=rest | given)
 
 
 def test_importing_envedit_imports_no_mitsuba():

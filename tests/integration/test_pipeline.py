@@ -321,8 +321,29 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
         assert found.metrics["envmap"] is None
         peak = np.unravel_index(found.envmap.sum(axis=2).argmax(), (16, 32))
         assert abs(peak[0] - 4) <= 2 and abs(peak[1] - 4) <= 2
+        assert_variants(found, tmp_path, settings_of(tmp_path, picture, target=target, **tables))
     else:  # without it the black bar counts
         assert error("edited") > 0.02 * error("initial")
+
+
+def assert_variants(found, folder, settings):
+    """Other explanations are measured, written and shown, and an edit goes on from one."""
+    assert found.variants
+    assert found.metrics["variants"] == [one.measures for one in found.variants]
+    said = [line for line in found.notes if line.startswith("other explanations: ")]
+    assert len(said) == 1 and all(one.name in said[0] for one in found.variants)
+    found.save(folder / "out")
+    kept = folder / "out" / "variants"
+    assert (kept / "variants.png").exists() and len(list(kept.glob("*.npz"))) == len(found.variants)
+    assert "Other explanations" in (folder / "out" / "report.html").read_text()
+    first = found.variants[0]
+    np.testing.assert_array_equal(images.read(kept / "1.exr")[0], first.envmap)
+    assert np.isfinite(first.envmap).all() and not np.array_equal(first.envmap, found.envmap)
+    optimizer = dataclasses.replace(settings.optimizer, start=str(kept / "1.npz"), iterations=1)
+    again = pipeline.run(dataclasses.replace(settings, optimizer=optimizer))
+    assert not again.variants and again.metrics["painted"]["towards"] is not None
+    found.save(folder / "out")  # what is there is moved away as a whole
+    assert (folder / "out" / "earlier-1" / "variants" / "1.npz").exists() and (kept / "1.npz").exists()
 
 
 @pytest.mark.slow

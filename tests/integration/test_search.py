@@ -80,6 +80,10 @@ def found_for(problem, start):
     found = search.search(problem, start, after_step=lambda: calls.append(1))
     state = found.run.state
     assert found.point.residual is not None and np.isfinite(found.score)
+    names = [found.name, *(one.name for one in found.others)]
+    scores = [one.score for one in found.others]
+    assert len(set(names)) == len(names) <= 1 + search.OTHERS and scores == sorted(scores)
+    assert found.others or not calls
     return found, {k: problem.direction(state, k) for k in problem.lit(state)}, before, len(calls)
 
 

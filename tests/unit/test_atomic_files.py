@@ -113,6 +113,15 @@ def test_a_folder_that_cannot_be_is_an_input_error(tmp_path, name):
         pass
 
 
+def test_an_input_in_a_folder_of_results_is_not_moved_away(tmp_path):
+    start = tmp_path / "variants" / "1.npz"
+    start.parent.mkdir()
+    start.write_text("a solution")
+    with pytest.raises(InputError, match="variants: this input lies where its own results would go"):
+        output_folder.prepare_folder(tmp_path, output_folder.RESULTS, [start])
+    assert start.exists() and list(tmp_path.iterdir()) == [start.parent]
+
+
 def test_what_no_checkpoint_protects_is_kept_even_by_a_resumed_run(tmp_path):
     names = ("metrics.json", "edited.exr", "config.toml", "checkpoint.npz")
 

@@ -617,7 +617,7 @@ class Session:
         self.tell.frame("map", "saved", saved)
         self._shown = None
         self.resting = True  # what is shown is what was saved
-        files = [name for name in output_folder.names(folder) if (folder / name).exists()]
+        files = [name for name in output_folder.names(folder) if (folder / name).is_file()]
         notes = [self._differs(shown, saved), *(note for note in result.notes if "target.hold =" in note)]
         told = {"folder": folder.name, "files": files, "warnings": warnings, "notes": notes}
         self.tell.say({"type": "saved", **told})

@@ -1,0 +1,133 @@
+"""Other explanations of paint than the one that is the result.
+
+Paint is ambiguous: a highlight is gone because the sun is elsewhere, softer, or dimmer. What the search has
+found beside the likeliest explanation can be looked at, and gone on from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envedit import config, inputs
+from envedit.core.errors import InputError
+from envedit.losses import metrics
+from envedit.report import map_files, preview
+from envedit.scene.scene import Scene
+from envedit.solve import checkpoint, gauss_newton
+from envedit.solve.search import Explanation
+
+FOLDER, SHEET = "variants", "variants.png"
+"""Where they are written in a run's folder, and what shows them beside each other."""
+SPP = 64
+"""Samples a pixel of their renderings."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """An explanation of paint, as it is after the few steps by which explanations are compared.
+
+    Attributes
+    ----------
+    name : str
+        What was done to the map's lights.
+    evidence : float
+        -2 log evidence, but for a constant that all explanations of a run have: lower is likelier.
+    envmap : ndarray (H, W, 3)
+        Its map, in the units of the file that was edited.
+    render : ndarray (h, w, 3)
+        Mitsuba's rendering of it, linear radiance.
+    towards, elsewhere : float or None
+        How far the paint is followed, and the rest changed, as of :func:`.metrics.painted`.
+    run : gauss_newton.Run
+        Where an edit goes on from it.
+    """
+
+    name: str
+    evidence: float
+    envmap: np.ndarray
+    render: np.ndarray
+    towards: float | None
+    elsewhere: float | None
+    run: gauss_newton.Run
+
+    @property
+    def said(self) -> str:
+        """One phrase for a note: what was done, and what it reaches."""
+        if self.towards is None:
+            return self.name
+        return f"{self.name} ({100 * self.towards:.0f} % of the painted change)"
+
+    @property
+    def measures(self) -> dict:
+        """What metrics.json has of it."""
+        numbers = {"evidence": self.evidence, "towards": self.towards, "elsewhere": self.elsewhere}
+        return {"name": self.name, **numbers}
+
+
+def seen(
+    explanation: Explanation, edited: np.ndarray, stored: np.ndarray, lit: Scene, target: Any, seed: int
+) -> Variant:
+    """Render an explanation of paint, and measure it.
+
+    Parameters
+    ----------
+    explanation : Explanation
+        Of the search.
+    edited, stored : ndarray (H, W, 3)
+        Its map, radiance that reaches the scene, and in the units of its file.
+    lit : Scene
+        The scene.
+    target : Target
+        With what was painted.
+    seed : int
+        Of the rendering.
+    """
+    render = lit.render(edited, SPP, seed)
+    counts = None if lit.alpha is None else lit.alpha > 0
+    found = metrics.painted(render, target.picture, target.initial, target.coverage, seen=counts)
+    return Variant(
+        name=explanation.name,
+        evidence=explanation.score,
+        envmap=stored,
+        render=render,
+        towards=found["towards"],
+        elsewhere=found["elsewhere"],
+        run=explanation.run,
+    )
+
+
+def write(
+    folder: Path, variants: Sequence[Variant], settings: config.Output, given: inputs.InputMap
+) -> list[str]:
+    """Write the map and the solution of each, numbered from 1, and a sheet; returns warnings.
+
+    ``optimizer.start`` takes a solution, ``1.npz``: an edit then goes on from it.
+
+    Raises
+    ------
+    InputError
+        A file cannot be written.
+    """
+    if not variants:
+        return []
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from error
+    warnings = []
+    for number, one in enumerate(variants, 1):
+        warnings += map_files.write_map(settings, folder / str(number), one.envmap, given)
+        checkpoint.save_solution(folder / f"{number}.npz", one.run)
+    named = {f"{number}: {one.name}": one for number, one in enumerate(variants, 1)}
+    preview.preview(
+        folder / SHEET,
+        {name: one.render for name, one in named.items()},
+        {name: one.envmap for name, one in named.items()},
+        settings.tonemap,
+    )
+    return warnings

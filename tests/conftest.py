@@ -84,6 +84,21 @@ def every_step(monkeypatch):
     monkeypatch.setattr(adam_loop, "READ_EVERY", 1)
 
 
+@pytest.fixture(scope="module")
+def own_core():
+    """Have no more threads than this process has cores: more wait for those of other tests in loops.
+
+    Not for tests in which Mitsuba itself reads an EXR file.
+    """
+    import drjit as dr
+
+    before, processes = dr.thread_count(), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    dr.set_thread_count(max(1, before // processes))
+    yield
+    dr.sync_thread()
+    dr.set_thread_count(before)
+
+
 @pytest.fixture
 def threads():
     """Set the number of threads; it is as before at the end."""

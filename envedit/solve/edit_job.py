@@ -198,8 +198,8 @@ class Job:
         return found
 
     def map_of(self, explanation: search.Explanation) -> np.ndarray:
-        """Return the map of an explanation, as :meth:`decode` does."""
-        return self.decode(self._problem().found(explanation.run.state))
+        """Return the map of an explanation of :meth:`explain`, whatever grids the gain has got since."""
+        return unseen_kept(self.original, explanation.point.edited)
 
     def solved(self, params: Params, begun: gauss_newton.Run, transport: LightTransport) -> Params:
         """Return where Gauss-Newton steps end, for what Adam goes on from.

@@ -122,7 +122,7 @@ def search(
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     seen, better = [best], best.point.residual is not None
     while better:
-        found = _beside(problem, best, sigma, after_step, steps, cleared)
+        found = _neighbours(problem, best, sigma, after_step, steps, cleared)
         seen += found
         likeliest = min([best, *found], key=lambda one: one.score)
         better = likeliest.score < best.score - POSITIVE
@@ -144,7 +144,7 @@ def further(
     """
     point = problem.evaluate(run.state, resolve=False)
     best = Explanation({}, run, point, score(problem, run, point, sigma))
-    found = _beside(problem, best, sigma, after_step, STEPS, {})
+    found = _neighbours(problem, best, sigma, after_step, STEPS, {})
     likeliest = min([best, *found], key=lambda one: one.score)
     return likeliest if likeliest.score < best.score - POSITIVE else None
 
@@ -158,7 +158,7 @@ def _others(best, seen):
     return tuple(others.values())[:OTHERS]
 
 
-def _beside(problem, best, sigma, after_step, steps, sky):
+def _neighbours(problem, best, sigma, after_step, steps, sky):
     """List the explanations one move from another, begun under a sky."""
     found = []
     for move in _moves(problem, best, sigma):

@@ -14,7 +14,7 @@ import pytest
 from tests.oracles import ROOT
 from tests.oracles.runs import call, changed, differing, pixels, world
 
-pytestmark = pytest.mark.usefixtures("isolated")
+pytestmark = pytest.mark.usefixtures("isolated", "own_core")
 
 KINDS = ("layers", "siren", "pixels", "log-pixels")
 

@@ -10,6 +10,8 @@ from envedit import config, pipeline
 from envedit.solve import adam_loop, edit_job, gauss_newton, map_problem
 from envedit.transport.light_transport import LightTransport
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 SMALL = [
     "input.width=64",
     "scene.width=32",

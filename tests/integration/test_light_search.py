@@ -14,6 +14,8 @@ from envedit.transport import texel_sampling
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.tiers import slow_but
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 HEIGHT, WIDTH, ROWS = 32, 64, 16
 PIXELS = 64
 SUN = (6, 20)

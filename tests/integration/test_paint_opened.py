@@ -17,7 +17,7 @@ from envedit.targets.pixel_weights import FOLLOWING
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, served
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
 pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
 pytest.importorskip("websockets", reason="the extra envedit[paint] is not installed")

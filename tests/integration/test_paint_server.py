@@ -19,7 +19,7 @@ from envedit.cli.paint import protocol
 from envedit.cli.paint.protocol import Document
 from tests.oracles.painting import SMALL, asked, connected, heard, served, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
 pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
 client = pytest.importorskip("websockets.sync.client", reason="the extra envedit[paint] is not installed")

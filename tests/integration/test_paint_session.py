@@ -10,7 +10,7 @@ from envedit.cli.paint.session import Session, Tell
 from envedit.core.rotations import rotation_vector
 from tests.oracles.painting import SMALL
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 ERASED = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
 DARK = {"type": "shadow", "ellipse": [0.75, 0.75, 0.2, 0.1], "softness": 0.03, "amount": 0.8}
 DRAGGED = {0.0: ((33, 10), (41, 10)), 40.0: ((40, 8), (31, 8))}

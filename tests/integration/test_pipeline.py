@@ -35,7 +35,7 @@ from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
 from tests.oracles.runs import HEIGHT, WIDTH, settings_of, smooth, sunny
 from tests.oracles.tiers import slow_but
 
-pytestmark = pytest.mark.usefixtures("own_cache")
+pytestmark = pytest.mark.usefixtures("own_cache", "own_core")
 
 PIXELS = {"representation": {"kind": "pixels"}}
 ADAM = {"optimizer": {"iterations": 20, "kind": "adam"}}

@@ -16,6 +16,8 @@ from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.tiers import slow_but
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 HEIGHT, WIDTH, ROWS, PIXELS = 32, 64, 16, 48
 SUN = (6, 20)
 DIRECTIONS = latlong.directions(HEIGHT, WIDTH)

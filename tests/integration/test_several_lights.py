@@ -6,6 +6,8 @@ import pytest
 import envedit
 from envedit.core import latlong
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 HEIGHT, WIDTH = 64, 128
 LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
 

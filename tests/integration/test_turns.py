@@ -10,6 +10,8 @@ from envedit.images import analytic_sky, images
 from tests.oracles import runs
 from tests.oracles.builders import write_scene
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 CLOUDS = 12
 TORUS = """<sensor type="perspective"><float name="fov" value="35"/>
 <transform name="to_world"><lookat origin="0,2.6,5" target="0,0.3,0" up="0,1,0"/></transform>

@@ -15,6 +15,8 @@ from envedit.scene import camera_paths, scene
 from tests.oracles.scenes import ball, build, one_hot, picture, references, stage
 from tests.oracles.statistics import disagreement
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 HEIGHT, WIDTH = 16, 32
 SUN = np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])
 WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}

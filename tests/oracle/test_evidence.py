@@ -20,6 +20,8 @@ from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 GRID, FILM, LEVEL, SIGMA = (24, 48), (10, 12), 4e-4, 2e-5
 SLOPE = 1e-3 ** (1 / 2.2) / 1e-3
 

@@ -16,7 +16,7 @@ from tests.oracles.extremes_stages import transport, write_plain
 from tests.oracles.runs import settings_of
 from tests.oracles.tiers import slow_but
 
-pytestmark = pytest.mark.usefixtures("own_cache")
+pytestmark = pytest.mark.usefixtures("own_cache", "own_core")
 
 
 @pytest.mark.parametrize(("name", "stage"), slow_but(extremes.CELLS, "1e30", "NaN"))

@@ -12,6 +12,8 @@ from envedit.scene import scene
 from envedit.solve import feasibility
 from envedit.transport.light_transport import LightTransport
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 HEIGHT, WIDTH = 4, 8
 PIXELS = (5, 6)
 

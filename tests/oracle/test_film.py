@@ -8,6 +8,8 @@ from envedit.core.errors import NumericalError
 from envedit.scene import film, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 WIDE = '<rfilter type="gaussian"/><boolean name="sample_border" value="true"/>'
 CROP = "".join(
     f'<integer name="crop_{key}" value="{value}"/>'

@@ -29,6 +29,8 @@ from tests.oracles.matrix_renderer import same, without_times
 from tests.oracles.plain import plain_display
 from tests.oracles.tiers import slow_but
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 GRID, FILM = (24, 48), (10, 12)
 SUN = (7, 20)
 PRIOR = Prior()

@@ -38,6 +38,8 @@ from tests.oracles.scenes import (
 from tests.oracles.statistics import LEVEL, disagreement
 from tests.oracles.tiers import slow_but
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 # ---- scenes ------------------------------------------------------------------------------------------------
 
 

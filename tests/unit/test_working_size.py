@@ -12,6 +12,8 @@ from envedit.scene import scene
 from envedit.targets import pixel_weights, target, working_size
 from tests.oracles.builders import LIGHT, write_scene
 
+pytestmark = pytest.mark.usefixtures("own_core")
+
 SKY = envedit.sunsky(32)
 SQUARE = {"type": "shadow", "amount": 0.6, "rectangle": [0.25, 0.5, 0.75, 1.0], "softness": 0.0}
 

@@ -209,7 +209,8 @@ def run(
             watch.stage("rendering other explanations")
             changed, _ = adjustments.adjust(job.map_of(other), settings.lights, settings.output, given.scale)
             in_file = given.as_stored(changed, edit.degrees)
-            others.append(variants.seen(other, changed, in_file, lit, target, seed))
+            curve = settings.output.tonemap
+            others.append(variants.seen(other, changed, in_file, lit, target, curve, seed))
 
     # ---- Notes
     notes += [job.note] if job.note else []

@@ -70,7 +70,13 @@ class Variant:
 
 
 def seen(
-    explanation: Explanation, edited: np.ndarray, stored: np.ndarray, lit: Scene, target: Any, seed: int
+    explanation: Explanation,
+    edited: np.ndarray,
+    stored: np.ndarray,
+    lit: Scene,
+    target: Any,
+    tonemap: str,
+    seed: int,
 ) -> Variant:
     """Render an explanation of paint, and measure it.
 
@@ -84,12 +90,16 @@ def seen(
         The scene.
     target : Target
         With what was painted.
+    tonemap : str
+        Of the display values that are compared.
     seed : int
         Of the rendering.
     """
     render = lit.render(edited, SPP, seed)
     counts = None if lit.alpha is None else lit.alpha > 0
-    found = metrics.painted(render, target.picture, target.initial, target.coverage, seen=counts)
+    found = metrics.painted(
+        render, target.picture, target.initial, target.coverage, tonemap=tonemap, seen=counts
+    )
     return Variant(
         name=explanation.name,
         evidence=explanation.score,

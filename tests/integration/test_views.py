@@ -183,8 +183,7 @@ def test_targets_that_fit_no_views(keys, what):
 
 @pytest.mark.usefixtures("isolated")
 def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
-    """The solver's posterior says so; the files are of each view. No light is tried elsewhere."""
-    monkeypatch.setattr(search, "_moves", lambda *_: [])
+    """The solver's posterior says so; the files are of each view."""
     out = two.parent / "out"
     (two.parent / "c.toml").write_text(config.to_toml(settings_of(two)))
     assert runs.call(two.parent / "c.toml", "--out", out) == 0
@@ -201,7 +200,9 @@ def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
     assert "edited, rendering of view 1 (behind)" in report and "<h2>Views</h2>" in report
     assert (out / "edited.xml").read_text().count("<sensor") == 2
     omega = latlong.solid_angles(32, 64)[:, None] / (4 * np.pi)
-    alone = [pipeline.run(settings_of(two, scene={"sensors": [k]})) for k in NAMES]
+    with monkeypatch.context() as patch:  # how well the sky is known hardly depends on where its light is
+        patch.setattr(search, "_moves", lambda *_: [])
+        alone = [pipeline.run(settings_of(two, scene={"sensors": [k]})) for k in NAMES]
     deviation = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()
     both = float((deviation["deviation.Y"].pixels * omega).sum())
     assert both < 0.97 * min((one.posterior.deviation * omega).sum() for one in alone)

@@ -610,7 +610,7 @@ def stopping_at(step):
     return pipeline.Watch(stages.append, progress)
 
 
-@pytest.mark.parametrize("name", slow_but([("sunny",), ("painted",), ("a sun of 1e6",)], "sunny"))
+@pytest.mark.parametrize("name", slow_but([("sunny",), ("painted",), ("a sun of 1e6",)], "painted"))
 def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path, rng, monkeypatch):
     """Interrupted in the first step, in the middle, in the last, and where nothing is left to do."""
     picture = sunny(rng)
@@ -719,6 +719,7 @@ def test_what_is_only_tried_is_not_the_map_so_far(tmp_path, rng):
     assert stop.value.envmap.tobytes() == original.tobytes()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng, monkeypatch):
     folder = tmp_path / "run"
     folder.mkdir()
@@ -904,6 +905,7 @@ def test_lights_before_are_those_of_the_file(tmp_path, rng):
         assert any("light 1 at azimuth 107, elevation 42 moved by" in line for line in found.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [60.0, 90.0])
 def test_a_turn_is_as_exact_where_the_transport_is_not(degrees, tmp_path, rng):
     """T with few samples; texels of 11.25 degrees each."""

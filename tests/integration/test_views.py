@@ -181,6 +181,7 @@ def test_targets_that_fit_no_views(keys, what):
 # ---- runs --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("isolated")
 def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
     """The solver's posterior says so; the files are of each view."""
@@ -213,6 +214,7 @@ def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
     assert not list(out.glob("render_*_*.exr")) and list(out.glob("earlier-1/render_edited_1.exr"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
 def test_an_interrupted_edit_of_two_views_goes_on_as_if_it_were_not(two):
     """With Adam, whose SSIM has no window across views."""

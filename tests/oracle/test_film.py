@@ -40,6 +40,7 @@ def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path,
         np.testing.assert_allclose(ours[..., :3], theirs, rtol=1e-5, atol=3e-5 * theirs.mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ['<rfilter type="box"/>', WIDE], ids=["box", "wide"])
 def test_any_number_of_samples_gives_the_same_bits_on_any_number_of_threads(part, tmp_path, rng, threads):
     loaded, sky = lit_by_a_sun(tmp_path, rng, part, size=48)

@@ -123,6 +123,8 @@ def search(
     seen, better = [best], best.point.residual is not None
     while better:
         found = _neighbours(problem, best, sigma, after_step, steps, cleared)
+        if not found and len(seen) == 1 and _unfollowed(problem, best, sigma):  # what else there is, is seen
+            found = _neighbours(problem, best, sigma, after_step, steps, cleared, least=-np.inf)
         seen += found
         likeliest = min([best, *found], key=lambda one: one.score)
         better = likeliest.score < best.score - POSITIVE
@@ -158,10 +160,18 @@ def _others(best, seen):
     return tuple(others.values())[:OTHERS]
 
 
-def _neighbours(problem, best, sigma, after_step, steps, sky):
-    """List the explanations one move from another, begun under a sky."""
+def _unfollowed(problem, best, sigma):
+    """Whether paint is followed so little that its noise is the largest there may be."""
+    most = problem.likelihood.paint_noise
+    return most is not None and problem.noise(best.point.residual, sigma) >= most
+
+
+def _neighbours(problem, best, sigma, after_step, steps, sky, least=0.0):
+    """List the explanations one move from another that promises more than ``least``, begun under a sky."""
     found = []
     for move in _moves(problem, best, sigma):
+        if not move.gain > least:
+            continue
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)
@@ -214,7 +224,7 @@ def _moves(problem, best, sigma):
     found: dict[tuple[int, str], _Move] = {}
     for move in (_under_the_original if painted else _beside_the_sky)(problem, best, sigma):
         kind = move.light, move.what
-        if move.gain > (found[kind].gain if kind in found else 0.0):
+        if move.gain > (found[kind].gain if kind in found else -np.inf):
             found[kind] = move
     return list(found.values())
 

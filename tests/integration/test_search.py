@@ -153,6 +153,17 @@ def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_ligh
 # ---- lights stay -------------------------------------------------------------------------------------------
 
 
+def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
+    """Stripes as bright as noon, and as dark as night: no move promises anything."""
+    image = sky(SUN)
+    before = rendered(transport, image)
+    coverage = np.ones((PIXELS, PIXELS, 1), np.float32)
+    stripes = np.where(np.arange(PIXELS) % 2, 4.0, 0.02).astype(np.float32)
+    problem, start = problem_of(transport, image, before * stripes[:, None, None], coverage)
+    found, _, _, tried = found_for(problem, start)
+    assert found.others and tried >= len(found.others)
+
+
 def test_paint_that_is_there_already_leaves_lights(transport):
     """No move is promising: nothing else is descended to."""
     image = sky(SUN)

@@ -65,8 +65,12 @@ class Variant:
     @property
     def measures(self) -> dict:
         """What metrics.json has of it."""
-        numbers = {"evidence": self.evidence, "towards": self.towards, "elsewhere": self.elsewhere}
-        return {"name": self.name, **numbers}
+        return {
+            "name": self.name,
+            "evidence": self.evidence,
+            "towards": self.towards,
+            "elsewhere": self.elsewhere,
+        }
 
 
 def seen(

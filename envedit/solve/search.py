@@ -120,15 +120,17 @@ def search(
     steps = min(most, STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
-    seen, better = [best], best.point.residual is not None
+    seen: list[Explanation] = [best]
+    better = best if best.point.residual is not None else None
     while better:
-        found = _neighbours(problem, best, sigma, after_step, steps, cleared)
-        if not found and len(seen) == 1 and _unfollowed(problem, best, sigma):  # what else there is, is seen
-            found = _neighbours(problem, best, sigma, after_step, steps, cleared, least=-np.inf)
+        best = better
+        moves = _moves(problem, best, sigma)
+        promising = [move for move in moves if move.gain > 0]
+        if not promising and len(seen) == 1 and _unfollowed(problem, best, sigma):
+            promising = moves  # what else there is, is seen
+        found = _neighbours(problem, best, promising, sigma, after_step, steps, cleared)
         seen += found
-        likeliest = min([best, *found], key=lambda one: one.score)
-        better = likeliest.score < best.score - POSITIVE
-        best = likeliest if better else best
+        better = _likelier(best, found)
     return replace(best, others=_others(best, seen))
 
 
@@ -146,7 +148,12 @@ def further(
     """
     point = problem.evaluate(run.state, resolve=False)
     best = Explanation({}, run, point, score(problem, run, point, sigma))
-    found = _neighbours(problem, best, sigma, after_step, STEPS, {})
+    promising = [move for move in _moves(problem, best, sigma) if move.gain > 0]
+    return _likelier(best, _neighbours(problem, best, promising, sigma, after_step, STEPS, {}))
+
+
+def _likelier(best, found):
+    """Return the likeliest of some explanations if it is likelier than the best so far, else None."""
     likeliest = min([best, *found], key=lambda one: one.score)
     return likeliest if likeliest.score < best.score - POSITIVE else None
 
@@ -166,12 +173,10 @@ def _unfollowed(problem, best, sigma):
     return most is not None and problem.noise(best.point.residual, sigma) >= most
 
 
-def _neighbours(problem, best, sigma, after_step, steps, sky, least=0.0):
-    """List the explanations one move from another that promises more than ``least``, begun under a sky."""
+def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
+    """List the explanations one of some moves from another, begun under a sky."""
     found = []
-    for move in _moves(problem, best, sigma):
-        if not move.gain > least:
-            continue
+    for move in moves:
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)

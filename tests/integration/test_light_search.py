@@ -7,10 +7,9 @@ import pytest
 from envedit.core import latlong
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
-from envedit.solve import gauss_newton, point_light, search
+from envedit.solve import gauss_newton, search
 from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import SIGMA, Problem
-from envedit.transport import texel_sampling
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.tiers import slow_but
 
@@ -204,69 +203,3 @@ def test_the_same_question_has_the_same_answer_to_the_bit(transport):
     assert first.name == again.name and first.decoded.tobytes() == again.decoded.tobytes()
     for name in first.state:
         assert first.state[name].tobytes() == again.state[name].tobytes(), name
-
-
-# ---- a light's place beside known pictures ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "values, place", [((0, 3, 0), 0), ((1, 2, 2), 0.5), ((2, 2, 1), -0.5), ((1, 4, 3), 0.25)]
-)
-def test_vertex_of_three_neighbours(values, place):
-    assert point_light._vertex(np.array(values, float), 1) == pytest.approx(place)
-
-
-def test_vertex_at_a_border_or_in_a_valley_is_the_point_itself():
-    values = np.array([3.0, 1.0, 2.0])
-    assert [point_light._vertex(values, i) for i in range(3)] == [0, 0, 0]
-
-
-@pytest.mark.slow
-def test_refinement_finds_a_light_from_three_texels_off(transport):
-    """Without any background; the flux is told as a factor."""
-    t = transport()
-    light = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    light[7, 33] = 1 / OMEGA[7]
-    t.resolve(light)
-    wanted = 2.5 * t.linear(mi.TensorXf(light)).numpy().reshape(-1, 3)
-    none = np.full((1, PIXELS**2, 3), 1e-12) * np.random.default_rng(0).random((1, PIXELS**2, 3))
-    direction, factor = point_light.refine(
-        t, wanted, wanted, None, none, DIRECTIONS[5, 36], np.ones(3), 0, ROWS - 1
-    )
-    assert degrees_apart(direction, DIRECTIONS[7, 33]) < 0.3 * TEXEL
-    np.testing.assert_allclose(factor, 2.5, rtol=0.05)
-
-
-@pytest.mark.parametrize("width", [2, 4, 8, 16])
-def test_a_light_is_refined_on_a_map_of_few_texels(width, rng):
-    """The exact columns of a map 8 wide are asked for once each: T would count one of two for ever."""
-    height = max(width // 2, 2)
-
-    class Few:
-        grid = texel_sampling.Grid(height, width, np.eye(3), np.ones(height))
-
-        def probe(self, texels):
-            assert len(np.unique(texels)) == len(texels)
-            return rng.random((len(texels), 30, 3))
-
-    wanted, known, gains = (rng.random(shape) for shape in ((30, 3), (30, 3), (4, 30, 3)))
-    asked = wanted, known, None, gains, np.array([0.6, 0.5, 0.6]), np.ones(3), 0, height - 1
-    direction, factor = point_light.refine(Few(), *asked)
-    assert abs(np.linalg.norm(direction) - 1) < 1e-6 and np.isfinite(factor).all() and factor.min() >= 0
-
-
-@pytest.mark.parametrize("size", [1e-37, 1e-30, 1.0, 1e30])
-def test_pixels_count_by_their_brightness_and_a_floor_at_every_scale(size):
-    known = np.array([[1.0, 2, 3], [0, 0, 0], [2, 2, 2], [0, 0, 0]], np.float32) * np.float32(size)
-    weight = np.array([[1.0], [1], [0.5], [0]], np.float32)
-    mean = known[0, 1].astype(float) / 2
-    found = point_light.relative(known, known, weight)
-    floor = 0.2 * mean
-    assert found == pytest.approx([1 / (2 * mean + floor), 1 / floor, 0.5 / (2 * mean + floor), 0], rel=1e-5)
-
-
-def test_paint_on_black_counts_by_its_own_light_and_nothing_by_nothing():
-    black, paint = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32)
-    paint[2] = -6
-    assert point_light.relative(black, paint) == pytest.approx(1 / (0.2 * 1.5))
-    assert (point_light.relative(black, black) == 1).all()

@@ -21,7 +21,7 @@ PIXELS = (5, 6)
 class Dense:
     """T as a matrix (pixels, texels) that all channels share, with the light of other lamps."""
 
-    capacity, columns = 0, np.zeros(0, np.int64)
+    columns = np.zeros(0, np.int64)
 
     def __init__(self, matrix, shape=PIXELS, grid=(HEIGHT, WIDTH), lamps=0.0, spp=256):
         self.matrix, self.shape, self.map, self.lamps, self.spp = matrix, shape, (*grid, 3), lamps, spp
@@ -77,7 +77,7 @@ def apart(a, b, painted):
 
 
 def sane(found, original):
-    assert 0 <= found.share <= 1 and 0 <= found.bound <= 1 and 0 <= found.too_dark <= 1
+    assert 0 <= found.share <= 1 and 0 <= found.too_dark <= 1
     for array in (found.picture, found.residual, found.envmap):
         assert array.dtype == np.float32 and np.isfinite(array).all()
     assert (found.envmap >= 0).all() and found.envmap.shape == original.shape
@@ -89,12 +89,14 @@ def sane(found, original):
 # ---- the convex problem ------------------------------------------------------------------------------------
 
 
-def test_solution_and_bound_against_coordinate_descent(dense, envmap, rng, monkeypatch):
+def test_the_solution_is_that_of_coordinate_descent(dense, envmap, rng, monkeypatch):
     target = np.clip(render(dense, envmap) * rng.choice([0.3, 1.5], size=(*PIXELS, 3)), 0, 0.99)
     weight = rng.random((*PIXELS, 1))
-    question = feasibility._Question(dense, envmap, target, weight, None, None, None, None)
-    model = feasibility._Model(question, np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH))
-    w = question.weights(question.initial)
+    monkeypatch.setattr(feasibility, "SHARP_SAMPLES", 0)  # every texel by itself
+    monkeypatch.setattr(feasibility, "STEPS", 2000)
+    found = feasibility.reachable(dense, envmap, target, weight)
+    request = feasibility._Request.of(dense, envmap, target, weight, None, None)
+    w = request.weights(found.picture)  # as linearised where the solution is
 
     def value(picture):
         return 0.5 * (w * (picture - target) ** 2).sum()
@@ -103,17 +105,9 @@ def test_solution_and_bound_against_coordinate_descent(dense, envmap, rng, monke
     exact = np.stack(
         [descend(root[:, [c]] * dense.matrix, root[:, c] * target[..., c].ravel()) for c in range(3)], 1
     )
-    least, start = value(render(dense, exact.reshape(envmap.shape))), value(question.initial)
+    least, start = value(render(dense, exact.reshape(envmap.shape))), value(request.initial)
     assert 0.05 * start < least < 0.8 * start  # something is left, and something is to be had
-    for steps, near in ((10, 0.2), (2000, 0.002)):
-        monkeypatch.setattr(feasibility, "STEPS", steps)
-        monkeypatch.setattr(feasibility, "ENOUGH", 0)
-        x, _, bound = feasibility._solve(model, model.start(), question.initial)
-        over = (value(question.apply(model.map(x))) - least) / start
-        assert (x >= 0).all()
-        assert -1e-5 < over < near
-        assert over - 1e-5 < bound < 1  # it is a bound
-    assert bound < 0.02  # and closes
+    assert -1e-5 < (value(found.picture) - least) / start < 0.02
 
 
 def test_what_a_map_makes_is_within_reach(dense, envmap, rng):
@@ -127,7 +121,7 @@ def test_what_a_map_makes_is_within_reach(dense, envmap, rng):
 
 
 def test_a_map_that_is_known_is_within_reach_whatever_the_solution_finds(dense, envmap, rng, monkeypatch):
-    monkeypatch.setattr(feasibility, "_solve", lambda model, x, picture: (x, 0, 1.0))  # stays at the original
+    monkeypatch.setattr(feasibility, "STEPS", 0)  # stays at the original
     other = (envmap * rng.uniform(0.3, 3, envmap.shape)).astype(np.float32)
     target = render(dense, other)
     assert feasibility.reachable(dense, envmap, target).share == 0
@@ -228,7 +222,7 @@ def test_sentences():
 
 def test_nothing_asked_is_all_within_reach(dense, envmap):
     found = sane(feasibility.reachable(dense, envmap, render(dense, envmap)), envmap)
-    assert found.share == 1 and found.steps == 0
+    assert found.share == 1
     np.testing.assert_array_equal(found.envmap, envmap)
 
 
@@ -355,8 +349,6 @@ def test_what_is_promised_is_seen_in_a_fresh_rendering(name, matte, rng):
     weight = (painted + 0.3 * (1 - painted))[..., None]
     rows = Rows(0, ROWS, len(original))
     found = sane(feasibility.reachable(transport, original, target, weight, rows, None, painted), original)
-    if name == "turned":  # the sun has exact columns where it went
-        assert {(14, 69), (14, 70), (14, 71)} <= {divmod(int(k), 128) for k in transport.columns}
     fresh = lit.render(found.envmap, spp=256, seed=9, max_depth=3)
     kept = 1 - apart(fresh, target, painted) / apart(initial, target, painted)
     assert low <= found.share <= high

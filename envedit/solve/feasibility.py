@@ -188,9 +188,9 @@ def reachable(
     left = np.abs(residual) * request.painted[..., None]
     return Reach(
         share=float(np.clip(1 - request.distance(picture) / asked, 0, 1)) if asked > 0 else 1.0,
-        picture=np.float32(picture),
-        residual=np.float32(residual),
-        envmap=np.float32(envmap),
+        picture=picture.astype(np.float32),
+        residual=residual.astype(np.float32),
+        envmap=envmap.astype(np.float32),
         too_dark=float(left[residual > 0].sum() / max(left.sum(), 1e-30)),
         all_painted=bool((request.painted > 0).all()),
     )

@@ -30,6 +30,7 @@ from envedit.report import variants
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import feasibility as reaches
+from envedit.solve import task
 from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
 from envedit.targets import working_size
 from envedit.targets.target import Target
@@ -183,8 +184,16 @@ def run(
     if traced and solved.coverage is not None:
         with clock("reach_s"):
             watch.stage("estimating how much of the target is feasible")
-            asked = traced, original, solved.picture, solved.weight, rows, None, solved.coverage[..., 0]
-            within = reaches.reachable(*asked, solved.initial, known=found_map)
+            within = reaches.reachable(
+                traced,
+                original,
+                solved.picture,
+                task.likelihood(solved),
+                rows,
+                painted=solved.coverage[..., 0],
+                rendered=solved.initial,
+                known=found_map,
+            )
             picture, residual = (at_size(one, small, lit) for one in (within.picture, within.residual))
             within = replace(within, picture=picture, residual=residual)
             notes.append(within.note)

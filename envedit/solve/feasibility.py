@@ -6,7 +6,8 @@ before minutes are spent on an edit. With I = T E + I_0, target t and weights w,
     min over E >= 0  1/2 sum_p w_p s_p^2 (I_p - t_p)^2
 
 where s_p is the slope of the display curve between the pixel's present value and the target, so that the
-sum is one of display values. A pixel whose target is white has no residual at any value above.
+sum is one of display values. A pixel whose target is white has no residual at any value above. The mean of
+what was not painted stays as the likelihood says (``likelihood.py``), whose weights w are.
 
 What may change is E = a E_0 + b, with a gain a and a radiance b, neither negative, in each cell of the map:
 a = 1, b = 0 is the original. Cells and not texels, because T is recorded: a column of a single texel consists
@@ -31,6 +32,7 @@ from envedit.core.color import tonemap
 from envedit.core.errors import InputError, place_of
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
+from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
 from envedit.transport.block_transport import CELLS, tiles
 from envedit.transport.light_transport import LightTransport
 
@@ -118,7 +120,7 @@ def reachable(
     transport: LightTransport,
     original: np.ndarray,
     target: np.ndarray,
-    weight: np.ndarray | None = None,
+    likelihood: Likelihood | None = None,
     rows: Rows | None = None,
     free: np.ndarray | None = None,
     painted: np.ndarray | None = None,
@@ -135,8 +137,8 @@ def reachable(
         The map, linear radiance.
     target : ndarray (h, w, 3)
         The target, linear radiance.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts; all the same by default.
+    likelihood : Likelihood, optional
+        How much each pixel counts, and the mean of what was not painted; by default all count the same.
     rows : Rows, optional
         Active rows; the light of the others stays. All by default.
     free : ndarray of bool (rows, W), optional
@@ -169,7 +171,7 @@ def reachable(
     height, width, _ = original.shape
     active = np.zeros((height, width), bool)
     active[slice(None) if rows is None else rows.slice] = True if free is None else free
-    request = _Request.of(transport, original, target, weight, painted, rendered)
+    request = _Request.of(transport, original, target, likelihood, painted, rendered)
     asked = request.distance(request.initial)
     if asked < 1e-6:  # float32
         asked = 0.0
@@ -198,29 +200,29 @@ def reachable(
 
 @dataclass(frozen=True)
 class _Request:
-    """Pictures (h, w, 3) before the edit and as wanted, weights (h, w, 1), and what is painted (h, w)."""
+    """Pictures (h, w, 3) before the edit and as wanted, and what is painted (h, w)."""
 
     initial: np.ndarray
     target: np.ndarray
-    weight: np.ndarray
+    likelihood: Likelihood
     painted: np.ndarray
 
     @classmethod
-    def of(cls, transport, original, target, weight, painted, rendered):
+    def of(cls, transport, original, target, likelihood, painted, rendered):
         shape = transport.shape
         target = _shaped("target", target, (*shape, 3))
         if (bad := ~np.isfinite(target)).any():
             raise InputError(f"target: pixel at {place_of(bad)} is not finite: repair it before painting")
-        weight = np.ones((*shape, 1)) if weight is None else _shaped("weight", weight, (*shape, 1))
-        counts = (weight[..., 0] > 0).astype(np.float64)
+        likelihood = likelihood or Likelihood(on_average_one(None, shape))
+        counts = (_shaped("weight", likelihood.weight, (*shape, 1))[..., 0] > 0).astype(np.float64)
         painted = counts if painted is None else _shaped("painted", painted, shape)
-        if not (painted.sum() > 0 and weight.sum() > 0):
+        if not (painted.sum() > 0 and counts.sum() > 0):
             raise ValueError("reachable: no pixel is painted or counts")
         transport.resolve(original)
         initial = _rendering(transport, original)
         if rendered is not None:
             target = target + initial - _shaped("rendered", rendered, (*shape, 3))
-        return cls(initial, np.maximum(target, 0), weight, painted)
+        return cls(initial, np.maximum(target, 0), likelihood, painted)
 
     def distance(self, picture):
         """Mean absolute difference of display values in the painted region."""
@@ -229,12 +231,27 @@ class _Request:
 
     def weights(self, picture):
         """Pixel weights (h, w, 3) under which squared differences of radiance are those of display values."""
+        return self.likelihood.weight * self.slope(picture) ** 2
+
+    def slope(self, picture):
+        """Slope (h, w, 3) of the display curve between a picture and the target."""
         low = np.clip(np.minimum(picture, self.target), 0, 1)
         # What is above 1 is shown as 1: the slope falls with the distance.
         high = np.maximum(np.maximum(np.minimum(self.target, 1), picture), low + TOE)
         rise = tonemap(high) - tonemap(low)
         slope, flat = rise / (high - low), (low >= 1) | (rise <= 0)
-        return self.weight * np.where(flat, 1 / 2.2, slope) ** 2
+        return np.where(flat, 1 / 2.2, slope)
+
+    def mean_of_rest(self, picture):
+        """Weights (h, w, 3) of radiance in the mean of what was not painted, in units of a pixel's error.
+
+        The likelihood's last part over its first: of a mean beyond what is visible, the absolute value.
+        """
+        mean = self.likelihood.mean(tonemap(picture) - tonemap(self.target))
+        beyond = max(1.0, float(np.sqrt(np.square(mean).mean())))
+        sigma = self.likelihood.paint_noise or 0.0
+        scale = sigma * np.sqrt(STATEMENTS * self.likelihood.area / beyond)
+        return scale * self.likelihood.share * self.slope(picture)
 
 
 def _shaped(name, values, shape):
@@ -298,13 +315,18 @@ def _solution(transport, original, active, request):
     one = render(np.stack([zeros, ones]))
 
     for _ in range(LINEARISATIONS):
+        weight, share = request.weights(fixed + light), request.mean_of_rest(fixed + light)
+
+        def pulled(residual, weight=weight, share=share):
+            """Return the adjoint of a weighted residual, and of its mean over the rest."""
+            return adjoint(weight * residual + share * (share * residual).sum(axis=(0, 1)))
+
         # ---- Metric (De Pierro), for a sky of one radiance that is as bright as the picture or the target
-        weight = request.weights(fixed + light)
         bright = (weight * np.maximum(light, aim)).sum(axis=(0, 1))
         mean = np.maximum(bright / np.maximum((weight * one).sum(axis=(0, 1)), 1e-30), 1e-12)
         # A single texel can grow by as much light as a cell.
         y = x + FLOOR * np.stack([ones, mean * size.max() / size])
-        metric = adjoint(weight * render(y)) / y
+        metric = pulled(render(y)) / y
         seen = metric > 1e-9 * metric.max(axis=1, keepdims=True)
         step = np.where(seen, 1 / np.maximum(metric, 1e-300), 0)
 
@@ -312,7 +334,7 @@ def _solution(transport, original, active, request):
         z, z_light, momentum = x, light, np.ones(3)
         for _ in range(STEPS):
             residual = aim - z_light
-            gradient = -adjoint(weight * np.where(white, np.maximum(residual, 0), residual))
+            gradient = -pulled(np.where(white, np.maximum(residual, 0), residual))
             new = np.maximum(z - step * gradient, 0)
             new_light = render(new)
             uphill = (gradient * (new - x)).sum(axis=(0, 1)) > 0

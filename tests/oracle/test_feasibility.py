@@ -10,6 +10,7 @@ from envedit.core.errors import InputError
 from envedit.core.rows import Rows
 from envedit.scene import scene
 from envedit.solve import feasibility
+from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.transport.light_transport import LightTransport
 
 pytestmark = pytest.mark.usefixtures("own_core")
@@ -61,6 +62,10 @@ def render(transport, image):
     return transport.apply(mi.TensorXf(np.float32(image))).numpy().astype(np.float64)
 
 
+def weighed(weight):
+    return Likelihood(on_average_one(weight, PIXELS))
+
+
 def descend(a, b, sweeps=500):
     """Solve min |a x - b| with x >= 0, one coordinate at a time."""
     x, rest, power = np.zeros(a.shape[1]), b.copy(), (a * a).sum(axis=0)
@@ -94,8 +99,8 @@ def test_the_solution_is_that_of_coordinate_descent(dense, envmap, rng, monkeypa
     weight = rng.random((*PIXELS, 1))
     monkeypatch.setattr(feasibility, "SHARP_SAMPLES", 0)  # every texel by itself
     monkeypatch.setattr(feasibility, "STEPS", 2000)
-    found = feasibility.reachable(dense, envmap, target, weight)
-    request = feasibility._Request.of(dense, envmap, target, weight, None, None)
+    found = feasibility.reachable(dense, envmap, target, weighed(weight))
+    request = feasibility._Request.of(dense, envmap, target, weighed(weight), None, None)
     w = request.weights(found.picture)  # as linearised where the solution is
 
     def value(picture):
@@ -134,7 +139,8 @@ def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):
     initial, painted = render(dense, envmap), rng.random(PIXELS)
     target = initial * np.where(rng.random((*PIXELS, 1)) < 0.5, 0.5, 1.4)
     found = sane(
-        feasibility.reachable(dense, envmap, target, 0.3 + painted[..., None], painted=painted), envmap
+        feasibility.reachable(dense, envmap, target, weighed(0.3 + painted[..., None]), painted=painted),
+        envmap,
     )
     wanted = 1 - apart(found.picture, target, painted) / apart(initial, target, painted)
     assert found.share == pytest.approx(wanted, abs=1e-4)
@@ -165,7 +171,7 @@ def test_two_pixels_that_see_the_same_cannot_differ(dense, envmap):
     painted = np.zeros(PIXELS)
     painted[1, 1] = 1
     weight = np.where(painted > 0, 1, 100)[..., None]
-    found = sane(feasibility.reachable(transport, envmap, target, weight, painted=painted), envmap)
+    found = sane(feasibility.reachable(transport, envmap, target, weighed(weight), painted=painted), envmap)
     assert found.share < 0.05
     assert (found.residual[1, 1] < -0.05).all()
     assert f"only {int(100 * found.share)} %" in found.warning and "darker" in found.warning
@@ -173,7 +179,7 @@ def test_two_pixels_that_see_the_same_cannot_differ(dense, envmap):
     assert shown[2] == 1 and shown[0] < 0.8  # blue
 
     target[1, 1] *= 3  # half as bright again
-    found = sane(feasibility.reachable(transport, envmap, target, weight, painted=painted), envmap)
+    found = sane(feasibility.reachable(transport, envmap, target, weighed(weight), painted=painted), envmap)
     assert found.share < 0.05 and "brighter" in found.warning
     shown = feasibility.unreachable(found)[1, 1]
     assert shown[0] == 1 and shown[2] < 0.8  # red
@@ -193,7 +199,7 @@ def test_white_is_any_value_above(dense, envmap, white):
     painted = np.zeros(PIXELS)
     painted[2, 3] = 1
     weight = np.where(painted > 0, 1, 1e-3)[..., None]
-    found = sane(feasibility.reachable(dense, envmap, target, weight, painted=painted), envmap)
+    found = sane(feasibility.reachable(dense, envmap, target, weighed(weight), painted=painted), envmap)
     assert found.share > 0.9 and (found.picture[2, 3] < 3).all()
 
 
@@ -252,7 +258,9 @@ def test_one_painted_pixel(dense, envmap):
     target[0, 0] *= 1.3
     painted = np.zeros(PIXELS)
     painted[0, 0] = 1
-    found = sane(feasibility.reachable(dense, envmap, target, painted[..., None], painted=painted), envmap)
+    found = sane(
+        feasibility.reachable(dense, envmap, target, weighed(painted[..., None]), painted=painted), envmap
+    )
     assert found.share > 0.95
 
 
@@ -348,10 +356,29 @@ def test_what_is_promised_is_seen_in_a_fresh_rendering(name, matte, rng):
     target, painted, low, high = requests(initial, turned, rng)[name]
     weight = (painted + 0.3 * (1 - painted))[..., None]
     rows = Rows(0, ROWS, len(original))
-    found = sane(feasibility.reachable(transport, original, target, weight, rows, None, painted), original)
+    found = sane(
+        feasibility.reachable(transport, original, target, weighed(weight), rows, None, painted), original
+    )
     fresh = lit.render(found.envmap, spp=256, seed=9, max_depth=3)
     kept = 1 - apart(fresh, target, painted) / apart(initial, target, painted)
     assert low <= found.share <= high
     assert (found.warning is None) == (found.share >= 0.5)
     # The shadow: 0.11 with cells, 0.35 with texels.
     assert kept > found.share - 0.15
+
+
+def test_the_mean_of_what_is_not_painted_is_held(dense, envmap):
+    """All pixels see the same light, at other strengths: brighter paint makes the rest brighter."""
+    strength = np.linspace(0.2, 0.4, PIXELS[0] * PIXELS[1])[:, None]
+    transport = Dense(strength * np.full((1, HEIGHT * WIDTH), 1 / HEIGHT / WIDTH))
+    initial = render(transport, envmap)
+    painted = np.zeros((*PIXELS, 1))
+    painted[2, 2] = 1
+    target = np.where(painted > 0, 2 * initial, initial)
+    weight = (painted + 0.01 * (1 - painted)).astype(np.float32)
+    asked = transport, envmap, target
+    shares = [
+        feasibility.reachable(*asked, likelihood, painted=painted[..., 0]).share
+        for likelihood in (weighed(weight), Likelihood.of_paint(weight, painted, initial, target))
+    ]
+    assert shares[0] > 0.6 and shares[1] < 0.3

@@ -441,7 +441,7 @@ class Session:
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
         self._tell_doing("estimating how much of the target is feasible")
-        asked = self.problem.envmap, self.target, self.weight, self.rows, None
+        asked = self.problem.envmap, self.target, self.problem.likelihood, self.rows, None
         painted, known = self.coverage[..., 0], self.point.edited
         self.reach = feasibility.reachable(self._watched, *asked, painted, self.base, known)
         self._tell_unreachable()

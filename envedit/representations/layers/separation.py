@@ -372,7 +372,7 @@ def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarra
     angle = np.degrees(np.arccos(np.clip(small.directions @ centre, -1, 1)))
     lum = image @ LUMINANCE
     ring = np.digitize(angle, _RINGS) - 1
-    middles, colours = [], []
+    middles, colours, sizes = [], [], []
     for i in range(len(_RINGS) - 1):
         inside = (ring == i) & ~cores
         if inside.sum() < 4:
@@ -381,13 +381,15 @@ def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarra
         low, high = np.quantile(values, RING_SHARE)
         middles.append((_RINGS[i] + _RINGS[i + 1]) / 2)
         colours.append(image[inside][(values >= low) & (values <= high)].mean(axis=0))
+        sizes.append(small.omega[inside].sum())
     middle, colour = np.array(middles), np.array(colours).reshape(-1, 3)
     bright = colour @ LUMINANCE
     for last in range(_end(middle, bright), 2, -1):
         far = np.maximum(colour[last], 1e-3 * colour[last].max())
         if not far.min() > 0:
             continue
-        factor = np.minimum.accumulate(np.maximum(colour[: last + 1] / far - 1, 0), axis=0)
+        rings = np.maximum(colour[: last + 1] / far - 1, 0)
+        factor = np.stack([_falling(ring, np.array(sizes[: last + 1])) for ring in rings.T], axis=1)
         table = np.stack([np.interp(GLOW_DEGREES, middle[: last + 1], f) for f in factor.T], axis=1)
         table = _without_kinks(table)
         inside = (angle < middle[last]) & ~cores & (lum > 0)
@@ -396,6 +398,27 @@ def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarra
         if len(before) and after.var() < (1 - LEAST_EXPLAINED) * before.var():
             return table
     return None
+
+
+def _falling(values, weights):
+    """Return the closest values that never rise: isotonic regression, by pooling adjacent violators.
+
+    One dark ring, of a silhouette or a cloud, does not make all farther ones dark as a running minimum would.
+    """
+    means: list[float] = []
+    sums: list[float] = []
+    counts: list[int] = []
+    for value, weight in zip(values, weights, strict=True):
+        mean, total, count = float(value), float(weight), 1
+        while means and means[-1] < mean:
+            before = sums.pop()
+            mean = (means.pop() * before + mean * total) / (before + total)
+            total += before
+            count += counts.pop()
+        means.append(mean)
+        sums.append(total)
+        counts.append(count)
+    return np.repeat(means, counts)
 
 
 def _without_kinks(table):

@@ -29,9 +29,9 @@ from envedit.preparation import Preparation
 from envedit.report import variants
 from envedit.results import Result
 from envedit.scene.renderings import rendered
+from envedit.solve import adam_solver, task
 from envedit.solve import feasibility as reaches
-from envedit.solve import task
-from envedit.solve.edit_job import Interrupted, Stopped, Watch, keeping
+from envedit.solve.edit_state import Interrupted, Stopped, Watch, keeping
 from envedit.targets import working_size
 from envedit.targets.target import Target
 from envedit.targets.target import make as make_target
@@ -214,15 +214,15 @@ def run(
     # ---- Other explanations of paint
     others = []
     with clock("judge_s"), in_file_units(), keeping(edited):
-        for other in job.others:
+        for other in job.layers.others:
             watch.stage("rendering other explanations")
-            changed, _ = adjustments.adjust(job.map_of(other), settings.lights, settings.output, given.scale)
+            changed, _ = adjustments.adjust(job.layers.map_of(other), settings.lights, settings.output, given.scale)
             in_file = given.as_stored(changed, edit.degrees)
             curve = settings.output.tonemap
             others.append(variants.seen(other, changed, in_file, lit, target, curve, seed))
 
     # ---- Notes
-    notes += [job.note] if job.note else []
+    notes += [job.layers.note] if job.layers.note else []
     if others:
         notes.append(f"other explanations: {', '.join(one.said for one in others)}")
     notes += [said_of] if (said_of := light_list.summary(lights, height)) else []
@@ -243,7 +243,7 @@ def run(
     measured["variants"] = [one.measures for one in others]
     if measured["painted"] and (unnatural := naturalness.warning(measured["natural"])):
         warnings.append(unnatural)
-    rate = "; lower optimizer.lr" if job.raised_rate else ""
+    rate = "; lower optimizer.lr" if adam_solver.raised_rate(job) else ""
     pair, where = [measured[name] for name in ("render", "initial")], ""
     if target.coverage is not None:
         painted, where = target.coverage[..., 0] > 0, " where painted"
@@ -309,7 +309,7 @@ def run(
         scene=lit.path,
         reach=within,
         found=Found(representation, params, job.free, edit.degrees, found_map),
-        posterior=job.posterior,
+        posterior=job.layers.posterior,
         variants=others,
         settings=settings,
         memory=memory,

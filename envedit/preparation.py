@@ -26,7 +26,8 @@ from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.scene.renderings import rendered
 from envedit.solve import initialization, turning
-from envedit.solve.edit_job import Job, Watch
+from envedit.solve.edit_job import Job
+from envedit.solve.edit_state import Watch
 from envedit.targets.target import Target
 
 TURNED = 0.5
@@ -89,7 +90,7 @@ class Preparation:
     watch : Watch
         Receives progress.
     dists : distances.Dists, optional
-        As for :class:`.edit_job.Job`.
+        As for :class:`.edit_state.EditState`.
     clock : callable
         ``with clock(name):`` adds up seconds.
     """
@@ -133,7 +134,7 @@ class Preparation:
         """
         if self._started_before:
             edit = self._prepared(target, 0.0, [], search=False, ask=False)
-            edit.job.go_on_from(self.settings.optimizer.start, edit.params)
+            edit.job.layers.go_on_from(self.settings.optimizer.start, edit.params)
             return edit
         # ---- Maps that explain the target to its noise are taken as they are
         if self._explains(0.0, target):
@@ -152,12 +153,12 @@ class Preparation:
         if not always and turn.left >= TURNED:
             return self._prepared(target, 0.0, [])
         turned = self._prepared(target, turn.degrees, [said])
-        if always or turned.job.begun is None:
+        if always or turned.job.layers.begun is None:
             return turned
         still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
-            score, other = (one.job.settle(one.params) for one in (turned, still))
+            score, other = (one.job.layers.settle(one.params) for one in (turned, still))
         # As many turns as the map has columns could have been the best one.
         score += 2 * np.log(self.original.shape[1])
         chosen = still if other < score else turned
@@ -293,17 +294,17 @@ class Preparation:
     def _explained(self, job, params, octaves, notes, transport):
         """Find the lights that explain the target, and for Adam the sky; returns parameters."""
         self.watch.stage("searching for lights")
-        explanation = job.explain(params, transport)
+        explanation = job.layers.explain(params, transport)
         said = "the target" if job.target.coverage is None else "the paint"
         notes.append(
             f"likeliest explanation of {said}: {explanation.name} (-2 log evidence {explanation.score:.1f})"
         )
         if job.newton and not octaves:
-            job.begun = explanation.run
+            job.layers.begun = explanation.run
             return params
         self.watch.stage("solving for lights and coarse gain")
         try:
-            solved = job.solved(params, explanation.run, transport)
+            solved = job.layers.solved(params, explanation.run, transport)
         except NumericalError:  # a start that goes nowhere is no reason to stop
             return params
         # What ground is lit by from elsewhere makes up for what coarse grids cannot show.

@@ -7,7 +7,7 @@ import drjit as dr
 import pytest
 
 from envedit import config, pipeline
-from envedit.solve import adam_loop, edit_job, gauss_newton, map_problem
+from envedit.solve import adam_loop, gauss_newton, layers_solver, map_problem
 from envedit.transport.light_transport import LightTransport
 
 pytestmark = pytest.mark.usefixtures("own_core")
@@ -77,7 +77,8 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
 
     monkeypatch.setattr(map_problem.Problem, "normal", counted)
     monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # some steps more
-    monkeypatch.setattr(edit_job.Job, "_corrected", lambda *_: None)  # what is between steps has kernels
+    # What is between steps has kernels of its own.
+    monkeypatch.setattr(layers_solver.LayersSolver, "_corrected", lambda *_: None)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         result = pipeline.run(settings)

@@ -14,7 +14,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.images import images
 from envedit.scene import scene
 from envedit.solve import search
-from envedit.solve.edit_job import Interrupted
+from envedit.solve.edit_state import Interrupted
 from envedit.targets import target
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import runs

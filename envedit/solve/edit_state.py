@@ -1,0 +1,150 @@
+"""An edit: what is given, and how parameters become a whole map."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envedit import config
+from envedit.core.errors import NumericalError, place_of
+from envedit.core.types import Params
+from envedit.losses.perceptual import distances
+from envedit.renderers import Renderer
+from envedit.representations.layers.gain import LEVELS
+from envedit.representations.layers.unseen import unseen_kept
+from envedit.scene import scene
+from envedit.solve import block_jacobian, task
+from envedit.solve.map_problem import Problem
+from envedit.targets.target import Target
+from envedit.transport.light_transport import LightTransport
+
+
+class Interrupted(Exception):
+    """Ctrl-C during the edit; ``envmap`` is the map so far, that of the checkpoint where there is one.
+
+    ``given`` is the input map in whose units ``envmap`` is, once the run has brought it there.
+    """
+
+    given: Any
+
+    def __init__(self, envmap: np.ndarray, step: int):
+        super().__init__(f"interrupted at iteration {step}")
+        self.envmap, self.step = envmap, step
+
+
+class Stopped(NumericalError):
+    """The optimisation could not go on; ``envmap`` is the last good map, ``given`` as of Interrupted."""
+
+    given: Any
+
+    def __init__(self, message: str, envmap: np.ndarray):
+        super().__init__(message)
+        self.envmap = envmap
+
+
+@dataclass
+class Watch:
+    """What a run reports while it works.
+
+    ``stage(text)`` when a part begins, ``progress(done, total, text)`` within one.
+    """
+
+    stage: Callable[[str], None] = lambda text: None
+    progress: Callable[[int, int, str], None] = lambda done, total, text: None
+
+
+@dataclass
+class EditState:
+    """One edit in progress.
+
+    Attributes
+    ----------
+    settings : config.Config
+        What is carried out.
+    lit : scene.Scene
+        The scene.
+    original : ndarray (H, W, 3)
+        The map.
+    first : int
+        Its first active row.
+    free : ndarray of bool (rows, W), optional
+        Active texels that may change; None: all.
+    target : Target
+        What the renderer is to make; solvers may change its weights and what it is compared with.
+    representation, renderer : Representation, Renderer
+        As :func:`.adam_loop.optimise` takes them; of layers, more than the protocol is used.
+    folder : Path, optional
+        Of the checkpoint.
+    watch : Watch
+        Receives progress.
+    dists : distances.Dists, optional
+        As for :class:`.adam_loop.Objective`.
+    """
+
+    settings: config.Config
+    lit: scene.Scene
+    original: np.ndarray
+    first: int
+    free: np.ndarray | None
+    target: Target
+    representation: Any
+    renderer: Renderer
+    folder: Path | None
+    watch: Watch
+    dists: distances.Dists | None = None
+    _blocks: dict = field(default_factory=dict, repr=False)
+
+    @property
+    def newton(self) -> bool:
+        """Whether Gauss-Newton steps are made: for layers through T, without grids of detail."""
+        if not self.representation.models_edit or self.renderer.transport is None:
+            return False
+        return self.settings.optimizer.kind != "adam" and len(self.representation.gain.sizes) == LEVELS
+
+    @property
+    def rendered(self) -> bool:
+        """Whether the target is a rendering, and not painted."""
+        return self.target.coverage is None
+
+    def decode(self, params: Params) -> np.ndarray:
+        """Parameters to a whole map on the host, refusing what is not finite."""
+        crop = self.representation.decode(params).numpy()
+        rows = slice(self.first, self.first + crop.shape[0])
+        if self.free is not None:
+            crop = np.where(self.free[..., None], crop, self.original[rows])
+        if (bad := ~np.isfinite(crop)).any():
+            where = place_of(bad, self.first)
+            remedy = "scale the map down" if self.newton else "lower [optimizer] lr"
+            raise NumericalError(f"the edited map is not finite at {where}: {remedy}")
+        edited = self.original.copy()
+        edited[rows] = crop
+        return unseen_kept(self.original, edited) if self.representation.models_edit else edited
+
+    def problem(self, transport: LightTransport | None = None) -> Problem:
+        """Return what is minimised through T, by default the renderer's."""
+        traced = transport or self.renderer.transport
+        if traced not in self._blocks:
+            shape = self.original.shape[:2]
+            self._blocks = {traced: block_jacobian.BlockJacobian(self.representation, traced, shape)}
+        return task.problem(
+            self.settings,
+            self.target,
+            self.representation,
+            traced,
+            self.original,
+            self._blocks[traced],
+        )
+
+
+@contextlib.contextmanager
+def keeping(envmap: np.ndarray) -> Iterator[None]:
+    """Let numbers that fail after the loop carry the map that it found: Stopped for NumericalError."""
+    try:
+        yield
+    except NumericalError as error:
+        raise Stopped(str(error), envmap) from error

@@ -1,0 +1,287 @@
+"""An edit of layers: the search for lights, Gauss-Newton steps, and what is done between them.
+
+Steps are made until none leads further. Of a rendered target another explanation follows if one is likelier
+by now, and then some steps towards the target without T's error; of paint, more weight on the rest, where
+that is to be kept. Each of these is a new run that goes on from the last.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from envedit.core.arrays import tensor
+from envedit.core.interrupts import ctrl_c
+from envedit.core.seeds import Seeds
+from envedit.core.types import Params
+from envedit.losses import display_curve
+from envedit.representations.layers.unseen import unseen_kept
+from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, search, task, transport_error
+from envedit.solve.edit_state import EditState, Interrupted
+from envedit.solve.map_problem import Posterior
+from envedit.transport.light_transport import LightTransport
+
+CHECKED_SPP = 64
+"""Samples a pixel of renderings by which start and solution are compared."""
+
+
+@dataclass
+class LayersSolver:
+    """Solver of one edit of layers.
+
+    Attributes
+    ----------
+    edit : EditState
+        What is edited.
+    begun : gauss_newton.Run, optional
+        Where :meth:`optimise` goes on from.
+    others : tuple of search.Explanation
+        Of paint: explanations that are less likely than the one that is solved for.
+    posterior : Posterior, optional
+        How well the target determines the sky, once :meth:`optimise` knows it.
+    note : str
+        What a user should know of the solution.
+    """
+
+    edit: EditState
+    begun: gauss_newton.Run | None = None
+    others: tuple[search.Explanation, ...] = ()
+    posterior: Posterior | None = None
+    note: str = ""
+    _likelier: list[str] = field(default_factory=list)
+
+    # ---- Before the steps ----------------------------------------------------------------------------------
+
+    def explain(self, params: Params, transport: LightTransport) -> search.Explanation:
+        """Return the likeliest explanation of the target through T; the parameters are those of the map."""
+        edit, tried = self.edit, itertools.count(1)
+        problem = edit.problem(transport)
+
+        with ctrl_c() as interrupt:
+
+            def after_step():
+                done = next(tried)
+                edit.watch.progress(done, done, "trying lights")
+                if interrupt.is_set():
+                    raise Interrupted(edit.original.copy(), 0)
+
+            explanation = search.search(
+                problem,
+                problem.state(params),
+                self._sigma,
+                after_step,
+                most=edit.settings.optimizer.iterations if edit.newton else search.STEPS,
+            )
+        self.others = () if edit.rendered else explanation.others
+        return explanation
+
+    def map_of(self, explanation: search.Explanation) -> np.ndarray:
+        """Return the map of an explanation of :meth:`explain`, whatever grids the gain has got since."""
+        return unseen_kept(self.edit.original, explanation.point.edited)
+
+    def solved(self, params: Params, begun: gauss_newton.Run, transport: LightTransport) -> Params:
+        """Return where Gauss-Newton steps end, for what Adam goes on from.
+
+        Raises
+        ------
+        NumericalError
+            If they cannot begin.
+        """
+        problem, rendered = self.edit.problem(transport), self.edit.rendered
+        problem.evaluate(begun.state)  # another explanation may have taken its columns of T
+        return gauss_newton.solve(
+            problem,
+            params,
+            self._sigma,
+            run=begun,
+            sparing=rendered,
+            judge=self._display_error if rendered else None,
+        ).params
+
+    def settle(self, params: Params) -> float:
+        """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
+        most, problem = self.edit.settings.optimizer.iterations, self.edit.problem()
+        problem.evaluate(self.begun.state)  # another edit may have taken its columns of T
+        while self.begun is not None:
+            solution = gauss_newton.solve(problem, params, self._sigma, most, run=self.begun, sparing=False)
+            self.begun = self._another(solution)
+        point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
+        self.begun = solution.run
+        if point.residual is not None:  # what T errs by may have been fitted
+            point = replace(point, residual=self._missed(point.edited).astype(np.float64))
+        return search.score(problem, solution.run, point, self._sigma)
+
+    def go_on_from(self, file: str, params: Params) -> None:
+        """Let :meth:`optimise` go on from a solution on disk; InputError if it is not of these layers."""
+        self.begun = checkpoint.load_solution(file, self.edit.problem().state(params))
+
+    # ---- Steps ---------------------------------------------------------------------------------------------
+
+    def optimise(self, params: Params, resume: bool) -> tuple[Params, adam_loop.State]:
+        """Make Gauss-Newton steps from :attr:`begun` or the map as it is, or from the checkpoint.
+
+        Raises
+        ------
+        Interrupted
+            After Ctrl-C.
+        NumericalError
+            If the start is not finite.
+        """
+        # ---- Where it starts
+        edit, run = self.edit, self.begun
+        settings = edit.settings.optimizer
+        digest = checkpoint.digest(edit.settings, edit.lit.digest, [edit.original, *edit.target.asked])
+        if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
+            state, arrays, traced, picture = stored
+            edit.renderer.restore(traced)
+            edit.target = replace(edit.target, picture=picture, compared=arrays.pop("aim"))
+            run = gauss_newton.Run.of_arrays(arrays, state.history)
+        elif run is not None:
+            edit.problem().evaluate(run.state)  # another explanation may have taken its columns
+        self._hold(run)
+
+        # ---- Runs, one from where the last has ended
+        with ctrl_c() as interrupt:
+            keep = _Checkpoints(edit, digest, interrupt)
+            while True:
+                compared = edit.rendered and not (run and run.corrected)
+                solution = gauss_newton.solve(
+                    edit.problem(),
+                    params,
+                    self._sigma,
+                    settings.iterations,
+                    keep.after_step,
+                    run,
+                    sparing=compared,  # paint is no noisy picture, and asks for what it shows
+                    judge=self._display_error if compared else None,
+                )
+                if edit.rendered:
+                    following = self._another(solution, interrupt) or self._corrected(solution)
+                else:
+                    following = self._held_more(solution.run)
+                if following is None:
+                    break
+                run = following
+        self.posterior = solution.posterior
+        self.note = "; ".join(self._notes(solution))
+        return solution.params, adam_loop.State(step=len(solution.history), history=solution.history)
+
+    def _notes(self, solution):
+        notes = [solution.note] if solution.note else list(self._likelier)
+        run = solution.run
+        if run.hold > 1:
+            notes.append(hold.said(run.hold, hold.change(*self._without_paint(run))))
+        if "saturation" in solution.params and not solution.note:
+            kept = 100 * float(np.exp(solution.params["saturation"].numpy()[0, 0]))
+            notes.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
+        if run.corrected:
+            missed = f"the stored transport's error at the solution ({transport_error.SPP} samples a pixel)"
+            notes.append(f"{missed} was taken off the target for the last steps")
+        return notes
+
+    def _another(self, solution, interrupt=None):
+        """Return a run that goes on from a likelier explanation than a solution; None where there is none."""
+        edit, run = self.edit, solution.run
+        if not self._goes_on(solution):
+            return None
+
+        def after_step():
+            edit.watch.progress(len(run.history), len(run.history), "trying lights")
+            if interrupt and interrupt.is_set():
+                raise Interrupted(edit.decode(solution.params), len(run.history))
+
+        likelier = search.further(edit.problem(), run, self._sigma, after_step)
+        if likelier is None:
+            return None
+        self._likelier.append(f"then likelier: {likelier.name} (-2 log evidence {likelier.score:.1f})")
+        return replace(likelier.run, most=len(likelier.run.history) + gauss_newton.ITERATIONS)
+
+    def _corrected(self, solution):
+        """Return a run that goes on towards the target without T's error; None where it need not."""
+        edit, run = self.edit, solution.run
+        if not self._goes_on(solution):
+            return None
+        point = edit.problem().evaluate(run.state)
+        edit.target = transport_error.corrected(
+            edit.target,
+            edit.lit,
+            point.edited,
+            point.rendering,
+            edit.settings.seed,
+            edit.settings.renderer.cache,
+        )
+        most = len(run.history) + transport_error.STEPS
+        return gauss_newton.Run(run.state, run.start, history=run.history, most=most, corrected=True)
+
+    def _goes_on(self, solution):
+        """Whether steps were made and kept, more are allowed, and T's error is not yet off the target."""
+        made, most = len(solution.run.history), self.edit.settings.optimizer.iterations
+        return not solution.note and not solution.run.corrected and 0 < made < most
+
+    # ---- What was not painted ------------------------------------------------------------------------------
+
+    def _hold(self, run):
+        """Take the weight of what was not painted that a run has come to."""
+        if run is not None and run.hold > 1:
+            self.edit.target = self.edit.target.held(self.edit.settings.target.paint, run.hold)
+        return run
+
+    def _held_more(self, run):
+        """Return a run that goes on with more weight on what was not painted; None where it need not."""
+        if len(run.history) >= self.edit.settings.optimizer.iterations:
+            return None
+        more = hold.further(self.edit.settings.target, run.hold, *self._without_paint(run))
+        if more is None:
+            return None
+        most = len(run.history) + gauss_newton.ITERATIONS
+        return self._hold(gauss_newton.Run(run.state, run.start, history=run.history, most=most, hold=more))
+
+    def _without_paint(self, run):
+        """Return what :func:`.hold.change` compares, at the point of a run, through T."""
+        target = self.edit.target
+        rendering = self.edit.problem().evaluate(run.state, resolve=False).rendering
+        return rendering, target.aim, target.coverage, target.weight
+
+    # ---- What T has no part in -----------------------------------------------------------------------------
+
+    @property
+    def _sigma(self):
+        return task.sigma(self.edit.target)
+
+    def _display_error(self, envmap):
+        """Return the mean square of :meth:`_missed`, weighed as the target."""
+        weight = 1 if self.edit.target.weight is None else self.edit.target.weight
+        return float((np.square(self._missed(envmap)) * weight).mean())
+
+    def _missed(self, envmap):
+        """Return display values of Mitsuba's rendering of a map less the target's."""
+        edit, seed = self.edit, Seeds.of(self.edit.settings.seed).step_check
+        shown = display_curve.to_display(tensor(edit.lit.render(envmap, CHECKED_SPP, seed)))
+        return shown.numpy() - display_curve.to_display(tensor(edit.target.picture)).numpy()
+
+
+class _Checkpoints:
+    """Reports steps, writes checkpoints when they are due, and ends the edit after Ctrl-C."""
+
+    def __init__(self, edit, digest, interrupt):
+        self.edit, self.digest, self.interrupt = edit, digest, interrupt
+        self.saved = time.perf_counter()
+
+    def after_step(self, run, point):
+        edit, settings, done = self.edit, self.edit.settings.optimizer, len(run.history)
+        most = min(settings.iterations, gauss_newton.ITERATIONS)
+        if done:
+            edit.watch.progress(done, max(most, done), f"loss {run.history[-1]['loss']:.4g}")
+        due = time.perf_counter() - self.saved >= settings.checkpoint_s
+        due |= run.finished or done >= most  # what follows may be interrupted too
+        if edit.folder and (due or self.interrupt.is_set()):
+            state = adam_loop.State(step=done, history=run.history)
+            arrays = run.arrays() | {"aim": edit.target.aim}
+            traced = edit.renderer.state()
+            checkpoint.save(edit.folder, self.digest, state, arrays, traced, edit.target.picture)
+            self.saved = time.perf_counter()
+        if self.interrupt.is_set():
+            raise Interrupted(point.edited, done)

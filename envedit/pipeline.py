@@ -216,7 +216,8 @@ def run(
     with clock("judge_s"), in_file_units(), keeping(edited):
         for other in job.layers.others:
             watch.stage("rendering other explanations")
-            changed, _ = adjustments.adjust(job.layers.map_of(other), settings.lights, settings.output, given.scale)
+            envmap = job.layers.map_of(other)
+            changed, _ = adjustments.adjust(envmap, settings.lights, settings.output, given.scale)
             in_file = given.as_stored(changed, edit.degrees)
             curve = settings.output.tonemap
             others.append(variants.seen(other, changed, in_file, lit, target, curve, seed))

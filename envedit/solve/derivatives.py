@@ -107,7 +107,7 @@ class Derivatives:
         """Return derivatives by lights and saturation, what these are, and the profile."""
         state, layers, sky, found, unknowns = point.state, self.layers, point.sky, [], []
         # Columns of one light must not take the place of another's.
-        lit = self.unknowns.lit(state)
+        lit = self.unknowns.shining(state)
         most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
         for i in lit:
             turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])

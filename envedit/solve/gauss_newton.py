@@ -21,6 +21,10 @@ ITERATIONS, LITTLE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
 TRIES = 5
 """Dampings that are tried in one step."""
+DAMPING_FACTOR = 10.0
+"""By how much damping rises after a step that does not lower F, and falls after one that does (Marquardt)."""
+LEAST_DAMPING, RAISED_DAMPING = 1e-4, 1e-2
+"""Least damping, and the least after a step that did not lower F."""
 NEAR, CLEARLY = 2.0, 0.95
 """Noise of the start over that of the solution up to which their renderings are compared, and the share of
 the start's squared error that the solution's must be below."""
@@ -201,39 +205,81 @@ def _descended(problem, run, point, sigma, most, after_step):
     """Make steps until none lowers F, or there are ``most`` in all; returns where they end."""
     while len(run.history) < most and not run.finished:
         began = time.perf_counter()
+
+        # ---- Huber's threshold: the noise, at most halved at once
+        noise = problem.noise(point.residual, sigma)
         halved = run.scale / 2 if np.isfinite(run.scale) else 0
-        run.scale = min(run.scale, max(problem.noise(point.residual, sigma), halved))
-        before = problem.loss(point, run.start, run.scale)
+        run.scale = min(run.scale, max(noise, halved))
+
+        # ---- F linearised
         problem.derivatives.angle = WIDE if run.wide else ANGLE
         normal = problem.normal(point, run.start, run.scale)
         problem.derivatives.angle = ANGLE
-        better = None
-        for _ in range(TRIES):
-            moved = problem.step(run.state, normal, run.damping)
-            tried = None if moved is None else problem.evaluate(moved)
-            if tried is not None and tried.residual is not None:
-                data = problem.misfit(tried.residual, run.scale)
-                penalty = problem.penalty(tried.state, run.start)
-                if data + penalty >= before:
-                    # Columns of T that were traced for it are not in what it is compared with.
-                    again = problem.evaluate(run.state, resolve=False)
-                    if again.residual is not None:
-                        point, before = again, problem.loss(again, run.start, run.scale)
-                if data + penalty < before:
-                    better = tried
-                    break
-            run.damping = max(10 * run.damping, 1e-2)
-        little = better is None or before - data - penalty < LITTLE * before
+
+        # ---- A step that lowers F
+        point, before, better = _lower(problem, run, point, normal)
+        loss = before if better is None else better.loss
+
+        # ---- Whether it is the last one
+        little = better is None or before - loss < LITTLE * before
         ended = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
-        run.finished = ended and (run.wide or not problem.lit(run.state))
+        run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
             run.wide, run.damping = True, Run.damping
+
+        # ---- Taken, and noted
         if better is not None:
-            point, run.state, run.damping = better, better.state, max(run.damping / 10, 1e-4)
-            row = {"loss": data + penalty, "data": data, "prior": penalty, "sigma": run.scale}
-            row["residual"] = float(np.sqrt(np.square(point.residual).mean()))
-            row |= {"damping": run.damping, "step_ms": round(1000 * (time.perf_counter() - began), 3)}
-            run.history.append({"iteration": len(run.history), **row})
+            point = better.point
+            run.state = point.state
+            run.damping = max(run.damping / DAMPING_FACTOR, LEAST_DAMPING)
+            run.history.append(
+                {
+                    "iteration": len(run.history),
+                    "loss": better.loss,
+                    "data": better.misfit,
+                    "prior": better.penalty,
+                    "sigma": run.scale,
+                    "residual": float(np.sqrt(np.square(point.residual).mean())),
+                    "damping": run.damping,
+                    "step_ms": round(1000 * (time.perf_counter() - began), 3),
+                }
+            )
         if after_step and (better is not None or run.finished):
             after_step(run, point)
     return point
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A point that a step leads to, and the two parts of F there."""
+
+    point: Point
+    misfit: float
+    penalty: float
+
+    @property
+    def loss(self):
+        return self.misfit + self.penalty
+
+
+def _lower(problem, run, point, normal):
+    """Try steps of more and more damping until one lowers F.
+
+    Returns the point that the run is at, F there, and the trial that is lower, or None. The point may have
+    been rendered anew: columns of T that were traced for a trial are not in what it is compared with.
+    """
+    before = problem.loss(point, run.start, run.scale)
+    for _ in range(TRIES):
+        state = problem.step(run.state, normal, run.damping)
+        there = None if state is None else problem.evaluate(state)
+        if there is not None and there.residual is not None:
+            misfit = problem.misfit(there.residual, run.scale)
+            trial = _Trial(there, misfit, problem.penalty(there.state, run.start))
+            if trial.loss >= before:
+                again = problem.evaluate(run.state, resolve=False)
+                if again.residual is not None:
+                    point, before = again, problem.loss(again, run.start, run.scale)
+            if trial.loss < before:
+                return point, before, trial
+        run.damping = max(DAMPING_FACTOR * run.damping, RAISED_DAMPING)
+    return point, before, None

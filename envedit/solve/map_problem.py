@@ -152,7 +152,7 @@ class Problem(Unknowns):
         """Return x' K x; ``start`` is where the search has put the lights."""
         total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
-        for i in self.lit(state):
+        for i in self.shining(state):
             change = self._flux_change(state, start, i)
             total += change @ self.prior.flux_precision @ change
             total += ((state["size"] - start["size"])[i, 0] / self._deviation("size", i)) ** 2
@@ -181,50 +181,70 @@ class Problem(Unknowns):
         and the gradient is 0.
         """
         state, n = point.state, self.nodes
-        robust = self.likelihood.weights(point.residual, sigma)
-        share, mean = self.likelihood.linear_mean(point.residual)
-        slope = display_curve.slope(point.rendering)
         blocks, linear = self.blocks, self.derivatives.at(point)
         pictures, profile = linear.pictures, linear.profile
         unknowns = 3 * n + len(pictures)
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        mean_by_unknowns = np.zeros((3, unknowns))
+
+        # ---- Weights of pixels, and of the mean of what was not painted
+        robust = self.likelihood.weights(point.residual, sigma)
+        share, mean = self.likelihood.linear_mean(point.residual)
+        slope = display_curve.slope(point.rendering)
+
+        # ---- Gain: the Hessian by blocks, the gradient through T
         squared = blocks.summed((slope * profile) ** 2 * robust)
         pulled = blocks.summed(slope * profile * robust * point.residual)
-        pulled_back = np.zeros((n, 3)), 0.0
-        if descent:
-            pulled_back = self._pulled_back(point, slope * (robust * point.residual + share * mean))
-        seen, lit = np.zeros((len(pictures), n * 3)), []
-        by_mean = np.zeros((3, unknowns))
         mean_by_blocks = blocks.summed(slope * profile * share)
+        by_nodes, by_saturation = np.zeros((n, 3)), 0.0
+        if descent:
+            weighted = slope * (robust * point.residual + share * mean)
+            by_nodes, by_saturation = self._pulled_back(point, weighted)
         for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
-            gradient[part] = pulled_back[0][:, c]
-            by_mean[c, part] = mean_by_blocks[:, c] @ j
-            if len(pictures):
-                weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
-                in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
-                seen[:, part] = in_blocks.T @ j
-                lit.append(in_blocks)
+            gradient[part] = by_nodes[:, c]
+            mean_by_unknowns[c, part] = mean_by_blocks[:, c] @ j
+
+        # ---- Lights and saturation, by pixels; with the gain, by blocks
+        lights_in_blocks = []
         if len(pictures):
             rest = slice(3 * n, unknowns)
             flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), -1)
             hessian[rest, rest] = flat @ flat.T
             gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
-            by_mean[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
-            gradient[rest] += mean @ by_mean[:, rest]
+            mean_by_unknowns[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
+            gradient[rest] += mean @ mean_by_unknowns[:, rest]
             if self.saturates:
-                gradient[-1] = pulled_back[1]
-            hessian[rest, : 3 * n], hessian[: 3 * n, rest] = seen, seen.T
-        hessian += by_mean.T @ by_mean
-        precision, back = self._precision(linear.named), self._from_prior(state, start, linear.named)
+                gradient[-1] = by_saturation
+            for c, j in enumerate(linear.jacobian):
+                part = slice(c * n, (c + 1) * n)
+                weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
+                in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
+                hessian[rest, part] = in_blocks.T @ j
+                hessian[part, rest] = hessian[rest, part].T
+                lights_in_blocks.append(in_blocks)
+
+        # ---- The mean of what was not painted, and the prior
+        hessian += mean_by_unknowns.T @ mean_by_unknowns
+        precision = self._precision(linear.named)
         hessian += precision
-        gradient = gradient + precision @ back if descent else np.zeros(unknowns)
-        pixels = robust, slope, point.residual, profile, pictures
-        parts = Blocks(linear.jacobian, squared, pulled, lit)
-        mean_of_rest = MeanOfRest(by_mean, mean, share * slope, mean_by_blocks)
-        return Normal(hessian, gradient, precision, linear.named, parts, *pixels, mean_of_rest)
+        if descent:
+            gradient += precision @ self._from_prior(state, start, linear.named)
+        return Normal(
+            hessian=hessian,
+            gradient=gradient if descent else np.zeros(unknowns),
+            precision=precision,
+            unknowns=linear.named,
+            blocks=Blocks(linear.jacobian, squared, pulled, lights_in_blocks),
+            robust=robust,
+            slope=slope,
+            residual=point.residual,
+            profile=profile,
+            pictures=pictures,
+            mean_of_rest=MeanOfRest(mean_by_unknowns, mean, share * slope, mean_by_blocks),
+        )
 
     def _pulled_back(self, point, picture):
         """Return the derivatives of the sum of a picture times T E.

@@ -209,7 +209,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
 def _faded(problem, state):
     """List the map's own lights that have faded."""
     own = problem.layers.lights.own
-    return [k for k in problem.lit(state) if k < own and state["flux"][k].mean() < FADED]
+    return [k for k in problem.shining(state) if k < own and state["flux"][k].mean() < FADED]
 
 
 def _descended(problem, done, run, sigma, steps):
@@ -238,7 +238,7 @@ def _beside_the_sky(problem, best, sigma):
     """Yield moves that lower F together with one step of all else."""
     lights, state, start = problem.layers.lights, best.run.state, best.run.start
     problem.evaluate(state)  # what was tried since may have taken its columns of T
-    for k in problem.lit(state):
+    for k in problem.shining(state):
         own, dark = k < lights.own, _changed(state, k, flux=DARK)
         places = _places(problem, dark, start, sigma)
         if places is None:
@@ -296,7 +296,7 @@ def _changes(problem, state, start, sigma):
     lights = problem.layers.lights
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
 
-    for k in problem.lit(state):
+    for k in problem.shining(state):
         own = k < lights.own
         dark = _changed(state, k, flux=DARK)
         # ---- elsewhere

@@ -94,11 +94,11 @@ class Unknowns:
         return params
 
     def added(self, state: dict) -> list[int]:
-        """List the spare lights that are lit."""
-        return [i for i in self.lit(state) if i >= self.layers.lights.own]
+        """List the added lights that shine: spare ones whose flux is not 0."""
+        return [i for i in self.shining(state) if i >= self.layers.lights.own]
 
-    def lit(self, state: dict) -> list[int]:
-        """List the lights that there are."""
+    def shining(self, state: dict) -> list[int]:
+        """List the lights whose flux is not 0."""
         return [i for i, flux in enumerate(state["flux"]) if flux.max() > DARK + 1]
 
     def direction(self, state: dict, i: int) -> np.ndarray:

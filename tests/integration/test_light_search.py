@@ -73,7 +73,7 @@ class Found:
             solution = gauss_newton.solve(problem, encoded, SIGMA, run=likelier.run)
         self.state = state = problem.state(solution.params)
         self.name, self.own = likeliest.name, layers.lights.own
-        self.lit = {k: problem.direction(state, k) for k in problem.lit(state)}
+        self.lit = {k: problem.direction(state, k) for k in problem.shining(state)}
         self.flux = np.exp(state["flux"])
         self.decoded = layers.decode(solution.params).numpy()
         assert all(np.isfinite(value).all() for value in state.values())

@@ -86,7 +86,7 @@ def found_for(problem, start):
     scores = [one.score for one in found.others]
     assert len(set(names)) == len(names) <= 1 + search.OTHERS and scores == sorted(scores)
     assert found.others or not calls
-    return found, {k: problem.direction(state, k) for k in problem.lit(state)}, before, len(calls)
+    return found, {k: problem.direction(state, k) for k in problem.shining(state)}, before, len(calls)
 
 
 # ---- the sun moves -----------------------------------------------------------------------------------------

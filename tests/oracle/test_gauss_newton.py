@@ -299,7 +299,7 @@ def test_state_and_params_are_inverse(case):
     again = problem.state(problem.params(state))
     for name in state:
         np.testing.assert_allclose(again[name], state[name], rtol=1e-6, atol=1e-7)
-    assert problem.lit(state) == [0]  # spare ones are dark
+    assert problem.shining(state) == [0]  # spare ones are dark
 
 
 # ---- F -----------------------------------------------------------------------------------------------------
@@ -788,7 +788,7 @@ def test_a_single_light_takes_its_flux(rng, factor):
     image = lamp()
     problem, _, last = extreme(rng, image, lambda t: factor * shown(t, image))
     np.testing.assert_allclose(last.state["flux"][0], np.log(factor), atol=0.1)
-    assert problem.lit(last.state) == [0]
+    assert problem.shining(last.state) == [0]
 
 
 @pytest.mark.parametrize("value", slow_but([0.0, 65504.0, 1e6, 1e30], 65504.0, 1e6))
@@ -881,7 +881,7 @@ def searched(image, transport, target):
     """Return the problem, the likeliest explanation, and its lights."""
     problem, params = problem_of(image, transport, target)
     found = search.search(problem, problem.state(params), 0.01)
-    return problem, found, problem.lit(found.run.state)
+    return problem, found, problem.shining(found.run.state)
 
 
 def degrees_off(problem, state, k, place):
@@ -948,7 +948,7 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
     problem, _, start, state = request.getfixturevalue(of)
     point, sigma = problem.evaluate(state), 0.1
     normal = problem.normal(point, start, sigma)
-    new = next(k for k in range(problem.layers.lights.count) if k not in problem.lit(state))
+    new = next(k for k in range(problem.layers.lights.count) if k not in problem.shining(state))
     found = light_places.Places(problem, point, normal).best(new)[0]
     d = latlong.directions(*GRID)
     row, column = np.unravel_index(np.argmax(d @ found.direction), GRID)

@@ -122,7 +122,7 @@ def moved(
     Better or None
         None where there is no such place.
     """
-    own = [k for k in problem.lit(start) if k < problem.layers.lights.own]
+    own = [k for k in problem.shining(start) if k < problem.layers.lights.own]
     if not own:
         return None
     flux = problem.layers.lights.flux

@@ -528,7 +528,7 @@ class Session:
             flux = self.placed.layers.lights.flux[i].tolist()
             own.append({"light": i + 1, "azimuth": azimuth, "elevation": elevation, "flux": flux})
         found, layers = [], self.problem.layers
-        for i in self.problem.lit(self.run.state):
+        for i in self.problem.shining(self.run.state):
             azimuth, elevation = angles(self.problem.direction(self.run.state, i))
             flux = layers.lights.flux[i] * np.exp(self.run.state["flux"][i])
             found.append({"azimuth": azimuth, "elevation": elevation, "flux": flux.tolist()})
@@ -557,7 +557,7 @@ class Session:
         """Say whose highlight or shadow a pixel shows, or where its light must go (:mod:`.picking`)."""
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
         shown = picking.lights(self.placed, self.document)
-        for k in [] if self._dragged else self.problem.lit(self.still):
+        for k in [] if self._dragged else self.problem.shining(self.still):
             i = picking.index_of(shown, self.problem.layers.lights.centres[k])
             if i is not None:  # where paint has put it
                 shown[i] = replace(shown[i], direction=self.problem.direction(self.run.state, k))

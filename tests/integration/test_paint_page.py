@@ -155,6 +155,28 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         assert not page.faults, page.faults
 
 
+def test_another_explanation_is_chosen(browser, tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    with served(tmp_path / "edit.toml") as server:
+        page = Page(browser, server.url)
+        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+        holder = page.page.get_by_test_id("explanations")
+        sync_api.expect(holder).to_be_hidden()
+        page.page.get_by_test_id("tool-erase-shadow").click()
+        page.drag(*(page.at("#overlay", 0.52 + 0.04 * k, 0.3) for k in range(5)))
+        sync_api.expect(page.page.get_by_test_id("explanation-1")).to_contain_text("%", timeout=120_000)
+        page.settled(False)
+        page.shot("explanations")
+        before = page.picture("map")
+        page.page.get_by_test_id("explanation-1").click()
+        sync_api.expect(page.page.get_by_test_id("explanation-1")).to_have_attribute("aria-pressed", "true")
+        sync_api.expect(page.status).to_have_attribute("data-state", "done", timeout=120_000)
+        assert page.picture("map") != before
+        page.page.get_by_test_id("undo").click()
+        sync_api.expect(holder).to_be_hidden(timeout=120_000)
+        assert not page.faults, page.faults
+
+
 def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
     (tmp_path / "edit.toml").write_text(SMALL)
     kept = tmp_path / "edit_out" / "painted.toml"

@@ -85,6 +85,30 @@ def test_advice_is_given_where_little_is_reached(painting):
     assert asked.reached(session.base) == pytest.approx(told["reaches"], abs=0.1), "it does something else"
 
 
+def test_other_explanations_are_shown_and_gone_on_from(painting):
+    session, heard = painting
+    reached = solved(painting, strokes=[ERASED])["reached"]
+    listed = heard.last["explanations"]["explanations"]
+    assert len(listed) > 1 and heard.last["explanations"]["chosen"] == 0
+    assert len({one["name"] for one in listed}) == len(listed)
+    first = {name: value.copy() for name, value in session.run.state.items()}
+
+    session.choose(1)
+    assert heard.last["explanations"]["chosen"] == 1
+    while session.advance():
+        pass
+    other = session.point.rendering
+    assert heard.last["status"]["reached"] != reached
+    assert np.abs(other - session.base).max() > 0.01
+
+    session.choose(0)  # as it was left
+    assert all(np.array_equal(session.run.state[name], first[name]) for name in first)
+    session.choose(len(listed))  # of what was painted before
+    assert heard.last["explanations"]["chosen"] == 0
+    solved(painting)
+    assert heard.last["explanations"]["explanations"] == []
+
+
 def test_a_shadow_is_dragged_by_its_tip(painting):
     session, heard = painting
 

@@ -25,7 +25,7 @@ MOST_BYTES = 1 << 20
 """Length of a message from the page."""
 MOST_STROKES, MOST_POINTS = 500, 20_000
 """Of a document: what is more would take seconds to paint."""
-KINDS = ("render", "map", "difference", "unreachable", "before")
+KINDS = ("render", "map", "difference", "unreachable", "before", "explanation")
 SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
@@ -152,11 +152,18 @@ class Open:
 
 
 @dataclass(frozen=True)
+class Choose:
+    """Go on from another explanation of the paint: its index in the last ``explanations`` message."""
+
+    explanation: int
+
+
+@dataclass(frozen=True)
 class Save:
     """Write the results."""
 
 
-def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
+def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | Save:
     """Read a message from the page.
 
     Raises
@@ -190,11 +197,13 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Open | Save:
             if not name:
                 raise BadMessageError("open: got no name, expected a scene or a configuration")
             return Open(name, envmap)
+        if kind == "choose":
+            return Choose(_count(found.get("explanation")))
     except WantedError as error:
         raise BadMessageError(f"{kind}: expected {error}") from None
     if kind == "save":
         return Save()
-    raise BadMessageError(f"type: got {show(kind)[:80]}, expected document, pick, open or save")
+    raise BadMessageError(f"type: got {show(kind)[:80]}, expected document, pick, choose, open or save")
 
 
 def _refused(name):

@@ -246,6 +246,7 @@ class Session:
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
         chosen, self.reach, self.searched, self.advised = self._chosen, None, False, False
+        self._explain([])
         self.hold = first_hold(chosen)
         painted = self._after(list(self.document.strokes), chosen.target.display_tonemap)
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
@@ -403,6 +404,36 @@ class Session:
             self.run, self.start = found.run, found.run.start
             self._rendered = None
         self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns
+        self._explain([replace(found, run=self.run, point=self.point), *found.others] if found.others else [])
+        self._show("transport")
+        self._tell_lights()
+        self.tell_state()
+
+    def _explain(self, explanations, chosen=0):
+        """Take explanations of the paint, of which one is shown, and tell the pages."""
+        self.explanations, self.explanation = explanations, chosen
+        listed = [
+            {"name": one.name, "reached": self._asked.reached(one.point.rendering)} for one in explanations
+        ]
+        self.tell.say({"type": "explanations", "chosen": chosen, "explanations": listed})
+        if explanations:
+            renderings = np.concatenate([one.point.rendering for one in explanations])
+            height = len(renderings) // len(explanations)
+            rows = tuple(slice(i * height, (i + 1) * height) for i in range(len(explanations)))
+            self.tell.frame("explanation", "transport", renderings, rows)
+
+    def choose(self, index: int) -> None:
+        """Go on from another explanation of the paint; that which is shown stays among them."""
+        if self._dragged or not 0 <= index < len(self.explanations):
+            return  # of what was painted before
+        explanations = list(self.explanations)
+        shown = explanations[self.explanation]
+        explanations[self.explanation] = replace(shown, run=self.run, point=self.point)
+        self.run = gauss_newton.Run(explanations[index].run.state, explanations[index].run.start)
+        self.start, self.point = self.run.start, self.problem.evaluate(self.run.state)
+        self._rendered, self.resting, self.advised = None, False, False
+        self.status = {"iterations": 0, **{name: self.status[name] for name in ("steps", "number", "client")}}
+        self._explain(explanations, index)
         self._show("transport")
         self._tell_lights()
         self.tell_state()
@@ -515,6 +546,7 @@ class Session:
         self.resting, self._shown = False, None
         self.tell.frame("before", "transport", self.before, self.lit.rows)
         self._tell_unreachable()
+        self._explain(self.explanations, self.explanation)
         self._show("transport")
         self._rendered = None
         self._tell_lights()

@@ -10,12 +10,12 @@ from pathlib import Path
 
 from envedit.cli import run
 from envedit.cli.paint import project
-from envedit.cli.paint.protocol import Edit, Open, Pick, Save
+from envedit.cli.paint.protocol import Choose, Edit, Open, Pick, Save
 from envedit.cli.paint.session import Session, SupersededError, Tell
 from envedit.core.errors import EnveditError, unwrapped
 from envedit.sweep import locks
 
-ORDER = (Open, Pick, Edit, Save)
+ORDER = (Open, Pick, Edit, Choose, Save)
 """Of requests that wait, which kind goes first: what is saved has all edits."""
 
 
@@ -104,7 +104,7 @@ class Worker(threading.Thread):
             self._open(project.opened(request.name, request.envmap))
             if before is not None:
                 with self._lock:  # what came meanwhile is about what was open before
-                    for kind in (Edit, Pick, Save):
+                    for kind in (Edit, Pick, Choose, Save):
                         self._waiting.pop(kind, None)
         elif self.session is None:
             if not isinstance(request, Again):
@@ -114,6 +114,8 @@ class Worker(threading.Thread):
                 self.session.update(request)
         elif isinstance(request, Pick):
             self.session.pick(request)
+        elif isinstance(request, Choose):
+            self.session.choose(request.explanation)
         elif isinstance(request, Save):
             self.tell.say({"type": "status", "state": "saving", "text": "saving"})
             try:

@@ -21,7 +21,7 @@ const log = []; // of edits and frames, for measurements
 window.envedit = { log, displays, advise };
 
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
-const frames = { render: [], map: [], difference: [], unreachable: [], before: [] }; // the last of each view
+const frames = { render: [], map: [], difference: [], unreachable: [], before: [], explanation: [] }; // the last of each view
 
 let view = 0, views = [], outlined = false;
 let client = "", painting = 0, sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
@@ -63,7 +63,8 @@ const connection = new Connection({
   lost() { state("error", "The server cannot be reached; trying again"); },
   frame(frame) {
     frames[frame.kind][frame.view] = frame;
-    if (frame.view === view || frame.kind === "map") show(frame);
+    if (frame.kind === "explanation") explanations[frame.view]?.show(frame);
+    else if (frame.view === view || frame.kind === "map") show(frame);
   },
   message(message) { RECEIVED[message.type]?.(message); },
 });
@@ -77,6 +78,24 @@ function show(frame) {
   if (frame.kind === "unreachable") $("unreachable").parentElement.hidden = !history.document.strokes.length;
   if (frame.kind !== "map") displays[frame.kind].canvas.style.setProperty("aspect-ratio", frame.width / frame.height);
   displays[frame.kind].show(frame);
+}
+
+// ---- explanations of the paint, of which one is shown
+
+let explanations = []; // their displays
+function explain(message) {
+  $("explanations").hidden = !message.explanations.length;
+  explanations = message.explanations.map(() => new Display(document.createElement("canvas"), "radiance", true));
+  $("explanations").replaceChildren(...message.explanations.map(({ name, reached }, i) => {
+    const button = document.createElement("button");
+    button.dataset.testid = `explanation-${i}`;
+    button.setAttribute("aria-pressed", String(i === message.chosen));
+    button.append(explanations[i].canvas, `${name}: ${percent(reached)}`);
+    button.addEventListener("click", () => connection.send({ type: "choose", explanation: i }));
+    explanations[i].set({ stops: Number($("exposure").value), curve: Number($("tonemap").value) });
+    if (frames.explanation[i]) explanations[i].show(frames.explanation[i]);
+    return button;
+  }));
 }
 
 // ---- views of the scene, one at a time
@@ -156,6 +175,7 @@ const RECEIVED = {
   },
   document(message) { history.follow({ ...EMPTY, ...message.document }, !message.client); refresh(); },
   lights(message) { lights.set(message); },
+  explanations(message) { explain(message); },
   status(message) {
     last = message;
     $("unreachable").classList.toggle("stale", message.reachable == null);
@@ -408,8 +428,7 @@ function outline() {
 
 function look(changed) {
   $("exposure-value").textContent = $("exposure").value;
-  displays.render.set(changed);
-  displays.map.set(changed);
+  for (const one of [displays.render, displays.map, ...explanations]) one.set(changed);
 }
 
 function save() {

@@ -14,7 +14,7 @@ from envedit.losses import optimizer
 from envedit.solve import adam_loop, checkpoint
 from envedit.solve.edit_state import EditState, Interrupted, Stopped
 
-RISEN = 2.0
+MOST_RISEN_LOSS = 2.0
 """Largest ratio of the last loss to the first where a user has raised Adam's rate. Measured on
 quickstart, four representations at rates of 0.1 to 1e38: it is 0.02 to 1.7, or the loss runs away, to 7 to
 1e6 times the first."""
@@ -142,7 +142,7 @@ def _ran_away(edit, objective, start, params, rows, bad_steps):
         return ""
     before, after = (_loss(edit, objective, one, rows, settings.iterations - 1) for one in (start, params))
     stuck = 2 * bad_steps >= settings.iterations and not after < before
-    if after <= RISEN * before and not stuck:
+    if after <= MOST_RISEN_LOSS * before and not stuck:
         return ""
     return (
         f"optimizer.lr = {settings.lr:g} is too high: the loss went from {before:.3g} to {after:.3g}, "

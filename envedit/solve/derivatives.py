@@ -18,7 +18,7 @@ from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.unknowns import Point, Unknowns
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
-ANGLE, WIDE = np.radians(0.7), np.radians(2.1)
+NARROW_ANGLE, WIDE_ANGLE = np.radians(0.7), np.radians(2.1)
 """Rotations of the finite difference by a light's direction: half a texel of a map of 256, and, where that
 leads no further, as much as the noise of single columns of T does not hide."""
 
@@ -67,7 +67,7 @@ class Derivatives:
         self.unknowns, self.transport, self.blocks = unknowns, transport, blocks
         self.layers = unknowns.layers
         self.rows, self.shape = self.layers.active, transport.shape
-        self.angle = ANGLE
+        self.angle = NARROW_ANGLE
         self._last: tuple[np.ndarray, float, Linearisation] | None = None
 
     def at(self, point: Point) -> Linearisation:

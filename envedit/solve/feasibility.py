@@ -42,13 +42,13 @@ PROBES = 8
 """Random pictures by which these samples are counted."""
 LINEARISATIONS, STEPS = 2, 40
 """How often the display curve is linearised, and steps of the solution each time."""
-FLOOR = 0.1
+METRIC_FLOOR = 0.1
 """Share of the mean that the metric takes every cell to have at least: what is dark can grow."""
-TOE = 1e-3
+LEAST_SLOPE_SPAN = 1e-3
 """Least difference of radiance over which the display curve's slope is taken: finite at black."""
-HALF = 0.5
+WARNED_SHARE = 0.5
 """Below this share :attr:`Reach.warning` warns."""
-FULL = 0.25
+FULL_COLOUR_DIFFERENCE = 0.25
 """Difference of display values that :func:`unreachable` shows in full colour."""
 
 
@@ -89,9 +89,9 @@ class Reach:
     @property
     def warning(self) -> str | None:
         """One sentence if less than half is within reach, else None."""
-        if self.share >= HALF:
+        if self.share >= WARNED_SHARE:
             return None
-        left = "brighter" if self.too_dark >= HALF else "darker"
+        left = "brighter" if self.too_dark >= WARNED_SHARE else "darker"
         without = "" if self.all_painted else f" without making pixels {left} that are held"
         return (
             f"only {_percent(self.share)} % of the painted change is feasible under any map: "
@@ -107,11 +107,11 @@ def unreachable(reach: Reach) -> np.ndarray:
     """Show the infeasible rest as display values (h, w, 3) in [0, 1].
 
     White: feasible. Red: stays darker than painted. Blue: stays brighter. Full colour is a difference of
-    :data:`FULL` in display values, whatever the request, so that pictures can be compared. Shown is the
-    channel that differs most.
+    :data:`FULL_COLOUR_DIFFERENCE` in display values, whatever the request, so that pictures can be compared.
+    Shown is the channel that differs most.
     """
     most = np.abs(reach.residual).argmax(axis=2)
-    signed = np.take_along_axis(reach.residual, most[..., None], axis=2)[..., 0] / FULL
+    signed = np.take_along_axis(reach.residual, most[..., None], axis=2)[..., 0] / FULL_COLOUR_DIFFERENCE
     red, blue = np.clip(signed, 0, 1), np.clip(-signed, 0, 1)
     return np.stack([1 - blue, 1 - np.maximum(red, blue), 1 - red], axis=2).astype(np.float32)
 
@@ -237,7 +237,7 @@ class _Request:
         """Slope (h, w, 3) of the display curve between a picture and the target."""
         low = np.clip(np.minimum(picture, self.target), 0, 1)
         # What is above 1 is shown as 1: the slope falls with the distance.
-        high = np.maximum(np.maximum(np.minimum(self.target, 1), picture), low + TOE)
+        high = np.maximum(np.maximum(np.minimum(self.target, 1), picture), low + LEAST_SLOPE_SPAN)
         rise = tonemap(high) - tonemap(low)
         slope, flat = rise / (high - low), (low >= 1) | (rise <= 0)
         return np.where(flat, 1 / 2.2, slope)
@@ -325,7 +325,7 @@ def _solution(transport, original, active, request):
         bright = (weight * np.maximum(light, aim)).sum(axis=(0, 1))
         mean = np.maximum(bright / np.maximum((weight * one).sum(axis=(0, 1)), 1e-30), 1e-12)
         # A single texel can grow by as much light as a cell.
-        y = x + FLOOR * np.stack([ones, mean * size.max() / size])
+        y = x + METRIC_FLOOR * np.stack([ones, mean * size.max() / size])
         metric = pulled(render(y)) / y
         seen = metric > 1e-9 * metric.max(axis=1, keepdims=True)
         step = np.where(seen, 1 / np.maximum(metric, 1e-300), 0)

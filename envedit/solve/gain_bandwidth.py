@@ -27,15 +27,15 @@ from envedit.transport.light_transport import LightTransport
 PROBES, FEW_PROBES = 12, 4
 """Random z; what is averaged over them, three patterns and the nodes of a patch is within a third. After the
 second number no more are drawn where the share is below half of what is asked for."""
-NOISE = 0.01
+KNOWN_DISPLAY_ERROR = 0.01
 """What a picture's display values are known to: its own noise and that of T together."""
-CONTRAST = 0.3
+DETAIL_LOG_GAIN = 0.3
 """Log gain of detail that would matter."""
-ENOUGH = 2.0
-"""The F of detail of that contrast at which it counts as half known, F^2 / (F^2 + ENOUGH^2)."""
+HALF_KNOWN_INFORMATION = 2.0
+"""The F of detail of that contrast at which it counts as half known: F_half of F^2 / (F^2 + F_half^2)."""
 FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
 """Shares of the sky's solid angle: below the first, no octave is returned; below the second, no further one.
-Whether detail is used is decided by :data:`.initialization.MIRRORED` (0.8)."""
+Whether detail is used is decided by :data:`.initialization.MIRRORED_SHARE` (0.8)."""
 
 
 def octaves(
@@ -71,7 +71,7 @@ def octaves(
         :data:`LEAST_SHARE`).
     """
     height, width, _ = background.shape
-    slope = display_curve.slope(picture) / NOISE
+    slope = display_curve.slope(picture) / KNOWN_DISPLAY_ERROR
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
@@ -88,8 +88,8 @@ def octaves(
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
             total += _alternating(*on_nodes)
             # Where nothing is identifiable, a product of two estimates may well be negative.
-            mean = np.maximum(_smooth(total / drawn), 0) * CONTRAST**2
-            known = mean**2 / (mean**2 + ENOUGH**2)
+            mean = np.maximum(_smooth(total / drawn), 0) * DETAIL_LOG_GAIN**2
+            known = mean**2 / (mean**2 + HALF_KNOWN_INFORMATION**2)
             share = float((known.mean(axis=1) * around).sum() / around.sum())
             if drawn >= FEW_PROBES and share < least / 2:
                 break

@@ -14,18 +14,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from envedit.core.errors import NumericalError
-from envedit.solve.derivatives import ANGLE, WIDE
+from envedit.solve.derivatives import NARROW_ANGLE, WIDE_ANGLE
 from envedit.solve.map_problem import SIGMA, Point, Posterior, Problem
 
-ITERATIONS, LITTLE = 16, 2e-3
+MOST_STEPS, LEAST_DECREASE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
-TRIES = 5
+DAMPINGS_TRIED = 5
 """Dampings that are tried in one step."""
 DAMPING_FACTOR = 10.0
 """By how much damping rises after a step that does not lower F, and falls after one that does (Marquardt)."""
 LEAST_DAMPING, RAISED_DAMPING = 1e-4, 1e-2
 """Least damping, and the least after a step that did not lower F."""
-NEAR, CLEARLY = 2.0, 0.95
+COMPARED_NOISE_RATIO, KEPT_ERROR_SHARE = 2.0, 0.95
 """Noise of the start over that of the solution up to which their renderings are compared, and the share of
 the start's squared error that the solution's must be below."""
 
@@ -62,7 +62,7 @@ class Run:
     scale: float = np.inf
     finished: bool = False
     history: list[dict] = field(default_factory=list)
-    most: int = ITERATIONS
+    most: int = MOST_STEPS
     hold: float = 1.0
     wide: bool = False
     corrected: bool = False
@@ -116,7 +116,7 @@ def solve(
     problem: Problem,
     params: dict,
     sigma: float = SIGMA,
-    iterations: int = 2 * ITERATIONS,
+    iterations: int = 2 * MOST_STEPS,
     after_step: Callable[[Run, Point], None] | None = None,
     run: Run | None = None,
     sparing: bool = True,
@@ -143,7 +143,7 @@ def solve(
         Stay at the start where steps lower the misfit by no more than noise would let them.
     judge : callable, optional
         Error of a map (H, W, 3) that is measured without T; used where the start is nearly as good as the
-        solution (:data:`NEAR`), as steps may then follow the errors of T.
+        solution (:data:`COMPARED_NOISE_RATIO`), as steps may then follow the errors of T.
 
     Raises
     ------
@@ -165,11 +165,13 @@ def solve(
         before = replace(run, state=start, start=start)
         first = problem.evaluate(start, resolve=False)
         loss = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined
-        near = problem.noise(first.residual, sigma) < NEAR * problem.noise(point.residual, sigma)
+        near = problem.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * problem.noise(
+            point.residual, sigma
+        )
         if _unlikeliness(problem, before, first, sigma) <= loss:
             note = "kept the initialisation: the better match of the rendering does not justify "
             note += f"{normal.determined:.0f} parameters (Akaike criterion)"
-        elif judge is not None and near and CLEARLY * judge(first.edited) <= judge(point.edited):
+        elif judge is not None and near and KEPT_ERROR_SHARE * judge(first.edited) <= judge(point.edited):
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
             run, normal = before, _normal(problem, before, first, sigma)
@@ -212,16 +214,16 @@ def _descended(problem, run, point, sigma, most, after_step):
         run.scale = min(run.scale, max(noise, halved))
 
         # ---- F linearised
-        problem.derivatives.angle = WIDE if run.wide else ANGLE
+        problem.derivatives.angle = WIDE_ANGLE if run.wide else NARROW_ANGLE
         normal = problem.normal(point, run.start, run.scale)
-        problem.derivatives.angle = ANGLE
+        problem.derivatives.angle = NARROW_ANGLE
 
         # ---- A step that lowers F
         point, before, better = _lower(problem, run, point, normal)
         loss = before if better is None else better.loss
 
         # ---- Whether it is the last one
-        little = better is None or before - loss < LITTLE * before
+        little = better is None or before - loss < LEAST_DECREASE * before
         ended = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
@@ -269,7 +271,7 @@ def _lower(problem, run, point, normal):
     been rendered anew: columns of T that were traced for a trial are not in what it is compared with.
     """
     before = problem.loss(point, run.start, run.scale)
-    for _ in range(TRIES):
+    for _ in range(DAMPINGS_TRIED):
         state = problem.step(run.state, normal, run.damping)
         there = None if state is None else problem.evaluate(state)
         if there is not None and there.residual is not None:

@@ -13,7 +13,7 @@ from envedit import config
 from envedit.core.color import tonemap
 from envedit.solve.likelihood import VISIBLE
 
-LEAST, MOST_AT_ONCE, MOST = 1.5, 16.0, 256.0
+LEAST_RAISE, LARGEST_RAISE, LARGEST_HOLD = 1.5, 16.0, 256.0
 """Least and largest factor by which the weight is raised at once; largest weight."""
 
 
@@ -38,15 +38,15 @@ def raised(hold: float, changed: float) -> float | None:
 
     Residuals count by their squares: the weight grows with the square of the change.
     """
-    if changed <= VISIBLE or hold >= MOST:
+    if changed <= VISIBLE or hold >= LARGEST_HOLD:
         return None
-    return min(MOST, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST, MOST_AT_ONCE)))
+    return min(LARGEST_HOLD, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST_RAISE, LARGEST_RAISE)))
 
 
 def said(weight: float, changed: float) -> str:
     """Say with which weight an edit ended; ``changed`` is the :func:`change` of what was not painted."""
     used = f"target.hold = {weight:.3g} was used"
-    if weight < MOST or changed <= VISIBLE:
+    if weight < LARGEST_HOLD or changed <= VISIBLE:
         return f"{used}: with less, pixels without paint would change visibly"
     return (
         f"{used}, the largest: pixels without paint still change by {changed:.2g} of a display value on "

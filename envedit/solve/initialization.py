@@ -23,9 +23,9 @@ from envedit.targets.target import Target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 
-AGAIN_SPP, AGAIN_COLUMNS = 32, 64
+SECOND_SPP, SECOND_COLUMNS = 32, 64
 """Most samples a pixel and exact columns of the second recording of T, which measures its noise."""
-MIRRORED = 0.8
+MIRRORED_SHARE = 0.8
 """Share of the sky whose detail must be identifiable, as in a mirror. In glossy scenes less is: there finer
 grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that no sky has."""
 
@@ -98,12 +98,12 @@ def recordings(
     fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
     if not fits or target.coverage is not None or settings.representation.cycles != "auto":
         return Recordings(transport)
-    pixels, few = lit.width * lit.height, min(AGAIN_SPP, transport.spp)
+    pixels, few = lit.width * lit.height, min(SECOND_SPP, transport.spp)
     second = trace(
         Seeds.of(settings.seed).second_recording,
         spp=few,
         max_depth=transport.bounces + 1,
-        memory_gb=recording.gigabytes(pixels, few, min(AGAIN_COLUMNS, transport.capacity) + 1),
+        memory_gb=recording.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),
         refresh=0,
     )
     asked = layers.separation.background, layers.rows, target.picture, target.weight
@@ -111,9 +111,9 @@ def recordings(
     shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in octaves)
     least = f"below {100 * gain_bandwidth.FIRST_SHARE:.0f} % at {2 * CYCLES} cycles"
     notes = [f"sky area with identifiable detail: {shares or least}"]
-    if octaves and octaves[0].share < MIRRORED:
+    if octaves and octaves[0].share < MIRRORED_SHARE:
         octaves = []
-        notes[0] += f"; gain limited to {CYCLES} cycles ({100 * MIRRORED:.0f} % needed)"
+        notes[0] += f"; gain limited to {CYCLES} cycles ({100 * MIRRORED_SHARE:.0f} % needed)"
     if octaves and traced and settings.renderer.spp == "auto":
         most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:

@@ -73,7 +73,7 @@ class LayersSolver:
                 problem.state(params),
                 self._sigma,
                 after_step,
-                most=edit.settings.optimizer.iterations if edit.newton else search.STEPS,
+                most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
         self.others = () if edit.rendered else explanation.others
         return explanation
@@ -197,7 +197,7 @@ class LayersSolver:
         if likelier is None:
             return None
         self._likelier.append(f"then likelier: {likelier.name} (-2 log evidence {likelier.score:.1f})")
-        return replace(likelier.run, most=len(likelier.run.history) + gauss_newton.ITERATIONS)
+        return replace(likelier.run, most=len(likelier.run.history) + gauss_newton.MOST_STEPS)
 
     def _corrected(self, solution):
         """Return a run that goes on towards the target without T's error; None where it need not."""
@@ -236,7 +236,7 @@ class LayersSolver:
         more = hold.further(self.edit.settings.target, run.hold, *self._without_paint(run))
         if more is None:
             return None
-        most = len(run.history) + gauss_newton.ITERATIONS
+        most = len(run.history) + gauss_newton.MOST_STEPS
         return self._hold(gauss_newton.Run(run.state, run.start, history=run.history, most=most, hold=more))
 
     def _without_paint(self, run):
@@ -272,7 +272,7 @@ class _Checkpoints:
 
     def after_step(self, run, point):
         edit, settings, done = self.edit, self.edit.settings.optimizer, len(run.history)
-        most = min(settings.iterations, gauss_newton.ITERATIONS)
+        most = min(settings.iterations, gauss_newton.MOST_STEPS)
         if done:
             edit.watch.progress(done, max(most, done), f"loss {run.history[-1]['loss']:.4g}")
         due = time.perf_counter() - self.saved >= settings.checkpoint_s

@@ -20,13 +20,13 @@ from envedit.representations.layers.lights import FAINTEST
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
 
-SPACINGS, REACH = (2, 1), (2, 1)
+PROBE_SPACINGS, PROBE_REACH = (2, 1), (2, 1)
 """Distances in texels of the exact columns around the best cell, and how many of them to each side."""
-CANDIDATES = 2
+PLACES_REFINED = 2
 """Best places of one light that are refined."""
-APART = np.cos(np.radians(15.0))
+PLACES_APART_COSINE = np.cos(np.radians(15.0))
 """Cosine of the angle between two places of a light that are different explanations."""
-LEAST_REST = 1e-4
+LEAST_UNEXPLAINED = 1e-4
 """Share of a light's squared picture that other unknowns must leave unexplained for it to be a candidate;
 by this share its channels are held to 0 where their strengths are found."""
 
@@ -59,7 +59,7 @@ class Places:
         self._model = _Model(problem, normal)
 
     def best(self, light: int) -> list[Place]:
-        """List the :data:`CANDIDATES` best places of a light, :data:`APART`.
+        """List the :data:`PLACES_REFINED` best places of a light, :data:`PLACES_APART_COSINE`.
 
         They are the best texels, through exact columns, around the best cells of the block transport.
         """
@@ -71,14 +71,14 @@ class Places:
         flux = flux / scale  # of any strength, in single precision
         strengths, falls = self._model.of_cells(flux)
         found: list[Place] = []
-        for _ in range(CANDIDATES):
+        for _ in range(PLACES_REFINED):
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
             place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
             place = self._refined(place, flux)
             found.append(replace(place, factor=place.factor / scale))
-            falls = np.where(directions @ directions[at] > APART, 0, falls)
+            falls = np.where(directions @ directions[at] > PLACES_APART_COSINE, 0, falls)
         return found
 
     def _refined(self, place, flux):
@@ -90,7 +90,7 @@ class Places:
         )
         row, column = (round(float(x)) for x in latlong.texel_position(place.direction, height, width))
         picture = None
-        for spacing, reach in zip(SPACINGS, REACH, strict=True):
+        for spacing, reach in zip(PROBE_SPACINGS, PROBE_REACH, strict=True):
             if transport.capacity < (2 * reach + 1) ** 2:
                 break  # memory leaves no exact columns to refine
             steps = spacing * np.arange(-reach, reach + 1)
@@ -146,7 +146,7 @@ class _Model:
         At least :data:`FAINTEST` of the strongest; those given, where they have no solution.
         """
         half, along, power = self._reduced(*self._products(np.float32(picture * np.eye(3)[:, None])))
-        rest = np.diag((1 + LEAST_REST) * power) - half.T @ half
+        rest = np.diag((1 + LEAST_UNEXPLAINED) * power) - half.T @ half
         try:
             found = np.linalg.solve(rest, along)
         except np.linalg.LinAlgError:
@@ -194,7 +194,7 @@ class _Model:
         """Return strengths and falls of single pictures."""
         half, along, power = self._reduced(*products)
         rest = power - np.square(half).sum(axis=0)
-        strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_REST * power)
+        strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_UNEXPLAINED * power)
         fall = np.maximum(strength, 0) * along
         finite = np.isfinite(strength) & np.isfinite(fall)
         return np.where(finite, strength, 0), np.where(finite, fall, 0)

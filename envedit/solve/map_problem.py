@@ -35,12 +35,12 @@ from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
-LARGEST = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
+LARGEST_STEP = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
 """Largest step of an unknown: beyond it the linear model does not hold."""
-SIZES, LOBE_SIZES = (-3.0, 1.5), (-3.0, 2.1)
+OWN_LOG_SIZES, LOBE_LOG_SIZES = (-3.0, 1.5), (-3.0, 2.1)
 """Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
 larger lobe would be seen."""
-SATURATIONS = (-3.0, 0.0)
+LOG_SATURATIONS = (-3.0, 0.0)
 """Logarithms of the sky's saturation that are looked for, from 5 % to the original's own: more would amplify
 what its colours have of noise."""
 
@@ -316,19 +316,19 @@ class Problem(Unknowns):
         if not np.isfinite(step).all():
             return None
         n, found = self.nodes, {name: value.copy() for name, value in state.items()}
-        found["gain"] += np.clip(step[: 3 * n], -LARGEST["gain"], LARGEST["gain"]).reshape(3, n).T
+        found["gain"] += np.clip(step[: 3 * n], -LARGEST_STEP["gain"], LARGEST_STEP["gain"]).reshape(3, n).T
         turns: dict[int, np.ndarray] = {}
         for value, (name, i, axis) in zip(step[3 * n :], normal.unknowns, strict=True):
             if name == "turn":
                 turns[i] = turns.get(i, 0.0) + value * axis
             else:
-                found[name][i, axis] += np.clip(value, -LARGEST[name], LARGEST[name])
+                found[name][i, axis] += np.clip(value, -LARGEST_STEP[name], LARGEST_STEP[name])
         own = self.layers.lights.own
-        found["saturation"] = np.clip(found["saturation"], *SATURATIONS)
-        found["size"][:own] = np.clip(found["size"][:own], *SIZES)
-        found["size"][own:] = np.clip(found["size"][own:], *LOBE_SIZES)
+        found["saturation"] = np.clip(found["saturation"], *LOG_SATURATIONS)
+        found["size"][:own] = np.clip(found["size"][:own], *OWN_LOG_SIZES)
+        found["size"][own:] = np.clip(found["size"][own:], *LOBE_LOG_SIZES)
         for i, turn in turns.items():
-            turn = turn * min(1.0, LARGEST["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
+            turn = turn * min(1.0, LARGEST_STEP["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
             there = self._in_sky(rotated(self.direction(state, i), turn), self.direction(state, i))
             found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
         return found
@@ -345,9 +345,9 @@ class Problem(Unknowns):
     def _within(self, step, now, damped, normal):
         """Return a step, solved anew for all else where it takes the saturation out of its bounds."""
         k = 3 * self.nodes + normal.unknowns.index(("saturation", 0, 0))
-        if SATURATIONS[0] <= now + step[k] <= SATURATIONS[1]:
+        if LOG_SATURATIONS[0] <= now + step[k] <= LOG_SATURATIONS[1]:
             return step
-        to = np.clip(now + step[k], *SATURATIONS) - now
+        to = np.clip(now + step[k], *LOG_SATURATIONS) - now
         rest = np.arange(len(step)) != k
         gradient = normal.gradient[rest] + damped[rest, k] * to
         step[rest] = -solved(np.linalg.cholesky(damped[np.ix_(rest, rest)]), gradient)

@@ -14,15 +14,15 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
 from envedit.losses import display_curve
-from envedit.solve.light_places import APART, CANDIDATES
+from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
 
-FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
+OWN_FLUX_FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
 """Fluxes that a light of the map is tried with elsewhere, over its own."""
-SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
+ADDED_FLUX_SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
 """Fluxes that an added light is tried with, as shares of the light in the picture."""
-SPACINGS = (2, 1)
+TRIAL_SPACINGS = (2, 1)
 """Distances in texels of the places that are tried around the best cell, one after the other."""
 
 
@@ -32,7 +32,8 @@ def best(
     """List where light ``k``, dark in a state, raises the likelihood most: direction, log flux (3,), -2 log.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
-    the best ones through exact columns. Places differ by :data:`.light_places.APART`, also from ``away``.
+    the best ones through exact columns. Places are :data:`.light_places.PLACES_APART_COSINE` apart, also from
+    ``away``.
     """
     lights, blocks, likelihood = problem.layers.lights, problem.blocks, problem.likelihood
     point = problem.evaluate(state, resolve=False)
@@ -51,13 +52,13 @@ def best(
     )
     factors, unlikeliness = seen.best(blocks.of_cells(flux), own)
     if away is not None:
-        unlikeliness = np.where(directions @ away > APART, np.inf, unlikeliness)
+        unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
     found = []
-    for _ in range(CANDIDATES):
+    for _ in range(PLACES_REFINED):
         at = int(np.argmin(unlikeliness))
         if not np.isfinite(unlikeliness[at]):
             break
-        unlikeliness = np.where(directions @ directions[at] > APART, np.inf, unlikeliness)
+        unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
         found.append(_refined(problem, point, flux, own, directions[at], sigma))
     return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in found]
 
@@ -76,7 +77,7 @@ def _refined(problem, point, flux, own, direction, sigma):
         share=likelihood.share.ravel(),
     )
     row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
-    for spacing in SPACINGS:
+    for spacing in TRIAL_SPACINGS:
         steps = spacing * np.arange(-1, 2)
         first = problem.rows.start
         rows = np.unique(np.clip(row + steps, first, first + problem.layers.shape[0] - 1))
@@ -114,7 +115,7 @@ class _Seen:
             light = self.before.mean() or max(float(self.target.mean()), 1e-30)
             mean = np.mean([dr.mean(one, axis=0).numpy() for one in pictures], axis=0)
             found = light / np.maximum(mean, 1e-30)
-        factors = np.float32(np.outer(FACTORS if own else SHARES, found))
+        factors = np.float32(np.outer(OWN_FLUX_FACTORS if own else ADDED_FLUX_SHARES, found))
         squares, means = self._sums(pictures, factors)
         count = 3 * self.likelihood.independent
         squares = squares / self.likelihood.area

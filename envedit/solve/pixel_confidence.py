@@ -13,15 +13,15 @@ import numpy as np
 from envedit.core.types import Views
 from envedit.losses.display_curve import to_display
 
-TRUSTED = 0.007
+HALF_TRUSTED_ERROR = 0.007
 """Standard error of display values, beyond what is usual in the picture, at which a pixel counts half."""
-AROUND = 2
+AVERAGED_PIXELS = 2
 """Pixels to each side over which noise is averaged: paths that have hit nothing give no estimate."""
-USUAL = 4.0
+NOISE_FLOOR_VARIANCES = 4.0
 """Noise floor, in multiples of the picture's median variance."""
-SHOWS_LIGHT = 3.0
+LIGHT_BRIGHTNESS = 3.0
 """Multiples of the target's median brightness from which on a noisy pixel shows a light itself."""
-LIT = 0.01
+LEAST_BRIGHTNESS = 0.01
 """Multiples of the target's mean brightness from which on a pixel counts in medians: not a black backdrop."""
 
 
@@ -52,26 +52,26 @@ def weights(
     Returns
     -------
     ndarray (h, w, 1) or None
-        s^2 / (s^2 + v), s = :data:`TRUSTED`, v the variance around a pixel beyond :data:`USUAL` times its
-        median, and 0 at those over or beside :data:`SHOWS_LIGHT`; medians are over pixels that are
-        :data:`LIT`. None where no pixel is below 1/2, or none that is lit is above 0.
+        s^2 / (s^2 + v), s = :data:`HALF_TRUSTED_ERROR`, v the variance around a pixel beyond
+        :data:`NOISE_FLOOR_VARIANCES` times its median, and 0 at those over or beside :data:`LIGHT_BRIGHTNESS`; medians are over pixels that are
+        :data:`LEAST_BRIGHTNESS`. None where no pixel is below 1/2, or none that is lit is above 0.
     """
     shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
     variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
     if noise is not None:
         variance += np.square(noise)
     views = views or (slice(None),)
-    around = np.concatenate([_windows(variance[rows], AROUND).mean(axis=(2, 3)) for rows in views])
+    around = np.concatenate([_windows(variance[rows], AVERAGED_PIXELS).mean(axis=(2, 3)) for rows in views])
     brightness = picture.max(axis=2)
-    lit = brightness > LIT * brightness.mean(dtype=np.float64)
+    lit = brightness > LEAST_BRIGHTNESS * brightness.mean(dtype=np.float64)
     if not lit.any():
         return None
-    beyond = np.maximum(around - USUAL * np.median(around[lit]), 0)
-    trust = TRUSTED**2 / (TRUSTED**2 + beyond)
+    beyond = np.maximum(around - NOISE_FLOOR_VARIANCES * np.median(around[lit]), 0)
+    trust = HALF_TRUSTED_ERROR**2 / (HALF_TRUSTED_ERROR**2 + beyond)
     if trust.min() >= 0.5:
         return None
     brightest = np.concatenate([_windows(brightness[rows], 1).max(axis=(2, 3)) for rows in views])
-    shows_light = (brightest >= SHOWS_LIGHT * np.median(brightness[lit])) & (beyond > 0)
+    shows_light = (brightest >= LIGHT_BRIGHTNESS * np.median(brightness[lit])) & (beyond > 0)
     trust = np.where(shows_light, 0, trust)
     return trust[..., None].astype(np.float32) if trust[lit].any() else None
 

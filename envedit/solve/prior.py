@@ -44,13 +44,13 @@ PHOTOGRAPHED = (
     SkyDifference(whole=0.076, gradient=0.016, falloff=1.6),
 )
 """Along luminance, blue-amber and green-magenta; nine maps (``python -m experiments natural.skies run``)."""
-FACTOR = 0.25
+LEAST_WHOLE_FREEDOM = 0.25
 """Least freedom of one factor for the whole sky: photographs differ in exposure as their makers chose it."""
 LEAST_FREEDOM = 0.01
 """Freedom that 0 stands for: a gain that is the same everywhere, to a hundredth of how skies differ."""
-FIXED = 1e6
+FIXED_PRECISION = 1e6
 """Precision of grids that do not take part: their nodes stay at 0."""
-NUGGET = 1e-6
+OWN_VARIANCE_SHARE = 1e-6
 """Share of the variance at a node that is its own, so that nodes at one place differ."""
 
 
@@ -96,7 +96,7 @@ class Prior:
     added_size: float = 1.0
     saturation: float = 1.0
     freedom: float | None = None
-    factor: float = FACTOR
+    factor: float = LEAST_WHOLE_FREEDOM
 
     def gain_precisions(self, gain: GridGain, ground: bool = False) -> np.ndarray:
         """Return the inverse covariance of the nodes' log gain along luminance, chroma and tint: (3, n, n).
@@ -123,9 +123,9 @@ class Prior:
         found = np.zeros((3, last + ground, last + ground))
         for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
             covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM), self.factor)
-            covariance[np.diag_indices_from(covariance)] *= 1 + NUGGET
+            covariance[np.diag_indices_from(covariance)] *= 1 + OWN_VARIANCE_SHARE
             precision[first:last, first:last] = np.linalg.inv(covariance)
-            precision[np.arange(first), np.arange(first)] = FIXED
+            precision[np.arange(first), np.arange(first)] = FIXED_PRECISION
             precision[last:, last:] = (self.factor * skies.whole) ** -2.0
         return found
 
@@ -150,5 +150,5 @@ def of_paint(freedom: float, coverage: np.ndarray | None = None) -> Prior:
         How much each pixel was painted; None: nothing was.
     """
     painted = 0.0 if coverage is None else float(coverage.mean(dtype=np.float64))
-    factor = max(FACTOR, freedom, painted)
+    factor = max(LEAST_WHOLE_FREEDOM, freedom, painted)
     return Prior(tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3, freedom=freedom, factor=factor)

@@ -9,7 +9,7 @@ number, -2 log evidence in Laplace's approximation (MacKay 1992),
 
 with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2. What an unknown
 gains in misfit it pays for by how far it is determined beyond its prior. The best explanation is kept if its
-number is lower by :data:`POSITIVE`, and the search goes on from there.
+number is lower by :data:`POSITIVE_EVIDENCE`, and the search goes on from there.
 
 Under a rendered target all of the sky may have changed: where a light promises most is asked beside what the
 sky can do (``light_places.py``). Of paint lights come first: it is asked under the sky of the original.
@@ -27,21 +27,21 @@ from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
 from envedit.solve.likelihood import INDEPENDENT
-from envedit.solve.map_problem import LARGEST, SIGMA, Problem
+from envedit.solve.map_problem import LARGEST_STEP, SIGMA, Problem
 from envedit.solve.unknowns import Point
 
 MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"
-POSITIVE = 2.0
+POSITIVE_EVIDENCE = 2.0
 """By how much -2 log evidence must be lower for another explanation: "positive" evidence by Kass and Raftery
 (1995), below which it is "not worth more than a bare mention"."""
-LIGHT = 2 * np.log(20.0)
+ADDED_LIGHT_COST = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
-STEPS = 5
+EXPLANATION_STEPS = 5
 """Most Gauss-Newton steps after which explanations are compared."""
-OTHERS = 3
+MOST_OTHERS = 3
 """Most explanations that are kept beside the likeliest."""
-FADED, FAINT = -1.0, 6 * INDEPENDENT * np.log(1.1)
+FADED_LOG_FLUX, FADED_LIGHT_COST = -1.0, 6 * INDEPENDENT * np.log(1.1)
 """Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
 rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
 SOFT_DEGREES = 2.0
@@ -100,7 +100,7 @@ def search(
     start: dict,
     sigma: float = SIGMA,
     after_step: Callable[[], None] | None = None,
-    most: int = STEPS,
+    most: int = EXPLANATION_STEPS,
 ) -> Explanation:
     """Find the likeliest explanation.
 
@@ -117,7 +117,7 @@ def search(
     most : int
         Most Gauss-Newton steps after which explanations are compared.
     """
-    steps = min(most, STEPS)
+    steps = min(most, EXPLANATION_STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     seen: list[Explanation] = [best]
@@ -149,13 +149,13 @@ def further(
     point = problem.evaluate(run.state, resolve=False)
     best = Explanation({}, run, point, score(problem, run, point, sigma))
     promising = [move for move in _moves(problem, best, sigma) if move.gain > 0]
-    return _likelier(best, _neighbours(problem, best, promising, sigma, after_step, STEPS, {}))
+    return _likelier(best, _neighbours(problem, best, promising, sigma, after_step, EXPLANATION_STEPS, {}))
 
 
 def _likelier(best, found):
     """Return the likeliest of some explanations if it is likelier than the best so far, else None."""
     likeliest = min([best, *found], key=lambda one: one.score)
-    return likeliest if likeliest.score < best.score - POSITIVE else None
+    return likeliest if likeliest.score < best.score - POSITIVE_EVIDENCE else None
 
 
 def _others(best, seen):
@@ -164,7 +164,7 @@ def _others(best, seen):
     for one in sorted(seen, key=lambda one: one.score):
         if one.name != best.name and np.isfinite(one.score):
             others.setdefault(one.name, one)
-    return tuple(others.values())[:OTHERS]
+    return tuple(others.values())[:MOST_OTHERS]
 
 
 def _unfollowed(problem, best, sigma):
@@ -187,9 +187,9 @@ def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
 
 
 def of_light(problem: Problem) -> float:
-    """Return what an added light costs, :data:`LIGHT`; of a rendering, also that it could be in any cell."""
+    """Return what an added light costs; of a rendering, also that it could be in any cell."""
     _, directions = problem.blocks.sky
-    return LIGHT + 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
+    return ADDED_LIGHT_COST + 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
 
 
 def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -> float:
@@ -202,14 +202,14 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     likelihood = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
     found = float(likelihood + known - expected + of_light(problem) * len(problem.added(run.state)))
     if problem.likelihood.robust:
-        found += FAINT * len(_faded(problem, run.state))
+        found += FADED_LIGHT_COST * len(_faded(problem, run.state))
     return found if np.isfinite(found) else np.inf
 
 
 def _faded(problem, state):
     """List the map's own lights that have faded."""
     own = problem.layers.lights.own
-    return [k for k in problem.shining(state) if k < own and state["flux"][k].mean() < FADED]
+    return [k for k in problem.shining(state) if k < own and state["flux"][k].mean() < FADED_LOG_FLUX]
 
 
 def _descended(problem, done, run, sigma, steps):
@@ -246,13 +246,13 @@ def _beside_the_sky(problem, best, sigma):
         # With the columns of T that the dark sky was rendered with.
         stays = places.fall(problem.evaluate(state, resolve=False).rendering)
         # ---- out
-        worth = LIGHT if own else of_light(problem)
+        worth = ADDED_LIGHT_COST if own else of_light(problem)
         if k in _faded(problem, state):
-            worth = FAINT
+            worth = FADED_LIGHT_COST
         yield _Move(k, REMOVED, dark, start, gain=worth - stays)
         # ---- elsewhere: farther than a step goes
         for there in places.best(k):
-            if there.direction @ problem.direction(state, k) > np.cos(LARGEST["turn"]):
+            if there.direction @ problem.direction(state, k) > np.cos(LARGEST_STEP["turn"]):
                 continue
             turn = rotation_vector(lights.centres[k], there.direction)
             flux = start["flux"][k] if own else np.log(there.factor)
@@ -266,7 +266,7 @@ def _beside_the_sky(problem, best, sigma):
         for there in places.best(k) if places else []:
             turn, flux = rotation_vector(lights.centres[k], there.direction), np.log(there.factor)
             more, centre = (_changed(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
-            yield _Move(k, ADDED, more, centre, gain=there.fall - LIGHT)
+            yield _Move(k, ADDED, more, centre, gain=there.fall - ADDED_LIGHT_COST)
 
 
 def _places(problem, state, start, sigma):
@@ -316,7 +316,7 @@ def _changes(problem, state, start, sigma):
             yield k, SOFTENED, soft, centre, _unlikeliness(problem, soft, sigma), 0.0
         # ---- out, if it was added
         if not own:
-            yield k, REMOVED, dark, start, _unlikeliness(problem, dark, sigma), -LIGHT
+            yield k, REMOVED, dark, start, _unlikeliness(problem, dark, sigma), -ADDED_LIGHT_COST
 
     # ---- one more
     size = lights.log_size(LOBE_DEGREES if lights.own else SOFT_DEGREES)
@@ -325,7 +325,7 @@ def _changes(problem, state, start, sigma):
             turn = rotation_vector(lights.centres[k], direction)
             more = _changed(state, k, turn=turn, flux=flux, size=size)
             centre = _changed(start, k, turn=turn, flux=flux, size=size)
-            yield k, ADDED, more, centre, unlikeliness, LIGHT
+            yield k, ADDED, more, centre, unlikeliness, ADDED_LIGHT_COST
 
 
 def _changed(state, k, **values):

@@ -18,15 +18,15 @@ from envedit.core.arrays import tensor
 from envedit.losses import display_curve
 from envedit.transport.light_transport import LightTransport
 
-CANDIDATES, APART, SURE = 3, 4, 0.5
+TURNS_RENDERED, TURNS_APART_TEXELS, SURE_SHARE = 3, 4, 0.5
 """Turns that are rendered, by how many texels they differ at least, and the share of the residual below which
 the first leaves no doubt."""
-LITTLE, BEYOND = 0.8, 2.0
+LEAST_EXPLAINED, BLOCK_ERROR_FACTOR = 0.8, 2.0
 """A turn explains nothing where the best one leaves more than the first share of the block residual, and
 more than so many times the block transport's own error."""
-FINEST = 0.02
+FINEST_TEXELS = 0.02
 """Finest turn in texels."""
-WHOLE = 3.0
+WHOLE_TEXEL_DEVIATIONS = 3.0
 """A turn by whole texels is preferred up to so many standard errors of the turn's fraction of a texel: texels
 keep their bits then."""
 
@@ -81,7 +81,7 @@ def find(
         How much each pixel counts.
     thorough : bool
         Render turns in any case; otherwise only where the block transport shows that a turn explains
-        something (:data:`LITTLE`, :data:`BEYOND`), and no turn is found elsewhere.
+        something (:data:`LEAST_EXPLAINED`, :data:`BLOCK_ERROR_FACTOR`), and no turn is found elsewhere.
     """
     width = envmap.shape[1]
     rendering = render(envmap, 0)
@@ -89,23 +89,23 @@ def find(
 
     # ---- Turns by whole texels, through the block transport
     misfit, least = _at_a_glance(transport, envmap, picture, weight, rendering)
-    explains = misfit.min() <= max(LITTLE**2 * misfit[0], BEYOND**2 * least)
+    explains = misfit.min() <= max(LEAST_EXPLAINED**2 * misfit[0], BLOCK_ERROR_FACTOR**2 * least)
     if not (thorough or explains):
         return Turn(0.0, known[0.0], known[0.0])
     best: list[int] = []
     for shift in np.argsort(misfit, kind="stable"):
         apart_by = [min(abs(shift - other), width - abs(shift - other)) for other in best]
-        if len(best) < CANDIDATES and (not apart_by or min(apart_by) >= APART):
+        if len(best) < TURNS_RENDERED and (not apart_by or min(apart_by) >= TURNS_APART_TEXELS):
             best.append(int(shift))
 
     # ---- The best of them rendered, and refined
     def error(texels):
-        texels = round(texels % width / FINEST) * FINEST % width
+        texels = round(texels % width / FINEST_TEXELS) * FINEST_TEXELS % width
         if texels not in known:
             known[texels] = apart(render(latlong.rotate(envmap, 360 * texels / width), 0), picture, weight)
         return known[texels]
 
-    sure = error(best[0]) < SURE * known[0.0]
+    sure = error(best[0]) < SURE_SHARE * known[0.0]
     texels: float = best[0] if sure else min(best, key=error)
     for step in (2.0,) if sure else (4.0, 2.0):
         texels = min((texels, texels - step, texels + step), key=error)
@@ -119,8 +119,8 @@ def find(
         if part > 0:
             break
     part = min(max(part, 0.0), 1.0)
-    texels += side * (part if abs(part - round(part)) > WHOLE * deviation else round(part))
-    texels = round(texels / FINEST) * FINEST % width
+    texels += side * (part if abs(part - round(part)) > WHOLE_TEXEL_DEVIATIONS * deviation else round(part))
+    texels = round(texels / FINEST_TEXELS) * FINEST_TEXELS % width
     blocks = np.inf
     if least < misfit[0] < np.inf:
         blocks = float(np.sqrt(max(misfit.min() - least, 0) / (misfit[0] - least)))

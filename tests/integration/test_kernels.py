@@ -76,7 +76,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
         return normal(problem, *arguments, **options)
 
     monkeypatch.setattr(map_problem.Problem, "normal", counted)
-    monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # some steps more
+    monkeypatch.setattr(gauss_newton, "LEAST_DECREASE", 1e-9)  # some steps more
     # What is between steps has kernels of its own.
     monkeypatch.setattr(layers_solver.LayersSolver, "_corrected", lambda *_: None)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -617,7 +617,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
     if name == "a sun of 1e6":
         picture[2, 5] = 1e6
     tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
-    monkeypatch.setattr(gauss_newton, "NEAR", 0)  # a solution that is no better stays, too
+    monkeypatch.setattr(gauss_newton, "COMPARED_NOISE_RATIO", 0)  # a solution that is no better stays, too
     settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     steps = len(whole.history)
@@ -627,7 +627,7 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path,
 
     folder = tmp_path / "run"
     folder.mkdir()
-    tried = min(steps, search.STEPS)  # from where the best explanation goes on
+    tried = min(steps, search.EXPLANATION_STEPS)  # from where the best explanation goes on
     for step in sorted({tried, max(tried, steps // 2), steps}):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
             pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))

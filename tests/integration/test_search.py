@@ -84,7 +84,7 @@ def found_for(problem, start):
     assert found.point.residual is not None and np.isfinite(found.score)
     names = [found.name, *(one.name for one in found.others)]
     scores = [one.score for one in found.others]
-    assert len(set(names)) == len(names) <= 1 + search.OTHERS and scores == sorted(scores)
+    assert len(set(names)) == len(names) <= 1 + search.MOST_OTHERS and scores == sorted(scores)
     assert found.others or not calls
     return found, {k: problem.direction(state, k) for k in problem.shining(state)}, before, len(calls)
 
@@ -100,7 +100,7 @@ def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transpor
     found, lights, before, tried = found_for(problem, start)
     assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[place]) < 5
     assert found.name == "light 1 moved" and tried >= 1
-    assert found.score < before - search.POSITIVE
+    assert found.score < before - search.POSITIVE_EVIDENCE
     assert np.exp(found.run.state["flux"][0]) == pytest.approx(np.ones(3), rel=0.35)
     # The prior is around where it was put.
     assert degrees(problem.direction(found.run.start, 0), DIRECTIONS[place]) < 8
@@ -135,7 +135,7 @@ def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     found, lights, before, _ = found_for(problem, start)
     assert found.name == "light added" and [*lights] == [0, problem.layers.lights.own]
     assert degrees(lights[1], DIRECTIONS[place]) < 8 and degrees(lights[0], DIRECTIONS[SUN]) < 8
-    assert found.score < before - search.POSITIVE
+    assert found.score < before - search.POSITIVE_EVIDENCE
     off = problem.likelihood.mean(found.point.residual) * VISIBLE
     assert np.abs(off).max() < 2 * VISIBLE
 

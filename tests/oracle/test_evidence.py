@@ -87,7 +87,7 @@ def test_a_light_that_was_added_costs_what_it_says(rng):
     for state in (start, with_light):
         scores.append(search.score(problem, Run(state, state), problem.evaluate(state), SIGMA))
     assert problem.added(with_light) == [spare]
-    assert scores[1] - scores[0] == pytest.approx(search.LIGHT, abs=0.05)
+    assert scores[1] - scores[0] == pytest.approx(search.ADDED_LIGHT_COST, abs=0.05)
     assert np.isfinite(before)
 
 

@@ -206,7 +206,7 @@ def test_white_is_any_value_above(dense, envmap, white):
 def test_colours_show_sign_and_size():
     residual = np.zeros((1, 4, 3), np.float32)
     residual[0, 1] = [0.1, -0.05, 0]
-    residual[0, 2] = -feasibility.FULL / 2
+    residual[0, 2] = -feasibility.FULL_COLOUR_DIFFERENCE / 2
     residual[0, 3] = 1
     shown = feasibility.unreachable(feasibility.Reach(0.5, residual, residual, residual))
     np.testing.assert_allclose(shown[0], [[1, 1, 1], [1, 0.6, 0.6], [0.5, 0.5, 1], [1, 0, 0]], atol=1e-6)

@@ -18,7 +18,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
 from envedit.solve import checkpoint, gauss_newton, light_places, map_problem, search
 from envedit.solve.adam_loop import State
-from envedit.solve.derivatives import ANGLE
+from envedit.solve.derivatives import NARROW_ANGLE
 from envedit.solve.gauss_newton import Run, solve
 from envedit.solve.likelihood import INDEPENDENT, Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
@@ -113,7 +113,7 @@ def moved_case(likelihood):
 
 # ---- derivatives -------------------------------------------------------------------------------------------
 
-STEPS = {"gain": 0.01, "flux": 0.01, "turn": ANGLE, "size": 0.002, "saturation": 0.02}
+STEPS = {"gain": 0.01, "flux": 0.01, "turn": NARROW_ANGLE, "size": 0.002, "saturation": 0.02}
 # Display values are good to 1e-7, differences of F over a step to 1e-4 of its slope. A light's direction is
 # differentiated over 0.7 degrees, a twentieth of a texel, and its size forwards, over 10 %.
 CLOSE = {"gain": 2e-3, "flux": 2e-3, "turn": 0.05, "size": 0.2}
@@ -416,7 +416,9 @@ def test_penalty_of_a_light(case):
 
 def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     """A grey sky so dark that display values are linear, and asked to change by a thousandth."""
-    monkeypatch.setattr(gauss_newton, "LITTLE", 1e-9)  # damped steps come close only one after the other
+    monkeypatch.setattr(
+        gauss_newton, "LEAST_DECREASE", 1e-9
+    )  # damped steps come close only one after the other
     level, sigma = 4e-4, 1e-3
     slope = 1e-3 ** (1 / 2.2) / 1e-3
     transport = DenseTransport.random(rng, FILM, GRID)
@@ -572,7 +574,7 @@ def test_a_change_that_layers_can_make_is_found(rng):
     start = problem.evaluate(problem.state(params))
     assert np.abs(last.residual).mean() < 0.05 * np.abs(start.residual).mean()
     assert problem.direction(last.state, 0) @ end > np.cos(np.radians(1.0))
-    assert 3 <= len(solution.history) <= gauss_newton.ITERATIONS
+    assert 3 <= len(solution.history) <= gauss_newton.MOST_STEPS
 
 
 def test_scale_is_that_of_the_residual_and_falls_by_half_at_most(case):
@@ -634,7 +636,7 @@ def test_no_step_is_longer_than_its_limit(case):
     normal = problem.normal(problem.evaluate(state), start, 0.01)
     far = dataclasses.replace(normal, gradient=1e6 * normal.gradient)
     found = problem.step(state, far, 1e-3)
-    largest = map_problem.LARGEST
+    largest = map_problem.LARGEST_STEP
     for name in ("gain", "flux", "size"):
         change = np.abs(found[name] - state[name])
         assert 0.99 * largest[name] < change.max() <= largest[name] * (1 + 1e-9), name
@@ -677,7 +679,7 @@ def test_of_a_rendering_the_step_is_marquardts(case, damping):
     damped = normal.hessian + damping * np.diag(np.diag(normal.hessian))
     expected = -np.linalg.solve(damped, normal.gradient)[:n]
     gain = (problem.step(state, normal, damping)["gain"] - state["gain"]).T.ravel()
-    assert np.abs(expected).max() < map_problem.LARGEST["gain"]
+    assert np.abs(expected).max() < map_problem.LARGEST_STEP["gain"]
     np.testing.assert_allclose(gain, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
     if not damping:
         np.testing.assert_allclose(gain, marquardt(normal, 0.0)[:n], rtol=0, atol=1e-6 * np.abs(gain).max())
@@ -1000,7 +1002,7 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
     of_channels = np.block(
         [
             [normal.hessian, np.array(columns).T],
-            [np.array(columns), np.diag(own) * (1 + light_places.LEAST_REST)],
+            [np.array(columns), np.diag(own) * (1 + light_places.LEAST_UNEXPLAINED)],
         ]
     )
     pulls = [(pulled * one).sum() + by_mean_of(one) for one in apart]

@@ -39,7 +39,7 @@ def test_the_turn_is_found(texels, traced, rng):
     degrees = 360 * texels / GRID[1]
     found = found_of(traced, image, rendered(traced, latlong.rotate(image, degrees)))
     off = abs(found.degrees - degrees) % 360
-    assert min(off, 360 - off) <= 1.01 * 360 / GRID[1] * turning.FINEST
+    assert min(off, 360 - off) <= 1.01 * 360 / GRID[1] * turning.FINEST_TEXELS
     assert found.error < 0.003 and (found.left < 0.2 or texels in (0.0, 63.9))
 
 

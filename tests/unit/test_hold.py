@@ -38,7 +38,7 @@ def test_the_weight_has_an_end_whatever_the_picture():
     while (more := hold.raised(weight, 1e6)) is not None:
         assert more > weight
         weight, rounds = more, rounds + 1
-    assert weight == hold.MOST and rounds <= 3
+    assert weight == hold.LARGEST_HOLD and rounds <= 3
     assert hold.raised(1.0, 0.0) is None
 
 
@@ -62,7 +62,11 @@ def test_only_a_weight_that_the_user_left_open_is_raised_where_the_rest_keeps_it
 
 @pytest.mark.parametrize(
     ("weight", "changed", "words"),
-    [(4.0, 0.01, "with less"), (hold.MOST, 0.01, "with less"), (hold.MOST, 0.05, "still change by 0.05")],
+    [
+        (4.0, 0.01, "with less"),
+        (hold.LARGEST_HOLD, 0.01, "with less"),
+        (hold.LARGEST_HOLD, 0.05, "still change by 0.05"),
+    ],
 )
 def test_what_even_the_largest_weight_does_not_hold_is_said(weight, changed, words):
     assert words in hold.said(weight, changed)

@@ -5,7 +5,7 @@ import pytest
 
 from envedit.representations.layers.gain import GridGain
 from envedit.solve import prior
-from envedit.solve.prior import AXES, DEGREES, FACTOR, PHOTOGRAPHED, Prior
+from envedit.solve.prior import AXES, DEGREES, LEAST_WHOLE_FREEDOM, PHOTOGRAPHED, Prior
 
 UPPER = GridGain(12, 0.5)
 FIRST = sum(rows * columns for rows, columns in UPPER.sizes[:-1])
@@ -18,7 +18,7 @@ def finest(freedom, gain=UPPER):
 
 def whole(skies, freedom):
     """The deviation of one factor for the whole sky."""
-    return max(freedom, FACTOR) * skies.whole
+    return max(freedom, LEAST_WHOLE_FREEDOM) * skies.whole
 
 
 def series(skies, cosine, freedom):
@@ -35,9 +35,9 @@ def series(skies, cosine, freedom):
 def test_covariance_is_the_series_of_legendre_polynomials(skies, freedom):
     cosines = np.array([-1.0, -0.3, 0.0, 0.5, 0.99, 1.0])
     expected = [series(skies, cosine, freedom) for cosine in cosines]
-    factor = max(freedom, FACTOR)
+    factor = max(freedom, LEAST_WHOLE_FREEDOM)
     np.testing.assert_allclose(skies.covariance(cosines, freedom, factor), expected, rtol=1e-10)
-    assert skies.covariance(cosines, 0.0, FACTOR) == pytest.approx(whole(skies, 0.0) ** 2)
+    assert skies.covariance(cosines, 0.0, LEAST_WHOLE_FREEDOM) == pytest.approx(whole(skies, 0.0) ** 2)
 
 
 @pytest.mark.parametrize("freedom", [0.01, 0.25, 1.0])
@@ -93,7 +93,7 @@ def test_coarser_grids_stay_where_the_finest_has_all_and_ground_changes_as_a_sky
     found = prior.of_paint(0.25).gain_precisions(UPPER, ground=True)
     assert found.shape == (3, *(2 * [FIRST + len(UPPER.directions(2)) + 1]))
     for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
-        np.testing.assert_array_equal(precision[:FIRST, :FIRST], prior.FIXED * np.eye(FIRST))
+        np.testing.assert_array_equal(precision[:FIRST, :FIRST], prior.FIXED_PRECISION * np.eye(FIRST))
         assert not precision[:FIRST, FIRST:].any() and not precision[-1, :-1].any()
         assert precision[-1, -1] == pytest.approx(whole(skies, 0.25) ** -2)
 

@@ -14,7 +14,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.losses import metrics
 from envedit.representations.layers.lights import DARK
 from envedit.solve import painted_places
-from envedit.solve.feasibility import HALF, Reach
+from envedit.solve.feasibility import WARNED_SHARE, Reach
 from envedit.solve.map_problem import SIGMA, Problem
 
 
@@ -56,7 +56,7 @@ def said(
     strokes : sequence of ndarray (h, w, 1)
         Coverage of each stroke by itself.
     """
-    if painted.reached(rendering) >= HALF:
+    if painted.reached(rendering) >= WARNED_SHARE:
         return ""
     # ---- Which stroke, and how
     left = np.float64(tonemap(painted.target)) - tonemap(rendering)
@@ -72,9 +72,9 @@ def said(
     # ---- Why, and what reaches more
     if document.rest == "keep":
         return f"{which}: the rest, which stays, keeps it so; try “follows”"
-    if reach.share < HALF:
+    if reach.share < WARNED_SHARE:
         return f"{which}: no light makes it {wanted} and leaves the mean of the rest; paint less"
-    if document.freedom < HALF:
+    if document.freedom < WARNED_SHARE:
         return f"{which}: lights alone do not make it {wanted}; let the sky change more"
     return f"{which}: what would make it {wanted} is unlikely for a sky; move or add a light"
 

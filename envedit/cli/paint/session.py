@@ -376,7 +376,7 @@ class Session:
     @property
     def converged(self) -> bool:
         """Whether no further step is made towards what is painted."""
-        return not self.solving or self.run.finished or len(self.run.history) >= gauss_newton.ITERATIONS
+        return not self.solving or self.run.finished or len(self.run.history) >= gauss_newton.MOST_STEPS
 
     def _step(self):
         began = time.perf_counter()
@@ -400,7 +400,7 @@ class Session:
         now = search.score(self.problem, self.run, self.point, map_problem.SIGMA)
         found = search.search(self.problem, self.still, after_step=self._unless_newer)
         self.searched = True
-        if found.score < now - search.POSITIVE:
+        if found.score < now - search.POSITIVE_EVIDENCE:
             self.run, self.start = found.run, found.run.start
             self._rendered = None
         self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns

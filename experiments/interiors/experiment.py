@@ -13,7 +13,8 @@ from envedit.core import latlong
 from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, edit_panels, make, number
+from experiments.harness import Case, Done, Experiment, edit_panels, make
+from experiments.summary import values
 
 WIDTH = 256
 LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
@@ -27,16 +28,15 @@ ROOMS = {
 LAMP_DEGREES, LAMP_RADIANCE = 3.0, 300.0
 STAYED, FAINT = 3.0, 0.25
 """Degrees up to which a light is where a lamp is, and share of a lamp's flux below which it is none."""
-PAINT = [
-    {
-        "type": "light",
-        "ellipse": [0.38, 0.32, 0.1, 0.08],
-        "amount": 0.3,
-        "color": "#ffd9a6",
-        "softness": 0.05,
-    },
-    {"type": "shadow", "ellipse": [0.68, 0.82, 0.15, 0.06], "amount": 0.4, "softness": 0.05},
-]
+WARM = {
+    "type": "light",
+    "ellipse": [0.38, 0.32, 0.1, 0.08],
+    "amount": 0.3,
+    "color": "#ffd9a6",
+    "softness": 0.05,
+}
+DARK = {"type": "shadow", "ellipse": [0.68, 0.82, 0.15, 0.06], "amount": 0.4, "softness": 0.05}
+PAINT = [WARM, DARK]
 """A warm light on the sphere, and a shadow on the ground."""
 
 
@@ -102,28 +102,25 @@ def lamps_found(about: dict, after: list[dict]) -> str:
 
 def measure(done: Done) -> dict:
     lights = json.loads((done.folder / "lights.json").read_bytes())
-    found, painted = done.metrics, done.metrics["painted"]
-    turn = found["turn_degrees"]
-    gone = sum(one["removed"] for one in lights["before"])
-    new = sum(one["added"] for one in lights["after"])
-    both = [one for one in lights["after"] if not one["added"]]
-    moved = 0 if turn else sum(one["moved_degrees"] > STAYED for one in both)
-    return {
-        "render": found["render"]["psnr"],
-        "initial": found["initial"]["psnr"],
-        "psnr": found["envmap"]["psnr"] if found["envmap"] else None,
-        "unedited": found["initial_envmap"]["psnr"] if found["envmap"] else None,
-        "towards": painted["towards"] if painted else None,
-        "reachable": painted["reachable"] if painted else None,
-        "turn": turn,
-        "lights": len(lights["before"]),
-        "moved": moved,
-        "gone": gone,
-        "new": new,
-        "lamps": lamps_found(done.case.about, lights["after"]),
-        "outside": found["natural"]["colours_outside"],
-        "seam": found["natural"]["seam"],
-    }
+    numbers = done.metrics
+    stayed = [one for one in lights["after"] if not one["added"]]
+    turn = numbers["turn_degrees"]
+    return values(
+        (numbers["painted"] or {"towards": None, "reachable": None})
+        | numbers["natural"]
+        | {
+            "render": numbers["render"]["psnr"],
+            "initial": numbers["initial"]["psnr"],
+            "psnr": (numbers["envmap"] or {}).get("psnr"),
+            "unedited": (numbers.get("initial_envmap") or {}).get("psnr"),
+            "turn": turn,
+            "lights": len(lights["before"]),
+            "moved": 0 if turn else sum(one["moved_degrees"] > STAYED for one in stayed),
+            "gone": sum(one["removed"] for one in lights["before"]),
+            "new": sum(one["added"] for one in lights["after"]),
+            "lamps": lamps_found(done.case.about, lights["after"]),
+        }
+    )
 
 
 def panels(done: Done):
@@ -132,10 +129,6 @@ def panels(done: Done):
     if done.maps[2] is None:  # painted: what it was painted on
         shown[1] = tonemap(done.picture("render_initial"), "gamma")
     return shown
-
-
-def share(value):
-    return "-" if value is None else f"{100 * value:.0f} %"
 
 
 EXPERIMENT = Experiment(
@@ -147,14 +140,14 @@ EXPERIMENT = Experiment(
         "map": "{map}",
         "target": "{label}",
         "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
-        "map (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['unedited'])})",
-        "of the paint (feasible)": lambda m: f"{share(m['towards'])} ({share(m['reachable'])})",
-        "turn, degrees": lambda m: number(m["turn"]),
+        "map (unedited), dB": "{psnr:.1f} ({unedited:.1f})",
+        "of the paint (feasible)": "{towards:.0%} ({reachable:.0%})",
+        "turn, degrees": "{turn:.1f}",
         "lights": "{lights}",
         "moved, gone, new": "{moved}, {gone}, {new}",
         "lamps where they are in truth": "{lamps}",
-        "colours outside": lambda m: share(m["outside"]),
-        "seam": lambda m: number(m["seam"]),
+        "colours outside": "{colours_outside:.0%}",
+        "seam": "{seam:.1f}",
     },
     panels=panels,
     sheet=lambda case: "sheet.jpg",

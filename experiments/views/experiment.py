@@ -12,6 +12,7 @@ import numpy as np
 from envedit.core import latlong
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, layer
+from experiments.summary import Summary
 
 SCENE = str(Path(__file__).parent / "two.xml")
 MATERIALS = {
@@ -25,24 +26,18 @@ SENSORS = {"front": ["front"], "behind": ["behind"], "both": "all"}
 
 def cases(given):
     maps = {"sunsky": "sunsky"} | {name: str(file) for name, file in puresky.find().items() if name in MAPS}
-    return [
-        Case(
-            f"{material}-{name}-{sensors}".replace(" ", "-"),
-            {
-                "input": {"envmap": maps[name], "width": 128},
-                "scene": {
-                    "file": SCENE,
-                    "width": 96,
-                    "sensors": SENSORS[sensors],
-                    "parameters": MATERIALS[material],
-                },
-                "target": {"rotate_degrees": 140.0},
-                "representation": {"turn": False},
-            },
-            {"ball": material, "map": name, "views": sensors},
-        )
-        for material, name, sensors in itertools.product(MATERIALS, maps, SENSORS)
-    ]
+    found = []
+    for material, name, sensors in itertools.product(MATERIALS, maps, SENSORS):
+        scene = {"file": SCENE, "width": 96, "sensors": SENSORS[sensors], "parameters": MATERIALS[material]}
+        tables = {
+            "input": {"envmap": maps[name], "width": 128},
+            "scene": scene,
+            "target": {"rotate_degrees": 140.0},
+            "representation": {"turn": False},
+        }
+        about = {"ball": material, "map": name, "views": sensors}
+        found.append(Case(f"{material}-{name}-{sensors}".replace(" ", "-"), tables, about))
+    return found
 
 
 def measure(done: Done) -> dict:
@@ -53,22 +48,6 @@ def measure(done: Done) -> dict:
         "psnr": done.metrics["envmap"]["psnr"],
         "deviation": float((deviation * omega).sum()),
     }
-
-
-def summary(rows) -> str:
-    """Compare both views with the mean of one, where all three are done."""
-    of = {(m["ball"], m["map"], m["views"]): np.array([m["psnr"], m["deviation"]]) for m in rows}
-    balls = dict.fromkeys((m["ball"], m["map"]) for m in rows)
-    whole = [key for key in balls if all((*key, views) in of for views in SENSORS)]
-    if not whole:
-        return "both views and each alone are not done for any ball and map"
-    gains = [of[*key, "both"] - (of[*key, "front"] + of[*key, "behind"]) / 2 for key in whole]
-    better, less = np.transpose(gains)
-    return (
-        f"Both views against the mean of one: map {better.mean():+.1f} dB (median {np.median(better):+.1f}, "
-        f"worst {better.min():+.1f}), deviation {less.mean():+.3f} (worst {less.max():+.3f}); "
-        f"{len(gains)} cases."
-    )
 
 
 EXPERIMENT = Experiment(
@@ -84,5 +63,12 @@ EXPERIMENT = Experiment(
         "map, dB": "{psnr:.1f}",
         "deviation": "{deviation:.3f}",
     },
-    summary=summary,
+    summary=Summary(
+        {"views": "{views}"},
+        {
+            "runs": "{runs}",
+            "map, dB (worst)": "{psnr.mean:.1f} ({psnr.min:.1f})",
+            "deviation (largest)": "{deviation.mean:.3f} ({deviation.max:.3f})",
+        },
+    ),
 )

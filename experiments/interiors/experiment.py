@@ -63,15 +63,15 @@ def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
     return envmap.astype(np.float32)
 
 
-def cases(given):
+def cases(args):
     data = puresky.data("hdri/NAME_1k.hdr", how="CONTRIBUTING.md lists the maps")
-    folder = make(given.out / "maps").absolute()
+    folder = make(args.out / "maps").absolute()
     rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
     for name, file in rooms.items():
         if not file.exists():
             images.write_exr(file, room(ROOMS[name]))
     maps = {file.stem.removesuffix("_1k"): file for file in sorted((data / "hdri").glob("*_1k.hdr"))}
-    found = []
+    made = []
     for name, file in (maps | {"room": rooms["as it is"]}).items():
         targets = {"60": {"rotate_degrees": 60}, "painted": {"kind": "strokes", "strokes": PAINT}}
         if name == "room":
@@ -84,8 +84,8 @@ def cases(given):
             }
             if "file" in target:
                 tables["representation"] = {"turn": False}
-            found.append(Case(f"{name}-{label}".replace(" ", "_"), tables, {"map": name, "label": label}))
-    return found
+            made.append(Case(f"{name}-{label}".replace(" ", "_"), tables, {"map": name, "label": label}))
+    return made
 
 
 def lamps_found(about: dict, after: list[dict]) -> str:

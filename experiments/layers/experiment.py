@@ -19,7 +19,7 @@ NAMES = {"layers": "layers", "siren": "R-SIREN"}
 SCENES = {"sphere": {"file": "sphere", "parameters": {"roughness": 0.3}}, "statue": {"file": "statue"}}
 
 
-def cases(given):
+def cases(args):
     return [
         Case(
             f"{kind}-{scene}-{angle}-{name}",

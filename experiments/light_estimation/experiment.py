@@ -28,9 +28,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=COUNT, help="so many maps (%(default)s)")
 
 
-def cases(given):
-    files, found = list(puresky.find().items()), []
-    for i in range(0, len(files), max(1, len(files) // max(given.count, 1))):
+def cases(args):
+    files = list(puresky.find().items())
+    made = []
+    for i in range(0, len(files), max(1, len(files) // max(args.count, 1))):
         name, file = files[i]
         other, other_file = files[(i + len(files) // 2) % len(files)]
         tables = {
@@ -38,14 +39,14 @@ def cases(given):
             "scene": {"file": "sphere"},
             "target": {"file": str(other_file)},
         }
-        found.append(Case(f"{name}-{other}", tables, {"map": name, "other": other}))
-    return found[: given.count]
+        made.append(Case(f"{name}-{other}", tables, {"map": name, "other": other}))
+    return made[: args.count]
 
 
 def pictures(envmap: np.ndarray) -> dict[str, np.ndarray]:
     """Render every sphere under a map (H, W, 3) of linear radiance."""
-    lit = protocol.tonemapped(envmap)
-    return {name: protocol.render(sphere, lit) for name, sphere in protocol.SPHERES.items()}
+    tonemapped = protocol.tonemapped(envmap)
+    return {name: protocol.render(sphere, tonemapped) for name, sphere in protocol.SPHERES.items()}
 
 
 def measure(done: Done) -> list[dict]:
@@ -55,7 +56,7 @@ def measure(done: Done) -> list[dict]:
     true_lights = light_list.listed(separate(true), np.eye(3))
     expected = pictures(true)
     rows = []
-    for kind, envmap, found in (("edited", edited, "after"), ("unedited", original, "before")):
+    for kind, envmap, when in (("edited", edited, "after"), ("unedited", original, "before")):
         about = {"kind": kind, "rendering": done.metrics["render"]["psnr"]}
         for sphere, picture in pictures(envmap).items():
             errors = protocol.compared(picture, expected[sphere])
@@ -63,7 +64,7 @@ def measure(done: Done) -> list[dict]:
         stops = np.abs(protocol.irradiance_error(envmap, true))
         measures = {
             "peak": protocol.peak_error(envmap, true),
-            "lights": protocol.lights_error(lights[found], true_lights),
+            "lights": protocol.lights_error(lights[when], true_lights),
             "stops": float(stops.mean()),
             "worst": float(stops.max()),
         }
@@ -127,8 +128,8 @@ COLUMNS = {
 
 def panels(done: Done):
     """Return each sphere under the unedited, the edited and the true map."""
-    three = [pictures(envmap) for envmap in done.maps]
-    return [protocol.display(lit[name]) for name in protocol.SPHERES for lit in three]
+    of_maps = [pictures(envmap) for envmap in done.maps]
+    return [protocol.display(spheres[name]) for name in protocol.SPHERES for spheres in of_maps]
 
 
 EXPERIMENT = Experiment(

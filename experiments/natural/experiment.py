@@ -7,7 +7,6 @@ maps. With a turn of the sky allowed and without.
 
 import hashlib
 import itertools
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,18 +36,21 @@ def options(parser):
     parser.add_argument("--count", type=int, help="so many cases, evenly from all kinds of them")
 
 
-def cases(given):
+def cases(args):
     skies = {name: str(file) for name, file in puresky.find().items()}
-    names, data = sorted(skies), puresky.data()
+    names = sorted(skies)
+    data = puresky.data()
     ground = {file.stem.removesuffix("_1k"): str(file) for file in sorted((data / "hdri").glob("*_1k.hdr"))}
-    analytic = {e: str(given.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
-    make(given.out / "maps")
+    analytic = {e: str(args.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
+    make(args.out / "maps")
     for elevation, file in analytic.items():
         if not Path(file).exists():
             images.write_exr(file, analytic_sky.sunsky(WIDTH, 90.0, elevation))
     maps = skies | ground | {"sunsky": analytic[ELEVATION]}
-    found, turns = [], ("auto", False)
-    for scene, (i, (name, source)), turn in itertools.product(SCENES, enumerate(maps.items()), turns):
+    made = []
+    for scene, (i, (name, source)), turn in itertools.product(
+        SCENES, enumerate(maps.items()), ("auto", False)
+    ):
         targets = [(str(angle), "turned", {"rotate_degrees": angle}) for angle in ANGLES]
         if name == "sunsky":
             targets += [(f"elevation_{e}", "elevation", {"file": analytic[e]}) for e in ELEVATIONS]
@@ -68,25 +70,25 @@ def cases(given):
                 "representation": {"turn": turn},
             }
             about = {"scene": scene, "map": name, "label": label, "kind": kind, "turn": word}
-            found.append(Case(f"{scene}-{name}-{label}-turn_{word}", configuration, about))
-    return picked(found, given, ("kind", "turn", "scene"))
+            made.append(Case(f"{scene}-{name}-{label}-turn_{word}", configuration, about))
+    return picked(made, args)
 
 
-def picked(found: list[Case], given, about: Sequence[str]) -> list[Case]:
+def picked(made: list[Case], args) -> list[Case]:
     """Return the cases that ``--only`` names; with ``--count``, so many of them, evenly from all kinds.
 
-    Kinds differ in ``about``. The order is always the same.
+    A kind is a kind of target, with a turn or without, in one scene. The order is always the same.
     """
-    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
-    if given.count is None:
-        return found
+    made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
+    if args.count is None:
+        return made
     strata: dict[tuple, list[Case]] = {}
-    for case in sorted(found, key=lambda c: _digest(c.name)):
-        strata.setdefault(tuple(case.about[key] for key in about), []).append(case)
+    for case in sorted(made, key=lambda c: _digest(c.name)):
+        strata.setdefault(tuple(case.about[key] for key in ("kind", "turn", "scene")), []).append(case)
     # Neighbours in a round differ in all of what distinguishes their kinds.
     keys = sorted(strata, key=lambda key: _digest(str(key)))
     rounds = itertools.zip_longest(*(strata[key] for key in keys))
-    return [case for some in rounds for case in some if case is not None][: given.count]
+    return [case for some in rounds for case in some if case is not None][: args.count]
 
 
 def _digest(text):

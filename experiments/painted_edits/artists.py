@@ -41,7 +41,7 @@ def options(parser):
     parser.add_argument("--count", type=int, help="so many cases, evenly from all edits")
 
 
-def cases(given):
+def cases(args):
     data, maps = puresky.data(), puresky.find()
     files = {
         "matpreview": {
@@ -51,7 +51,7 @@ def cases(given):
         "mesh": {"file": "mesh", "parameters": {"mesh": str(data / "meshes" / "spot.obj")}},
     }
     turns = {"matpreview": {"rotate_degrees": MATPREVIEW_TURN}}
-    found = []
+    made = []
     for edit, scene, name in itertools.product(PAINTERS, SCENES, filter(maps.__contains__, MAPS)):
         if name in SHADOWLESS and edit in SHADOWS:
             continue
@@ -61,12 +61,12 @@ def cases(given):
         }
         about = {"edit": edit, "scene": scene, "map": name}
         function = "experiments.painted_edits.artists:carry_out"
-        found.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), function, tables, about, edit=edit))
-    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
-    return found if given.count is None else evenly(found, given.count)
+        made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), function, tables, about, edit=edit))
+    made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
+    return made if args.count is None else evenly(made, args.count)
 
 
-def evenly(found: list[Case], count: int) -> list[Case]:
+def evenly(made: list[Case], count: int) -> list[Case]:
     """Pick cases of all edits in the same number; scene and map change from one edit to the next."""
 
     def late(case):
@@ -74,7 +74,7 @@ def evenly(found: list[Case], count: int) -> list[Case]:
         i = list(PAINTERS).index(edit)
         return (MAPS.index(name) - i) % len(MAPS), (SCENES.index(scene) - i) % len(SCENES)
 
-    of_edits = [sorted((c for c in found if c.about["edit"] == edit), key=late) for edit in PAINTERS]
+    of_edits = [sorted((c for c in made if c.about["edit"] == edit), key=late) for edit in PAINTERS]
     rounds = itertools.zip_longest(*of_edits)
     return [case for some in rounds for case in some if case is not None][:count]
 

@@ -34,18 +34,18 @@ def file_of(name: str) -> str | None:
     return str(file) if file else None
 
 
-def cases(given):
+def cases(args):
     maps = {name: file_of(name) for name in MAPS}
     for name in [name for name in maps if not maps[name]]:
         print(f"{name}: skipped, ENVEDIT_DATA has no puresky/{name}_puresky_1k.hdr", file=sys.stderr)
         maps.pop(name)
-    found = []
+    made = []
     for edit, name in itertools.product(EDITS, maps):
         tables = tomllib.loads((FOLDER / f"{edit}.toml").read_text(encoding="utf-8"))
         tables.pop("output", None)
         tables = overridden(tables, [f"input.envmap={maps[name]}"])
-        found.append(Case(f"{edit}-{name}", tables, {"edit": edit, "map": name}))
-    return found
+        made.append(Case(f"{edit}-{name}", tables, {"edit": edit, "map": name}))
+    return made
 
 
 def explanation(notes: list[str]) -> str:

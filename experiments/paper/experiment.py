@@ -59,18 +59,18 @@ def options(parser):
     parser.add_argument("--all-maps", action="store_true", help="where the paper has one map")
 
 
-def maps_of(given) -> dict[str, Path]:
+def maps_of(args) -> dict[str, Path]:
     """Return the maps of a table by name."""
-    found = puresky.find()
-    if KINDS[given.name].several or given.all_maps:
-        return found
-    name = DEFAULT if DEFAULT in found else next(iter(found))
-    return {name: found[name]}
+    maps = puresky.find()
+    if KINDS[args.name].several or args.all_maps:
+        return maps
+    name = DEFAULT if DEFAULT in maps else next(iter(maps))
+    return {name: maps[name]}
 
 
-def cases(given):
-    kind, maps = KINDS[given.name], maps_of(given)
-    found = []
+def cases(args):
+    kind, maps = KINDS[args.name], maps_of(args)
+    made = []
     # Maps last: what shares a fit is then many jobs apart, and finds it on disk also with several workers.
     for settings, roughness, row, sky in itertools.product(
         ("paper", "ours"), kind.roughness, kind.rows, maps
@@ -85,10 +85,10 @@ def cases(given):
             "output": {"report": False, "full": False},
             "renderer": {"cache": False},  # every run pays for its transport, whichever comes first
         }
-        about = {"table": given.name, "settings": settings, "row": row, "map": sky, "roughness": roughness}
+        about = {"table": args.name, "settings": settings, "row": row, "map": sky, "roughness": roughness}
         name = f"{settings}-{row}-{sky}" + ("" if roughness is None else f"-{roughness:.1f}")
-        found.append(Case(name, presets.overlaid(METHODS[row].under(settings), question), about))
-    return found
+        made.append(Case(name, presets.overlaid(METHODS[row].under(settings), question), about))
+    return made
 
 
 # ---- Tables ------------------------------------------------------------------------------------------------
@@ -174,5 +174,5 @@ EXPERIMENT = Experiment(
     combine=averages,
     sheet=lambda case: "{table}-{settings}-{roughness}".format(**case.about).removesuffix("-None"),
     options=options,
-    file=lambda given: given.name,
+    file=lambda args: args.name,
 )

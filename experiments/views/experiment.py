@@ -24,9 +24,9 @@ MAPS = "autumn_field", "mud_road", "syferfontein_18d_clear"
 SENSORS = {"front": ["front"], "behind": ["behind"], "both": "all"}
 
 
-def cases(given):
+def cases(args):
     maps = {"sunsky": "sunsky"} | {name: str(file) for name, file in puresky.find().items() if name in MAPS}
-    found = []
+    made = []
     for material, name, sensors in itertools.product(MATERIALS, maps, SENSORS):
         scene = {"file": SCENE, "width": 96, "sensors": SENSORS[sensors], "parameters": MATERIALS[material]}
         tables = {
@@ -36,8 +36,8 @@ def cases(given):
             "representation": {"turn": False},
         }
         about = {"ball": material, "map": name, "views": sensors}
-        found.append(Case(f"{material}-{name}-{sensors}".replace(" ", "-"), tables, about))
-    return found
+        made.append(Case(f"{material}-{name}-{sensors}".replace(" ", "-"), tables, about))
+    return made
 
 
 def measure(done: Done) -> dict:

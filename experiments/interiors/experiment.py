@@ -102,18 +102,12 @@ def lamps_found(about: dict, after: list[dict]) -> str:
 
 def measure(done: Done) -> dict:
     lights = json.loads((done.folder / "lights.json").read_bytes())
-    numbers = done.metrics
     stayed = [one for one in lights["after"] if not one["added"]]
-    turn = numbers["turn_degrees"]
+    turn = done.metrics["turn_degrees"]
     return values(
-        (numbers["painted"] or {"towards": None, "reachable": None})
-        | numbers["natural"]
+        {"initial_envmap": None}  # of a painted target there is none
+        | done.metrics
         | {
-            "render": numbers["render"]["psnr"],
-            "initial": numbers["initial"]["psnr"],
-            "psnr": (numbers["envmap"] or {}).get("psnr"),
-            "unedited": (numbers.get("initial_envmap") or {}).get("psnr"),
-            "turn": turn,
             "lights": len(lights["before"]),
             "moved": 0 if turn else sum(one["moved_degrees"] > STAYED for one in stayed),
             "gone": sum(one["removed"] for one in lights["before"]),
@@ -139,15 +133,15 @@ EXPERIMENT = Experiment(
     {
         "map": "{map}",
         "target": "{label}",
-        "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
-        "map (unedited), dB": "{psnr:.1f} ({unedited:.1f})",
-        "of the paint (feasible)": "{towards:.0%} ({reachable:.0%})",
-        "turn, degrees": "{turn:.1f}",
+        "rendering (unedited), dB": "{render[psnr]:.1f} ({initial[psnr]:.1f})",
+        "map (unedited), dB": "{envmap[psnr]:.1f} ({initial_envmap[psnr]:.1f})",
+        "of the paint (feasible)": "{painted[towards]:.0%} ({painted[reachable]:.0%})",
+        "turn, degrees": "{turn_degrees:.1f}",
         "lights": "{lights}",
         "moved, gone, new": "{moved}, {gone}, {new}",
         "lamps where they are in truth": "{lamps}",
-        "colours outside": "{colours_outside:.0%}",
-        "seam": "{seam:.1f}",
+        "colours outside": "{natural[colours_outside]:.0%}",
+        "seam": "{natural[seam]:.1f}",
     },
     panels=panels,
     sheet=lambda case: "sheet.jpg",

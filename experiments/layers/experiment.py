@@ -38,12 +38,12 @@ def cases(args):
 
 
 def measure(done: Done) -> dict:
-    """Return metrics; peak of the original, flux of the light over the true one's, high frequencies.
+    """Return metrics; whether the map is sunny, flux of the light over the true one's, high frequencies.
 
     High frequencies: metrics.high_frequency_energy (log luminance less its 5 x 5 binomial blur) over the
     original's, and the same of the true map, which a turn by part of a texel changes; active rows all.
     """
-    numbers, rows = done.metrics, done.rows
+    rows = done.rows
     original, edited, true = done.maps
     directions = latlong.directions(*true.shape[:2])[rows]
     omega = latlong.solid_angles(*true.shape[:2])[rows, None]
@@ -52,23 +52,15 @@ def measure(done: Done) -> dict:
     flux = [float((luminance(m[rows]) * omega)[near].sum()) for m in (edited, true)]
     sharp = [metrics.high_frequency_energy(m[rows]) for m in (edited, original, true)]
     sunny = float(luminance(original[rows]).max()) > SUNNY
-    unedited = {f"unedited_{key}": value for key, value in numbers["initial_envmap"].items()}
     return values(
-        unedited
+        done.metrics
         | {
             "sunny": " (sunny)" * sunny,
-            "render": numbers["render"]["psnr"],
-            "render_ssim": numbers["render"]["ssim"],
-            "initial": numbers["initial"]["psnr"],
-            "psnr": numbers["envmap"]["psnr"],
-            "ssim": numbers["envmap"]["ssim"],
-            "gain": numbers["envmap"]["psnr"] - numbers["initial_envmap"]["psnr"],
-            "lpips": numbers["envmap"]["lpips"],
-            "off": numbers["sun_offset_texels"] if sunny else None,
+            "gain": done.metrics["envmap"]["psnr"] - done.metrics["initial_envmap"]["psnr"],
+            "off": done.metrics["sun_offset_texels"] if sunny else None,
             "flux": flux[0] / flux[1] if sunny else None,
             "sharp": sharp[0] / sharp[1],
             "true_sharp": sharp[2] / sharp[1],
-            "seconds": numbers["timing"]["total_s"],
         }
     )
 
@@ -83,31 +75,31 @@ STATISTICS = Summary(
     {"": "{kind}", "maps": "{of}"},
     {
         "runs": "{runs}",
-        "rendering PSNR (worst)": "{render.mean:.1f} ({render.min:.1f})",
-        "SSIM": "{render_ssim.mean:.3f}",
-        "map PSNR": "{psnr.mean:.1f}",
+        "rendering PSNR (worst)": "{render[psnr].mean:.1f} ({render[psnr].min:.1f})",
+        "SSIM": "{render[ssim].mean:.3f}",
+        "map PSNR": "{envmap[psnr].mean:.1f}",
         "gain (worst)": "{gain.mean:+.1f} ({gain.min:+.1f})",
-        "map SSIM": "{ssim.mean:.3f}",
-        "LPIPS (worst)": "{lpips.mean:.4f} ({lpips.max:.3f})",
+        "map SSIM": "{envmap[ssim].mean:.3f}",
+        "LPIPS (worst)": "{envmap[lpips].mean:.4f} ({envmap[lpips].max:.3f})",
         "light off, texels, at most": "{off.max:.1f}",
         "flux": "{flux.min:.2f} to {flux.max:.2f}",
         "high frequencies": "{sharp.min:.2f} to {sharp.max:.2f}",
-        "s, median": "{seconds.median:.0f}",
+        "s, median": "{timing[total_s].median:.0f}",
     },
 )
 COLUMNS = {
     "map": "{map}{sunny}",
     "": "{kind}",
-    "rendering PSNR (unedited)": "{render:.1f} ({initial:.1f})",
-    "SSIM": "{render_ssim:.3f}",
-    "map PSNR (unedited)": "{psnr:.1f} ({unedited_psnr:.1f})",
+    "rendering PSNR (unedited)": "{render[psnr]:.1f} ({initial[psnr]:.1f})",
+    "SSIM": "{render[ssim]:.3f}",
+    "map PSNR (unedited)": "{envmap[psnr]:.1f} ({initial_envmap[psnr]:.1f})",
     "gain": "{gain:+.1f}",
-    "SSIM (unedited)": "{ssim:.3f} ({unedited_ssim:.3f})",
-    "LPIPS (unedited)": "{lpips:.4f} ({unedited_lpips:.3f})",
+    "SSIM (unedited)": "{envmap[ssim]:.3f} ({initial_envmap[ssim]:.3f})",
+    "LPIPS (unedited)": "{envmap[lpips]:.4f} ({initial_envmap[lpips]:.3f})",
     "light off, texels": "{off:.1f}",
     "flux": "{flux:.2f}",
     "high frequencies (true map)": "{sharp:.2f} ({true_sharp:.2f})",
-    "s": "{seconds:.0f}",
+    "s": "{timing[total_s]:.0f}",
 }
 
 

@@ -110,19 +110,16 @@ def gained(done: Done, part: slice) -> float | None:
 
 def measure(done: Done) -> dict:
     """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
-    metrics = done.metrics
     original, edited, true = done.maps
     return values(
-        metrics["natural"]
+        done.metrics
+        | done.metrics["natural"]
         | {
-            "render": metrics["render"]["psnr"],
-            "initial": metrics["initial"]["psnr"],
             "psnr": psnr(edited, true),
             "unedited": psnr(original, true),
             "gain": gained(done, slice(None)),
             "upper": gained(done, slice(0, WIDTH // 4)),
             "lower": gained(done, slice(WIDTH // 4, None)),
-            "off": metrics.get("sun_offset_texels"),
         }
     )
 
@@ -132,17 +129,17 @@ COLUMNS = {
     "map": "{map}",
     "target": "{label}",
     "turn": "{turn}",
-    "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
+    "rendering (unedited), dB": "{render[psnr]:.1f} ({initial[psnr]:.1f})",
     "map (unedited), dB": "{psnr:.1f} ({unedited:.1f})",
     "upper, lower half": "{upper:+.1f} / {lower:+.1f}",
-    "sun off, texels": "{off:.1f}",
+    "sun off, texels": "{sun_offset_texels:.1f}",
     "colours outside": "{colours_outside:.1%}",
     "seam": "{seam:.1f}",
     "high frequencies": "{high_frequency:.2f}",
 }
 STATISTICS = {
     "runs": "{runs}",
-    "rendering, dB (worst)": "{render.mean:.1f} ({render.min:.1f})",
+    "rendering, dB (worst)": "{render[psnr].mean:.1f} ({render[psnr].min:.1f})",
     "map over the unedited one, dB (worst)": "{gain.mean:+.1f} ({gain.min:+.1f})",
     "worse than unedited": "{gain.below[0]}",
     "lower half, dB": "{lower.mean:+.1f}",

@@ -101,12 +101,12 @@ def carry_out(settings, folder, edit: str) -> dict:
         cosine = np.dot(lights[int(np.argmax(flux))]["direction"], scene.to_world @ paint.sun)
         off = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     return {
+        **result.metrics,
         **result.metrics["painted"],
         **result.metrics["natural"],
         "explanation": explanation(result.notes),
         "sun_off": off,
         "suns": sum(f >= SUN * max(flux) for f in flux),
-        "seconds": result.metrics["timing"]["total_s"],
     }
 
 

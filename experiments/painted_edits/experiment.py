@@ -58,14 +58,14 @@ def measure(done: Done) -> dict:
     rows, painted = done.rows, done.metrics["painted"]
     before = metrics.high_frequency_energy(original[rows])
     return values(
-        painted
+        done.metrics
+        | painted
         | done.metrics["natural"]
         | {
             "explanation": explanation(done.metrics.get("choices", [])),
             "share": painted["towards"] / painted["reachable"] if painted["reachable"] else None,
             "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
             "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else None,
-            "seconds": done.metrics["timing"]["total_s"],
         }
     )
 
@@ -86,7 +86,7 @@ PAINT = {
     "patches": "{patches:.2f}",
     "colours outside": "{colours_outside:.1%}",
     "explanation": "{explanation}",
-    "s": "{seconds:.0f}",
+    "s": "{timing[total_s]:.0f}",
 }
 """Columns that all painted edits have."""
 STATISTICS = {
@@ -96,7 +96,7 @@ STATISTICS = {
     "change elsewhere (most)": "{elsewhere.mean:.3f} ({elsewhere.max:.3f})",
     "white (most), over 2 %": "{white.mean:+.1%} ({white.max:+.1%}), {white.above[0.02]}",
     "colours outside, over 5 %": "{colours_outside.mean:.1%}, {colours_outside.above[0.05]}",
-    "s, median": "{seconds.median:.0f}",
+    "s, median": "{timing[total_s].median:.0f}",
 }
 
 EXPERIMENT = Experiment(

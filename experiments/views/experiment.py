@@ -43,11 +43,8 @@ def cases(args):
 def measure(done: Done) -> dict:
     deviation = layer(done.folder, "deviation")
     omega = latlong.solid_angles(*deviation.shape)[:, None] / (4 * np.pi)
-    return {
-        "unedited": done.metrics["initial_envmap"]["psnr"],
-        "psnr": done.metrics["envmap"]["psnr"],
-        "deviation": float((deviation * omega).sum()),
-    }
+    maps = {name: done.metrics[name]["psnr"] for name in ("initial_envmap", "envmap")}
+    return maps | {"deviation": float((deviation * omega).sum())}
 
 
 EXPERIMENT = Experiment(
@@ -59,15 +56,15 @@ EXPERIMENT = Experiment(
         "ball": "{ball}",
         "map": "{map}",
         "views": "{views}",
-        "unedited, dB": "{unedited:.1f}",
-        "map, dB": "{psnr:.1f}",
+        "unedited, dB": "{initial_envmap:.1f}",
+        "map, dB": "{envmap:.1f}",
         "deviation": "{deviation:.3f}",
     },
     summary=Summary(
         {"views": "{views}"},
         {
             "runs": "{runs}",
-            "map, dB (worst)": "{psnr.mean:.1f} ({psnr.min:.1f})",
+            "map, dB (worst)": "{envmap.mean:.1f} ({envmap.min:.1f})",
             "deviation (largest)": "{deviation.mean:.3f} ({deviation.max:.3f})",
         },
     ),

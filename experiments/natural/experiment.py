@@ -111,10 +111,12 @@ def gained(done: Done, part: slice) -> float | None:
 def measure(done: Done) -> dict:
     """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
     original, edited, true = done.maps
+    render, ceiling = done.metrics["render"], done.metrics["ceiling"]
     return values(
         done.metrics
         | done.metrics["natural"]
         | {
+            "over": render["psnr"] - ceiling["psnr"] if ceiling else None,
             "psnr": psnr(edited, true),
             "unedited": psnr(original, true),
             "gain": gained(done, slice(None)),
@@ -130,6 +132,7 @@ COLUMNS = {
     "target": "{label}",
     "turn": "{turn}",
     "rendering (unedited), dB": "{render[psnr]:.1f} ({initial[psnr]:.1f})",
+    "over the true map's rendering, dB": "{over:+.2f}",
     "map (unedited), dB": "{psnr:.1f} ({unedited:.1f})",
     "upper, lower half": "{upper:+.1f} / {lower:+.1f}",
     "sun off, texels": "{sun_offset_texels:.1f}",
@@ -140,6 +143,7 @@ COLUMNS = {
 STATISTICS = {
     "runs": "{runs}",
     "rendering, dB (worst)": "{render[psnr].mean:.1f} ({render[psnr].min:.1f})",
+    "over the true map's rendering, dB (least)": "{over.mean:+.2f} ({over.min:+.2f})",
     "map over the unedited one, dB (worst)": "{gain.mean:+.1f} ({gain.min:+.1f})",
     "worse than unedited": "{gain.below[0]}",
     "lower half, dB": "{lower.mean:+.1f}",

@@ -14,10 +14,10 @@ from envedit.config import presets
 from envedit.sweep import DONE
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment
-from experiments.summary import Numbers, values
+from experiments.summary import Summary
 
 from .methods import METHODS, ONLY_OURS
-from .published import COLUMNS, PUBLISHED
+from .published import PUBLISHED
 
 DEGREES = 60.0
 """Turn of the true map to the left."""
@@ -93,22 +93,12 @@ def cases(args):
 
 # ---- Tables ------------------------------------------------------------------------------------------------
 
-UNEDITED = {"envmap": "initial_envmap", "render": "initial"}
-"""What ``metrics.json`` calls the unedited map and its rendering."""
-FORMS = {"psnr": ".2f", "lpips": ".3f", "mse": ".5f", "ssim": ".3f"}
-HEADINGS = {
-    f"{'map' if image == 'envmap' else 'rendering'} {metric.upper()}": (image, metric)
-    for image, metric in COLUMNS
-}
 
-
-def measure(done: Done) -> dict:
-    """Return the numbers of a run by (map or rendering, metric); those before the edit; seconds."""
-    numbers: dict = {}
-    for image, metric in COLUMNS:
-        numbers[image, metric] = (done.metrics[image] or {}).get(metric)
-        numbers["unedited", image, metric] = (done.metrics[UNEDITED[image]] or {}).get(metric)
-    return values(numbers | seconds(done))
+def measure(done: Done) -> list[dict]:
+    """Return the numbers of a run, and those before the edit as a row of their own."""
+    title = METHODS[done.case.about["row"]].title
+    unedited = {"envmap": done.metrics["initial_envmap"], "render": done.metrics["initial"]}
+    return [{"title": "unedited", **unedited}, {**done.metrics, "title": title, **seconds(done)}]
 
 
 def seconds(done: Done) -> dict[str, float | None]:
@@ -120,58 +110,54 @@ def seconds(done: Done) -> dict[str, float | None]:
     fit, timing = done.metrics["fit"], done.metrics["timing"]
     resumed = json.loads((done.folder / DONE).read_bytes())["resumed"]
     rest = timing["total_s"] - (timing["fit_s"] if fit else 0)
-    return {"fit": fit["seconds"] if fit else None, "rest": None if resumed else rest}
+    return {"fit_s": fit["seconds"] if fit else None, "rest_s": None if resumed else rest}
 
 
-def averages(rows: list[dict]) -> list[dict]:
-    """Return the cells of a table for either settings and every roughness: a row for each method.
+def published(table: str, roughness: float | None) -> list[dict]:
+    """Return the numbers that the paper printed, a row for each method."""
+    return [
+        {"title": f"{METHODS[name].title}, published", **numbers}
+        for name, numbers in PUBLISHED[table].get(roughness, {}).items()
+    ]
 
-    Averages are over the maps that are done in every row that has any, so that methods can be compared. The
-    paper's own numbers are in brackets.
+
+def summary(rows: list[dict]) -> str:
+    """Return a table for either settings and every roughness: means of each method, and the paper's own.
+
+    Means are over the maps that are done in every row that has any, so that methods can be compared.
     """
-    lines = []
+    parts = []
     for settings, roughness in dict.fromkeys((row["settings"], row["roughness"]) for row in rows):
         some = [row for row in rows if (row["settings"], row["roughness"]) == (settings, roughness)]
-        methods = {row["row"]: [r for r in some if r["row"] == row["row"]] for row in some}
-        maps = set.intersection(*({row["map"] for row in method} for method in methods.values()))
-        published = PUBLISHED[some[0]["table"]].get(roughness, {})
+        maps = set.intersection(
+            *({row["map"] for row in some if row["row"] == name} for name in {row["row"] for row in some})
+        )
+        compared = [row for row in some if row["map"] in maps]
         whose = {"paper": "The paper's settings", "ours": "Our settings"}[settings]
         at = "" if roughness is None else f", roughness {roughness:g}"
-        heading = f"{whose}{at}, {', '.join(maps) if len(maps) == 1 else f'{len(maps)} maps'}"
-
-        # ---- Before any edit: the same for every method
-        first = [row for row in next(iter(methods.values())) if row["map"] in maps]
-        cells = {text: _cell(first, ("unedited", *key)) for text, key in HEADINGS.items()}
-        lines.append(
-            {"heading": heading, "title": "unedited", "fit, s": "-", "rest, s": "-", "maps": "-", **cells}
-        )
-
-        # ---- Methods
-        for name, method in methods.items():
-            compared = [row for row in method if row["map"] in maps]
-            cells = {text: _cell(compared, key, published.get(name)) for text, key in HEADINGS.items()}
-            for key in ("fit", "rest"):
-                cells[f"{key}, s"] = f"{Numbers([row[key] for row in compared]).mean:.0f}"
-            title = METHODS[name].title
-            lines.append({"heading": heading, "title": title, "maps": str(len(method)), **cells})
-    return lines
+        over = ", ".join(maps) if len(maps) == 1 else f"{len(maps)} maps"
+        parts += [f"{whose}{at}, {over}:", MEANS(compared + published(some[0]["table"], roughness))]
+    return "\n\n".join(parts)
 
 
-def _cell(rows, key, published=None):
-    """Write the mean of a number, and what the paper has."""
-    form = FORMS[key[-1]]
-    text = f"{Numbers([row[key] for row in rows]).mean:{form}}"
-    return f"{text} ({published[key]:{form}})" if published else text
-
+FORMS = {"psnr": ".2f", "lpips": ".3f", "mse": ".5f", "ssim": ".3f"}
+MEANS = Summary(
+    {"": "{title}"},
+    {
+        f"{words} {metric.upper()}": f"{{{image}[{metric}].mean:{form}}}"
+        for image, words in (("envmap", "map"), ("render", "rendering"))
+        for metric, form in FORMS.items()
+    }
+    | {"fit, s": "{fit_s.mean:.0f}", "rest, s": "{rest_s.mean:.0f}", "rows": "{runs}"},
+)
 
 EXPERIMENT = Experiment(
     "paper",
     "Tables 1 to 3 of the paper, under its settings and under ours.",
     cases,
     measure,
-    {"": "{title}"} | {text: f"{{{text}}}" for text in (*HEADINGS, "fit, s", "rest, s", "maps")},
-    group=lambda row: row["heading"],
-    combine=averages,
+    summary=summary,
+    combine=lambda rows: [],  # means alone
     sheet=lambda case: "{table}-{settings}-{roughness}".format(**case.about).removesuffix("-None"),
     options=options,
     file=lambda args: args.name,

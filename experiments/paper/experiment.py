@@ -95,10 +95,14 @@ def cases(args):
 
 
 def measure(done: Done) -> list[dict]:
-    """Return the numbers of a run, and those before the edit as a row of their own."""
-    title = METHODS[done.case.about["row"]].title
+    """Return rows: before the edit; what the true map itself scores, rendered twice; the edit."""
     unedited = {"envmap": done.metrics["initial_envmap"], "render": done.metrics["initial"]}
-    return [{"title": "unedited", **unedited}, {**done.metrics, "title": title, **seconds(done)}]
+    title = METHODS[done.case.about["row"]].title
+    return [
+        {"title": "unedited", **unedited},
+        {"title": "the true map", "render": done.metrics["ceiling"]},
+        {**done.metrics, "title": title, **seconds(done)},
+    ]
 
 
 def seconds(done: Done) -> dict[str, float | None]:

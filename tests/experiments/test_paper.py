@@ -242,6 +242,7 @@ def finish(out, made, part="", *, numbers=SOME, fit_s=None, cached=False, resume
             "render": {**numbers, "psnr": numbers["psnr"] + 20},
             "initial": {**SOME, "psnr": 12.0},
             "initial_envmap": {**SOME, "psnr": 9.0},
+            "ceiling": {**SOME, "psnr": 48.0} if numbers["lpips"] else None,
             "fit": None if fit_s is None else {"cached": cached, "seconds": 840.0},
             "timing": {"fit_s": timing_fit, "total_s": timing_fit + 30},
         }
@@ -268,6 +269,8 @@ def test_a_table_has_a_row_for_each_method_that_is_done(maps, build, tmp_path):
     assert pixels[:3] == ["13.00", "-", "0.00200"]
     (unedited,) = row_of(shown, "unedited")
     assert unedited[:-1] == ["9.00", "-", "0.01000", "0.500", "12.00", "-", "0.01000", "0.500", "-", "-"]
+    (true,) = row_of(shown, "the true map")
+    assert true == ["-"] * 4 + ["48.00", "-", "0.01000", "0.500", "-", "-", "2"]
     theirs = "14.56", "0.621", "0.03496", "0.345", "46.38", "0.053", "0.00002", "0.993"
     assert row_of(shown, "SIREN HDR, published") == [[*theirs, "-", "-", "1"]]
     assert not row_of(shown, "SIREN HDR")

@@ -165,9 +165,8 @@ def solve(
         before = replace(run, state=start, start=start)
         first = problem.evaluate(start, resolve=False)
         loss = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined
-        near = problem.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * problem.noise(
-            point.residual, sigma
-        )
+        noise = problem.noise(point.residual, sigma)
+        near = problem.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
         if _unlikeliness(problem, before, first, sigma) <= loss:
             note = "kept the initialisation: the better match of the rendering does not justify "
             note += f"{normal.determined:.0f} parameters (Akaike criterion)"

@@ -36,7 +36,7 @@ STATEMENTS = 3.0
 """Independent values, per channel, that all paint together states."""
 PAINT_NOISE = 0.3
 """Largest standard error of paint, as a share of the change that it asks for: no map makes all of what is
-painted (``experiments/painted_edits`` has what other values do)."""
+painted (``docs/decisions/experiment_painted_likelihood.md`` has what other values do)."""
 VISIBLE = 0.02
 """Mean change of display values from which on a change of what was not painted counts as visible."""
 

@@ -9,7 +9,7 @@ from envedit.core.errors import InputError
 
 FOLLOWING = 0.1
 """Weight, beside paint, of what was not painted and follows: its pattern, as its mean has a term of its own
-(``experiments/painted_edits`` has what other values do)."""
+(``docs/decisions/experiment_painted_likelihood.md`` has what other values do)."""
 
 
 def first_hold(settings: config.Config) -> float:

@@ -13,7 +13,8 @@ from envedit.core import latlong
 from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, edit_panels, make, number
+from experiments.harness import Case, Done, Experiment, edit_panels, make
+from experiments.summary import values
 
 WIDTH = 256
 LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
@@ -27,16 +28,15 @@ ROOMS = {
 LAMP_DEGREES, LAMP_RADIANCE = 3.0, 300.0
 STAYED, FAINT = 3.0, 0.25
 """Degrees up to which a light is where a lamp is, and share of a lamp's flux below which it is none."""
-PAINT = [
-    {
-        "type": "light",
-        "ellipse": [0.38, 0.32, 0.1, 0.08],
-        "amount": 0.3,
-        "color": "#ffd9a6",
-        "softness": 0.05,
-    },
-    {"type": "shadow", "ellipse": [0.68, 0.82, 0.15, 0.06], "amount": 0.4, "softness": 0.05},
-]
+WARM = {
+    "type": "light",
+    "ellipse": [0.38, 0.32, 0.1, 0.08],
+    "amount": 0.3,
+    "color": "#ffd9a6",
+    "softness": 0.05,
+}
+DARK = {"type": "shadow", "ellipse": [0.68, 0.82, 0.15, 0.06], "amount": 0.4, "softness": 0.05}
+PAINT = [WARM, DARK]
 """A warm light on the sphere, and a shadow on the ground."""
 
 
@@ -63,15 +63,15 @@ def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
     return envmap.astype(np.float32)
 
 
-def cases(given):
+def cases(args):
     data = puresky.data("hdri/NAME_1k.hdr", how="CONTRIBUTING.md lists the maps")
-    folder = make(given.out / "maps").absolute()
+    folder = make(args.out / "maps").absolute()
     rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
     for name, file in rooms.items():
         if not file.exists():
             images.write_exr(file, room(ROOMS[name]))
     maps = {file.stem.removesuffix("_1k"): file for file in sorted((data / "hdri").glob("*_1k.hdr"))}
-    found = []
+    made = []
     for name, file in (maps | {"room": rooms["as it is"]}).items():
         targets = {"60": {"rotate_degrees": 60}, "painted": {"kind": "strokes", "strokes": PAINT}}
         if name == "room":
@@ -84,8 +84,8 @@ def cases(given):
             }
             if "file" in target:
                 tables["representation"] = {"turn": False}
-            found.append(Case(f"{name}-{label}".replace(" ", "_"), tables, {"map": name, "label": label}))
-    return found
+            made.append(Case(f"{name}-{label}".replace(" ", "_"), tables, {"map": name, "label": label}))
+    return made
 
 
 def lamps_found(about: dict, after: list[dict]) -> str:
@@ -102,28 +102,19 @@ def lamps_found(about: dict, after: list[dict]) -> str:
 
 def measure(done: Done) -> dict:
     lights = json.loads((done.folder / "lights.json").read_bytes())
-    found, painted = done.metrics, done.metrics["painted"]
-    turn = found["turn_degrees"]
-    gone = sum(one["removed"] for one in lights["before"])
-    new = sum(one["added"] for one in lights["after"])
-    both = [one for one in lights["after"] if not one["added"]]
-    moved = 0 if turn else sum(one["moved_degrees"] > STAYED for one in both)
-    return {
-        "render": found["render"]["psnr"],
-        "initial": found["initial"]["psnr"],
-        "psnr": found["envmap"]["psnr"] if found["envmap"] else None,
-        "unedited": found["initial_envmap"]["psnr"] if found["envmap"] else None,
-        "towards": painted["towards"] if painted else None,
-        "reachable": painted["reachable"] if painted else None,
-        "turn": turn,
-        "lights": len(lights["before"]),
-        "moved": moved,
-        "gone": gone,
-        "new": new,
-        "lamps": lamps_found(done.case.about, lights["after"]),
-        "outside": found["natural"]["colours_outside"],
-        "seam": found["natural"]["seam"],
-    }
+    stayed = [one for one in lights["after"] if not one["added"]]
+    turn = done.metrics["turn_degrees"]
+    return values(
+        {"initial_envmap": None}  # of a painted target there is none
+        | done.metrics
+        | {
+            "lights": len(lights["before"]),
+            "moved": 0 if turn else sum(one["moved_degrees"] > STAYED for one in stayed),
+            "gone": sum(one["removed"] for one in lights["before"]),
+            "new": sum(one["added"] for one in lights["after"]),
+            "lamps": lamps_found(done.case.about, lights["after"]),
+        }
+    )
 
 
 def panels(done: Done):
@@ -134,10 +125,6 @@ def panels(done: Done):
     return shown
 
 
-def share(value):
-    return "-" if value is None else f"{100 * value:.0f} %"
-
-
 EXPERIMENT = Experiment(
     "interiors",
     "Edit maps with several lights: which of them moved, and which stayed.",
@@ -146,15 +133,15 @@ EXPERIMENT = Experiment(
     {
         "map": "{map}",
         "target": "{label}",
-        "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
-        "map (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['unedited'])})",
-        "of the paint (feasible)": lambda m: f"{share(m['towards'])} ({share(m['reachable'])})",
-        "turn, degrees": lambda m: number(m["turn"]),
+        "rendering (unedited), dB": "{render[psnr]:.1f} ({initial[psnr]:.1f})",
+        "map (unedited), dB": "{envmap[psnr]:.1f} ({initial_envmap[psnr]:.1f})",
+        "of the paint (feasible)": "{painted[towards]:.0%} ({painted[reachable]:.0%})",
+        "turn, degrees": "{turn_degrees:.1f}",
         "lights": "{lights}",
         "moved, gone, new": "{moved}, {gone}, {new}",
         "lamps where they are in truth": "{lamps}",
-        "colours outside": lambda m: share(m["outside"]),
-        "seam": lambda m: number(m["seam"]),
+        "colours outside": "{natural[colours_outside]:.0%}",
+        "seam": "{natural[seam]:.1f}",
     },
     panels=panels,
     sheet=lambda case: "sheet.jpg",

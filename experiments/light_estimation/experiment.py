@@ -12,19 +12,11 @@ import numpy as np
 from envedit.export import light_list
 from envedit.representations.layers.separation import separate
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, markdown, number
+from experiments.harness import Case, Done, Experiment
 from experiments.light_estimation import protocol
+from experiments.summary import Summary, values
 
 COUNT = 6
-PICTURES = {"rmse": "RMSE", "si_rmse": "si-RMSE", "normalised": "normalised RMSE", "angle": "angle, degrees"}
-"""Measures of pictures."""
-MAPS = {
-    "peak": "brightest direction",
-    "lights": "lights",
-    "stops": "irradiance: mean of six planes, stops",
-    "worst": "worst plane",
-}
-"""Measures of maps, the first two in degrees."""
 PUBLISHED = {
     "DiffusionLight, a photograph": {"si_rmse": (0.14, 0.45, 0.66), "angle": (2.14, 3.60, 4.29)},
     "LuxDiT, a photograph": {"angle": (1.23, 1.98, 2.78)},
@@ -36,9 +28,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=COUNT, help="so many maps (%(default)s)")
 
 
-def cases(given):
-    files, found = list(puresky.find().items()), []
-    for i in range(0, len(files), max(1, len(files) // max(given.count, 1))):
+def cases(args):
+    files = list(puresky.find().items())
+    made = []
+    for i in range(0, len(files), max(1, len(files) // max(args.count, 1))):
         name, file = files[i]
         other, other_file = files[(i + len(files) // 2) % len(files)]
         tables = {
@@ -46,77 +39,98 @@ def cases(given):
             "scene": {"file": "sphere"},
             "target": {"file": str(other_file)},
         }
-        found.append(Case(f"{name}-{other}", tables, {"map": name, "other": other}))
-    return found[: given.count]
+        made.append(Case(f"{name}-{other}", tables, {"map": name, "other": other}))
+    return made[: args.count]
 
 
 def pictures(envmap: np.ndarray) -> dict[str, np.ndarray]:
     """Render every sphere under a map (H, W, 3) of linear radiance."""
-    lit = protocol.tonemapped(envmap)
-    return {name: protocol.render(sphere, lit) for name, sphere in protocol.SPHERES.items()}
+    tonemapped = protocol.tonemapped(envmap)
+    return {name: protocol.render(sphere, tonemapped) for name, sphere in protocol.SPHERES.items()}
 
 
-def measure(done: Done) -> dict:
-    """Return the errors of the edited and of the unedited map."""
+def measure(done: Done) -> list[dict]:
+    """Return rows of the edited and of the unedited map: one for each sphere, and one of the map itself."""
     original, edited, true = done.maps
     lights = json.loads((done.folder / "lights.json").read_bytes())
     true_lights = light_list.listed(separate(true), np.eye(3))
     expected = pictures(true)
-    row = {"rendering": done.metrics["render"]["psnr"]}
-    for kind, envmap, found in (("edited", edited, "after"), ("unedited", original, "before")):
-        for name, picture in pictures(envmap).items():
-            values = protocol.compared(picture, expected[name])
-            row |= {f"{kind} {name} {key}": value for key, value in values.items()}
+    rows = []
+    for kind, envmap, when in (("edited", edited, "after"), ("unedited", original, "before")):
+        about = {"kind": kind, "rendering": done.metrics["render"]["psnr"]}
+        for sphere, picture in pictures(envmap).items():
+            errors = protocol.compared(picture, expected[sphere])
+            rows.append(values(about | {"sphere": sphere} | errors))
         stops = np.abs(protocol.irradiance_error(envmap, true))
-        row[f"{kind} peak"] = protocol.peak_error(envmap, true)
-        row[f"{kind} lights"] = protocol.lights_error(lights[found], true_lights)
-        row[f"{kind} stops"] = float(stops.mean())
-        row[f"{kind} worst"] = float(stops.max())
-    return row
+        measures = {
+            "peak": protocol.peak_error(envmap, true),
+            "lights": protocol.lights_error(lights[when], true_lights),
+            "stops": float(stops.mean()),
+            "worst": float(stops.max()),
+        }
+        rows.append(values(about | {"sphere": ""} | measures))
+    return rows
+
+
+def published() -> list[dict]:
+    """Return the published means, a row for each sphere."""
+    return [
+        {"kind": name, "sphere": sphere} | {key: numbers[i] for key, numbers in means.items()}
+        for name, means in PUBLISHED.items()
+        for i, sphere in enumerate(protocol.SPHERES)
+    ]
 
 
 def summary(rows) -> str:
     """Return means over the maps beside the published ones, and measures of maps."""
-    spheres, maps = [], []
-    for kind in ("edited", "unedited"):
-        means = {}
-        for key in PICTURES:
-            means[key] = [np.mean([row[f"{kind} {name} {key}"] for row in rows]) for name in protocol.SPHERES]
-        spheres.append([f"{kind}, {len(rows)} maps", *(_three(values, ".3f") for values in means.values())])
-        maps.append([kind, *(_average([row[f"{kind} {key}"] for row in rows]) for key in MAPS)])
-    for name, values in PUBLISHED.items():
-        spheres.append([name, *(_three(values.get(key, ()), ".2f") for key in PICTURES)])
-    first = markdown(["diffuse / matte silver / mirror", *PICTURES.values()], spheres)
-    return f"{first}\n\n{markdown(['mean (median)', *MAPS.values()], maps)}"
+    spheres = [row for row in rows if row["sphere"]]
+    return f"{OF_SPHERES(spheres + published())}\n\n{OF_MAPS([row for row in rows if not row['sphere']])}"
 
 
-def _three(values, form):
-    return " / ".join(format(value, form) for value in values) or "-"
-
-
-def _average(values):
-    """Return mean and median of those that there are, and of how many if not of all."""
-    known = [value for value in values if value is not None and value == value]
-    if not known:
-        return "-"
-    text = f"{np.mean(known):.2f} ({np.median(known):.2f})"
-    return text if len(known) == len(values) else f"{text}, of {len(known)}"
-
-
-def _both(key, form):
-    return lambda row: f"{number(row[f'edited {key}'], form)} ({number(row[f'unedited {key}'], form)})"
+OF_SPHERES = Summary(
+    {"": "{kind}", "sphere": "{sphere}"},
+    {
+        "runs": "{runs}",
+        "RMSE": "{rmse.mean:.3f}",
+        "si-RMSE": "{si_rmse.mean:.3f}",
+        "normalised RMSE": "{normalised.mean:.3f}",
+        "angle, degrees": "{angle.mean:.3f}",
+    },
+)
+OF_MAPS = Summary(
+    {"mean (median), number of maps": "{kind}"},
+    {
+        "brightest direction": "{peak.mean:.2f} ({peak.median:.2f}), {peak.count}",
+        "lights": "{lights.mean:.2f} ({lights.median:.2f}), {lights.count}",
+        "irradiance: mean of six planes, stops": "{stops.mean:.2f} ({stops.median:.2f}), {stops.count}",
+        "worst plane": "{worst.mean:.2f} ({worst.median:.2f}), {worst.count}",
+    },
+)
+COLUMNS = {
+    "Spheres": {
+        "map": "{map} towards {other}",
+        "": "{kind}",
+        "rendering PSNR": "{rendering:.1f}",
+        "sphere": "{sphere}",
+        "si-RMSE": "{si_rmse:.3f}",
+        "angle, degrees": "{angle:.1f}",
+    },
+    "Maps": {
+        "map": "{map} towards {other}",
+        "": "{kind}",
+        "brightest direction": "{peak:.2f}",
+        "lights": "{lights:.2f}",
+        "irradiance: mean of six planes, stops": "{stops:.2f}",
+        "worst plane": "{worst:.2f}",
+    },
+}
 
 
 def panels(done: Done):
     """Return each sphere under the unedited, the edited and the true map."""
-    three = [pictures(envmap) for envmap in done.maps]
-    return [protocol.display(lit[name]) for name in protocol.SPHERES for lit in three]
+    of_maps = [pictures(envmap) for envmap in done.maps]
+    return [protocol.display(spheres[name]) for name in protocol.SPHERES for spheres in of_maps]
 
-
-COLUMNS = {"map": "{map} towards {other}", "rendering PSNR": "{rendering:.1f}"}
-COLUMNS |= {f"{name}: si-RMSE": _both(f"{name} si_rmse", ".3f") for name in protocol.SPHERES}
-COLUMNS |= {f"{name}: angle": _both(f"{name} angle", ".1f") for name in protocol.SPHERES}
-COLUMNS |= {title: _both(key, ".2f") for key, title in MAPS.items()}
 
 EXPERIMENT = Experiment(
     "light_estimation",
@@ -124,6 +138,7 @@ EXPERIMENT = Experiment(
     cases,
     measure,
     COLUMNS,
+    group=lambda row: "Spheres" if row["sphere"] else "Maps",
     summary=summary,
     panels=panels,
     sheet=lambda case: "sheet.jpg",

@@ -69,7 +69,7 @@ def tonemapped(envmap: np.ndarray) -> np.ndarray:
     return power * (LEVEL / np.percentile(positive, PERCENTILE)) if len(positive) else power
 
 
-def render(sphere: Sphere, lit: np.ndarray) -> np.ndarray:
+def render(sphere: Sphere, tonemapped_map: np.ndarray) -> np.ndarray:
     """Render a sphere under a tonemapped map (H, W, 3).
 
     Directions are sampled by the BSDF alone, with the same seed: they are the same under every map, and so is
@@ -92,7 +92,7 @@ def render(sphere: Sphere, lit: np.ndarray) -> np.ndarray:
         "type": "scene",
         "integrator": integrator | {"hide_emitters": True},
         "sensor": {"type": "perspective", "fov": fov, "to_world": to_world, "film": film},
-        "map": {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(lit, np.float32))},
+        "map": {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(tonemapped_map, np.float32))},
         "sphere": {"type": "sphere", "radius": RADIUS, "bsdf": sphere.bsdf},
     }
     picture = np.asarray(mi.render(mi.load_dict(scene), spp=SPP, seed=SEED))
@@ -111,7 +111,7 @@ def display(picture: np.ndarray) -> np.ndarray:
 # ---- Measures of pictures ----------------------------------------------------------------------------------
 
 
-def compared(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
+def compared(estimate: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Compare two pictures of a sphere, RGBA (H, W, 4), over the pixels where the first has an alpha.
 
     Returns
@@ -123,17 +123,17 @@ def compared(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
         which each is scaled so that the 0.01th and 99.9th percentile of its values, those around the sphere
         included, are 0 and 1.
     """
-    mask = found[..., 3] > 0
-    scaled = [_scaled(np.float64(picture[..., :3]))[mask] for picture in (found, true)]
-    a, b = (np.float64(picture[..., :3])[mask] for picture in (found, true))
+    mask = estimate[..., 3] > 0
+    scaled = [_scaled(np.float64(picture[..., :3]))[mask] for picture in (estimate, true)]
+    a, b = (np.float64(picture[..., :3])[mask] for picture in (estimate, true))
     factor = (a * b).sum() / max((a * a).sum(), 1e-30)
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    seen = lengths > 0
-    cosines = (a * b).sum(axis=1)[seen] / lengths[seen]
+    coloured = lengths > 0
+    angles = _degrees((a * b).sum(axis=1)[coloured] / lengths[coloured])
     return {
         "rmse": _rmse(a, b),
         "si_rmse": _rmse(factor * a, b),
-        "angle": float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean()) if seen.any() else float("nan"),
+        "angle": float(angles.mean()) if coloured.any() else float("nan"),
         "normalised": _rmse(scaled[0], scaled[1]),
     }
 
@@ -150,13 +150,13 @@ def _scaled(picture):
 # ---- Measures of maps --------------------------------------------------------------------------------------
 
 
-def peak_error(found: np.ndarray, true: np.ndarray) -> float:
+def peak_error(estimate: np.ndarray, true: np.ndarray) -> float:
     """Return the angle between the brightest texels of two maps (H, W, 3), degrees.
 
     NaN if a map has the same luminance everywhere.
     """
     peaks = []
-    for envmap in (found, true):
+    for envmap in (estimate, true):
         values = luminance(envmap)
         if values.max() == values.min():
             return float("nan")
@@ -164,12 +164,12 @@ def peak_error(found: np.ndarray, true: np.ndarray) -> float:
     return _degrees(peaks[0] @ peaks[1])
 
 
-def lights_error(found: list[dict], true: list[dict], count: int = 5) -> float:
+def lights_error(estimate: list[dict], true: list[dict], count: int = 5) -> float:
     """Return how far the lights of two maps are from each other, degrees (EnvMapNet, Somanath and Kurz 2021).
 
     Parameters
     ----------
-    found, true : list of dict
+    estimate, true : list of dict
         Lights of ``lights.json``, the strongest first.
     count : int
         So many of either count, and not more than the shorter list has, or two.
@@ -180,22 +180,22 @@ def lights_error(found: list[dict], true: list[dict], count: int = 5) -> float:
         Angle to the nearest light of the other list: mean over the lights of a list, mean of both lists. NaN
         if there is no light in one of them.
     """
-    if not found or not true:
+    if not estimate or not true:
         return float("nan")
-    count = min(count, max(len(found), 2), max(len(true), 2))
-    a, b = (_directions(lights[:count]) for lights in (found, true))
+    count = min(count, max(len(estimate), 2), max(len(true), 2))
+    a, b = (_directions(lights[:count]) for lights in (estimate, true))
     angles = _degrees(a @ b.T)
     return float((angles.min(axis=0).mean() + angles.min(axis=1).mean()) / 2)
 
 
-def irradiance_error(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+def irradiance_error(estimate: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return the difference of irradiance on planes that face +x, -x, +y, -y, +z, -z, (6,) stops.
 
     Of luminance; of maps (H, W, 3). 0 where neither map lights a plane, infinite where one does.
     """
     normals = np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
     both = []
-    for envmap in (found, true):
+    for envmap in (estimate, true):
         height, width, _ = envmap.shape
         cosines = np.maximum(latlong.directions(height, width) @ normals.T, 0)
         omega = latlong.lookup_solid_angles(height, width)

@@ -7,14 +7,14 @@ maps. With a turn of the sky allowed and without.
 
 import hashlib
 import itertools
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from envedit.images import analytic_sky, images
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, make, markdown, number
+from experiments.harness import Case, Done, Experiment, make
+from experiments.summary import Summary, values
 
 SCENES = {
     "sphere": "sphere",
@@ -34,21 +34,23 @@ SAME = 120.0
 
 def options(parser):
     parser.add_argument("--count", type=int, help="so many cases, evenly from all kinds of them")
-    parser.add_argument("--quick", action="store_true", help="--count 10")
 
 
-def cases(given):
+def cases(args):
     skies = {name: str(file) for name, file in puresky.find().items()}
-    names, data = sorted(skies), puresky.data()
+    names = sorted(skies)
+    data = puresky.data()
     ground = {file.stem.removesuffix("_1k"): str(file) for file in sorted((data / "hdri").glob("*_1k.hdr"))}
-    analytic = {e: str(given.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
-    make(given.out / "maps")
+    analytic = {e: str(args.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
+    make(args.out / "maps")
     for elevation, file in analytic.items():
         if not Path(file).exists():
             images.write_exr(file, analytic_sky.sunsky(WIDTH, 90.0, elevation))
     maps = skies | ground | {"sunsky": analytic[ELEVATION]}
-    found, turns = [], ("auto", False)
-    for scene, (i, (name, source)), turn in itertools.product(SCENES, enumerate(maps.items()), turns):
+    made = []
+    for scene, (i, (name, source)), turn in itertools.product(
+        SCENES, enumerate(maps.items()), ("auto", False)
+    ):
         targets = [(str(angle), "turned", {"rotate_degrees": angle}) for angle in ANGLES]
         if name == "sunsky":
             targets += [(f"elevation_{e}", "elevation", {"file": analytic[e]}) for e in ELEVATIONS]
@@ -56,37 +58,41 @@ def cases(given):
             others = [names[(i + k) % len(names)] for k in OTHERS]
             targets += [(other, "another map", {"file": skies[other]}) for other in others]
         file = SCENES[scene]
-        shown = {"file": str(data / "scenes" / file) if "/" in file else file, "width": 128}
+        tables = {"file": str(data / "scenes" / file) if "/" in file else file, "width": 128}
         if scene == "sphere":
-            shown["parameters"] = {"roughness": 0.3}
+            tables["parameters"] = {"roughness": 0.3}
+        word = str(turn).lower()
         for label, kind, target in targets:
-            word = str(turn).lower()
-            found.append(
-                Case(
-                    f"{scene}-{name}-{label}-turn_{word}",
-                    {
-                        "input": {"envmap": source, "width": WIDTH},
-                        "scene": shown,
-                        "target": target,
-                        "representation": {"turn": turn},
-                    },
-                    {"scene": scene, "map": name, "label": label, "kind": kind, "turn": word},
-                )
-            )
-    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
-    count = 10 if given.quick else given.count
-    return found if count is None else evenly(found, count)
+            configuration = {
+                "input": {"envmap": source, "width": WIDTH},
+                "scene": tables,
+                "target": target,
+                "representation": {"turn": turn},
+            }
+            about = {"scene": scene, "map": name, "label": label, "kind": kind, "turn": word}
+            made.append(Case(f"{scene}-{name}-{label}-turn_{word}", configuration, about))
+    return picked(made, args)
 
 
-def evenly(found: list[Case], count: int, about: Sequence[str] = ("kind", "turn", "scene")) -> list[Case]:
-    """Pick cases of all kinds, told by ``about``, in the same number, in an order that is always the same."""
+def picked(made: list[Case], args) -> list[Case]:
+    """Return the cases that ``--only`` names; with ``--count``, so many of them, evenly from all kinds.
+
+    A kind is a kind of target, with a turn or without, in one scene. The order is always the same.
+    """
+    made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
+    if args.count is None:
+        return made
     strata: dict[tuple, list[Case]] = {}
-    for case in sorted(found, key=lambda c: hashlib.sha256(c.name.encode()).hexdigest()):
-        strata.setdefault(tuple(case.about[key] for key in about), []).append(case)
-    # Neighbours in a round differ in all of what tells their kinds.
-    keys = sorted(strata, key=lambda key: hashlib.sha256(str(key).encode()).hexdigest())
+    for case in sorted(made, key=lambda c: _digest(c.name)):
+        strata.setdefault(tuple(case.about[key] for key in ("kind", "turn", "scene")), []).append(case)
+    # Neighbours in a round differ in all of what distinguishes their kinds.
+    keys = sorted(strata, key=lambda key: _digest(str(key)))
     rounds = itertools.zip_longest(*(strata[key] for key in keys))
-    return [case for some in rounds for case in some if case is not None][:count]
+    return [case for some in rounds for case in some if case is not None][: args.count]
+
+
+def _digest(text):
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def psnr(a, b) -> float:
@@ -104,18 +110,20 @@ def gained(done: Done, part: slice) -> float | None:
 
 def measure(done: Done) -> dict:
     """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
-    found = done.metrics
     original, edited, true = done.maps
-    return found["natural"] | {
-        "render": found["render"]["psnr"],
-        "initial": found["initial"]["psnr"],
-        "psnr": psnr(edited, true),
-        "unedited": psnr(original, true),
-        "gain": gained(done, slice(None)),
-        "upper": gained(done, slice(0, WIDTH // 4)),
-        "lower": gained(done, slice(WIDTH // 4, None)),
-        "off": found.get("sun_offset_texels"),
-    }
+    render, ceiling = done.metrics["render"], done.metrics["ceiling"]
+    return values(
+        done.metrics
+        | done.metrics["natural"]
+        | {
+            "over": render["psnr"] - ceiling["psnr"] if ceiling else None,
+            "psnr": psnr(edited, true),
+            "unedited": psnr(original, true),
+            "gain": gained(done, slice(None)),
+            "upper": gained(done, slice(0, WIDTH // 4)),
+            "lower": gained(done, slice(WIDTH // 4, None)),
+        }
+    )
 
 
 COLUMNS = {
@@ -123,50 +131,31 @@ COLUMNS = {
     "map": "{map}",
     "target": "{label}",
     "turn": "{turn}",
-    "rendering (unedited), dB": "{render:.1f} ({initial:.1f})",
+    "rendering (unedited), dB": "{render[psnr]:.1f} ({initial[psnr]:.1f})",
+    "over the true map's rendering, dB": "{over:+.2f}",
     "map (unedited), dB": "{psnr:.1f} ({unedited:.1f})",
-    "upper, lower half": lambda m: f"{number(m['upper'], '+.1f')} / {number(m['lower'], '+.1f')}",
-    "sun off, texels": lambda m: number(m["off"]),
-    "colours outside": lambda m: f"{100 * m['colours_outside']:.1f} %",
-    "seam": lambda m: number(m["seam"]),
-    "high frequencies": lambda m: number(m["high_frequency"], ".2f"),
+    "upper, lower half": "{upper:+.1f} / {lower:+.1f}",
+    "sun off, texels": "{sun_offset_texels:.1f}",
+    "colours outside": "{colours_outside:.1%}",
+    "seam": "{seam:.1f}",
+    "high frequencies": "{high_frequency:.2f}",
 }
-
-
-def summary(rows) -> str:
-    """Return means and extremes of every kind of target, with a turn and without, of every scene and map."""
-    head = (
-        "runs", "rendering, dB (worst)", "map over the unedited one, dB (worst)", "worse than unedited",
-        "lower half, dB", "colours outside (most), over 5 %", "seam (most), over 2.5",
-        "high frequencies, outside 0.7 to 1.3",
-    )  # fmt: skip
-    tables = []
-    for keys in (("kind", "turn"), ("scene",), ("map",)):
-        groups: dict[tuple, list] = {}
-        for m in rows:
-            groups.setdefault(tuple(m[key] for key in keys), []).append(m)
-        names = ["target" if key == "kind" else key for key in keys]
-        lines = [[*name, *_told(some)] for name, some in sorted(groups.items())]
-        tables.append(markdown((*names, *head), lines))
-    return "\n\n".join(tables)
-
-
-def _told(some):
-    """Return means and extremes of rows, as words."""
-    render, gain, lower, outside, seam, sharp = (
-        np.array([m[key] for m in some if m[key] is not None] or [np.nan])
-        for key in ("render", "gain", "lower", "colours_outside", "seam", "high_frequency")
-    )
-    return [
-        str(len(some)),
-        f"{render.mean():.1f} ({render.min():.1f})",
-        f"{gain.mean():+.1f} ({gain.min():+.1f})",
-        str((gain < 0).sum()),
-        f"{lower.mean():+.1f}",
-        f"{100 * outside.mean():.1f} % ({100 * outside.max():.1f}), {(outside > 0.05).sum()}",
-        f"{number(seam.mean())} ({number(seam.max())}), {(seam > 2.5).sum()}",
-        f"{number(sharp.mean(), '.2f')}, {((sharp < 0.7) | (sharp > 1.3)).sum()}",
-    ]
+STATISTICS = {
+    "runs": "{runs}",
+    "rendering, dB (worst)": "{render[psnr].mean:.1f} ({render[psnr].min:.1f})",
+    "over the true map's rendering, dB (least)": "{over.mean:+.2f} ({over.min:+.2f})",
+    "map over the unedited one, dB (worst)": "{gain.mean:+.1f} ({gain.min:+.1f})",
+    "worse than unedited": "{gain.below[0]}",
+    "lower half, dB": "{lower.mean:+.1f}",
+    "colours outside (most), over 5 %": (
+        "{colours_outside.mean:.1%} ({colours_outside.max:.1%}), {colours_outside.above[0.05]}"
+    ),
+    "seam (most), over 2.5": "{seam.mean:.1f} ({seam.max:.1f}), {seam.above[2.5]}",
+    "high frequencies, under 0.7, over 1.3": (
+        "{high_frequency.mean:.2f}, {high_frequency.below[0.7]}, {high_frequency.above[1.3]}"
+    ),
+}
+GROUPS = {"target": "{kind}", "turn": "{turn}"}, {"scene": "{scene}"}, {"map": "{map}"}
 
 
 EXPERIMENT = Experiment(
@@ -175,7 +164,7 @@ EXPERIMENT = Experiment(
     cases,
     measure,
     COLUMNS,
-    summary=summary,
+    summary=lambda rows: "\n\n".join(Summary(by, STATISTICS)(rows) for by in GROUPS),
     sheet=lambda case: case.about["scene"] + ".jpg",
     options=options,
 )

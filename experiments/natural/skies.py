@@ -23,16 +23,16 @@ BINS = np.radians([0, 5, 15, 30, 45, 60, 75, 90, 105, 120, 135, 150, 165])
 
 def fields(files: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return log radiance (maps, cells, 3) along the axes, and the cells' directions and solid angles."""
-    found = []
+    logs_of_maps = []
     for file in files:
         envmap, _ = images.load_envmap(file, WIDTH)
         half = envmap[: len(envmap) // 2]
         sun = np.unravel_index(half.mean(axis=2).argmax(), half.shape[:2])[1]
         turned = np.roll(envmap, WIDTH // 2 - sun, axis=1)
         channels = [naturalness.cells(np.repeat(turned[..., c : c + 1], 3, axis=2)) for c in range(3)]
-        found.append(np.stack([logs for logs, _, _ in channels], axis=1) @ AXES.T)
+        logs_of_maps.append(np.stack([logs for logs, _, _ in channels], axis=1) @ AXES.T)
         _, directions, omega = channels[0]
-    return np.array(found), directions, omega / omega.sum()
+    return np.array(logs_of_maps), directions, omega / omega.sum()
 
 
 def fitted(angle: np.ndarray, covariance: np.ndarray) -> dict:
@@ -73,14 +73,13 @@ def differences(settings, folder, files: list[str]) -> dict:
     return {"rows": rows, "patches": float(np.sqrt(np.mean(np.square(between))))}
 
 
-def cases(given):
+def cases(args):
     files = [str(file) for name, file in sorted(puresky.find().items()) if name not in KEPT]
     return [calling("skies", "experiments.natural.skies:differences", {}, files=files)]
 
 
 def measure(done) -> list[dict]:
-    found = done.metrics
-    return [{**row, "patches": found["patches"]} for row in found["rows"]]
+    return [{**row, "patches": done.metrics["patches"]} for row in done.metrics["rows"]]
 
 
 EXPERIMENT = Experiment(

@@ -13,10 +13,11 @@ from envedit import inputs
 from envedit.core.color import tonemap
 from envedit.targets import initial_rendering
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, calling, number
+from experiments.harness import Case, Done, Experiment, calling
 from experiments.natural.skies import KEPT
-from experiments.painted_edits.experiment import explanation, percent
+from experiments.painted_edits.experiment import PAINT, STATISTICS, explanation
 from experiments.painted_edits.painters import PAINTERS, SHADOWS, View
+from experiments.summary import Summary, values
 
 SCENES = ("sphere", "statue", "matpreview", "mesh")
 MAPS = (
@@ -40,7 +41,7 @@ def options(parser):
     parser.add_argument("--count", type=int, help="so many cases, evenly from all edits")
 
 
-def cases(given):
+def cases(args):
     data, maps = puresky.data(), puresky.find()
     files = {
         "matpreview": {
@@ -50,7 +51,7 @@ def cases(given):
         "mesh": {"file": "mesh", "parameters": {"mesh": str(data / "meshes" / "spot.obj")}},
     }
     turns = {"matpreview": {"rotate_degrees": MATPREVIEW_TURN}}
-    found = []
+    made = []
     for edit, scene, name in itertools.product(PAINTERS, SCENES, filter(maps.__contains__, MAPS)):
         if name in SHADOWLESS and edit in SHADOWS:
             continue
@@ -60,12 +61,12 @@ def cases(given):
         }
         about = {"edit": edit, "scene": scene, "map": name}
         function = "experiments.painted_edits.artists:carry_out"
-        found.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), function, tables, about, edit=edit))
-    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
-    return found if given.count is None else evenly(found, given.count)
+        made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), function, tables, about, edit=edit))
+    made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
+    return made if args.count is None else evenly(made, args.count)
 
 
-def evenly(found: list[Case], count: int) -> list[Case]:
+def evenly(made: list[Case], count: int) -> list[Case]:
     """Pick cases of all edits in the same number; scene and map change from one edit to the next."""
 
     def late(case):
@@ -73,7 +74,7 @@ def evenly(found: list[Case], count: int) -> list[Case]:
         i = list(PAINTERS).index(edit)
         return (MAPS.index(name) - i) % len(MAPS), (SCENES.index(scene) - i) % len(SCENES)
 
-    of_edits = [sorted((c for c in found if c.about["edit"] == edit), key=late) for edit in PAINTERS]
+    of_edits = [sorted((c for c in made if c.about["edit"] == edit), key=late) for edit in PAINTERS]
     rounds = itertools.zip_longest(*of_edits)
     return [case for some in rounds for case in some if case is not None][:count]
 
@@ -93,7 +94,6 @@ def carry_out(settings, folder, edit: str) -> dict:
     result.save(folder / EDIT)
 
     # ---- Measures
-    found = result.metrics
     lights = result.lights["after"]
     flux = [sum(light["flux"]) for light in lights]
     off = None
@@ -101,31 +101,26 @@ def carry_out(settings, folder, edit: str) -> dict:
         cosine = np.dot(lights[int(np.argmax(flux))]["direction"], scene.to_world @ paint.sun)
         off = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     return {
-        **found["painted"],
-        **found["natural"],
+        **result.metrics,
+        **result.metrics["painted"],
+        **result.metrics["natural"],
         "explanation": explanation(result.notes),
         "sun_off": off,
         "suns": sum(f >= SUN * max(flux) for f in flux),
-        "seconds": found["timing"]["total_s"],
     }
 
 
 def measure(done: Done) -> list[dict]:
     """Return the row of a case; none where there was nothing to paint on."""
     kept = " (kept out)" if done.case.about["map"] in KEPT else ""
-    return [{"kept": kept, **done.metrics}] if done.metrics else []
-
-
-def edit_of(done: Done) -> Done:
-    """Return the edit of a case as one that ``envedit run`` did."""
-    return Done(replace(done.case, result="metrics.json"), done.folder / EDIT)
+    return [values({"kept": kept, **done.metrics})] if done.metrics else []
 
 
 def panels(done: Done):
     """Return initial, painted and edited rendering, original and edited map."""
     if not done.metrics:
         return []
-    edit = edit_of(done)
+    edit = Done(replace(done.case, result="metrics.json"), done.folder / EDIT)  # as `envedit run` leaves it
     pictures = [edit.picture(f"render_{name}") for name in ("initial", "target", "edited")]
     original, edited, _ = edit.maps
     return [tonemap(one, "gamma") for one in (*pictures, original, edited)]
@@ -140,17 +135,11 @@ EXPERIMENT = Experiment(
         "edit": "{edit}",
         "scene": "{scene}",
         "map": "{map}{kept}",
-        "towards the paint": lambda m: percent(m["towards"]),
-        "feasible": lambda m: percent(m["reachable"]),
-        "change elsewhere": lambda m: number(m["elsewhere"], ".3f"),
-        "white": lambda m: percent(m["white"], "+.1f"),
-        "patches": "{patches:.2f}",
-        "colours outside": lambda m: percent(m["colours_outside"], ".1f"),
-        "explanation": "{explanation}",
-        "sun off, degrees": lambda m: number(m["sun_off"]),
+        "sun off, degrees": "{sun_off:.1f}",
         "suns": "{suns}",
-        "s": "{seconds:.0f}",
+        **PAINT,
     },
+    summary=Summary({"edit": "{edit}"}, STATISTICS | {"sun off, degrees, at most": "{sun_off.max:.1f}"}),
     panels=panels,
     sheet=lambda case: f"artists_{case.about['scene']}.jpg",
     options=options,

@@ -14,23 +14,13 @@ from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.losses import metrics
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, number, overridden
+from experiments.harness import Case, Done, Experiment, overridden
+from experiments.summary import Summary, values
 
 FOLDER = Path(__file__).parents[2] / "scenes" / "edits"
 EDITS = ("move_shadow", "add_reflection", "add_shadow", "warmer", "enhance_shadow", "blur_shadow")
 MAPS = ("sunsky", "kloofendal_48d_partly_cloudy", "sunflowers")
-ABLATION = {
-    "no regulariser": ["loss.change=0"],
-    "change 0.01": [],
-    "luminance + L1": ["loss.change=0", "loss.luminance=[1e-5, 1e-9]", "loss.l1=[1e-5, 1e-9]"],
-    "change 0.1": ["loss.change=0.1"],
-}
-"""What the ablation sets, with Adam: Gauss-Newton has the prior in place of these terms."""
 NOTE = "likeliest explanation of the paint: "
-
-
-def options(parser):
-    parser.add_argument("--ablation", action="store_true", help="regularisers on the analytic sky (Figure 9)")
 
 
 def file_of(name: str) -> str | None:
@@ -44,25 +34,18 @@ def file_of(name: str) -> str | None:
     return str(file) if file else None
 
 
-def cases(given):
-    maps = {name: file_of(name) for name in (MAPS[:1] if given.ablation else MAPS)}
+def cases(args):
+    maps = {name: file_of(name) for name in MAPS}
     for name in [name for name in maps if not maps[name]]:
         print(f"{name}: skipped, ENVEDIT_DATA has no puresky/{name}_puresky_1k.hdr", file=sys.stderr)
         maps.pop(name)
-    found = []
-    for kind, edit, name in itertools.product(ABLATION if given.ablation else [""], EDITS, maps):
+    made = []
+    for edit, name in itertools.product(EDITS, maps):
         tables = tomllib.loads((FOLDER / f"{edit}.toml").read_text(encoding="utf-8"))
         tables.pop("output", None)
-        tables = overridden(tables, [f"input.envmap={maps[name]}", *regularised(kind)])
-        label = "-".join(part.replace(" ", "_") for part in (edit, name, kind) if part)
-        shown = {"edit": f"{edit}, {kind}" if kind else edit, "map": name, "kind": kind}
-        found.append(Case(label, tables, shown))
-    return found
-
-
-def regularised(kind: str) -> list[str]:
-    """Return the settings of one kind of the ablation; none without one."""
-    return ["optimizer.kind=adam", *ABLATION[kind]] if kind else []
+        tables = overridden(tables, [f"input.envmap={maps[name]}"])
+        made.append(Case(f"{edit}-{name}", tables, {"edit": edit, "map": name}))
+    return made
 
 
 def explanation(notes: list[str]) -> str:
@@ -70,25 +53,21 @@ def explanation(notes: list[str]) -> str:
     return next((note.removeprefix(NOTE) for note in notes if note.startswith(NOTE)), "-")
 
 
-def percent(value: float | None, form: str = ".0f") -> str:
-    """Format a share; a dash for None and NaN."""
-    return "-" if value is None or value != value else f"{100 * value:{form}} %"
-
-
 def measure(done: Done) -> dict:
     original, edited, _ = done.maps
     rows, painted = done.rows, done.metrics["painted"]
     before = metrics.high_frequency_energy(original[rows])
-    return painted | {
-        "outside": done.metrics["natural"]["colours_outside"],
-        "white": done.metrics["natural"]["white"],
-        "patches": done.metrics["natural"]["patches"],
-        "explanation": explanation(done.metrics.get("choices", [])),
-        "share": painted["towards"] / painted["reachable"] if painted["reachable"] else float("nan"),
-        "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
-        "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else float("nan"),
-        "seconds": done.metrics["timing"]["total_s"],
-    }
+    return values(
+        done.metrics
+        | painted
+        | done.metrics["natural"]
+        | {
+            "explanation": explanation(done.metrics.get("choices", [])),
+            "share": painted["towards"] / painted["reachable"] if painted["reachable"] else None,
+            "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
+            "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else None,
+        }
+    )
 
 
 def panels(done: Done):
@@ -99,6 +78,27 @@ def panels(done: Done):
     return [*shown, unreachable[..., :3] / 255, *(tonemap(m, "gamma") for m in (original, edited))]
 
 
+PAINT = {
+    "towards the paint": "{towards:.0%}",
+    "feasible": "{reachable:.0%}",
+    "change elsewhere": "{elsewhere:.3f}",
+    "white": "{white:+.1%}",
+    "patches": "{patches:.2f}",
+    "colours outside": "{colours_outside:.1%}",
+    "explanation": "{explanation}",
+    "s": "{timing[total_s]:.0f}",
+}
+"""Columns that all painted edits have."""
+STATISTICS = {
+    "runs": "{runs}",
+    "towards the paint": "{towards.mean:.0%}",
+    "feasible": "{reachable.mean:.0%}",
+    "change elsewhere (most)": "{elsewhere.mean:.3f} ({elsewhere.max:.3f})",
+    "white (most), over 2 %": "{white.mean:+.1%} ({white.max:+.1%}), {white.above[0.02]}",
+    "colours outside, over 5 %": "{colours_outside.mean:.1%}, {colours_outside.above[0.05]}",
+    "s, median": "{timing[total_s].median:.0f}",
+}
+
 EXPERIMENT = Experiment(
     "painted_edits",
     "Carry out the six edits of scenes/edits on the analytic sky and on real maps.",
@@ -107,19 +107,12 @@ EXPERIMENT = Experiment(
     {
         "edit": "{edit}",
         "map": "{map}",
-        "towards the paint": lambda m: percent(m["towards"]),
-        "feasible": lambda m: percent(m["reachable"]),
-        "share of it": lambda m: percent(m["share"]),
-        "change elsewhere": lambda m: number(m["elsewhere"], ".4f"),
-        "white": lambda m: percent(m["white"], "+.1f"),
-        "patches": "{patches:.2f}",
-        "colours outside": lambda m: percent(m["outside"], ".1f"),
+        "share of what is feasible": "{share:.0%}",
         "map SSIM": "{ssim:.3f}",
-        "high frequencies": lambda m: number(m["sharp"], ".2f"),
-        "explanation": "{explanation}",
-        "s": "{seconds:.0f}",
+        "high frequencies": "{sharp:.2f}",
+        **PAINT,
     },
+    summary=Summary({"edit": "{edit}"}, STATISTICS),
     panels=panels,
-    sheet=lambda case: case.about["map"] + "-ablation" * bool(case.about["kind"]),
-    options=options,
+    sheet=lambda case: case.about["map"],
 )

@@ -127,8 +127,8 @@ class View:
         """Return where a direction of the map is blocked on the floor; None if that is too small an area."""
         world = self.scene.to_world @ direction
         blocked = self.scene.mi.ray_test(self._hit.spawn_ray(mi.Vector3f(*world.tolist())))
-        found = np.array(blocked).reshape(self.shape) & self.floor
-        return found if found.mean() >= LEAST_AREA else None
+        shaded = np.array(blocked).reshape(self.shape) & self.floor
+        return shaded if shaded.mean() >= LEAST_AREA else None
 
     def blurred(self, values: np.ndarray, deviation: float) -> np.ndarray:
         """Return values (h, w) under a Gaussian filter, its standard deviation in 1 / UNIT of the width."""
@@ -161,9 +161,9 @@ def turned(direction: np.ndarray, degrees: float, lift: float = 0.0) -> np.ndarr
 # ---- Shadows -----------------------------------------------------------------------------------------------
 
 
-def _of_shadow(view, picture, shadow, beside):
-    """Return the floor's radiance beside a shadow and in its middle, (3,) each; None if it is not seen."""
-    ring = view.floor & (view.blurred(shadow, 6) > 0.02) & beside
+def _of_shadow(view, picture, shadow, surroundings):
+    """Return the floor's radiance beside a shadow and in its middle, (3,) each; None if it is not visible."""
+    ring = view.floor & (view.blurred(shadow, 6) > 0.02) & surroundings
     middle = shadow & (view.blurred(~shadow, 2) <= 0.5)
     if not ring.any():
         return None
@@ -183,8 +183,8 @@ def moved_shadow(view: View, picture: np.ndarray, degrees: float = 0.0, lift: fl
     light, dark = radiance
     erased = view.brush(old, 1, view.floor)[..., None]
     painted = view.brush(new, 1, view.floor)[..., None]
-    lit = picture * (1 - erased) + erased * light
-    shaded = lit * (1 - painted + painted * np.minimum(dark / light, 1))
+    without = picture * (1 - erased) + erased * light
+    shaded = without * (1 - painted + painted * np.minimum(dark / light, 1))
     return Paint(shaded, np.maximum(erased, painted)[..., 0], sun)
 
 

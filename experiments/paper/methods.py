@@ -16,8 +16,8 @@ REGULARISERS = {"luminance": [1e-4, 1e-8], "l1": [1e-4, 1e-8], "dists": 0.6}
 NO_REGULARISERS = {"luminance": 0.0, "l1": 0.0, "dists": 0.0}
 
 PIXEL_RATES = {"pixels": 2e-4, "log-pixels": 1e-4}
-"""Learning rates of the paper's pixel rows: it gives none. The best of those that were tried and change
-anything, by the mean rendering of two maps (README, "Learning rates of the pixel rows")."""
+"""Learning rates of the paper's pixel rows, which gives none: of those that change anything, the best by the
+mean rendering of two maps (docs/decisions/experiment_paper.md)."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Method:
         tables = {"preset": PRESETS[settings], **self.tables}
         kind = tables["representation"]["kind"]
         # The paper's task: the upper rows of a turned map, for models that cannot turn it.
-        tables["input"] = {"rows": "upper"} | tables.get("input", {})
+        tables["input"] = {"rows": "upper"}
         tables["representation"] = tables["representation"] | {"turn": False}
         if settings == "paper" and kind in PIXEL_RATES:
             tables["optimizer"] = {"lr": PIXEL_RATES[kind]}
@@ -58,43 +58,7 @@ METHODS = {
     "r-siren-reg": _siren("R-SIREN HDR + L_reg", True, awp_gamma=0.01),
     "layers": _plain("Layers (ours)", "layers"),
 }
-"""Rows of Tables 1 to 3 and of Figure 8."""
+"""Rows of the tables."""
 
-ONLY_OURS = ("layers", "siren-polished", "r-siren-polished")
+ONLY_OURS = ("layers",)
 """Rows that the paper's settings do not have."""
-
-# Luminance weighs less where light may be added (Sec. 6.4, which gives no number: the paper preset's tenth).
-_PAINTED = {"luminance": [1e-5, 1e-9], "l1": [1e-4, 1e-8], "dists": 0.0, "change": 0.0}
-
-
-def _painted(title, **loss):
-    tables = {"representation": {"kind": "siren"}, "fit": {"awp_gamma": 0.01}, "loss": _PAINTED | loss}
-    return Method(title, tables)
-
-
-PAINTED = {
-    "none": _painted("R-SIREN HDR", luminance=0.0, l1=0.0),
-    "lum-l1": _painted("+ L_lum + L_l1"),
-    "lum-l1-dists": _painted("+ L_lum + L_l1 + L_dists", dists=0.6),
-    "layers": Method("Layers (ours)", {"representation": {"kind": "layers"}}),
-}
-"""Columns of Figure 9."""
-
-
-def _fit(title, **fit):
-    return Method(title, {"representation": {"kind": "siren"}, "fit": {"polish": "never", **fit}})
-
-
-# What the stock network is trained by besides its rate: the squared error over all texels.
-_STOCK = {"log_mse": 1.0, "log_ssim": 0.0, "hdr": 0.0, "awp_gamma": 0.0, "stride": 1}
-
-FITS = {
-    "stock": _fit("stock SIREN, radiance", **_STOCK),
-    "stock-scaled": _fit("stock SIREN, radiance scaled to [-1, 1]", **_STOCK),
-    "siren-no-hdr": _fit("SIREN HDR w/o L_hdr", hdr=0.0, awp_gamma=0.0),
-    "siren": _fit("SIREN HDR", awp_gamma=0.0),
-    "r-siren": _fit("R-SIREN HDR", awp_gamma=0.01),
-    "siren-polished": _fit("SIREN HDR, polished (ours)", polish="always", awp_gamma=0.0),
-    "r-siren-polished": _fit("R-SIREN HDR, polished (ours)", polish="always", awp_gamma=0.01),
-}
-"""Rows of Figures 4 and 5: networks, not edits."""

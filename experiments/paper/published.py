@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-COLUMNS = tuple((image, name) for image in ("envmap", "render") for name in ("psnr", "lpips", "mse", "ssim"))
-"""Columns of every table: map and rendering, each with PSNR (dB), LPIPS, MSE and SSIM."""
+METRICS = ("psnr", "lpips", "mse", "ssim")
+"""Columns of every table, of the map and then of the rendering; PSNR in dB."""
 
 _TABLE1 = """
 pixels        8.91931 0.63838 0.12825 0.31881   29.91687 0.17168 0.00102 0.94152
@@ -45,7 +45,11 @@ r-siren-reg  11.09265 0.51780 0.09469 0.30140   40.64959 0.17940 0.01541 0.97294
 
 def _read(text):
     rows = (line.split() for line in text.strip().splitlines())
-    return {row: dict(zip(COLUMNS, map(float, numbers), strict=True)) for row, *numbers in rows}
+    return {row: {"envmap": _metrics(numbers[:4]), "render": _metrics(numbers[4:])} for row, *numbers in rows}
+
+
+def _metrics(numbers):
+    return dict(zip(METRICS, map(float, numbers), strict=True))
 
 
 PUBLISHED: dict[str, dict[float | None, dict[str, dict]]] = {
@@ -53,4 +57,4 @@ PUBLISHED: dict[str, dict[float | None, dict[str, dict]]] = {
     "table2": {None: _read(_TABLE2)},
     "table3": {roughness: _read(text) for roughness, text in _TABLE3.items()},
 }
-"""Table -> roughness (None: not varied) -> row -> column -> number."""
+"""Table -> roughness (None: not varied) -> row -> "envmap" or "render" -> metric -> number."""

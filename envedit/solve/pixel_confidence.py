@@ -54,7 +54,8 @@ def weights(
     ndarray (h, w, 1) or None
         s^2 / (s^2 + v), s = :data:`HALF_TRUSTED_ERROR`, v the variance around a pixel beyond
         :data:`NOISE_FLOOR_VARIANCES` times its median, and 0 at those over or beside
-        :data:`LIGHT_BRIGHTNESS`; medians are over pixels that are :data:`LEAST_BRIGHTNESS`. None where no pixel is below 1/2, or none that is lit is above 0.
+        :data:`LIGHT_BRIGHTNESS`; medians are over pixels that are :data:`LEAST_BRIGHTNESS`. None where no
+        pixel is below 1/2, or none that is lit is above 0.
     """
     shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
     variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)

@@ -1,40 +1,47 @@
-"""Tables 1 to 3 of the paper: ``python -m experiments paper run NAME``.
+"""Tables 1 to 3 and Figures 8 and 9 of the paper: ``python -m experiments paper run NAME``.
 
 Tables share the runs that they have in common.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from envedit.config import presets
+from envedit.core import latlong
+from envedit.images import images
 from envedit.sweep import DONE
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment
+from experiments.harness import Case, Done, Experiment, make
+from experiments.painted_edits import experiment as painted_edits
 from experiments.summary import Summary
 
-from .methods import METHODS, ONLY_OURS
+from .methods import METHODS, ONLY_OURS, PAINTED
 from .published import PUBLISHED
 
 DEGREES = 60.0
 """Turn of the true map to the left."""
 DEFAULT = "kloofendal_48d_partly_cloudy"
 """The map of a table that the paper made with one; it does not name its own."""
+OTHER = "autumn_field"
+"""The true map of Figure 8, turned: "a different environment map in a different light orientation"."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One table.
+    """One table or figure.
 
     Attributes
     ----------
     rows : tuple of str
-        Of :data:`METHODS`, in the order in which they are shown.
+        Of :data:`METHODS` or :data:`PAINTED`, in the order in which they are shown.
     scene : str
-        Shipped scene.
+        Shipped scene; "" for a painted edit, which has its own.
     roughness : tuple
         Values of the scene's parameter, (None,): as the scene has it.
     several : bool
@@ -51,16 +58,22 @@ KINDS = {
     "table1": Kind(tuple(row for row in METHODS if row != "siren-reg"), "statue"),
     "table2": Kind(tuple(METHODS), "mirror"),
     "table3": Kind(tuple(METHODS), "statue", (0.0, 0.5, 1.0), several=True),
+    "figure8": Kind(("r-siren-reg", "layers"), "statue", (0.0, 0.5, 1.0)),
+    "figure9": Kind(tuple(PAINTED), ""),
 }
 
 
 def options(parser):
     parser.add_argument("name", choices=KINDS, metavar="NAME", help=", ".join(KINDS))
     parser.add_argument("--all-maps", action="store_true", help="where the paper has one map")
+    edits = painted_edits.EDITS
+    parser.add_argument("--edit", choices=edits, default=edits[0], help="of Figure 9 (%(default)s)")
 
 
-def maps_of(args) -> dict[str, Path]:
+def maps_of(args) -> dict[str, Path | str]:
     """Return the maps of a table by name."""
+    if args.name == "figure9":
+        return {"sunsky": "sunsky"}
     maps = puresky.find()
     if KINDS[args.name].several or args.all_maps:
         return maps
@@ -77,18 +90,37 @@ def cases(args):
     ):
         if settings == "paper" and row in ONLY_OURS:
             continue
-        scene = {"file": kind.scene} | ({} if roughness is None else {"parameters": {"roughness": roughness}})
-        question = {
-            "input": {"envmap": str(maps[sky])},
-            "scene": scene,
-            "target": {"rotate_degrees": DEGREES},
-            "output": {"report": False, "full": False},
-            "renderer": {"cache": False},  # every run pays for its transport, whichever comes first
-        }
+        question = presets.overlaid(asked(args, kind, roughness), {"input": {"envmap": str(maps[sky])}})
         about = {"table": args.name, "settings": settings, "row": row, "map": sky, "roughness": roughness}
         name = f"{settings}-{row}-{sky}" + ("" if roughness is None else f"-{roughness:.1f}")
-        made.append(Case(name, presets.overlaid(METHODS[row].under(settings), question), about))
+        made.append(Case(name, presets.overlaid((METHODS | PAINTED)[row].under(settings), question), about))
     return made
+
+
+def asked(args, kind: Kind, roughness: float | None) -> dict:
+    """Return the tables of a configuration that neither row nor map decides."""
+    # Every run pays for its transport, whichever comes first.
+    common = {"output": {"report": False, "full": False}, "renderer": {"cache": False}}
+    if not kind.scene:
+        edit = tomllib.loads((painted_edits.FOLDER / f"{args.edit}.toml").read_text(encoding="utf-8"))
+        return edit | common
+    scene = {"file": kind.scene} | ({} if roughness is None else {"parameters": {"roughness": roughness}})
+    target = {"rotate_degrees": DEGREES}
+    if args.name == "figure8":
+        target = {"file": str(turned(Path(puresky.file(OTHER)), args.out / "maps"))}
+    return common | {"scene": scene, "target": target}
+
+
+def turned(file: Path, folder: Path) -> Path:
+    """Write a map turned by :data:`DEGREES` to ``NAME-turned-CONTENT.exr``, if missing.
+
+    All PureSky maps have their sun in the middle: another map alone is not another orientation of the light.
+    """
+    content = hashlib.sha256(file.read_bytes()).hexdigest()[:8]
+    path = make(folder.absolute()) / f"{file.stem}-turned-{content}.exr"
+    if not path.exists():
+        images.write_exr(path, latlong.rotate(images.load_envmap(str(file))[0], DEGREES))
+    return path
 
 
 # ---- Tables ------------------------------------------------------------------------------------------------
@@ -97,11 +129,14 @@ def cases(args):
 def measure(done: Done) -> list[dict]:
     """Return rows: before the edit; what the true map itself scores, rendered twice; the edit."""
     unedited = {"envmap": done.metrics["initial_envmap"], "render": done.metrics["initial"]}
-    title = METHODS[done.case.about["row"]].title
+    title = (METHODS | PAINTED)[done.case.about["row"]].title
+    edited = {**done.metrics, "title": title, **seconds(done)}
+    if done.metrics["painted"]:
+        return [edited]
     return [
         {"title": "unedited", **unedited},
         {"title": "the true map", "render": done.metrics["ceiling"]},
-        {**done.metrics, "title": title, **seconds(done)},
+        edited,
     ]
 
 
@@ -121,7 +156,7 @@ def published(table: str, roughness: float | None) -> list[dict]:
     """Return the numbers that the paper printed, a row for each method."""
     return [
         {"title": f"{METHODS[name].title}, published", **numbers}
-        for name, numbers in PUBLISHED[table].get(roughness, {}).items()
+        for name, numbers in PUBLISHED.get(table, {}).get(roughness, {}).items()
     ]
 
 
@@ -140,7 +175,8 @@ def summary(rows: list[dict]) -> str:
         whose = {"paper": "The paper's settings", "ours": "Our settings"}[settings]
         at = "" if roughness is None else f", roughness {roughness:g}"
         over = ", ".join(maps) if len(maps) == 1 else f"{len(maps)} maps"
-        parts += [f"{whose}{at}, {over}:", MEANS(compared + published(some[0]["table"], roughness))]
+        means = PAINT if some[0]["painted"] else MEANS
+        parts += [f"{whose}{at}, {over}:", means(compared + published(some[0]["table"], roughness))]
     return "\n\n".join(parts)
 
 
@@ -154,10 +190,18 @@ MEANS = Summary(
     }
     | {"fit, s": "{fit_s.mean:.0f}", "rest, s": "{rest_s.mean:.0f}", "rows": "{runs}"},
 )
+PAINT = Summary(
+    {"": "{title}"},
+    {
+        "towards the paint": "{painted[towards].mean:.2f}",
+        "change elsewhere": "{painted[elsewhere].mean:.3f}",
+        "rest, s": "{rest_s.mean:.0f}",
+    },
+)
 
 EXPERIMENT = Experiment(
     "paper",
-    "Tables 1 to 3 of the paper, under its settings and under ours.",
+    "Tables 1 to 3 and Figures 8 and 9 of the paper, under its settings and under ours.",
     cases,
     measure,
     summary=summary,

@@ -60,5 +60,20 @@ METHODS = {
 }
 """Rows of the tables."""
 
-ONLY_OURS = ("layers",)
+
+def _painted(title, **changed):
+    """Return a column of Figure 9: R-SIREN of a painted edit, luminance at a tenth ("reduced")."""
+    weights = REGULARISERS | {"luminance": [1e-5, 1e-9], "dists": 0.0} | changed
+    return Method(title, {"representation": {"kind": "siren"}, "fit": {"awp_gamma": 0.01}, "loss": weights})
+
+
+PAINTED = {
+    "none": _painted("R-SIREN HDR", luminance=0.0, l1=0.0),
+    "lum-l1": _painted("+ L_lum + L_l1"),
+    "lum-l1-dists": _painted("+ L_lum + L_l1 + L_dists", dists=0.6),
+    "layers-painted": Method("Layers (ours)", {"representation": {"kind": "layers"}}),
+}
+"""Columns of Figure 9."""
+
+ONLY_OURS = ("layers", "layers-painted")
 """Rows that the paper's settings do not have."""

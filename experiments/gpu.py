@@ -88,7 +88,7 @@ def engine(variant: str, small: bool) -> dict[str, Any]:
 def solver(variant: str, small: bool) -> dict[str, Any]:
     """Edit twice; the second time transport, renderings and kernels are there."""
     from envedit import config
-    from experiments.solver.growth import second
+    from experiments.solver.edits import second
 
     settings = {
         "variant": variant,

@@ -7,14 +7,12 @@ the noise of its judge allows: one that does shows a picture that is smoother th
 
 from pathlib import Path
 
-import numpy as np
-
 from envedit import inputs
 from envedit.core.seeds import Seeds
 from envedit.losses import metrics
 from envedit.targets import target
 from experiments import puresky
-from experiments.harness import Done, Experiment, calling, done_of, markdown, number
+from experiments.harness import Done, Experiment, Summary, calling, done_of
 from experiments.natural import experiment as natural
 
 BELOW = 0.5
@@ -32,7 +30,6 @@ def twice(settings, folder) -> dict:
 
 
 def cases(given):
-    maps = puresky.find().items()
     found = [
         (
             f"paper-{name}-{roughness:.1f}",
@@ -41,40 +38,32 @@ def cases(given):
                 "scene": {"file": "statue", "width": 128, "parameters": {"roughness": roughness}},
                 "target": {"rotate_degrees": 60},
             },
-            {"scene": f"Table 3, roughness {roughness:g}", "edit": None},
+            {"scene": f"Table 3, roughness {roughness:g}", "done": []},
         )
         for roughness in ROUGHNESS
-        for name, file in maps
+        for name, file in puresky.find().items()
     ]
     for case in natural.cases(given):
         if case.about["kind"] == "turned" and case.about["turn"] == "auto":
-            edit = done_of([(case, case.job())], given.edits.absolute())
-            about = {"scene": case.about["scene"], "edit": edit[0] if edit else None}
-            found.append((case.name, case.tables, about))
+            done = done_of([(case, case.job())], given.edits.absolute())
+            found.append((case.name, case.tables, {"scene": case.about["scene"], "done": done}))
     return [calling(n, "experiments.ceiling.experiment:twice", t, {"name": n} | a) for n, t, a in found]
 
 
 def measure(done: Done) -> dict:
-    edit = done.case.about["edit"]
+    true = done.metrics["psnr"]
+    edit = next((one.metrics["render"]["psnr"] for one in done.case.about["done"]), None)
     return {
-        "psnr": done.metrics["psnr"],
+        "psnr": true,
         "ssim": done.metrics["ssim"],
-        "edit": edit.metrics["render"]["psnr"] if edit else np.nan,
+        "edit": edit,
+        "over": None if edit is None else edit - true,
     }
 
 
-def summary(rows) -> str:
-    """Return means by scene, the edits' over the true maps', and how many are BELOW under them."""
-    lines = []
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        keys = "psnr", "ssim", "edit"
-        some = np.array([[row[key] for key in keys] for row in rows if row["scene"] == scene])
-        over = some[:, 2] - some[:, 0]
-        psnr, ssim, edit = some.mean(axis=0)
-        shown = number(psnr, ".2f"), number(ssim, ".3f"), number(edit, ".2f"), number(over.mean(), "+.2f")
-        lines.append([scene, str(len(some)), *shown, number(over.min(), "+.2f"), str((over < -BELOW).sum())])
-    head = ["scene", "runs", "true maps, dB", "SSIM", "edits, dB", "edits over them", "least"]
-    return markdown([*head, f"under -{BELOW}"], lines)
+def below(rows: list[dict]) -> str:
+    """Count the edits that are more than :data:`BELOW` under the true map."""
+    return str(sum(row["over"] is not None and row["over"] < -BELOW for row in rows))
 
 
 def options(parser):
@@ -87,13 +76,19 @@ EXPERIMENT = Experiment(
     "Measure what the true map itself scores: two renderings of it, as target and result are rendered.",
     cases,
     measure,
-    {
-        "case": "{name}",
-        "true map, dB": "{psnr:.2f}",
-        "SSIM": "{ssim:.3f}",
-        "edit, dB": lambda m: number(m["edit"], ".2f"),
-    },
-    group=lambda m: m["scene"],
-    summary=summary,
+    {"case": "{name}", "true map, dB": "{psnr:.2f}", "SSIM": "{ssim:.3f}", "edit, dB": "{edit:.2f}"},
+    group=lambda row: row["scene"],
+    summary=Summary(
+        {
+            "runs": "{rows}",
+            "true maps, dB": "{psnr.mean:.2f}",
+            "SSIM": "{ssim.mean:.3f}",
+            "edits, dB": "{edit.mean:.2f}",
+            "edits over them": "{over.mean:+.2f}",
+            "least": "{over.min:+.2f}",
+            f"under -{BELOW}": below,
+        },
+        by=("scene",),
+    ),
     options=options,
 )

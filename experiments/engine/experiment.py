@@ -1,6 +1,6 @@
 """Measure the engine beside the machine's own floors, Mitsuba's ``prb`` and PyTorch.
 
-``--quick`` measures tiny sizes without data; what must hold of any size is in :mod:`.check`.
+``--quick`` measures tiny sizes without data; what must hold of any size is in :mod:`.tables`.
 """
 
 import itertools
@@ -11,7 +11,7 @@ from envedit.core import shipped
 from experiments import puresky
 from experiments.harness import Experiment, calling, done_of, rows_of
 
-from . import check, plot, tables
+from . import tables
 
 SUNNY = "kloofendal_48d_partly_cloudy"
 ANALYTIC = {"envmap": "sunsky", "azimuth": 130, "elevation": 45}
@@ -46,7 +46,7 @@ def cases(given):
     def add(name, function, settings, about=None, **arguments):
         about = {"case": name, "section": name.partition("-")[0], "quick": quick} | (about or {})
         called = {"measuring": function, "quick": quick} | arguments
-        found.append(calling(name, "experiments.engine.machine:measured", settings, about, **called))
+        found.append(calling(name, "experiments.engine.timing:measured", settings, about, **called))
 
     def lit(pixels, texels, spp="auto", scene="sphere"):
         shown = {"file": scene, "width": pixels, "parameters": meshes.get(scene, {})}
@@ -75,7 +75,7 @@ def cases(given):
     for variable, values in ranges.items():
         for value in values:
             settings = lit(**base | {variable: value})
-            add(f"scaling-{variable}-{value}", "scaling:measure", settings, {"variable": variable})
+            add(f"scaling-{variable}-{value}", "transport:scaling", settings, {"variable": variable})
     tiny = {"fit": {"epochs": 60}, "representation": {"kind": "siren", "hidden": 32}}
     for name, file in {"sunsky": "sunsky"}.items() if quick else maps.items():
         settings = {"representation": {"kind": "siren"}} | (tiny if quick else {})
@@ -91,9 +91,9 @@ EXPERIMENT = Experiment(
     tables.measure,
     tables.COLUMNS,
     group=lambda row: row["table"],
-    failures=check.failures,
+    failures=tables.failures,
     summary=tables.summary,
     options=options,
-    draw=lambda cases, out, to, given: plot.draw(rows_of(EXPERIMENT, done_of(cases, out)), to),
+    draw=lambda cases, out, to, given: tables.draw(rows_of(EXPERIMENT, done_of(cases, out)), to),
     alone=True,
 )

@@ -74,6 +74,33 @@ def measure(settings, sun: list, spp: int, quick: bool = False) -> dict:
     return {"quality": [row], "equal-error": [row], "quality-parts": parts}
 
 
+def without_caustics(lit, sky: np.ndarray, spp: int) -> list[dict]:
+    """Compare direct light alone (path depth 2), in the pixels that see a mirror and in those that do not.
+
+    A caustic takes three segments or more. No unidirectional path tracer finds the sun through it but by
+    chance, so that neither T nor the reference converges there. With two segments there is none; what stays
+    hard is the sun's own image in the mirror, smaller than a pixel, which is why the pixels are kept apart.
+    """
+    transport = LightTransport.build(lit, *sky.shape[:2], max_depth=2)
+    transport.resolve(sky)
+    halves = reference(lit, sky, spp, depth=2)
+    got, mirror = transport.apply(mi.TensorXf(sky)).numpy(), sees_mirror(lit)
+    return [
+        {"part": part, "pixels": int(mask.sum())} | errors(got, halves, mask)
+        for part, mask in (("matte pixels", ~mirror), ("mirror pixels", mirror))
+    ]
+
+
+def sees_mirror(lit, across: int = 8) -> np.ndarray:
+    """Mark the pixels (h, w) any of whose across^2 camera rays hits a mirror or clear glass."""
+    x, y = ((np.arange(size * across) + 0.5) / (size * across) for size in (lit.width, lit.height))
+    places = mi.Point2f(*(mi.Float(one.ravel()) for one in np.meshgrid(x, y)))
+    ray, _ = lit.mi.sensors()[0].sample_ray(0, 0, places, mi.Point2f(0.5))
+    hit = lit.mi.ray_intersect(ray)
+    mirror = hit.is_valid() & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Delta)
+    return mirror.numpy().reshape(lit.height, across, lit.width, across).any(axis=(1, 3))
+
+
 def path_tracer(lit, samples: int, transport: LightTransport) -> PathTracer:
     """Return prb with samples a pixel and with the path depth of T, or more."""
     return PathTracer(lit, samples, max(AUTO_DEPTH, transport.bounces + 1), one_thread=False)
@@ -97,24 +124,6 @@ def one_texel_sun(width: int, elevation: float, across: float) -> np.ndarray:
     # Rows are aligned to the corners: row 0 is the zenith, the last one the nadir.
     picture[round((90 - elevation) / 180 * (height - 1)), int(across * width)] = 1e5
     return picture
-
-
-def without_caustics(lit, sky: np.ndarray, spp: int) -> list[dict]:
-    """Compare direct light alone (path depth 2), in the pixels that see a mirror and in those that do not.
-
-    A caustic reaches a matte surface by way of a mirror and takes three segments or more. No unidirectional
-    path tracer finds the sun through it but by chance, so that neither T nor the reference converges there.
-    With two segments there is none; what stays hard is the sun's own image in the mirror, smaller than a
-    pixel and met by chance by camera rays, which is why the pixels are kept apart.
-    """
-    transport = LightTransport.build(lit, *sky.shape[:2], max_depth=2)
-    transport.resolve(sky)
-    halves = reference(lit, sky, spp, depth=2)
-    got, matte = transport.apply(mi.TensorXf(sky)).numpy(), sees_no_mirror(lit)
-    return [
-        {"part": part, "pixels": int(mask.sum())} | errors(got, halves, mask)
-        for part, mask in (("matte pixels", matte), ("mirror pixels", ~matte))
-    ]
 
 
 def curve(settings, sun: list, spp: int, quick: bool = False) -> dict:
@@ -160,15 +169,3 @@ def errors(got: np.ndarray, halves: list[np.ndarray], pixels=...) -> dict[str, f
     differences = got[pixels] - wanted[pixels], (halves[0] - halves[1])[pixels] / 2
     rmse, noise = (float(np.sqrt(np.square(one).mean()) / wanted.mean()) for one in differences)
     return {"rmse": rmse, "noise": noise, "corrected": float(np.sqrt(max(rmse**2 - noise**2, 0)))}
-
-
-def sees_no_mirror(lit, across: int = 8) -> np.ndarray:
-    """Mark the pixels (h, w) none of whose across^2 camera rays hits a mirror or clear glass."""
-    rays = dr.arange(mi.UInt32, lit.width * lit.height * across**2)
-    pixel, within = rays // across**2, rays % across**2
-    x = (mi.Float(pixel % lit.width) + (mi.Float(within % across) + 0.5) / across) / lit.width
-    y = (mi.Float(pixel // lit.width) + (mi.Float(within // across) + 0.5) / across) / lit.height
-    ray, _ = lit.mi.sensors()[0].sample_ray(0, 0, mi.Point2f(x, y), mi.Point2f(0.5))
-    hit = lit.mi.ray_intersect(ray)
-    mirror = hit.is_valid() & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Delta)
-    return ~mirror.numpy().reshape(lit.height, lit.width, across**2).any(axis=2)

@@ -12,7 +12,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import latlong
 from envedit.inputs import load_map
 from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
@@ -41,8 +40,8 @@ def measure(settings, quick: bool = False) -> dict:
         (``first_s``, ``again_s`` of tracing, ``resolve_s``, ``load_s``), bytes (``held``, and those that
         ``apply`` and ``adjoint`` read), and ``floor_s``: the seconds that reading these bytes once takes.
         ``transport-time``: rows ``what``, ``median_s`` and ``note``. A step is a rendering and its gradient;
-        through T with its share of looking for texels grown bright, by path tracing with the map set as an
-        edit has to (Mitsuba builds its sampling table anew), and without setting it, which no edit can do.
+        through T with its share of looking for texels grown bright, and by path tracing with the map set as
+        an edit has to (Mitsuba builds its sampling table anew).
     """
     bandwidth = floors.bandwidth(1 << 20 if quick else None)["read"]
     lit, spp = load_scene(settings), settings.renderer.spp
@@ -66,7 +65,7 @@ def measure(settings, quick: bool = False) -> dict:
     resolve = time.perf_counter() - start
     depth = transport.bounces + 1
     tracer = PathTracer(lit, PRB_SPP, depth, one_thread=False)
-    steps, bare = itertools.count(), bare_prb(settings, sky, depth, weight)
+    steps = itertools.count()
     times = side_by_side(
         {
             **applied,
@@ -75,7 +74,6 @@ def measure(settings, quick: bool = False) -> dict:
             "T look": lambda: transport.resolve(dr.detach(env).numpy()),
             "prb forward": lambda: tracer.render(env, next(steps)),
             "prb step": lambda: gradient(lambda e: tracer.render(e, next(steps)), env, weight),
-            "prb bare step": bare,
         },
         repeats,
     )
@@ -99,11 +97,6 @@ def measure(settings, quick: bool = False) -> dict:
         {"what": "of it: looking for bright texels", "median_s": look, "every": RESOLVE_EVERY},
         {"what": f"prb, {PRB_SPP} spp, forward", **times["prb forward"]},
         {"what": f"prb, {PRB_SPP} spp, a step", **times["prb step"], "ratio": median["prb step"] / step},
-        {
-            "what": "the same, the map never set",
-            **times["prb bare step"],
-            "ratio": median["prb bare step"] / step,
-        },
     ]
     size = {"pixels": lit.width, "texels": [height, width]}
     row = {
@@ -122,6 +115,45 @@ def measure(settings, quick: bool = False) -> dict:
         "kernels": compiled(lambda: gradient(transport.apply, env, weight)),
     }
     return {"transport": [size | row], "transport-time": [size | line for line in spent]}
+
+
+def scaling(settings, quick: bool = False) -> dict:
+    """Trace a scene at one size and measure T under a clear sky with its exact columns.
+
+    Returns
+    -------
+    dict
+        ``scaling``: a row with ``trace_s`` (kernels compiled), ``spp``, ``columns``, ``bytes`` that both
+        products read, ``held``, and seconds ``apply_s`` and ``adjoint_s``.
+    """
+    lit = load_scene(settings)
+    sky, _ = load_map(settings.input)
+    height, width, _ = sky.shape
+    build(lit, height, width, settings.renderer.spp)
+    gc.collect()
+    transport, trace = build(lit, height, width, settings.renderer.spp)
+    transport.resolve(sky)
+    env = dr.opaque(mi.TensorXf(sky))
+    picture = np.random.default_rng(0).random((*transport.shape, 3), np.float32)
+    picture = dr.opaque(mi.TensorXf(picture))
+    taken = side_by_side(
+        {"apply": lambda: transport.apply(env), "adjoint": lambda: transport.adjoint(picture)},
+        3 if quick else 7,
+    )
+    reads = bytes_read(transport)
+    row = {
+        "pixels": lit.width,
+        "texels": [height, width],
+        "spp": transport.spp,
+        "columns": len(transport.columns),
+        "trace_s": trace,
+        "bytes": reads["apply"] + reads["adjoint"],
+        "held": transport.memory_bytes,
+        "apply_s": taken["apply"]["median_s"],
+        "adjoint_s": taken["adjoint"]["median_s"],
+        "choices": transport.choices,
+    }
+    return {"scaling": [row]}
 
 
 def from_disk(lit, height: int, width: int, spp, repeats: int = 3) -> float | None:
@@ -158,28 +190,6 @@ def gradient(render, env: mi.TensorXf, weight: mi.TensorXf):
         picture = render(leaf)
         dr.backward(dr.sum(picture * weight, axis=None))
     return dr.detach(picture), dr.grad(leaf)
-
-
-def bare_prb(settings, sky, depth, weight):
-    """Return a function that renders and differentiates by prb under a map that was set once."""
-    lit = load_scene(settings)  # its own: the other one's map is set at every step
-    leaf = mi.TensorXf(latlong.to_envmap_data(sky))
-    dr.enable_grad(leaf)
-    lit.params[lit.envmap_key] = leaf
-    lit.params.update()
-    integrator = mi.load_dict({"type": "prb", "max_depth": depth, "rr_depth": depth + 1})
-    seeds = itertools.count()
-
-    def run():
-        dr.set_grad(lit.params[lit.envmap_key], 0)
-        seed = next(seeds)
-        picture = mi.render(
-            lit.mi, lit.params, integrator=integrator, spp=PRB_SPP, seed=2 * seed, seed_grad=2 * seed + 1
-        )
-        dr.backward(dr.sum(picture * weight, axis=None))
-        return dr.detach(picture), dr.grad(lit.params[lit.envmap_key])
-
-    return run
 
 
 def bytes_read(transport: LightTransport) -> dict:

@@ -17,14 +17,13 @@ PIECE = 2500
 
 def options(parser):
     parser.add_argument("--count", type=int, default=10000, help="damaged files of each kind (%(default)s)")
-    parser.add_argument("--heap-check", default="", help="library to preload, such as libc_malloc_debug.so.0")
 
 
 def cases(given):
     found = []
     for what, first in itertools.product(KINDS, range(0, given.count, PIECE)):
         count = min(PIECE, given.count - first)
-        files = {"what": what, "first": first, "count": count, "heap_check": given.heap_check}
+        files = {"what": what, "first": first, "count": count}
         name = f"{what} {first}-{first + count - 1}"
         found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
     return found

@@ -18,8 +18,7 @@ import mitsuba as mi
 
 from envedit.core.errors import ConfigError, InputError
 
-from .kinds import KINDS
-from .readers import WrongError
+from .kinds import KINDS, WrongError
 
 MIB = 1 << 20
 MULTIPLE, ROOM = 8, 64 * MIB

@@ -27,8 +27,10 @@ def test_the_ceiling_is_the_noise_of_two_renderings(tmp_path):
 
 def test_edits_are_counted_that_are_under_the_true_map():
     rows = [
-        {"scene": "sphere", "psnr": 40.0, "ssim": 0.9, "edit": edit} for edit in (39.0, 41.0, float("nan"))
+        {"scene": "sphere", "psnr": 40.0, "ssim": 0.9, "edit": 40.0 + over, "over": over}
+        for over in (-1.0, 1.0)
     ]
-    line = ceiling.summary(rows[:2]).splitlines()[-1]
+    line = ceiling.EXPERIMENT.summary(rows).splitlines()[-1]
     assert line == "| sphere | 2 | 40.00 | 0.900 | 40.00 | +0.00 | -1.00 | 1 |"
-    assert ceiling.summary(rows).splitlines()[-1] == "| sphere | 3 | 40.00 | 0.900 | - | - | - | 1 |"
+    unknown = rows[0] | {"edit": None, "over": None}
+    assert ceiling.EXPERIMENT.summary([unknown]).endswith("| sphere | 1 | 40.00 | 0.900 | - | - | - | 0 |")

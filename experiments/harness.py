@@ -354,18 +354,21 @@ class Statistics:
 
     Attributes
     ----------
-    mean, median, min, max, deviation : Number
+    mean, median, min, max, sum, deviation : Number
         ``deviation``: standard deviation, of the population.
     count : int
         How many values are known.
     """
 
+    _FUNCTIONS = {
+        "mean": np.mean, "median": np.median, "min": np.min, "max": np.max, "sum": np.sum,
+        "deviation": np.std,
+    }  # fmt: skip
+
     def __init__(self, values: Iterable[float | None]):
         known = np.array([v for v in values if v is not None and v == v], float)
         self.count = len(known)
-        for name, function in (
-            ("mean", np.mean), ("median", np.median), ("min", np.min), ("max", np.max), ("deviation", np.std)
-        ):  # fmt: skip
+        for name, function in self._FUNCTIONS.items():
             setattr(self, name, Number(function(known) if self.count else None))
 
 

@@ -56,46 +56,39 @@ def measure(settings, quick: bool = False) -> dict:
     env = dr.opaque(mi.TensorXf(sky))
     weight = np.random.default_rng(0).random((*transport.shape, 3), np.float32)
     weight = dr.opaque(mi.TensorXf(weight))
-    repeats = 3 if quick else 11
-    applied = {"apply": lambda: transport.apply(env), "adjoint": lambda: transport.adjoint(weight)}
-    coarse = side_by_side(applied, repeats)
-
     start = time.perf_counter()
     transport.resolve(sky)
     resolve = time.perf_counter() - start
     depth = transport.bounces + 1
-    tracer = PathTracer(lit, PRB_SPP, depth, one_thread=False)
-    steps = itertools.count()
+    tracer, steps = PathTracer(lit, PRB_SPP, depth, one_thread=False), itertools.count()
     times = side_by_side(
         {
-            **applied,
+            "T E": lambda: transport.apply(env),
+            "T' I": lambda: transport.adjoint(weight),
             "T step": lambda: gradient(transport.apply, env, weight),
             # Every time, as in an edit: the map is read back to the host.
             "T look": lambda: transport.resolve(dr.detach(env).numpy()),
-            "prb forward": lambda: tracer.render(env, next(steps)),
             "prb step": lambda: gradient(lambda e: tracer.render(e, next(steps)), env, weight),
         },
-        repeats,
+        3 if quick else 11,
     )
     reads = bytes_read(transport)
     read = reads["apply"] + reads["adjoint"]
+    floor = read / bandwidth
     median = {name: found["median_s"] for name, found in times.items()}
     look = median["T look"] / RESOLVE_EVERY
     step = median["T step"] + look
-    floor = read / bandwidth
+    above = (median["T E"] + median["T' I"]) / floor
     spent = [
-        {"what": "T E, coarse tier", **coarse["apply"]},
-        {"what": "T' I, coarse tier", **coarse["adjoint"]},
-        {"what": "T E", **times["apply"]},
-        {"what": "T' I", **times["adjoint"]},
+        {"what": "T E", **times["T E"]},
+        {"what": "T' I", **times["T' I"]},
         {
             "what": f"floor of both: {si(read, 'B')} at {si(bandwidth, 'B/s')}",
             "median_s": floor,
-            "above_floor": (median["apply"] + median["adjoint"]) / floor,
+            "above_floor": above,
         },
         {"what": "a step through T", "median_s": step},
         {"what": "of it: looking for bright texels", "median_s": look, "every": RESOLVE_EVERY},
-        {"what": f"prb, {PRB_SPP} spp, forward", **times["prb forward"]},
         {"what": f"prb, {PRB_SPP} spp, a step", **times["prb step"], "ratio": median["prb step"] / step},
     ]
     size = {"pixels": lit.width, "texels": [height, width]}

@@ -5,11 +5,10 @@ Linux only: memory is read from /proc.
 """
 
 import itertools
-from collections import Counter
 
 from experiments.fuzz.drive import FAULTS
 from experiments.fuzz.kinds import KINDS
-from experiments.harness import Experiment, calling
+from experiments.harness import Experiment, Summary, calling
 
 PIECE = 2500
 """Files of a case of the harness."""
@@ -29,21 +28,12 @@ def cases(given):
     return found
 
 
-def combine(rows: list[dict]) -> list[dict]:
-    """Add up the pieces of each kind."""
-    sums = {}
-    for row in rows:
-        empty = {"what": row["what"], "counts": Counter(), "errors": Counter(), "beyond": 0}
-        total = sums.setdefault(row["what"], empty)
-        total["counts"].update(row["counts"])
-        total["errors"].update(row["errors"])
-        total["beyond"] = max(total["beyond"], row["beyond"])
-    return list(sums.values())
-
-
-def refused(row: dict) -> str:
-    """Name the errors of the refused files, the most frequent first."""
-    return ", ".join(f"{number} {error}" for error, number in row["errors"].most_common()) or "0"
+def measure(done) -> dict:
+    """Return how many files of a piece had each outcome, and the most memory that one took, MiB."""
+    found = done.metrics
+    outcomes = {outcome: found["counts"].get(outcome, 0) for outcome in ("read", "refused", *FAULTS)}
+    about = {"files": done.case.name, "folder": done.folder, "faults": found["faults"]}
+    return about | outcomes | {"cases": sum(outcomes.values()), "mib": found["beyond"] / 2**20}
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -58,16 +48,16 @@ EXPERIMENT = Experiment(
     "fuzz",
     "Damage files of every kind that the package reads, and see that reading them ends well.",
     cases,
-    lambda done: done.metrics | {"folder": done.folder},
-    {
-        "what": "{what}",
-        "cases": lambda row: str(row["counts"].total()),
-        "read whole": "{counts[read]}",
-        "refused": refused,
-    }
-    | {fault: f"{{counts[{fault}]}}" for fault in FAULTS}
-    | {"most memory beyond the declared image": lambda row: f"{row['beyond'] / 2**20:.1f} MiB"},
+    measure,
+    {"files": "{files}", "read whole": "{read}", "refused": "{refused}"}
+    | {fault: f"{{{fault}}}" for fault in FAULTS}
+    | {"most memory beyond the declared image": "{mib:.1f} MiB"},
     failures=failures,
-    combine=combine,
+    summary=Summary(
+        {"cases": "{cases.sum:.0f}", "read whole": "{read.sum:.0f}", "refused": "{refused.sum:.0f}"}
+        | {fault: f"{{{fault}.sum:.0f}}" for fault in FAULTS}
+        | {"most memory beyond the declared image": "{mib.max:.1f} MiB"},
+        by=("what",),
+    ),
     options=options,
 )

@@ -181,10 +181,12 @@ def read_checkpoint(path: Path, index: int) -> None:
 
 
 def damaged_configuration(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the text of a configuration."""
     return damage.of_text(data, rng, TOML)
 
 
 def damaged_scene(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the text of a scene, or the bytes of a file that it names."""
     return damage.of_text(data, rng, XML) if data.startswith(b"<?xml") else damage.of_bytes(data, rng)
 
 

@@ -177,51 +177,29 @@ def painted_files() -> dict[str, bytes]:
 
 # ---- configurations ----------------------------------------------------------------------------------------
 
-WRITTEN = """\
-preset = "draft"
-seed = 7
-
-[input]
-envmap = "maps/sky.exr"
-width = 128
-rows = [0, 40]
-
-[scene]
-file = "statue"
-parameters = { roughness = 0.5, mesh = "a.ply", smooth = true }
-
-[target]
-kind = "strokes"
-
+PAINTED = """
+scene = { file = "statue", parameters = { roughness = 0.5, mesh = "a.ply", smooth = true } }
+input = { envmap = "maps/sky.exr", rows = [0, 40] }
+loss = { ssim = [1.0, 100.0], tv = 1e-3 }
+target.kind = "strokes"
 [[target.strokes]]
 type = "shadow"
 ellipse = [0.5, 0.7, 0.2, 0.1, 15]
-amount = 0.6
-
 [[target.strokes]]
 type = "light"
 points = [[0.1, 0.2], [0.3, 0.4]]
 width = 0.05
 color = [1.0, 0.8, 0.5]
-
-[loss]
-ssim = [1.0, 100.0]
-tv = 1e-3
-
-[optimizer]
-lr = "auto"
-iterations = 50
 """
 
 
 def toml_files() -> dict[str, bytes]:
-    """Return whole configurations: by hand, and presets and kinds with every key spelled out."""
-    files = {"written.toml": WRITTEN.encode()}
+    """Return whole configurations: two by hand, and presets and kinds with every key spelled out."""
+    files = {"painted.toml": PAINTED.encode()}
+    files["image.toml"] = '[target]\nkind = "image"\nfile = "é/paint.png"\n'.encode()
     for preset, kind in itertools.product(config.preset_names(), ("layers", "siren", "pixels")):
         chosen = config.loads(f'representation.kind = "{kind}"', "/maps", "a.toml", preset)
         files[f"{preset}-{kind}.toml"] = config.to_toml(chosen).encode()
-    painted = '[target]\nkind = "image"\nfile = "é/paint.png"\n'
-    files["painted.toml"] = config.to_toml(config.loads(painted, "/maps")).encode()
     return files
 
 

@@ -14,7 +14,7 @@ from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.scene import parser, scene
-from experiments.harness import Experiment, calling, number
+from experiments.harness import Experiment, calling
 
 WIDTH, MAP = 64, 128
 """Pixels and texels across."""
@@ -133,8 +133,8 @@ EXPERIMENT = Experiment(
         "mean over Mitsuba's, with standard error": lambda m: (
             cell(m["plain"]) if m["ratio"] is None else f"{m['ratio']:.4f} ± {m['noise']:.4f}"
         ),
-        "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['initial'])})",
-        "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m['unedited'])})",
+        "rendering (unedited), dB": "{psnr:.1f} ({initial:.1f})",
+        "map (unedited), dB": "{map:.1f} ({unedited:.1f})",
     },
     summary=summary,
     options=options,

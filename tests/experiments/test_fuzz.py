@@ -3,7 +3,6 @@
 import argparse
 import struct
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from envedit.config import Config
 from experiments.fuzz import damage, drive, experiment, kinds, whole
 from experiments.fuzz.declared import declared as declared_bytes
-from experiments.harness import table
+from experiments.harness import Case, Done, rows_of, table
 from tests.oracles.tiers import slow_but
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
@@ -211,18 +210,24 @@ def test_a_case_is_the_same_file_every_time():
         assert sum(data == dict(files)[name] for name, data in one) < 6  # nearly all are damaged
 
 
-def test_pieces_of_a_kind_add_up_and_faults_are_named():
-    common = {"what": "exr", "errors": {"InputError": 2}, "folder": Path("kept")}
-    hung = common | {"counts": {"refused": 2, "hung": 1}, "beyond": 3 << 20, "faults": [[7, "hung", "5 s"]]}
-    whole = common | {"counts": {"read": 1, "refused": 2}, "beyond": 1 << 20, "faults": []}
-    rows = [hung, whole, whole | {"what": "hdr"}]
-    exr, hdr = experiment.combine(rows)
-    assert exr["counts"] == {"read": 1, "refused": 4, "hung": 1} and exr["beyond"] == 3 << 20
-    lines = table(experiment.EXPERIMENT, rows).splitlines()
-    row = [cell.strip() for cell in lines[2].split("|")]
-    assert row[1:7] == ["exr", "6", "1", "4 InputError", "0", "1"] and row[-2] == "3.0 MiB"
-    assert hdr["counts"].total() == 3 and len(lines) == 4
-    assert experiment.failures(rows) == ["exr 7: hung: 5 s (kept in kept)"]
+def test_pieces_of_a_kind_add_up_and_faults_are_named(tmp_path):
+    def piece(what, counts, mib, faults=()):
+        done = Done(Case(f"{what} 0-2", {}, {"what": what}), tmp_path)
+        done.__dict__["metrics"] = {"counts": counts, "beyond": mib << 20, "faults": faults}
+        return done
+
+    pieces = [
+        piece("map", {"refused": 2, "hung": 1}, 3, [[7, "hung", "5 s"]]),
+        piece("map", {"read": 1, "refused": 2}, 1),
+        piece("toml", {"read": 3}, 0),
+    ]
+    rows = rows_of(experiment.EXPERIMENT, pieces)
+    lines = [
+        [cell.strip() for cell in line.split("|")] for line in table(experiment.EXPERIMENT, rows).splitlines()
+    ]
+    assert lines[2][1:7] == ["map", "6", "1", "4", "0", "1"] and lines[2][-2] == "3.0 MiB"
+    assert lines[3][1:5] == ["toml", "3", "3", "0"] and lines[7][1:5] == ["map 0-2", "0", "2", "0"]
+    assert experiment.failures(rows) == [f"map 7: hung: 5 s (kept in {tmp_path})"]
 
 
 def test_the_pieces_of_a_kind_are_all_its_files():
@@ -245,7 +250,7 @@ def test_images_say_how_large_they_are():
 
 def test_damage_never_fails_and_stays_small():
     rng = np.random.default_rng(0)
-    for data in (b"a", b"[a]\n", whole.WRITTEN.encode(), whole.SCENE.encode()):
+    for data in (b"a", b"[a]\n", whole.PAINTED.encode(), whole.SCENE.encode()):
         for _ in range(100):
             for changed in (damage.of_bytes, kinds.damaged_configuration, kinds.damaged_scene):
                 assert len(changed(data, rng)) <= damage.MOST_BYTES

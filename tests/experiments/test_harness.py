@@ -191,7 +191,6 @@ MAPS = [
     "wasteland_clouds",
 ]  # fmt: skip
 COUNTS = {
-    "ceiling": 166,
     "divergence": 4,
     "engine": 45,
     "fuzz": 28,
@@ -205,7 +204,6 @@ COUNTS = {
     "natural": 680,
     "natural.skies": 1,
     "paint.figure10": 7,
-    "paint.rates": 2,
     "painted_edits": 18,
     "painted_edits.artists": 296,
     "painted_edits.full_resolution": 2,

@@ -4,25 +4,16 @@ import json
 
 import numpy as np
 
-from envedit import config
 from envedit.images import images
 from experiments import harness
 from experiments.harness import Done, calling
-from experiments.paint import browser, figure10, rates
-
-
-def test_rates_without_an_answer_are_dashes():
-    row = dict.fromkeys(rates.FIGURES.values(), 12.345) | {"pixels": 128, "map": 256, "cores": 2}
-    line = harness.table(rates.EXPERIMENT, [row | {"pointer_to_picture_ms": None}]).splitlines()[-1]
-    assert line == "| 128x128 | 256 wide | 2 | 12.3 | 12.3 | 12.3 | 12.3 | - | 12.3 | 12.3 | 12.3 |"
-    sizes = [config.loads(case.job(["input.width=64"]).toml) for case in rates.cases(None)]
-    assert [(one.scene.width, one.input.width) for one in sizes] == [(128, 64), (256, 64)]
+from experiments.paint import figure10
 
 
 def test_the_command_gets_the_configuration_of_the_case_in_an_empty_folder(tmp_path):
     (tmp_path / "job.toml").write_text("seed = 3\n")
-    (browser.prepared(tmp_path) / "edit_out").mkdir()
-    work = browser.prepared(tmp_path)
+    (figure10.prepared(tmp_path) / "edit_out").mkdir()
+    work = figure10.prepared(tmp_path)
     assert [path.name for path in work.iterdir()] == ["edit.toml"]
     assert (work / "edit.toml").read_text() == "seed = 3\n"
 

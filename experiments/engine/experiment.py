@@ -18,6 +18,8 @@ ANALYTIC = {"envmap": "sunsky", "azimuth": 130, "elevation": 45}
 """In its place where there is no data."""
 SUNS = {80: 0.62, 45: 0.40, 10: 0.70}
 """Elevation in degrees of the sun of one texel, and its place across the map."""
+CURVE = (16, 64, 256)
+"""Samples a pixel of T and of prb."""
 RANGES = {"pixels": (64, 128, 256, 512), "texels": (128, 256, 512), "spp": (16, 32, 64, 128, 256)}
 
 
@@ -60,22 +62,30 @@ def cases(given):
     for scene in ("sphere", *meshes):
         size = (32, 32, 64) if quick else (256, 256)
         about = {"scene": scene, "map": SUNNY if SUNNY in maps else "analytic sun and sky"}
-        add(f"transport-{scene}", "transport:measure", lit(*size, scene=scene), about)
+        add(f"transport-{scene}", "transport:measure", lit(*size, scene=scene), about, disk=True)
 
     size, spp = ((24, 32), 2048) if quick else ((128, 256), 4096)
     scenes = ["sphere"] if quick else [s for s in shipped.scenes() if s != "mesh"] + [*meshes]
     for scene, sun in itertools.product(scenes, [45] if quick else SUNS):
-        about, settings = {"scene": scene, "sun": f"{sun} degrees"}, lit(*size, scene=scene)
-        add(f"quality-{scene}-{sun}", "quality:measure", settings, about, sun=[sun, SUNS[sun]], spp=spp)
-    settings = lit(*size, scene="sphere" if quick else "matte")
-    add("curve", "quality:curve", settings, sun=[45, SUNS[45]], spp=spp)
+        about = {"scene": scene, "sun": f"{sun} degrees"}
+        compared = {"sun": [sun, SUNS[sun]], "reference_spp": spp}
+        add(f"quality-{scene}-{sun}", "transport:measure", lit(*size, scene=scene), about, **compared)
+    for samples in (16, 64) if quick else CURVE:
+        settings = lit(*size, samples, "sphere" if quick else "matte")
+        compared = {"sun": [45, SUNS[45]], "reference_spp": spp, "prb_spp": samples}
+        add(f"curve-{samples}", "transport:measure", settings, **compared)
 
     base = {"pixels": 16, "texels": 32, "spp": 16} if quick else {"pixels": 128, "texels": 256, "spp": "auto"}
     ranges = {"pixels": (16, 32), "texels": (16, 32), "spp": (16, 32)} if quick else RANGES
     for variable, values in ranges.items():
         for value in values:
             settings = lit(**base | {variable: value})
-            add(f"scaling-{variable}-{value}", "transport:scaling", settings, {"variable": variable})
+            add(
+                f"scaling-{variable}-{value}",
+                "transport:measure",
+                settings,
+                {"variable": variable, "scene": "sphere"},
+            )
     tiny = {"fit": {"epochs": 60}, "representation": {"kind": "siren", "hidden": 32}}
     for name, file in {"sunsky": "sunsky"}.items() if quick else maps.items():
         settings = {"representation": {"kind": "siren"}} | (tiny if quick else {})

@@ -4,6 +4,7 @@ A program that has to read so many bytes, or to multiply so many numbers, cannot
 """
 
 import functools
+import os
 from pathlib import Path
 
 import drjit as dr
@@ -34,7 +35,8 @@ def measure(settings, quick: bool = False) -> dict:
 def bandwidth(elements: int | None = None) -> dict:
     """Measure bytes a second between memory and cores, on float32 arrays larger than the caches.
 
-    ``elements`` is the number of floats in an array; by default twice the largest cache, 256 MiB or more.
+    ``elements`` is the number of floats in an array; by default of twice the largest cache, 256 MiB or more,
+    but at most a sixteenth of the memory.
 
     Returns
     -------
@@ -44,7 +46,8 @@ def bandwidth(elements: int | None = None) -> dict:
         element: what the processor reads of ``a`` before it writes there is not counted (McCalpin's STREAM).
     """
     cache = largest_cache()
-    elements = elements or max(2 * (cache or 0), 256 << 20) // 4
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    elements = elements or min(max(2 * (cache or 0), 256 << 20), memory // 16) // 4
     b = dr.opaque(mi.Float, 1.5, elements)
     c = dr.opaque(mi.Float, 0.25, elements)
     s = dr.opaque(mi.Float, 3)

@@ -45,18 +45,9 @@ def median_and_best(key: str):
     return lambda row: f"{seconds(row[key]['median_s'])} ({seconds(row[key]['min_s'])})"
 
 
-def _note(row):
-    """Write what a time of the transport is held against; the shortest one if there is no such thing."""
-    if "ratio" in row:
-        return f"{row['ratio']:.3g} times a step through T"
-    if "above_floor" in row:
-        return f"they take {row['above_floor']:.2f} times that"
-    return f"every {row['every']} steps" if "every" in row else seconds(row.get("min_s"))
-
-
 # ---- tables ------------------------------------------------------------------------------------------------
 
-SIZE = {"pixels": "{pixels}x{pixels}", "texels": "{texels[1]}x{texels[0]}"}
+SIZE = {"scene": "{scene}", "pixels": "{pixels}x{pixels}", "texels": "{texels[1]}x{texels[0]}"}
 SUN = {"scene": "{scene}", "sun at": "{sun}"}
 ERROR = {
     "RMSE": of("rmse", percent),
@@ -95,51 +86,55 @@ COLUMNS = {
         "compiled after warm-up": "{kernels[compiled]} of {kernels[launched]}",
         "growth of memory": lambda r: f"{si(r['memory']['bytes'], 'B')} in {r['memory']['calls']} steps",
     },
-    "transport": {
-        "scene": "{scene}",
-        **SIZE,
+    "transport": SIZE
+    | {
         "map": "{map}",
         "spp": "{spp}",
         "path depth": "{depth}",
         "exact columns": "{columns}",
-        "held": lambda r: si(r["bytes"]["held"], "B"),
+        "held": of("held", si, "B"),
         "traced in (first time)": lambda r: f"{seconds(r['again_s'])} ({seconds(r['first_s'])})",
         "columns in": of("resolve_s"),
         "loaded in": of("load_s"),
         "traced in, prb steps": "{trace_in_prb_steps:.3g}",
     },
-    "transport-time": {
-        "scene": "{scene}",
-        "pixels": SIZE["pixels"],
-        "what": "{what}",
-        "median": of("median_s"),
-        "best, or ratio": _note,
+    "transport-time": SIZE
+    | {
+        "T E": of("apply_s"),
+        "T' I": of("adjoint_s"),
+        "read by both": of("read", si, "B"),
+        "bandwidth": of("bandwidth", si, "B/s"),
+        "both over the floor": "{above_floor:.2f}",
+        "a step through T": of("step_s"),
+        "prb, 16 spp, a step": of("prb_step_s"),
+        "over a step through T": "{prb_ratio:.3g}",
     },
     "quality": SUN | {"exact columns": "{columns}"} | ERROR,
-    "quality-parts": SUN | {"path depth 2: region": "{part}", "pixels": "{pixels}"} | ERROR,
+    "quality-parts": SUN | {"path depth 2: region": "{part}", "pixels": "{seen}"} | ERROR,
     "equal-error": SUN
     | {
         "T: error": of("rmse", percent),
-        "a step through T": of("t_step_s"),
+        "a step through T": of("step_s"),
         "prb, 16 spp: error": of("prb_rmse", percent),
         "a step of prb": of("prb_step_s"),
-        "prb needs, spp": of("prb_spp", si),
+        "prb needs, spp": of("prb_needs", si),
         "times a step through T": "{equal_error:.0f}",
     },
     "error-time": {
-        "renderer": "{kind}",
-        "samples a pixel": "{samples}",
-        "step": of("step_s"),
-        "RMSE": ERROR["RMSE"],
-        "without the reference's noise": ERROR["without it"],
+        "samples a pixel": "{prb_samples}",
+        "T: a step": of("step_s"),
+        "RMSE": of("rmse", percent),
+        "without the reference's noise": of("corrected", percent),
+        "prb: a step": of("prb_step_s"),
+        "its RMSE without the noise": of("prb_rmse", percent),
     },
     "scaling": {"varied": "{variable}"}
     | SIZE
     | {
         "spp": "{spp}",
         "exact columns": "{columns}",
-        "traced in": of("trace_s"),
-        "read by both": of("bytes", si, "B"),
+        "traced in": of("again_s"),
+        "read by both": of("read", si, "B"),
         "held": of("held", si, "B"),
         "T E": of("apply_s"),
         "T' I": of("adjoint_s"),
@@ -170,13 +165,25 @@ FITS = Summary(
 )
 
 
+SHOWN = {
+    "transport": ("transport", "transport-time"),
+    "quality": ("quality", "equal-error"),
+    "curve": ("error-time",),
+    "scaling": ("scaling",),
+}
+"""For each section: the tables that show what :func:`.transport.measure` returns as ``transport``."""
+
+
 def measure(done) -> list[dict]:
     """Return the rows of all tables that a case has numbers for, and its own of ``machine``."""
     found = done.metrics
     common = {key: found[key] for key in ("machine", "seconds", "not_finite")}
     choices = {line for rows in found["tables"].values() for row in rows for line in row.get("choices", [])}
-    tables = {"machine": [{"sampling": "; ".join(sorted(choices))}]} | found["tables"]
-    return [common | {"table": name} | row for name, rows in tables.items() for row in rows]
+    rows = [common | {"table": "machine", "sampling": "; ".join(sorted(choices))}]
+    for name, some in found["tables"].items():
+        shown = SHOWN[done.case.about["section"]] if name == "transport" else (name,)
+        rows += [common | {"table": one} | row for one in shown for row in some]
+    return rows
 
 
 def summary(rows: list[dict]) -> str:
@@ -215,7 +222,7 @@ def _transport(row):
     return _kernels(row["kernels"]) | {
         f"adjoint off by {row['adjointness']:.2g}": row["adjointness"] < ADJOINT,
         "no exact column under a clear sky": row["columns"] > 0,
-        "nothing is read": row["bytes"]["apply"] > 0 and row["floor_s"] > 0,
+        "nothing is read": row["read"] > 0 and row["floor_s"] > 0,
         "T was not found on disk after it was kept there": row["load_s"] is not None,
     }
 
@@ -239,15 +246,7 @@ CHECKS = {
     "fits": _fits,
 }  # fmt: skip
 """For each table: row -> what is wrong unless it holds."""
-NEEDED = {
-    "floors": ("bandwidth", "matmul", "rays"),
-    "siren": ("siren",),
-    "transport": ("transport", "transport-time"),
-    "quality": ("quality", "equal-error"),
-    "curve": ("error-time",),
-    "scaling": ("scaling",),
-    "fits": ("fits",),
-}
+NEEDED = SHOWN | {"floors": ("bandwidth", "matmul", "rays"), "siren": ("siren",), "fits": ("fits",)}
 """For each section: what its cases must have rows of."""
 
 
@@ -271,10 +270,10 @@ GROWTH = {
 }
 """Label and value of what is varied."""
 CURVES = {
-    "tracing, s": ("s-", lambda row: row["trace_s"]),
+    "tracing, s": ("s-", lambda row: row["again_s"]),
     "T E, s": ("o-", lambda row: row["apply_s"]),
     "T' I, s": ("^-", lambda row: row["adjoint_s"]),
-    "read by both, GB": ("x--", lambda row: row["bytes"] / 1e9),
+    "read by both, GB": ("x--", lambda row: row["read"] / 1e9),
 }
 
 
@@ -295,16 +294,18 @@ def growth(rows: list[dict], file: Path) -> None:
 def error_time(rows: list[dict], file: Path) -> None:
     """Draw error against the seconds of a step, T and prb."""
     with figure(file, 1, 1, (5.5, 4)) as panel:
-        for kind, style in (("prb", "s-"), ("T", "o-")):
-            some = [row for row in rows if row["kind"] == kind]
-            points = [(row["step_s"], 100 * row["rmse"]) for row in some]
-            panel.loglog(*zip(*points, strict=True), style, label=kind)
-            for row, point in zip(some, points, strict=True):
-                panel.annotate(f" {row['samples']} spp", point, fontsize="x-small")
+        for name, style, step, error in (
+            ("prb", "s-", "prb_step_s", "prb_rmse"),
+            ("T", "o-", "step_s", "corrected"),
+        ):
+            points = [(row[step], 100 * row[error]) for row in rows]
+            panel.loglog(*zip(*points, strict=True), style, label=name)
+            for row, point in zip(rows, points, strict=True):
+                panel.annotate(f" {row['prb_samples']} spp", point, fontsize="x-small")
         panel.margins(x=0.1)
         panel.axhline(100 * rows[0]["noise"], color="grey", ls=":", label="noise of the reference")
         panel.set_xlabel("seconds of a step: rendering and gradient")
-        panel.set_ylabel("RMSE, % of the mean")
+        panel.set_ylabel("RMSE, % of the mean, without that noise")
         panel.legend(fontsize="small")
 
 

@@ -17,7 +17,7 @@ TRANSPORT = {
     "kernels": SIREN["kernels"],
     "adjointness": 1e-7,
     "columns": 1,
-    "bytes": {"apply": 1},
+    "read": 1,
     "floor_s": 1e-3,
     "load_s": 0.1,
 }
@@ -77,12 +77,11 @@ def test_numbers_have_three_digits():
 
 
 def test_figures_are_drawn_of_what_there_is(tmp_path):
-    size = {"table": "scaling", "pixels": 16, "texels": [8, 16], "spp": 16, "trace_s": 1.0, "apply_s": 0.1}
-    size |= {"adjoint_s": 0.2, "bytes": 1e6}
-    error = {"table": "error-time", "samples": 16, "step_s": 0.1, "rmse": 0.01, "noise": 0.001}
-    found = [size | {"variable": name} for name in tables.GROWTH] + [
-        error | {"kind": k} for k in ("prb", "T")
-    ]
+    size = {"table": "scaling", "pixels": 16, "texels": [8, 16], "spp": 16, "again_s": 1.0, "apply_s": 0.1}
+    size |= {"adjoint_s": 0.2, "read": 1e6}
+    error = {"table": "error-time", "prb_samples": 16, "step_s": 0.1, "corrected": 0.01, "noise": 0.001}
+    error |= {"prb_step_s": 0.2, "prb_rmse": 0.1}
+    found = [size | {"variable": name} for name in tables.GROWTH] + [error, error]
     files = tables.draw(found, tmp_path)
     assert [file.name for file in files] == ["engine_scaling.png", "engine_error_time.png"]
     assert all(file.stat().st_size > 1000 for file in files)
@@ -97,7 +96,7 @@ def test_cases_with_data_and_without(tmp_path, monkeypatch, capsys):
         return int(re.search(r"(\d+) jobs?: ", said.out)[1]), said.err
 
     monkeypatch.delenv("ENVEDIT_DATA", raising=False)
-    assert count("--quick") == (12, "")
+    assert count("--quick") == (13, "")
     without, said = count()
     assert "ENVEDIT_DATA is not set" in said
     for name in ("puresky/a_puresky_1k.hdr", "meshes/bunny_watertight.ply"):

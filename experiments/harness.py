@@ -14,9 +14,8 @@ interrupted continues, and results of another configuration or version are never
            Case(name, {"input": {"envmap": str(file)}, "target": {"rotate_degrees": 60}}, {"map": name})
            for name, file in puresky.find().items()
        ],
-       measure=measures,
-       columns={"map": "{map}", "rendering, dB": "{render:.1f}"},
-       summary=Summary({"maps": "{rows}", "rendering, dB (worst)": "{render.mean:.1f} ({render.min:.1f})"}),
+       measure=lambda done: {"psnr": done.metrics["render"]["psnr"]},
+       columns={"map": "{map}", "rendering, dB": "{psnr:.1f}"},
    )
 
 What a run does not measure is a function, called in a process of its own (:func:`calling`).
@@ -168,52 +167,6 @@ class Done:
         return slice(first, last + 1)
 
 
-MEASURES = {
-    "render": "render.psnr",
-    "render_ssim": "render.ssim",
-    "initial": "initial.psnr",
-    "noise": "ceiling.psnr",
-    "psnr": "envmap.psnr",
-    "ssim": "envmap.ssim",
-    "lpips": "envmap.lpips",
-    "unedited": "initial_envmap.psnr",
-    "unedited_ssim": "initial_envmap.ssim",
-    "unedited_lpips": "initial_envmap.lpips",
-    "off": "sun_offset_texels",
-    "turn": "turn_degrees",
-    "colours_outside": "natural.colours_outside",
-    "seam": "natural.seam",
-    "high_frequency": "natural.high_frequency",
-    "towards": "painted.towards",
-    "reachable": "painted.reachable",
-    "elsewhere": "painted.elsewhere",
-    "iterations": "iterations",
-    "solve_s": "timing.solve_s",
-    "total_s": "timing.total_s",
-}
-"""Numbers of an edit by name, and where ``metrics.json`` has them."""
-
-
-def measures(done: Done) -> dict:
-    """Return the numbers of an edit that tables show: those of :data:`MEASURES`, and ``gain``.
-
-    Returns
-    -------
-    dict
-        None for what the edit has not. ``gain``: the map's PSNR over that of the unedited one, dB.
-    """
-    found = {name: at(done.metrics, path) for name, path in MEASURES.items()}
-    known = None not in (found["psnr"], found["unedited"])
-    return found | {"gain": found["psnr"] - found["unedited"] if known else None}
-
-
-def at(tree: Any, path: str) -> Any:
-    """Return what a dotted path leads to in nested dicts; None where it leads to nothing."""
-    for key in path.split("."):
-        tree = tree.get(key) if isinstance(tree, dict) else None
-    return tree
-
-
 def layer(folder: Path, name: str) -> np.ndarray:
     """Read a layer of ``edited_layers.exr``: (H, W, 3), or (H, W) of one that has luminance only."""
     channels = OpenEXR.File(str(folder / "edited_layers.exr"), separate_channels=True).channels()
@@ -244,14 +197,14 @@ class Experiment:
         Done -> dict, or a list of them where a case is several rows; with the case's ``about``, the columns
         are made of them.
     columns : dict
-        Heading -> format string, or callable of the row's dict that returns the text, as :func:`cells`; or of
-        each group (a dict of dicts).
+        Heading -> format string, or callable of the row's dict that returns the text; or of each group
+        (a dict of dicts).
     group : callable
         Row -> heading of the part of the table that it belongs to; "" for one table.
     failures : callable, optional
         All rows -> a sentence for each thing that must hold and does not: exit code 1 if there are any.
-    summary : Summary or callable, optional
-        Markdown that precedes the table: statistics of all rows, or made of them by a callable.
+    summary : callable, optional
+        All rows -> Markdown that precedes the table.
     combine : callable
         All rows -> rows of the table, such as means over cases.
     panels : callable
@@ -276,7 +229,7 @@ class Experiment:
     columns: dict[str, Any] = field(default_factory=dict)
     group: Callable[[dict], str] = lambda row: ""
     failures: Callable[[list[dict]], list[str]] | None = None
-    summary: Summary | Callable[[list[dict]], str] | None = None
+    summary: Callable[[list[dict]], str] | None = None
     combine: Callable[[list[dict]], list[dict]] = lambda rows: rows
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
     sheet: Callable[[Case], str] = lambda case: "sheet"
@@ -333,92 +286,8 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def number(value: float | None, form: str = ".1f") -> str:
-    """Format a number; a dash for None and NaN, a space before the sign of percent."""
-    if value is None or value != value:
-        return "-"
-    return format(value, form).replace("%", " %")
-
-
-class Number(float):
-    """A number that is formatted as :func:`number`; None becomes NaN."""
-
-    def __new__(cls, value: float | None):
-        return super().__new__(cls, np.nan if value is None else value)
-
-    def __format__(self, form: str) -> str:
-        return number(float(self), form)
-
-
-class Statistics:
-    """Statistics of the known values of a list; a dash for each where there are none.
-
-    Attributes
-    ----------
-    mean, median, min, max, sum, deviation : Number
-        ``deviation``: standard deviation, of the population.
-    count : int
-        How many values are known.
-    """
-
-    _FUNCTIONS = {
-        "mean": np.mean, "median": np.median, "min": np.min, "max": np.max, "sum": np.sum,
-        "deviation": np.std,
-    }  # fmt: skip
-
-    def __init__(self, values: Iterable[float | None]):
-        known = np.array([v for v in values if v is not None and v == v], float)
-        self.count = len(known)
-        for name, function in self._FUNCTIONS.items():
-            setattr(self, name, Number(function(known) if self.count else None))
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Statistics of the rows of a table, a line for each group.
-
-    Attributes
-    ----------
-    columns : dict
-        Heading -> format string of ``{rows}``, their number, and of the :class:`Statistics` of each column,
-        as ``{psnr.mean:.1f}``; or a callable of the group's rows that returns the text.
-    by : sequence of str
-        Columns that rows of a group have in common; each is shown.
-    """
-
-    columns: dict[str, str | Callable[[list[dict]], str]]
-    by: Sequence[str] = ()
-
-    def __call__(self, rows: list[dict]) -> str:
-        """Return the table."""
-        groups: dict[tuple, list[dict]] = {}
-        for row in rows:
-            groups.setdefault(tuple(row[key] for key in self.by), []).append(row)
-        lines = []
-        for key, some in groups.items():
-            numeric = [k for k in some[0] if all(_is_number(row.get(k)) for row in some)]
-            values = {k: Statistics(row.get(k) for row in some) for k in numeric} | {"rows": len(some)}
-            texts = [
-                form(some) if callable(form) else form.format_map(values) for form in self.columns.values()
-            ]
-            lines.append([*map(str, key), *texts])
-        return markdown([*self.by, *self.columns], lines)
-
-
-def _is_number(value):
-    return value is None or isinstance(value, int | float | np.number)
-
-
-def cells(columns: dict, row: dict) -> list[str]:
-    """Return the texts of a row.
-
-    Parameters
-    ----------
-    columns : dict
-        Heading -> format string of the row's values, where an unknown number is a dash and ``{x:.1%}`` has a
-        space before its sign; or a callable of the row.
-    """
-    shown = {k: Number(v) if v is None or isinstance(v, float) else v for k, v in row.items()}
-    return [form(row) if callable(form) else form.format_map(shown) for form in columns.values()]
+    """Format a number; a dash for None and NaN."""
+    return "-" if value is None or value != value else format(value, form)
 
 
 def rows_of(experiment: Experiment, done: Iterable[Done]) -> list[dict]:
@@ -436,7 +305,8 @@ def table(experiment: Experiment, rows: list[dict]) -> str:
     for heading in dict.fromkeys(map(experiment.group, rows)):
         some = [row for row in rows if experiment.group(row) == heading]
         columns = experiment.columns.get(heading, experiment.columns)
-        lines = [cells(columns, row) for row in some]
+        forms = [form.format_map if isinstance(form, str) else form for form in columns.values()]
+        lines = [[form(row) for form in forms] for row in some]
         parts += [f"{heading}:"] * bool(heading) + [markdown(list(columns), lines)]
     return "\n\n".join(parts)
 

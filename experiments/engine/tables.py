@@ -4,7 +4,8 @@ import math
 from collections import Counter
 from pathlib import Path
 
-from experiments.harness import Summary, figure, number
+from experiments.harness import figure
+from experiments.summary import Summary, values
 
 ADJOINT = 1e-5
 """|<T E, I> - <E, T' I>| over <T E, I>: sums of float32 in two orders, taken in double at the end."""
@@ -59,7 +60,7 @@ COLUMNS = {
         "case": "{case}",
         "begun, UTC": lambda r: r["machine"]["time_utc"].removesuffix("+00:00"),
         "took": "{seconds:.0f} s",
-        "load before": lambda r: number(r["machine"]["load"], ".2f"),
+        "load before": "{load:.2f}",
         "sampling of T": "{sampling}",
     },
     "bandwidth": {
@@ -153,15 +154,16 @@ COLUMNS = {
 }
 """Columns of each table: a table's name is that of its marker in docs/engine.md."""
 FITS = Summary(
+    {"fits, medians": "{preset}"},
     {
-        "fits": "{rows}",
-        "log-PSNR, median, dB": "{log_psnr.median:.1f}",
+        "maps": "{runs}",
+        "log-PSNR, dB": "{log_psnr.median:.1f}",
         "peak ratio": "{peak_ratio.median:.2f}",
         "mean ratio": "{mean_ratio.median:.2f}",
         "with noise: mean, dB": "{noisy_mean.median:.1f}",
         "worst of 5, dB": "{noisy_worst.median:.1f}",
         "fitted in, s": "{fitted_s.median:.1f}",
-    }
+    },
 )
 
 
@@ -179,9 +181,11 @@ def measure(done) -> list[dict]:
     found = done.metrics
     common = {key: found[key] for key in ("machine", "seconds", "not_finite")}
     choices = {line for rows in found["tables"].values() for row in rows for line in row.get("choices", [])}
-    rows = [common | {"table": "machine", "sampling": "; ".join(sorted(choices))}]
+    about = {"sampling": "; ".join(sorted(choices)), "load": found["machine"]["load"]}
+    rows = [common | {"table": "machine"} | values(about)]
     for name, some in found["tables"].items():
         shown = SHOWN[done.case.about["section"]] if name == "transport" else (name,)
+        some = [values(row) for row in some] if name == "fits" else some
         rows += [common | {"table": one} | row for one in shown for row in some]
     return rows
 
@@ -237,8 +241,8 @@ def _quality(row):
 
 def _fits(row):
     worst, mean, log_psnr = (row[key] for key in ("noisy_worst", "noisy_mean", "log_psnr"))
-    known = None not in (worst, mean, log_psnr)
-    return {"noise makes the fit better": not known or worst <= mean <= log_psnr + 1}
+    unknown = worst != worst or mean != mean  # NaN
+    return {"noise makes the fit better": unknown or worst <= mean <= log_psnr + 1}
 
 
 CHECKS = {

@@ -8,8 +8,9 @@ import itertools
 
 from experiments.fuzz.drive import FAULTS
 from experiments.fuzz.kinds import KINDS
-from experiments.harness import Experiment, Summary, calling
+from experiments.harness import Experiment, calling
 
+OUTCOMES = ("read", "refused", *FAULTS)
 PIECE = 2500
 """Files of a case of the harness."""
 
@@ -31,9 +32,19 @@ def cases(given):
 def measure(done) -> dict:
     """Return how many files of a piece had each outcome, and the most memory that one took, MiB."""
     found = done.metrics
-    outcomes = {outcome: found["counts"].get(outcome, 0) for outcome in ("read", "refused", *FAULTS)}
-    about = {"files": done.case.name, "folder": done.folder, "faults": found["faults"]}
-    return about | outcomes | {"cases": sum(outcomes.values()), "mib": found["beyond"] / 2**20}
+    outcomes = {outcome: found["counts"].get(outcome, 0) for outcome in OUTCOMES}
+    return outcomes | {"mib": found["beyond"] / 2**20, "faults": found["faults"], "folder": done.folder}
+
+
+def combine(rows: list[dict]) -> list[dict]:
+    """Add up the pieces of each kind."""
+    found = []
+    for what in dict.fromkeys(row["what"] for row in rows):
+        some = [row for row in rows if row["what"] == what]
+        sums = {outcome: sum(row[outcome] for row in some) for outcome in OUTCOMES}
+        most = max(row["mib"] for row in some)
+        found.append({"what": what, "cases": sum(sums.values()), "mib": most} | sums)
+    return found
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -49,15 +60,10 @@ EXPERIMENT = Experiment(
     "Damage files of every kind that the package reads, and see that reading them ends well.",
     cases,
     measure,
-    {"files": "{files}", "read whole": "{read}", "refused": "{refused}"}
+    {"what": "{what}", "cases": "{cases}", "read whole": "{read}", "refused": "{refused}"}
     | {fault: f"{{{fault}}}" for fault in FAULTS}
     | {"most memory beyond the declared image": "{mib:.1f} MiB"},
     failures=failures,
-    summary=Summary(
-        {"cases": "{cases.sum:.0f}", "read whole": "{read.sum:.0f}", "refused": "{refused.sum:.0f}"}
-        | {fault: f"{{{fault}.sum:.0f}}" for fault in FAULTS}
-        | {"most memory beyond the declared image": "{mib.max:.1f} MiB"},
-        by=("what",),
-    ),
+    combine=combine,
     options=options,
 )

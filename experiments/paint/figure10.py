@@ -27,6 +27,7 @@ from envedit.images import images
 from envedit.sweep.process import CONFIG
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
+from experiments.summary import values
 
 MAP = "kloofendal_48d_partly_cloudy"
 CORNER_S, SETTING_S = 0.4, 1.0
@@ -214,7 +215,7 @@ EXPERIMENT = Experiment(
     "paint.figure10",
     "The six edits of the paper's Figure 10, each painted in the page.",
     cases,
-    lambda done: [] if done.case.name == "page" else done.metrics,
+    lambda done: [] if done.case.name == "page" else values(done.metrics),
     {
         "edit": "{edit}",
         "strokes": lambda row: ", ".join(f"{s['type']} ({shape_of(s) or 'all'})" for s in row["strokes"]),

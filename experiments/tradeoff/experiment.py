@@ -6,9 +6,11 @@ those of the same call. Nothing else should run on the machine meanwhile.
 
 from __future__ import annotations
 
+import math
 import statistics
 
-from experiments.harness import Done, Experiment, Summary, calling
+from experiments.harness import Done, Experiment, calling
+from experiments.summary import Numbers, Value, values
 
 from . import plan
 
@@ -78,17 +80,20 @@ def measure(done: Done) -> list[dict]:
             row[change] = row[key] - standard[0][key]
     unknown = dict.fromkeys(rows[0])
     bounds = {name: worth(judged) for name, judged in done.metrics["bounds"].items()}
-    return rows + [unknown | {"setting": f"({name} map)"} | found for name, found in bounds.items()]
+    rows += [unknown | {"setting": f"({name} map)"} | found for name, found in bounds.items()]
+    return [values(row) for row in rows]
 
 
-def geometric(key: str):
-    """Return a column of the geometric mean of ratios."""
-
-    def text(rows):
-        known = [row[key] for row in rows if row[key] is not None]
-        return f"{statistics.geometric_mean(known):.2f}" if known else "-"
-
-    return text
+def means(rows: list[dict]) -> list[dict]:
+    """Average every setting over its cells: ratios geometrically, differences arithmetically."""
+    found = []
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        some = [row for row in rows if row["setting"] == setting]
+        logs = {key: Numbers([math.log(row[key]) for row in some]) for key in ("time", "again", "memory")}
+        mean = {key: Numbers([row[key] for row in some]).mean for key in ("rendering", "map", "ssim", "sun")}
+        mean |= {key: Value(math.exp(one.mean)) for key, one in logs.items()}
+        found.append({"table": "settings", "setting": setting, "cells": len(some)} | mean)
+    return found
 
 
 EXPERIMENT = Experiment(
@@ -97,33 +102,35 @@ EXPERIMENT = Experiment(
     cases,
     measure,
     {
-        "cell": "{cell}",
-        "setting": "{setting}",
-        "s": "{s:.1f}",
-        "s again": "{again_s:.1f}",
-        "rendering s": "{rendering_s:.1f}",
-        "tracing and search s": "{tracing_s:.1f}",
-        "numbers s": "{numbers_s:.1f}",
-        "processors": "{processors:.2f}",
-        "GB": "{gb:.2f}",
-        "rendering, dB": "{psnr:.1f}",
-        "with the judge's noise": "{noisy_psnr:.1f}",
-        "map, dB": "{map_psnr:.1f}",
-        "map SSIM": "{map_ssim:.3f}",
-        "sun off, degrees": "{sun:.1f}",
-    },
-    summary=Summary(
-        {
-            "cells": "{rows}",
-            "time": geometric("time"),
-            "again": geometric("again"),
-            "memory": geometric("memory"),
-            "rendering, dB": "{rendering.mean:+.2f}",
-            "map, dB": "{map.mean:+.2f}",
-            "map SSIM": "{ssim.mean:+.3f}",
-            "sun off, degrees": "{sun.mean:.1f}",
+        "settings": {
+            "setting": "{setting}",
+            "cells": "{cells}",
+            "time": "{time:.2f}",
+            "again": "{again:.2f}",
+            "memory": "{memory:.2f}",
+            "rendering, dB": "{rendering:+.2f}",
+            "map, dB": "{map:+.2f}",
+            "map SSIM": "{ssim:+.3f}",
+            "sun off, degrees": "{sun:.1f}",
         },
-        by=("setting",),
-    ),
+        "runs": {
+            "cell": "{cell}",
+            "setting": "{setting}",
+            "s": "{s:.1f}",
+            "s again": "{again_s:.1f}",
+            "rendering s": "{rendering_s:.1f}",
+            "tracing and search s": "{tracing_s:.1f}",
+            "numbers s": "{numbers_s:.1f}",
+            "processors": "{processors:.2f}",
+            "GB": "{gb:.2f}",
+            "rendering, dB": "{psnr:.1f}",
+            "with the judge's noise": "{noisy_psnr:.1f}",
+            "map, dB": "{map_psnr:.1f}",
+            "map SSIM": "{map_ssim:.3f}",
+            "sun off, degrees": "{sun:.1f}",
+        },
+    },
+    group=lambda row: row["table"],
+    combine=lambda rows: means(rows) + [row | {"table": "runs"} for row in rows],
     alone=True,
 )

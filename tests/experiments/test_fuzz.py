@@ -226,7 +226,7 @@ def test_pieces_of_a_kind_add_up_and_faults_are_named(tmp_path):
         [cell.strip() for cell in line.split("|")] for line in table(experiment.EXPERIMENT, rows).splitlines()
     ]
     assert lines[2][1:7] == ["map", "6", "1", "4", "0", "1"] and lines[2][-2] == "3.0 MiB"
-    assert lines[3][1:5] == ["toml", "3", "3", "0"] and lines[7][1:5] == ["map 0-2", "0", "2", "0"]
+    assert lines[3][1:5] == ["toml", "3", "3", "0"] and len(lines) == 4
     assert experiment.failures(rows) == [f"map 7: hung: 5 s (kept in {tmp_path})"]
 
 

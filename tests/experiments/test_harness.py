@@ -13,7 +13,7 @@ import experiments.__main__ as command
 from envedit import sweep
 from envedit.core.errors import ConfigError, InputError
 from experiments import harness
-from experiments.harness import Case, Done, Experiment, Summary, markdown, montage, number, overridden
+from experiments.harness import Case, Done, Experiment, markdown, montage, number, overridden
 
 STUB = (
     "import json, pathlib, sys, tomllib; folder = pathlib.Path(sys.argv[1]);"
@@ -143,40 +143,8 @@ def test_an_override_beats_the_case_and_a_target_file_its_turn():
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
 
 
-def test_a_summary_has_statistics_of_what_is_known_by_group():
-    columns = {
-        "runs": "{rows}",
-        "dB (worst)": "{x.mean:.1f} ({x.min:.1f})",
-        "over 3": "{x.count} {y.max:+.0%}",
-    }
-    rows = [
-        {"kind": kind, "x": x, "y": None} for kind, x in (("a", 1.0), ("a", 2.0), ("b", None), ("a", None))
-    ]
-    rows[0]["y"] = 0.25
-    lines = Summary(columns, by=("kind",))(rows).splitlines()
-    assert lines[0] == "| kind | runs | dB (worst) | over 3 |"
-    assert lines[2:] == ["| a | 3 | 1.5 (1.0) | 2 +25 % |", "| b | 1 | - (-) | 0 - |"]
-    assert Summary({"all": lambda some: str(len(some))})(rows).endswith("| 4 |")
-
-
-def test_the_measures_of_an_edit_are_those_of_its_metrics(tmp_path):
-    done = Done(Case("x", {}), tmp_path)
-    done.__dict__["metrics"] = {"render": {"psnr": 40.0}, "envmap": {"psnr": 30.0}, "painted": None}
-    found = harness.measures(done)
-    assert (found["render"], found["psnr"], found["towards"], found["gain"]) == (40.0, 30.0, None, None)
-    done.metrics["initial_envmap"] = {"psnr": 21.0}
-    assert harness.measures(done)["gain"] == 9.0
-    columns = {
-        "map": "{psnr:.1f} ({gain:+.1f})",
-        "paint": "{towards:.0%}",
-        "twice": lambda m: str(2 * m["psnr"]),
-    }
-    assert harness.cells(columns, harness.measures(done)) == ["30.0 (+9.0)", "-", "60.0"]
-
-
 def test_numbers_tables_and_montages():
     assert [number(v) for v in (None, float("nan"), 1.25, 0)] == ["-", "-", "1.2", "0.0"]
-    assert number(0.123, ".1%") == "12.3 %"
     assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
     gap = harness.GAP
     made = montage([[np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))], [np.full((4, 1, 3), 2.0)]])

@@ -253,12 +253,13 @@ def test_ratios_are_to_the_median_of_the_cell_and_changes_from_the_same_seed(res
     lines = [
         [text.strip() for text in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()
     ]
-    means = {line[0]: line[1:] for line in lines[2 : lines.index([])]}
+    heads = [i for i, line in enumerate(lines) if line[:1] in (["setting"], ["cell"])]
+    means = {line[0]: line[1:] for line in lines[heads[0] : heads[1]] if line}
     # Geometric means: of 0.5 and 2; of 4.5 and 19.5 over 9.5. The rendering is shown with at most 55 dB.
     assert means["x"] == ["6", "1.00", "0.99", "1.00", "+15.00", "+0.00", "+0.000", "2.0"]
     assert means["standard, seed 1"][:2] == ["6", "1.00"] and means["standard, seed 1"][4] == "+1.00"
     assert means["(unedited map)"] == ["6", *["-"] * 7]
-    rows = {tuple(line[:2]): line[2:] for line in lines[lines.index([]) :] if line}
+    rows = {tuple(line[:2]): line[2:] for line in lines[heads[1] :] if line}
     cell_of = f"{plan.MAPS[0]}, matte"
     assert rows[cell_of, "x"] == [
         "20.0", "19.5", "0.5", "0.5", "0.8", "1.50", "2.00", "55.0", "69.0", "20.0", "0.700", "-",

@@ -1,0 +1,103 @@
+"""Statistics over the rows of an experiment, declared as columns.
+
+.. code-block:: python
+
+   Summary(
+       {"scene": "{scene}"},
+       {
+           "runs": "{runs}",
+           "rendering, dB (worst)": "{render.mean:.1f} ({render.min:.1f})",
+           "over 5 %": "{outside.above[0.05]}",
+       },
+   )
+
+A row of this table is a scene: all rows of the experiment that agree in what the first dictionary writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.harness import markdown
+
+
+class Value(float):
+    """A number that is written as a dash where it is not known (NaN), and by ``.0%`` as ``12 %``."""
+
+    def __format__(self, form: str) -> str:
+        """Write the number."""
+        return "-" if self != self else super().__format__(form).replace("%", " %")
+
+
+def values(row: dict) -> dict:
+    """Return a row in which numbers, and None, are :class:`Value`; texts, lists and counts stay."""
+    numbers = {key: value for key, value in row.items() if value is None or isinstance(value, float)}
+    return row | {key: Value("nan" if value is None else value) for key, value in numbers.items()}
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How many numbers are on one side of a limit; ``[limit]`` in a format string."""
+
+    count: Callable[[float], int]
+
+    def __getitem__(self, limit) -> int:
+        return int(self.count(float(limit)))
+
+
+class Numbers:
+    """One measure over several rows: ``count``, ``mean``, ``median``, ``min`` and ``max``.
+
+    None and NaN are left out. ``above[0.05]`` and ``below[0]`` count the numbers on either side of a limit.
+    """
+
+    def __init__(self, measured: Sequence[float | None]):
+        known = np.array([value for value in measured if value is not None and value == value], float)
+        self.count = len(known)
+        statistics = [np.mean, np.median, np.min, np.max]
+        self.mean, self.median, self.min, self.max = (
+            Value(f(known) if self.count else "nan") for f in statistics
+        )
+        self.above = Counts(lambda limit: (known > limit).sum())
+        self.below = Counts(lambda limit: (known < limit).sum())
+
+
+class _Statistics(dict):
+    """The numbers of some rows by their keys, as a format string looks them up."""
+
+    def __init__(self, rows):
+        super().__init__(runs=len(rows))
+        self.rows = rows
+
+    def __missing__(self, key):
+        return Numbers([row.get(key) for row in self.rows])
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A table of statistics: ``summary`` of an :class:`experiments.harness.Experiment`.
+
+    Attributes
+    ----------
+    by : dict
+        Heading -> format string of a row: rows that agree in all of them are one row of the table.
+    columns : dict
+        Heading -> format string of :class:`Numbers` by the rows' keys, and of ``runs``, the number of rows.
+    """
+
+    by: dict[str, str]
+    columns: dict[str, str]
+
+    def __call__(self, rows: list[dict]) -> str:
+        """Return the table of some rows, as Markdown."""
+        groups: dict[tuple, list[dict]] = {}
+        for row in rows:
+            groups.setdefault(tuple(form.format_map(row) for form in self.by.values()), []).append(row)
+        lines = []
+        for names, some in groups.items():
+            statistics = _Statistics(some)
+            lines.append([*names, *(form.format_map(statistics) for form in self.columns.values())])
+        return markdown([*self.by, *self.columns], lines)

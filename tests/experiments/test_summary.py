@@ -1,0 +1,30 @@
+"""Statistics over rows: what counts, what is left out, and how it is written."""
+
+from experiments.summary import Numbers, Summary, Value, values
+
+ROWS = [
+    {"scene": "b", "psnr": 10.0, "seam": None},
+    {"scene": "a", "psnr": 30.0, "seam": 2.0},
+    {"scene": "b", "psnr": float("nan"), "seam": 3.0},
+    {"scene": "b", "psnr": 20.0, "seam": 5.0},
+]
+
+
+def test_a_row_for_each_group_in_the_order_in_which_they_come():
+    columns = {"runs": "{runs}", "PSNR": "{psnr.mean:.1f} ({psnr.min:.0f}), {psnr.count}"}
+    lines = Summary({"scene": "{scene}"}, columns)(ROWS).splitlines()
+    assert lines[0] == "| scene | runs | PSNR |"
+    assert lines[2:] == ["| b | 3 | 15.0 (10), 2 |", "| a | 1 | 30.0 (30), 1 |"]
+
+
+def test_counts_on_either_side_of_a_number():
+    text = Summary({}, {"": "{seam.above[2.5]} {seam.above[3]} {seam.below[3]} {seam.median:.1f}"})(ROWS)
+    assert text.endswith("| 2 1 1 3.0 |")
+
+
+def test_what_is_not_known_is_a_dash():
+    assert f"{Value('nan'):.1f} {Value(0.125):+.1%} {Value(2):.1f}" == "- +12.5 % 2.0"
+    assert f"{Numbers([None]).max:.1f}" == "-" and Numbers([]).above[0] == 0
+    row = values({"a": None, "b": 0.5, "c": "text", "d": [1.0], "e": 3})
+    assert "{a:.1f} {b:.0%} {c} {e}".format_map(row) == "- 50 % text 3"
+    assert Summary({}, {"": "{other.mean:.1f}"})(ROWS).endswith("| - |")

@@ -31,11 +31,25 @@ class Value(float):
         """Write the number."""
         return "-" if self != self else super().__format__(form).replace("%", " %")
 
+    def __getitem__(self, key):
+        """Return an unknown part of something unknown, such as the PSNR of a map that there is not."""
+        return Value("nan")
+
 
 def values(row: dict) -> dict:
-    """Return a row in which numbers, and None, are :class:`Value`; texts, lists and counts stay."""
-    numbers = {key: value for key, value in row.items() if value is None or isinstance(value, float)}
-    return row | {key: Value("nan" if value is None else value) for key, value in numbers.items()}
+    """Return a row, such as of ``metrics.json``, whose numbers, and None, are :class:`Value`.
+
+    Columns write parts of it as ``{render[psnr]:.1f}``. Texts, lists and counts stay.
+    """
+    return {key: _value(value) for key, value in row.items()}
+
+
+def _value(content):
+    if isinstance(content, dict):
+        return values(content)
+    if content is None or isinstance(content, float):
+        return Value("nan" if content is None else content)
+    return content
 
 
 @dataclass(frozen=True)
@@ -51,10 +65,13 @@ class Counts:
 class Numbers:
     """One measure over several rows: ``count``, ``mean``, ``median``, ``min`` and ``max``.
 
-    None and NaN are left out. ``above[0.05]`` and ``below[0]`` count the numbers on either side of a limit.
+    None and NaN are left out. ``above[0.05]`` and ``below[0]`` count the numbers on either side of a limit;
+    ``[key]`` is a part of each, where they are dicts.
     """
 
-    def __init__(self, measured: Sequence[float | None]):
+    def __init__(self, measured: Sequence):
+        self.parts = measured
+        measured = [value for value in measured if not isinstance(value, dict)]
         known = np.array([value for value in measured if value is not None and value == value], float)
         self.count = len(known)
         statistics = [np.mean, np.median, np.min, np.max]
@@ -63,6 +80,10 @@ class Numbers:
         )
         self.above = Counts(lambda limit: (known > limit).sum())
         self.below = Counts(lambda limit: (known < limit).sum())
+
+    def __getitem__(self, key) -> Numbers:
+        """Return the numbers of one part."""
+        return Numbers([part[key] for part in self.parts if isinstance(part, dict)])
 
 
 class _Statistics(dict):

@@ -59,6 +59,7 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=self.printed,
         )
+        self.process.stdout.readline()  # it is ready: starting counts for no file
 
     def stop(self) -> None:
         """End the process."""

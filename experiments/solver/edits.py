@@ -7,7 +7,7 @@ Run two versions in one go, where nothing else runs.
 from envedit import pipeline
 from experiments import puresky
 from experiments.harness import Experiment, calling
-from experiments.summary import Summary
+from experiments.summary import Summary, values
 
 EDITS = (  # map, scene, target (degrees or another map), whether the sky may turn
     ("sunflowers", "sphere", "60", False),
@@ -53,46 +53,39 @@ def cases(given):
     return edits + sizes
 
 
-def measure(done) -> dict:
-    metrics, timing = done.metrics, done.metrics["timing"]
-    return {
-        "render": metrics["render"]["psnr"],
-        "psnr": metrics["envmap"]["psnr"],
-        "iterations": metrics["iterations"],
-        "solve": timing["solve_s"],
-        "step_ms": timing["per_iteration_ms"] or 0.0,
-    } | {part: timing[f"{part}_s"] for part in PARTS}
-
-
 EXPERIMENT = Experiment(
     "solver.edits",
     "Times and errors of nine edits, to compare two versions of the solver; growth with sizes.",
     cases,
-    measure,
+    lambda done: values(done.metrics),
     {
         "edits": {
             "edit": "{edit}",
-            "solve, s": "{solve:.2f}",
-            "total, s": "{total:.2f}",
+            "solve, s": "{timing[solve_s]:.2f}",
+            "total, s": "{timing[total_s]:.2f}",
             "steps": "{iterations}",
-            "a step, ms": "{step_ms:.0f}",
-            "rendering, dB": "{render:.2f}",
-            "map, dB": "{psnr:.2f}",
+            "a step, ms": "{timing[per_iteration_ms]:.0f}",
+            "rendering, dB": "{render[psnr]:.2f}",
+            "map, dB": "{envmap[psnr]:.2f}",
         },
-        "sizes": {"picture, map": "{edit}", "steps": "{iterations}", "a step, ms": "{step_ms:.0f}"}
-        | {part: f"{{{part}:.2f}}" for part in PARTS},
+        "sizes": {
+            "picture, map": "{edit}",
+            "steps": "{iterations}",
+            "a step, ms": "{timing[per_iteration_ms]:.0f}",
+        }
+        | {part: f"{{timing[{part}_s]:.2f}}" for part in PARTS},
     },
     group=lambda row: row["group"],
     summary=Summary(
         {"": "{group}"},
         {
             "runs": "{runs}",
-            "solve, s": "{solve.mean:.2f}",
-            "total, s": "{total.mean:.2f}",
+            "solve, s": "{timing[solve_s].mean:.2f}",
+            "total, s": "{timing[total_s].mean:.2f}",
             "steps": "{iterations.mean:.1f}",
-            "a step, ms": "{step_ms.mean:.0f}",
-            "rendering, dB": "{render.mean:.2f}",
-            "map, dB": "{psnr.mean:.2f}",
+            "a step, ms": "{timing[per_iteration_ms].mean:.0f}",
+            "rendering, dB": "{render[psnr].mean:.2f}",
+            "map, dB": "{envmap[psnr].mean:.2f}",
         },
     ),
     alone=True,

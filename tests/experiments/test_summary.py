@@ -28,3 +28,9 @@ def test_what_is_not_known_is_a_dash():
     row = values({"a": None, "b": 0.5, "c": "text", "d": [1.0], "e": 3})
     assert "{a:.1f} {b:.0%} {c} {e}".format_map(row) == "- 50 % text 3"
     assert Summary({}, {"": "{other.mean:.1f}"})(ROWS).endswith("| - |")
+
+
+def test_columns_write_parts_of_what_a_run_measures():
+    rows = [values({"map": one}) for one in ({"psnr": 10.0}, {"psnr": None}, {"psnr": 20.0}, None)]
+    assert ["{map[psnr]:.1f}".format_map(row) for row in rows] == ["10.0", "-", "20.0", "-"]
+    assert Summary({}, {"": "{map[psnr].mean:.1f}, {map[psnr].count}"})(rows).endswith("| 15.0, 2 |")

@@ -136,9 +136,9 @@ def of_text(data: bytes, rng: np.random.Generator, grammar: Grammar) -> bytes:
     A third has its bytes damaged like any file; the others one to three of: tokens replaced, removed,
     doubled, exchanged, stretched to thousands of characters, nests in their place.
     """
-    if rng.random() < 1 / 3:
-        return of_bytes(data, rng)
     parts = re.split(f"({grammar.token})", data.decode())
+    if len(parts) == 1 or rng.random() < 1 / 3:
+        return of_bytes(data, rng)
     for _ in times(rng):
         i, j = (one_of(range(1, len(parts), 2), rng) for _ in range(2))
         count = int(2 ** rng.uniform(0, 15))

@@ -4,8 +4,6 @@ Case i of a kind and of the configuration's ``seed`` is always the same file, wh
 Linux only: memory is read from /proc.
 """
 
-import itertools
-
 from experiments.fuzz.drive import FAULTS
 from experiments.fuzz.kinds import KINDS
 from experiments.harness import Experiment, calling
@@ -21,11 +19,12 @@ def options(parser):
 
 def cases(given):
     found = []
-    for what, first in itertools.product(KINDS, range(0, given.count, PIECE)):
-        count = min(PIECE, given.count - first)
-        files = {"what": what, "first": first, "count": count}
-        name = f"{what} {first}-{first + count - 1}"
-        found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
+    for what, kind in KINDS.items():
+        total = given.count // kind.one_in
+        for first in range(0, total, PIECE):
+            files = {"what": what, "first": first, "count": min(PIECE, total - first)}
+            name = f"{what} {first}-{first + files['count'] - 1}"
+            found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
     return found
 
 

@@ -131,28 +131,32 @@ def read_weights(path: Path, index: int) -> None:
 
 
 def read_scene(path: Path, index: int) -> None:
-    """Load a scene, or one that names a mesh, a volume or a texture."""
+    """Load a scene."""
+    _load(path, path)
+
+
+def read_asset(path: Path, index: int) -> None:
+    """Load a scene that names a mesh, a volume or a texture."""
     named = f'<string name="filename" value="{path}"/>'
-    match path.suffix[1:]:
-        case "xml":
-            shape = ""
-        case "ply" | "obj" | "serialized":
-            shape = f'<shape type="{path.suffix[1:]}">{named}</shape>'
-        case "vol":
-            volume = f'<volume type="gridvolume" name="sigma_t">{named}</volume>'
-            medium = f'<medium type="heterogeneous" name="interior">{volume}</medium>'
-            shape = f'<shape type="cube">{medium}</shape>'
-        case _:
-            bitmap = f'<texture type="bitmap" name="reflectance">{named}</texture>'
-            shape = f'<shape type="sphere"><bsdf type="diffuse">{bitmap}</bsdf></shape>'
-    file = path
-    if shape:
-        file = path.with_name("outer.xml")
-        file.write_text(f'<scene version="3.0.0">{whole.SENSOR}<emitter type="constant"/>{shape}</scene>')
+    kind = path.suffix[1:]
+    if kind in ("ply", "obj", "serialized"):
+        shape = f'<shape type="{kind}">{named}</shape>'
+    elif kind == "vol":
+        volume = f'<volume type="gridvolume" name="sigma_t">{named}</volume>'
+        shape = f'<shape type="cube"><medium type="heterogeneous" name="interior">{volume}</medium></shape>'
+    else:
+        bitmap = f'<texture type="bitmap" name="reflectance">{named}</texture>'
+        shape = f'<shape type="sphere"><bsdf type="diffuse">{bitmap}</bsdf></shape>'
+    outer = path.with_name("outer.xml")
+    outer.write_text(f'<scene version="3.0.0">{whole.SENSOR}<emitter type="constant"/>{shape}</scene>')
+    _load(path, outer)
+
+
+def _load(path, file):
+    """Load a scene; an error may name it or the damaged file by the name alone, as those of parameters do."""
     try:
         scene.load(file)
     except EnveditError as error:
-        # It may name either file by its name alone, as errors of parameters do.
         if str(path) not in str(error) and (path.name in str(error) or file.name in str(error)):
             raise type(error)(f"{path}: {error}") from None
         raise
@@ -186,8 +190,8 @@ def damaged_configuration(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damaged_scene(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the text of a scene, or the bytes of a file that it names."""
-    return damage.of_text(data, rng, XML) if data.startswith(b"<?xml") else damage.of_bytes(data, rng)
+    """Change the text of a scene."""
+    return damage.of_text(data, rng, XML)
 
 
 def damaged_entry(data: bytes, rng: np.random.Generator) -> bytes:
@@ -224,11 +228,15 @@ def damaged_checkpoint(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 class Kind(NamedTuple):
-    """A kind of files: makes whole ones by name, reads one of a case, and damages the content of one."""
+    """A kind of files: makes whole ones by name, reads one of a case, and damages the content of one.
+
+    Of the files that are requested, one in ``one_in`` is made: to load a scene around each takes long.
+    """
 
     files: Callable[[], dict[str, bytes]]
     read: Callable[[Path, int], None]
     damage: Callable[[bytes, np.random.Generator], bytes] = damage.of_bytes
+    one_in: int = 1
 
 
 KINDS = {
@@ -237,6 +245,7 @@ KINDS = {
     "toml": Kind(whole.toml_files, read_configuration, damaged_configuration),
     "weights": Kind(whole.weight_files, read_weights),
     "scene": Kind(whole.scene_files, read_scene, damaged_scene),
+    "asset": Kind(whole.asset_files, read_asset, one_in=10),
     "entry": Kind(whole.entry_files, read_entry, damaged_entry),
     "checkpoint": Kind(whole.checkpoint_files, read_checkpoint, damaged_checkpoint),
 }

@@ -263,9 +263,14 @@ FACES = np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3]], "<i4")
 
 
 def scene_files() -> dict[str, bytes]:
-    """Return a scene, and files that scenes name: meshes of every format, a volume, textures."""
+    """Return a scene."""
+    return {"written.xml": SCENE.encode()}
+
+
+def asset_files() -> dict[str, bytes]:
+    """Return files that scenes name: meshes of every format, a volume, textures."""
     textures = {name: data for name, data in painted_files().items() if name[:3] in ("rgb", "q95", "our")}
-    return {"written.xml": SCENE.encode()} | mesh_files() | textures
+    return mesh_files() | textures
 
 
 def mesh_files() -> dict[str, bytes]:

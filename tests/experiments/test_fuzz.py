@@ -27,7 +27,8 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
             ("toml", 90),
             ("painted", 60),
             ("weights", 60),
-            ("scene", 180),
+            ("scene", 60),
+            ("asset", 40),
             ("entry", 40),
             ("checkpoint", 100),
         ],
@@ -234,7 +235,8 @@ def test_the_pieces_of_a_kind_are_all_its_files():
     asked = experiment.cases(argparse.Namespace(count=6000))
     names = [case.name for case in asked if case.about["what"] == "map"]
     assert names == ["map 0-2499", "map 2500-4999", "map 5000-5999"]
-    assert len(asked) == 3 * len(kinds.KINDS)
+    assert [case.name for case in asked if case.about["what"] == "asset"] == ["asset 0-599"]
+    assert len(asked) == 3 * (len(kinds.KINDS) - 1) + 1
 
 
 def test_images_say_how_large_they_are():

@@ -161,7 +161,7 @@ MAPS = [
 COUNTS = {
     "divergence": 4,
     "engine": 47,
-    "fuzz": 28,
+    "fuzz": 29,
     "interiors": 5,
     "layers": 96,
     "layers.gain": 72,

@@ -1,6 +1,6 @@
 """A budget instead of knobs: settings for this machine, scene and map that end within so many seconds.
 
-Levels from coarse to fine, each with what it cost and lost on a reference machine (``experiments/levels``).
+Levels from coarse to fine, each with what it cost and lost on a reference machine (``experiments/tradeoff``).
 Three renderings and a few products of matrices measure how fast this machine is in this scene,
 and how noisy the scene is under this map; the finest level that is expected to end in time is taken.
 """

@@ -1,6 +1,6 @@
 """Measure the engine beside the machine's own floors, Mitsuba's ``prb`` and PyTorch.
 
-``--quick`` measures tiny sizes without data; what must hold of any size is in :mod:`.check`.
+``--quick`` measures tiny sizes without data; what must hold of any size is in :mod:`.tables`.
 """
 
 import itertools
@@ -11,13 +11,15 @@ from envedit.core import shipped
 from experiments import puresky
 from experiments.harness import Experiment, calling, done_of, rows_of
 
-from . import check, plot, tables
+from . import tables
 
 SUNNY = "kloofendal_48d_partly_cloudy"
 ANALYTIC = {"envmap": "sunsky", "azimuth": 130, "elevation": 45}
 """In its place where there is no data."""
 SUNS = {80: 0.62, 45: 0.40, 10: 0.70}
 """Elevation in degrees of the sun of one texel, and its place across the map."""
+CURVE = (16, 64, 256)
+"""Samples a pixel of T and of prb."""
 RANGES = {"pixels": (64, 128, 256, 512), "texels": (128, 256, 512), "spp": (16, 32, 64, 128, 256)}
 
 
@@ -46,7 +48,7 @@ def cases(given):
     def add(name, function, settings, about=None, **arguments):
         about = {"case": name, "section": name.partition("-")[0], "quick": quick} | (about or {})
         called = {"measuring": function, "quick": quick} | arguments
-        found.append(calling(name, "experiments.engine.machine:measured", settings, about, **called))
+        found.append(calling(name, "experiments.engine.timing:measured", settings, about, **called))
 
     def lit(pixels, texels, spp="auto", scene="sphere"):
         shown = {"file": scene, "width": pixels, "parameters": meshes.get(scene, {})}
@@ -60,22 +62,30 @@ def cases(given):
     for scene in ("sphere", *meshes):
         size = (32, 32, 64) if quick else (256, 256)
         about = {"scene": scene, "map": SUNNY if SUNNY in maps else "analytic sun and sky"}
-        add(f"transport-{scene}", "transport:measure", lit(*size, scene=scene), about)
+        add(f"transport-{scene}", "transport:measure", lit(*size, scene=scene), about, disk=True)
 
     size, spp = ((24, 32), 2048) if quick else ((128, 256), 4096)
     scenes = ["sphere"] if quick else [s for s in shipped.scenes() if s != "mesh"] + [*meshes]
     for scene, sun in itertools.product(scenes, [45] if quick else SUNS):
-        about, settings = {"scene": scene, "sun": f"{sun} degrees"}, lit(*size, scene=scene)
-        add(f"quality-{scene}-{sun}", "quality:measure", settings, about, sun=[sun, SUNS[sun]], spp=spp)
-    settings = lit(*size, scene="sphere" if quick else "matte")
-    add("curve", "quality:curve", settings, sun=[45, SUNS[45]], spp=spp)
+        about = {"scene": scene, "sun": f"{sun} degrees"}
+        compared = {"sun": [sun, SUNS[sun]], "reference_spp": spp}
+        add(f"quality-{scene}-{sun}", "transport:measure", lit(*size, scene=scene), about, **compared)
+    for samples in (16, 64) if quick else CURVE:
+        settings = lit(*size, samples, "sphere" if quick else "matte")
+        compared = {"sun": [45, SUNS[45]], "reference_spp": spp, "prb_spp": samples}
+        add(f"curve-{samples}", "transport:measure", settings, **compared)
 
     base = {"pixels": 16, "texels": 32, "spp": 16} if quick else {"pixels": 128, "texels": 256, "spp": "auto"}
     ranges = {"pixels": (16, 32), "texels": (16, 32), "spp": (16, 32)} if quick else RANGES
     for variable, values in ranges.items():
         for value in values:
             settings = lit(**base | {variable: value})
-            add(f"scaling-{variable}-{value}", "scaling:measure", settings, {"variable": variable})
+            add(
+                f"scaling-{variable}-{value}",
+                "transport:measure",
+                settings,
+                {"variable": variable, "scene": "sphere"},
+            )
     tiny = {"fit": {"epochs": 60}, "representation": {"kind": "siren", "hidden": 32}}
     for name, file in {"sunsky": "sunsky"}.items() if quick else maps.items():
         settings = {"representation": {"kind": "siren"}} | (tiny if quick else {})
@@ -91,9 +101,9 @@ EXPERIMENT = Experiment(
     tables.measure,
     tables.COLUMNS,
     group=lambda row: row["table"],
-    failures=check.failures,
+    failures=tables.failures,
     summary=tables.summary,
     options=options,
-    draw=lambda cases, out, to, given: plot.draw(rows_of(EXPERIMENT, done_of(cases, out)), to),
+    draw=lambda cases, out, to, given: tables.draw(rows_of(EXPERIMENT, done_of(cases, out)), to),
     alone=True,
 )

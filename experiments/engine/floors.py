@@ -4,6 +4,7 @@ A program that has to read so many bytes, or to multiply so many numbers, cannot
 """
 
 import functools
+import os
 from pathlib import Path
 
 import drjit as dr
@@ -22,20 +23,20 @@ SHAPES = ((256, 16384), (128, 16384), (64, 16384))
 
 def measure(settings, quick: bool = False) -> dict:
     """Return the rows of the tables ``bandwidth``, ``matmul`` and ``rays``."""
-    memory = bandwidth(1 << 20 if quick else None, 3 if quick else 7)
+    memory = bandwidth(1 << 20 if quick else None)
     sizes = {key: memory[key] for key in ("array_bytes", "cache_bytes")}
     return {
         "bandwidth": [{"streaming": name, "rate": rate} | sizes for name, rate in memory["rates"].items()],
-        "matmul": matmul(((16, 256),) if quick else SHAPES, 3 if quick else 9),
-        "rays": rays(1 << 12 if quick else 1 << 20, 3 if quick else 7),
+        "matmul": matmul(((16, 256),) if quick else SHAPES),
+        "rays": rays(1 << 12 if quick else 1 << 20),
     }
 
 
-def bandwidth(elements: int | None = None, repeats: int = 7) -> dict:
+def bandwidth(elements: int | None = None) -> dict:
     """Measure bytes a second between memory and cores, on float32 arrays larger than the caches.
 
-    ``elements`` is the number of floats in an array; by default twice the largest cache, but no more than an
-    eighth of the free memory.
+    ``elements`` is the number of floats in an array; by default of twice the largest cache, 256 MiB or more,
+    but at most a sixteenth of the memory.
 
     Returns
     -------
@@ -45,29 +46,19 @@ def bandwidth(elements: int | None = None, repeats: int = 7) -> dict:
         element: what the processor reads of ``a`` before it writes there is not counted (McCalpin's STREAM).
     """
     cache = largest_cache()
-    elements = elements or _beyond(cache)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    elements = elements or min(max(2 * (cache or 0), 256 << 20), memory // 16) // 4
     b = dr.opaque(mi.Float, 1.5, elements)
     c = dr.opaque(mi.Float, 0.25, elements)
     s = dr.opaque(mi.Float, 3)
-    host_b, host_c = np.full(elements, 1.5, np.float32), np.full(elements, 0.25, np.float32)
-    host_a = np.zeros_like(host_b)
-
-    def host_triad():
-        np.multiply(host_c, np.float32(3), out=host_a)
-        np.add(host_a, host_b, out=host_a)
-        return host_a[0]
-
     lanes = sparse_matrix.SLICE * 512  # enough for any number of cores; each lane then reads a long row
     rows = dr.opaque(mi.UInt32, elements // 4 // lanes)
-    jobs = {
+    jobs = {  # bytes an element, and what is timed
         "Dr.Jit sum": (4, lambda: dr.sum(b)),
         "Dr.Jit packets": (4, lambda: _read_packets(b, rows, lanes)),
         "Dr.Jit triad": (12, lambda: b + s * c),
-        "numpy sum": (4, lambda: host_b.sum()),
-        # Two passes, as numpy has no fused one: c, a, then a, b, a.
-        "numpy triad": (20, host_triad),
     }
-    taken = side_by_side({name: job for name, (_, job) in jobs.items()}, repeats)
+    taken = side_by_side({name: job for name, (_, job) in jobs.items()})
     rates = {name: size * elements / taken[name]["min_s"] for name, (size, _) in jobs.items()}
     read = max(rate for name, rate in rates.items() if jobs[name][0] == 4)
     return {"array_bytes": 4 * elements, "cache_bytes": cache, "rates": rates, "read": read}
@@ -96,44 +87,32 @@ def largest_cache() -> int | None:
     return max(found, default=None)
 
 
-def _beyond(cache):
-    # Five arrays live at once.
-    elements = max(2 * (cache or 0), 256 << 20) // 4
-    try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        elements = min(elements, int(lines["MemAvailable"].split()[0]) * 1024 // 8 // 4)
-    except (OSError, KeyError, ValueError):
-        pass
-    return elements // 2**20 * 2**20
-
-
-def matmul(shapes=SHAPES, repeats: int = 9) -> list[dict]:
+def matmul(shapes=SHAPES) -> list[dict]:
     """Measure Dr.Jit's matrix products of a hidden layer: forward, and the two of the reverse pass.
 
     Returns
     -------
     list of dict
         A row for each shape and layout: ``width``, ``points``, ``layout`` ("rows": a point a row), and for
-        each product ``gflops`` (of the median) and ``gflops_best``.
+        each product GFLOP/s, of the median.
     """
     found, rng = [], np.random.default_rng(0)
     for width, points in shapes:
-        operands = {
-            (layout, product): (network.operand(rng, a), network.operand(rng, b), flags)
-            for layout in network.LAYOUTS
-            for product, a, b, flags in network.products(layout, points, width, width)
-        }
-        jobs = {key: functools.partial(dr.matmul, a, b, **flags) for key, (a, b, flags) in operands.items()}
-        rows = {layout: {"width": width, "points": points, "layout": layout} for layout in network.LAYOUTS}
-        work = 2 * width * width * points / 1e9
-        for (layout, product), taken in side_by_side(jobs, repeats).items():
-            rates = {"gflops": work / taken["median_s"], "gflops_best": work / taken["min_s"]}
-            rows[layout][product] = rates
-        found += rows.values()
+        jobs = {}
+        for layout in network.LAYOUTS:
+            for product, a, b, flags in network.products(layout, points, width, width):
+                operands = network.operand(rng, a), network.operand(rng, b)
+                jobs[layout, product] = functools.partial(dr.matmul, *operands, **flags)
+        taken = side_by_side(jobs)
+        for layout in network.LAYOUTS:
+            rates = {
+                p: 2e-9 * width**2 * points / t["median_s"] for (of, p), t in taken.items() if of == layout
+            }
+            found.append({"width": width, "points": points, "layout": layout} | rates)
     return found
 
 
-def rays(count: int = 1 << 20, repeats: int = 7) -> list[dict]:
+def rays(count: int = 1 << 20) -> list[dict]:
     """Measure rays a second in the scene ``sphere``.
 
     Returns
@@ -149,15 +128,14 @@ def rays(count: int = 1 << 20, repeats: int = 7) -> list[dict]:
     origins = rng.uniform((-2, 0.01, -2), 2, (count, 3)).astype(np.float32).T
     ways = rng.normal(size=(3, count)).astype(np.float32)
     origins, ways = mi.Point3f(*map(mi.Float, origins)), mi.Vector3f(*map(mi.Float, ways))
-    scattered = mi.Ray3f(origins, dr.normalize(ways))
-    camera, scattered = dr.opaque(mi.Ray3f(camera)), dr.opaque(scattered)
+    camera = dr.opaque(mi.Ray3f(camera))
+    scattered = dr.opaque(mi.Ray3f(origins, dr.normalize(ways)))
     taken = side_by_side(
         {
             "from the camera, nearest hit": lambda: lit.mi.ray_intersect(camera).t,
             "from anywhere, nearest hit": lambda: lit.mi.ray_intersect(scattered).t,
             "from anywhere, any hit": lambda: lit.mi.ray_test(scattered),
-        },
-        repeats,
+        }
     )
     return [
         {"rays": name, "count": count, "rate": count / found["median_s"]} for name, found in taken.items()

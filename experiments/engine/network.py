@@ -22,7 +22,7 @@ from .timing import compiled, growth, side_by_side
 MAP = (64, 256)
 """Active texels of a 256x128 map: 16,384 points."""
 LAYOUTS = ("columns", "rows")
-"""A point a column of an activation, (width, N), or a point a row, (N, width)."""
+"""A point a column of an activation, (width, N), or a point a row, (N, width), as in the network."""
 
 
 def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
@@ -36,19 +36,18 @@ def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
     Returns
     -------
     dict
-        ``siren``: a row with the times of ``forward``, ``step`` and ``own``, the products in the network's
-        layout; ``ratio``: median of the step over that; ``ratio_best``: over the products of the quicker
-        layout; ``kernels`` after warm-up; ``memory`` over 200 steps; ``torch``: the peer, or None.
+        ``siren``: a row with the times of ``forward``, ``step`` and ``own``, the products alone; ``ratio``:
+        median of the step over that; ``kernels`` after warm-up; ``memory`` over 200 steps; ``torch``: the
+        peer, or None.
     """
     hidden, depth, omega = (getattr(settings.representation, key) for key in ("hidden", "depth", "omega"))
     shape = (8, 32) if quick else MAP
+    points = shape[0] * shape[1]
     job = {"hidden": hidden, "depth": depth, "omega": omega, "shape": shape, "threads": dr.thread_count()}
     # Before and after: a subprocess cannot take turns with this one, and the machine may have slowed down.
     peers = [_peer(torch, job)] if torch else []
     params = siren.init(0, hidden, depth, omega)
     x = dr.opaque(siren.coordinates(*shape))
-    points = shape[0] * shape[1]
-    layout = "rows" if x.shape[0] == points else "columns"
     ones = dr.opaque(mi.TensorXf, 1, siren.forward(params, x, omega)[0].shape)
 
     def forward():
@@ -59,8 +58,8 @@ def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
         return siren.backward(params, tape, ones)
 
     sizes = [2] + [hidden] * (depth + 1) + [3]
-    alone = {name: _products_alone(name, points, sizes) for name in LAYOUTS}
-    taken = side_by_side({"forward": forward, "step": both} | alone, 3 if quick else 11)
+    jobs = {"forward": forward, "step": both, "own": _products_alone(points, sizes)}
+    taken = side_by_side(jobs, 3 if quick else 11)
     peers += [_peer(torch, job)] if torch else []
     weights = sum(a * b for a, b in zip(sizes[:-1], sizes[1:], strict=True))
     work = 2 * points * (3 * weights - sizes[0] * sizes[1])
@@ -70,18 +69,13 @@ def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
         "hidden": hidden,
         "depth": depth,
         "points": points,
-        "layout": layout,
-        "forward": taken["forward"],
-        "step": taken["step"],
-        "own": taken[layout],
-        "ratio": step / taken[layout]["median_s"],
-        "ratio_best": step / min(taken[name]["median_s"] for name in LAYOUTS),
+        "ratio": step / taken["own"]["median_s"],
         "gflops": work / step / 1e9,
         "kernels": compiled(both),
         "memory": growth(both, 20 if quick else 200, 5 if quick else 20),
         "torch": min(peers, key=lambda peer: peer["median_s"], default=None),
     }
-    return {"siren": [row]}
+    return {"siren": [row | taken]}
 
 
 def products(layout: str, points: int, inputs: int, outputs: int) -> list[tuple]:
@@ -100,14 +94,13 @@ def products(layout: str, points: int, inputs: int, outputs: int) -> list[tuple]
     ]
 
 
-def _products_alone(layout, points, sizes):
+def _products_alone(points, sizes):
     """Return a function that makes every product of a step, evaluated one by one as the step's are."""
     rng = np.random.default_rng(0)
     made, jobs = {}, []
     for i, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
-        for which, a, b, flags in products(layout, points, inputs, outputs):
-            if i == 0 and which == "gradient of the input":
-                continue
+        layer = products("rows", points, inputs, outputs)
+        for _, a, b, flags in layer if i else layer[:2]:  # the first layer's input needs no gradient
             made |= {shape: operand(rng, shape) for shape in (a, b) if shape not in made}
             jobs.append((made[a], made[b], flags))
 

@@ -1,9 +1,19 @@
-"""The results as tables, one for each marker of docs/engine.md, and what precedes them."""
+"""The results as tables, one for each name; what must hold of any of them; and two figures."""
 
 import math
-import statistics
+from collections import Counter
+from pathlib import Path
 
-from experiments.harness import markdown, number
+from experiments.harness import figure
+from experiments.summary import Summary, values
+
+ADJOINT = 1e-5
+"""|<T E, I> - <E, T' I>| over <T E, I>: sums of float32 in two orders, taken in double at the end."""
+PICTURE = 0.05
+"""RMSE of T's picture under a one-texel sun, 24x24 pixels; a lost or doubled tier is off by 0.5 or more."""
+
+
+# ---- forms -------------------------------------------------------------------------------------------------
 
 
 def si(value: float | None, unit: str = "") -> str:
@@ -18,7 +28,7 @@ def si(value: float | None, unit: str = "") -> str:
 
 def seconds(value: float | None) -> str:
     """Write a duration: 1200 s, 12.3 ms."""
-    return "-" if value is None else f"{value:.0f} s" if value >= 100 else si(value, "s")
+    return f"{value:.0f} s" if value and value >= 100 else si(value, "s")
 
 
 def percent(value: float) -> str:
@@ -26,12 +36,7 @@ def percent(value: float) -> str:
     return f"{100 * value:.3g} %"
 
 
-def times(value: float) -> str:
-    """Write a ratio with three digits."""
-    return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-
-
-def of(key: str, write, *arguments):
+def of(key: str, write=seconds, *arguments):
     """Return a column: what ``write`` makes of a row's number."""
     return lambda row: write(row[key], *arguments)
 
@@ -41,20 +46,9 @@ def median_and_best(key: str):
     return lambda row: f"{seconds(row[key]['median_s'])} ({seconds(row[key]['min_s'])})"
 
 
-def _note(row):
-    """Write what a time of the transport is held against; the shortest one if there is no such thing."""
-    if "ratio" in row:
-        return f"{times(row['ratio'])} times a step through T"
-    if "above_floor" in row:
-        return f"they take {row['above_floor']:.2f} times that"
-    return f"every {row['every']} steps" if "every" in row else seconds(row.get("min_s"))
+# ---- tables ------------------------------------------------------------------------------------------------
 
-
-def _rates(product):
-    return lambda row: f"{row[product]['gflops']:.0f} ({row[product]['gflops_best']:.0f})"
-
-
-SIZE = {"pixels": "{pixels}x{pixels}", "texels": "{texels[1]}x{texels[0]}"}
+SIZE = {"scene": "{scene}", "pixels": "{pixels}x{pixels}", "texels": "{texels[1]}x{texels[0]}"}
 SUN = {"scene": "{scene}", "sun at": "{sun}"}
 ERROR = {
     "RMSE": of("rmse", percent),
@@ -65,8 +59,8 @@ COLUMNS = {
     "machine": {
         "case": "{case}",
         "begun, UTC": lambda r: r["machine"]["time_utc"].removesuffix("+00:00"),
-        "took": lambda r: f"{r['seconds']:.0f} s",
-        "load before": lambda r: number(r["machine"]["load"], ".2f"),
+        "took": "{seconds:.0f} s",
+        "load before": "{load:.2f}",
         "sampling of T": "{sampling}",
     },
     "bandwidth": {
@@ -77,7 +71,7 @@ COLUMNS = {
     },
     "matmul": {"width": "{width}", "points": "{points:,}", "a point is a": lambda r: r["layout"][:-1]}
     | {
-        f"{product}, GFLOP/s": _rates(product)
+        f"{product}, GFLOP/s": f"{{{product}:.0f}}"
         for product in ("forward", "gradient of the weights", "gradient of the input")
     },
     "rays": {"rays": "{rays}", "at once": "{count:,}", "rays a second": of("rate", si)},
@@ -88,73 +82,98 @@ COLUMNS = {
         "forward + backward": median_and_best("step"),
         "its products alone": median_and_best("own"),
         "ratio": "{ratio:.2f}",
-        "to the quicker layout": "{ratio_best:.2f}",
         "PyTorch": lambda r: seconds(r["torch"] and r["torch"]["median_s"]),
         "GFLOP/s": "{gflops:.0f}",
         "compiled after warm-up": "{kernels[compiled]} of {kernels[launched]}",
         "growth of memory": lambda r: f"{si(r['memory']['bytes'], 'B')} in {r['memory']['calls']} steps",
     },
-    "transport": {
-        "scene, pixels": "{scene}, {pixels}x{pixels}",
-        "texels": SIZE["texels"],
+    "transport": SIZE
+    | {
         "map": "{map}",
         "spp": "{spp}",
         "path depth": "{depth}",
         "exact columns": "{columns}",
-        "held": lambda r: si(r["bytes"]["held"], "B"),
+        "held": of("held", si, "B"),
         "traced in (first time)": lambda r: f"{seconds(r['again_s'])} ({seconds(r['first_s'])})",
-        "columns in": of("resolve_s", seconds),
-        "loaded in": of("load_s", seconds),
-        "traced in, prb steps": of("trace_in_prb_steps", times),
+        "columns in": of("resolve_s"),
+        "loaded in": of("load_s"),
+        "traced in, prb steps": "{trace_in_prb_steps:.3g}",
     },
-    "transport-time": {
-        "scene, pixels": "{scene}, {pixels}x{pixels}",
-        "what": "{what}",
-        "median": of("median_s", seconds),
-        "best, or ratio": _note,
+    "transport-time": SIZE
+    | {
+        "T E": of("apply_s"),
+        "T' I": of("adjoint_s"),
+        "read by both": of("read", si, "B"),
+        "bandwidth": of("bandwidth", si, "B/s"),
+        "both over the floor": "{above_floor:.2f}",
+        "a step through T": of("step_s"),
+        "prb, 16 spp, a step": of("prb_step_s"),
+        "over a step through T": "{prb_ratio:.3g}",
     },
     "quality": SUN | {"exact columns": "{columns}"} | ERROR,
-    "quality-parts": SUN | {"path depth 2: region": "{part}", "pixels": "{pixels}"} | ERROR,
+    "quality-parts": SUN | {"path depth 2: region": "{part}", "pixels": "{seen}"} | ERROR,
     "equal-error": SUN
     | {
         "T: error": of("rmse", percent),
-        "a step through T": of("t_step_s", seconds),
+        "a step through T": of("step_s"),
         "prb, 16 spp: error": of("prb_rmse", percent),
-        "a step of prb": of("prb_step_s", seconds),
-        "prb needs, spp": of("prb_spp", si),
-        "times a step through T": of("equal_error", times),
+        "a step of prb": of("prb_step_s"),
+        "prb needs, spp": of("prb_needs", si),
+        "times a step through T": "{equal_error:.0f}",
     },
     "error-time": {
-        "renderer": "{kind}",
-        "samples a pixel": "{samples}",
-        "step": of("step_s", seconds),
+        "samples a pixel": "{prb_samples}",
+        "T: a step": of("step_s"),
         "RMSE": of("rmse", percent),
         "without the reference's noise": of("corrected", percent),
+        "prb: a step": of("prb_step_s"),
+        "its RMSE without the noise": of("prb_rmse", percent),
     },
     "scaling": {"varied": "{variable}"}
     | SIZE
     | {
         "spp": "{spp}",
         "exact columns": "{columns}",
-        "traced in": of("trace_s", seconds),
-        "read by both": of("bytes", si, "B"),
+        "traced in": of("again_s"),
+        "read by both": of("read", si, "B"),
         "held": of("held", si, "B"),
-        "T E": of("apply_s", seconds),
-        "T' I": of("adjoint_s", seconds),
+        "T E": of("apply_s"),
+        "T' I": of("adjoint_s"),
     },
     "fits": {
         "map": "{map}",
         "preset": "{preset}",
         "peak": lambda r: f"{r['peak']:,.{1 if r['peak'] < 100 else 0}f}",
-        "log-PSNR, dB": of("log_psnr", number),
-        "peak ratio": of("peak_ratio", number, ".2f"),
-        "mean ratio": of("mean_ratio", number, ".2f"),
-        "with noise: mean, dB": of("noisy_mean", number),
-        "worst of 5, dB": of("noisy_worst", number),
-        "fitted in": of("fitted_s", seconds),
+        "log-PSNR, dB": "{log_psnr:.1f}",
+        "peak ratio": "{peak_ratio:.2f}",
+        "mean ratio": "{mean_ratio:.2f}",
+        "with noise: mean, dB": "{noisy_mean:.1f}",
+        "worst of 5, dB": "{noisy_worst:.1f}",
+        "fitted in": of("fitted_s"),
     },
 }
-"""Columns of each table: a table's name is that of its marker."""
+"""Columns of each table: a table's name is that of its marker in docs/engine.md."""
+FITS = Summary(
+    {"fits, medians": "{preset}"},
+    {
+        "maps": "{runs}",
+        "log-PSNR, dB": "{log_psnr.median:.1f}",
+        "peak ratio": "{peak_ratio.median:.2f}",
+        "mean ratio": "{mean_ratio.median:.2f}",
+        "with noise: mean, dB": "{noisy_mean.median:.1f}",
+        "worst of 5, dB": "{noisy_worst.median:.1f}",
+        "fitted in, s": "{fitted_s.median:.1f}",
+    },
+)
+
+
+SHOWN = {
+    "transport": ("transport", "transport-time"),
+    "quality": ("quality", "equal-error"),
+    "curve": ("error-time",),
+    "scaling": ("scaling",),
+}
+"""For each section: the tables that show what :func:`.transport.measure` returns as ``transport``."""
 
 
 def measure(done) -> list[dict]:
@@ -162,8 +181,13 @@ def measure(done) -> list[dict]:
     found = done.metrics
     common = {key: found[key] for key in ("machine", "seconds", "not_finite")}
     choices = {line for rows in found["tables"].values() for row in rows for line in row.get("choices", [])}
-    tables = {"machine": [{"sampling": "; ".join(sorted(choices))}]} | found["tables"]
-    return [common | {"table": name} | row for name, rows in tables.items() for row in rows]
+    about = {"sampling": "; ".join(sorted(choices)), "load": found["machine"]["load"]}
+    rows = [common | {"table": "machine"} | values(about)]
+    for name, some in found["tables"].items():
+        shown = SHOWN[done.case.about["section"]] if name == "transport" else (name,)
+        some = [values(row) for row in some] if name == "fits" else some
+        rows += [common | {"table": one} | row for one in shown for row in some]
+    return rows
 
 
 def summary(rows: list[dict]) -> str:
@@ -175,14 +199,125 @@ def summary(rows: list[dict]) -> str:
         llvm = f"LLVM {(about['llvm'] or {}).get('version')}"
         machines[f"{where}; {versions}, {llvm}; commit {about['commit']}."] = None
     fits = [row for row in rows if row["table"] == "fits"]
-    return "\n\n".join([*machines, *([_medians(fits)] if len(fits) > 1 else [])])
+    return "\n\n".join([*machines, *([FITS(fits)] if len(fits) > 1 else [])])
 
 
-def _medians(fits):
-    """Return a table of one row, the medians over all maps."""
-    columns, middle = COLUMNS["fits"], {"map": f"median of {len(fits)}", "preset": fits[0]["preset"]}
-    for key in ("peak", "log_psnr", "peak_ratio", "mean_ratio", "noisy_mean", "noisy_worst", "fitted_s"):
-        known = [row[key] for row in fits if row[key] is not None]
-        middle[key] = statistics.median(known) if known else math.nan
-    cells = [form.format_map(middle) if isinstance(form, str) else form(middle) for form in columns.values()]
-    return markdown(list(columns), [cells])
+# ---- what must hold ----------------------------------------------------------------------------------------
+
+
+def _kernels(kernels):
+    launched, compiled = kernels["launched"], kernels["compiled"]
+    return {
+        f"only {launched} kernels in the history": launched >= kernels["calls"],
+        f"{compiled} of {launched} kernels compiled after warm-up": compiled == 0,
+    }
+
+
+def _rate(row):
+    return {f"a rate of {row['rate']}": row["rate"] > 0}
+
+
+def _siren(row):
+    slower = row["step"]["median_s"] > row["forward"]["min_s"]
+    return _kernels(row["kernels"]) | {"a reverse pass that takes no time": slower}
+
+
+def _transport(row):
+    return _kernels(row["kernels"]) | {
+        f"adjoint off by {row['adjointness']:.2g}": row["adjointness"] < ADJOINT,
+        "no exact column under a clear sky": row["columns"] > 0,
+        "nothing is read": row["read"] > 0 and row["floor_s"] > 0,
+        "T was not found on disk after it was kept there": row["load_s"] is not None,
+    }
+
+
+def _quality(row):
+    holds = {"16 samples of prb are better than T": row["prb_rmse"] > row["rmse"]}
+    if row["quick"]:  # a mirror's caustic, at full size, is off by more than the picture's mean
+        holds[f"T's picture is off by {100 * row['corrected']:.2g} %"] = row["corrected"] < PICTURE
+        holds[f"the reference is off by {100 * row['noise']:.2g} %"] = row["noise"] < PICTURE
+    return holds
+
+
+def _fits(row):
+    worst, mean, log_psnr = (row[key] for key in ("noisy_worst", "noisy_mean", "log_psnr"))
+    unknown = worst != worst or mean != mean  # NaN
+    return {"noise makes the fit better": unknown or worst <= mean <= log_psnr + 1}
+
+
+CHECKS = {
+    "bandwidth": _rate, "rays": _rate, "siren": _siren, "transport": _transport, "quality": _quality,
+    "fits": _fits,
+}  # fmt: skip
+"""For each table: row -> what is wrong unless it holds."""
+NEEDED = SHOWN | {"floors": ("bandwidth", "matmul", "rays"), "siren": ("siren",), "fits": ("fits",)}
+"""For each section: what its cases must have rows of."""
+
+
+def failures(rows: list[dict]) -> list[str]:
+    """Return a sentence for each thing that does not hold."""
+    infinite = {f"{row['case']}: {place} is not finite": None for row in rows for place in row["not_finite"]}
+    there = Counter((row["case"], row["table"]) for row in rows)
+    needed = {(row["case"], table): None for row in rows for table in NEEDED[row["section"]]}
+    wrong = [f"{case}: no row of table {table}" for case, table in needed if not there[case, table]]
+    checked = [(row["case"], CHECKS[row["table"]](row)) for row in rows if row["table"] in CHECKS]
+    wrong += [f"{case}: {text}" for case, holds in checked for text, right in holds.items() if not right]
+    return list(infinite) or wrong
+
+
+# ---- figures -----------------------------------------------------------------------------------------------
+
+GROWTH = {
+    "pixels": ("pixels", lambda row: row["pixels"] ** 2),
+    "texels": ("texels", lambda row: row["texels"][0] * row["texels"][1]),
+    "spp": ("paths a pixel", lambda row: row["spp"]),
+}
+"""Label and value of what is varied."""
+CURVES = {
+    "tracing, s": ("s-", lambda row: row["again_s"]),
+    "T E, s": ("o-", lambda row: row["apply_s"]),
+    "T' I, s": ("^-", lambda row: row["adjoint_s"]),
+    "read by both, GB": ("x--", lambda row: row["read"] / 1e9),
+}
+
+
+def growth(rows: list[dict], file: Path) -> None:
+    """Draw seconds and bytes of T against pixels, texels and samples, one panel each."""
+    with figure(file, 1, 3, (12, 3.6), sharey=True) as panels:
+        for panel, (variable, (label, value)) in zip(panels, GROWTH.items(), strict=True):
+            some = [row for row in rows if row["variable"] == variable]
+            across = [value(row) for row in some]
+            for name, (style, height) in CURVES.items():
+                panel.loglog(across, [height(row) for row in some], style, label=name)
+            panel.set_xticks(across, [f"{tick:,}" for tick in across], fontsize="small")
+            panel.minorticks_off()
+            panel.set_xlabel(label)
+        panels[0].legend(fontsize="small")
+
+
+def error_time(rows: list[dict], file: Path) -> None:
+    """Draw error against the seconds of a step, T and prb."""
+    with figure(file, 1, 1, (5.5, 4)) as panel:
+        for name, style, step, error in (
+            ("prb", "s-", "prb_step_s", "prb_rmse"),
+            ("T", "o-", "step_s", "corrected"),
+        ):
+            points = [(row[step], 100 * row[error]) for row in rows]
+            panel.loglog(*zip(*points, strict=True), style, label=name)
+            for row, point in zip(rows, points, strict=True):
+                panel.annotate(f" {row['prb_samples']} spp", point, fontsize="x-small")
+        panel.margins(x=0.1)
+        panel.axhline(100 * rows[0]["noise"], color="grey", ls=":", label="noise of the reference")
+        panel.set_xlabel("seconds of a step: rendering and gradient")
+        panel.set_ylabel("RMSE, % of the mean, without that noise")
+        panel.legend(fontsize="small")
+
+
+def draw(rows: list[dict], folder: Path) -> list[Path]:
+    """Draw what there are rows for; returns the files."""
+    files = []
+    for table, plot in (("scaling", growth), ("error-time", error_time)):
+        if some := [row for row in rows if row["table"] == table]:
+            files.append(folder / f"engine_{table.replace('-', '_')}.png")
+            plot(some, files[-1])
+    return files

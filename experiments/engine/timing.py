@@ -1,12 +1,16 @@
-"""Clocks and counters: seconds of an evaluated result, kernels compiled, memory in use."""
+"""Clocks and counters: seconds of an evaluated result, kernels compiled, memory in use, the machine."""
 
+import importlib
 import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
+
+from envedit.report.manifest import manifest, plain
 
 REPEATS = 7
 WARM_UP = 3  # a first call compiles; a second may still see other literals
@@ -26,7 +30,7 @@ def once(function: Callable) -> float:
     return time.perf_counter() - start
 
 
-def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS, warm_up: int = WARM_UP) -> dict:
+def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS) -> dict:
     """Time functions in turns, so that whatever else the machine does meets all of them alike.
 
     Returns
@@ -35,7 +39,7 @@ def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS, warm_up
         For each name ``median_s`` and ``min_s``.
     """
     for function in functions.values():
-        for _ in range(warm_up):
+        for _ in range(WARM_UP):
             once(function)
     seconds = {name: [] for name in functions}
     for _ in range(repeats):
@@ -55,12 +59,12 @@ def compiled(function: Callable, calls: int = 5) -> dict:
     return {"calls": calls, "launched": len(kernels), "compiled": fresh}
 
 
-def resident_bytes() -> int | None:
-    """Return the memory that the process occupies now; None where the system does not report it."""
+def resident_bytes() -> int:
+    """Return the memory that the process occupies now; 0 where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
-        return None
+        return 0
 
 
 def growth(function: Callable, calls: int, settle: int) -> dict:
@@ -70,4 +74,39 @@ def growth(function: Callable, calls: int, settle: int) -> dict:
     before = resident_bytes()
     for _ in range(calls):
         once(function)
-    return {"calls": calls, "bytes": None if before is None else resident_bytes() - before}
+    return {"calls": calls, "bytes": resident_bytes() - before}
+
+
+def machine() -> dict:
+    """Describe machine and versions, and how busy the machine is with other things."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), None)
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        load = os.getloadavg()[0]
+    except (OSError, ValueError):
+        cpu = memory = load = None
+    found = {"cpu": cpu, "threads": dr.thread_count(), "memory_bytes": memory, "load": load}
+    return manifest({}, {}, mi.variant()) | found
+
+
+def measured(settings, folder, measuring: str, **arguments) -> dict:
+    """Describe the machine, and then measure.
+
+    Parameters
+    ----------
+    measuring : str
+        ``module:name`` of this package: (settings, **arguments) -> the rows of each table.
+
+    Returns
+    -------
+    dict
+        ``machine``, as it was before; ``seconds``; ``tables``: rows by table; ``not_finite``: where numbers
+        of them are NaN or infinite.
+    """
+    module, _, name = measuring.partition(":")
+    called = getattr(importlib.import_module(f"experiments.engine.{module}"), name)
+    before, begun, not_finite = machine(), time.perf_counter(), []
+    tables = plain(called(settings, **arguments), "", not_finite)
+    seconds = time.perf_counter() - begun
+    return {"machine": before, "seconds": seconds, "tables": tables, "not_finite": not_finite}

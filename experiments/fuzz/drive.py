@@ -11,7 +11,8 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from . import headers, worker
+from . import worker
+from .declared import declared as declared_bytes
 from .kinds import case, seeds
 
 ROOT = Path(__file__).parents[2]
@@ -28,16 +29,16 @@ class Worker:
     ----------
     reader : str
         As for :mod:`.worker`.
-    heap_check : str
-        A library to preload that checks the heap, such as glibc's ``libc_malloc_debug.so.0``.
     seconds : float
         Processor time that a small file may take.
     patience : float
         Seconds of wall time, for each second of processor time that a case has, after which it is stuck.
     """
 
-    def __init__(self, reader: str, heap_check: str = "", seconds: float = 5.0, patience: float = 20.0):
-        self.reader, self.heap_check, self.seconds, self.patience = reader, heap_check, seconds, patience
+    def __init__(self, reader: str, seconds: float = 5.0, patience: float = 20.0):
+        self.reader = reader
+        self.seconds = seconds
+        self.patience = patience
         self.process = None
 
     def __enter__(self):
@@ -49,8 +50,6 @@ class Worker:
     def _start(self):
         # Freed memory is overwritten, so that its use is seen; large blocks go back to the system at once.
         more = {"MALLOC_PERTURB_": "165", "MALLOC_MMAP_THRESHOLD_": "65536"}
-        if self.heap_check:
-            more |= {"LD_PRELOAD": self.heap_check, "MALLOC_CHECK_": "3"}
         self.printed = tempfile.TemporaryFile()  # noqa: SIM115 it lives as long as the process
         self.process = subprocess.Popen(
             [sys.executable, "-X", "faulthandler", "-m", "experiments.fuzz.worker", self.reader],
@@ -60,6 +59,7 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=self.printed,
         )
+        self.process.stdout.readline()  # it is ready: starting counts for no file
 
     def stop(self) -> None:
         """End the process."""
@@ -98,9 +98,7 @@ class Worker:
         return {"outcome": "crashed", "error": f"{name}\n{said}"}
 
 
-def piece(
-    settings, folder, what: str, first: int, count: int, heap_check: str = "", reader: str = ""
-) -> dict:
+def piece(settings, folder, what: str, first: int, count: int, reader: str = "") -> dict:
     """Read damaged files of one kind; those that go wrong, and why, are kept in ``folder``.
 
     Every worker reads all whole files first; one that is not read is a fault as well.
@@ -113,8 +111,8 @@ def piece(
         One of ``kinds.KINDS``.
     first, count : int
         Which files; file i of a seed is the same whichever others are made.
-    heap_check, reader : str
-        As for :class:`Worker`; the reader in place of that of ``what``.
+    reader : str
+        As for :class:`Worker`, in place of that of ``what``.
 
     Returns
     -------
@@ -123,18 +121,19 @@ def piece(
         memory that a file took beyond the image that it declares, bytes; ``faults``: [index, outcome, error]
         of every file that went wrong.
     """
-    counts, errors, beyond, faults, whole = Counter(), Counter(), 0, [], seeds(what)
-    with tempfile.TemporaryDirectory() as work, Worker(reader or what, heap_check) as process:
+    whole, counts, errors = seeds(what), Counter(), Counter()
+    beyond, faults = 0, []
+    with tempfile.TemporaryDirectory() as work, Worker(reader or what) as process:
 
         def read(name, data, index):
             (path := Path(work) / name).write_bytes(data)
-            return process.read(path, index, headers.declared(data), limited=index != WHOLE)
+            return process.read(path, index, declared_bytes(data), limited=index != WHOLE)
 
         for index in range(first, first + count):
             if process.process is None:  # a reader's first call takes memory that later ones do not
                 for name, data in whole:
                     answer = read(name, data, WHOLE)
-                    if answer["outcome"] != "read" and not name.startswith("deep"):
+                    if answer["outcome"] != "read" and name != "deep.exr":
                         faults.append((name, answer["outcome"], answer.get("error", "")))
             name, data = case(what, whole, settings.seed, index)
             answer = read(name, data, index)
@@ -142,7 +141,7 @@ def piece(
             counts[outcome] += 1
             if outcome == "refused":
                 errors[answer["kind"]] += 1
-            beyond = max(beyond, answer.get("peak", 0) - headers.declared(data))
+            beyond = max(beyond, answer.get("peak", 0) - declared_bytes(data))
             if outcome in FAULTS:
                 faults.append((index, outcome, error))
                 kept = folder / f"{index}-{outcome}-{name}"

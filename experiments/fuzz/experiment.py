@@ -4,47 +4,46 @@ Case i of a kind and of the configuration's ``seed`` is always the same file, wh
 Linux only: memory is read from /proc.
 """
 
-import itertools
-from collections import Counter
-
 from experiments.fuzz.drive import FAULTS
 from experiments.fuzz.kinds import KINDS
 from experiments.harness import Experiment, calling
 
+OUTCOMES = ("read", "refused", *FAULTS)
 PIECE = 2500
 """Files of a case of the harness."""
 
 
 def options(parser):
     parser.add_argument("--count", type=int, default=10000, help="damaged files of each kind (%(default)s)")
-    parser.add_argument("--heap-check", default="", help="library to preload, such as libc_malloc_debug.so.0")
 
 
 def cases(given):
     found = []
-    for what, first in itertools.product(KINDS, range(0, given.count, PIECE)):
-        count = min(PIECE, given.count - first)
-        files = {"what": what, "first": first, "count": count, "heap_check": given.heap_check}
-        name = f"{what} {first}-{first + count - 1}"
-        found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
+    for what, kind in KINDS.items():
+        total = given.count // kind.one_in
+        for first in range(0, total, PIECE):
+            files = {"what": what, "first": first, "count": min(PIECE, total - first)}
+            name = f"{what} {first}-{first + files['count'] - 1}"
+            found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
     return found
+
+
+def measure(done) -> dict:
+    """Return how many files of a piece had each outcome, and the most memory that one took, MiB."""
+    found = done.metrics
+    outcomes = {outcome: found["counts"].get(outcome, 0) for outcome in OUTCOMES}
+    return outcomes | {"mib": found["beyond"] / 2**20, "faults": found["faults"], "folder": done.folder}
 
 
 def combine(rows: list[dict]) -> list[dict]:
     """Add up the pieces of each kind."""
-    sums = {}
-    for row in rows:
-        empty = {"what": row["what"], "counts": Counter(), "errors": Counter(), "beyond": 0}
-        total = sums.setdefault(row["what"], empty)
-        total["counts"].update(row["counts"])
-        total["errors"].update(row["errors"])
-        total["beyond"] = max(total["beyond"], row["beyond"])
-    return list(sums.values())
-
-
-def refused(row: dict) -> str:
-    """Name the errors of the refused files, the most frequent first."""
-    return ", ".join(f"{number} {error}" for error, number in row["errors"].most_common()) or "0"
+    found = []
+    for what in dict.fromkeys(row["what"] for row in rows):
+        some = [row for row in rows if row["what"] == what]
+        sums = {outcome: sum(row[outcome] for row in some) for outcome in OUTCOMES}
+        most = max(row["mib"] for row in some)
+        found.append({"what": what, "cases": sum(sums.values()), "mib": most} | sums)
+    return found
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -59,15 +58,10 @@ EXPERIMENT = Experiment(
     "fuzz",
     "Damage files of every kind that the package reads, and see that reading them ends well.",
     cases,
-    lambda done: done.metrics | {"folder": done.folder},
-    {
-        "what": "{what}",
-        "cases": lambda row: str(row["counts"].total()),
-        "read whole": "{counts[read]}",
-        "refused": refused,
-    }
-    | {fault: f"{{counts[{fault}]}}" for fault in FAULTS}
-    | {"most memory beyond the declared image": lambda row: f"{row['beyond'] / 2**20:.1f} MiB"},
+    measure,
+    {"what": "{what}", "cases": "{cases}", "read whole": "{read}", "refused": "{refused}"}
+    | {fault: f"{{{fault}}}" for fault in FAULTS}
+    | {"most memory beyond the declared image": "{mib:.1f} MiB"},
     failures=failures,
     combine=combine,
     options=options,

@@ -1,35 +1,253 @@
-"""The kinds of files: where whole ones come from, how they are damaged, and what reads them."""
+"""The kinds of files: where whole ones come from, how they are damaged, and what reads them.
 
+A reader finds fault with what the package returns (:class:`WrongError`).
+"""
+
+import io
+import json
+import tempfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import mitsuba as mi
 import numpy as np
 
-from . import documents, mutate, pictures, readers, scenes
+from envedit import config
+from envedit.core import array_cache
+from envedit.core.errors import EnveditError
+from envedit.images import images
+from envedit.losses.perceptual import weights
+from envedit.scene import scene
+from envedit.solve import checkpoint
+from envedit.targets import painted_image
+
+from . import damage, whole
+
+VALUES = (
+    "0", "-1", "1", "2147483647", "-2147483648", "99999999999999999999", "0xff", "1e400", "-1e400", "1e-320",
+    "nan", "-inf", "-0.0", "1e38", "1e39", "0.5", "1_0.0", "true", '""', '"auto"', '"sunsky"', '"layers"',
+    "'a\\b'", '"\\u0000"', '"\\uD800"', '"\\U0001F600"', '"""\na\n"""', "'''", '"', "[]", "[1.0, 2.0]",
+    "[1, [2]]", "{ a.b = [] }", "{", "[", "]", "=", "1979-05-27T07:32:00Z", "\0", "\x1b[31m", "\u2028",
+    "\udcff", "\u202e", "[nan, inf]", '[{ type = "blur" }]', "'../../etc'", "a.b", "input.width", "preset",
+    "[[input]]",
+)  # fmt: skip
+TOML = damage.Grammar(
+    r"[\w.-]+|\"[^\"]*\"|[=\[\]{},]",
+    VALUES,
+    (("[", "", "]"), ("{a=", "1", "}"), ("a.", "a", ""), ("9", "", ""), ("[[a]]\n", "", "")),
+)
+XML = damage.Grammar(
+    r"<[^>]*>|(?<=\")[^\"]*(?=\")",
+    (
+        *VALUES, "<scene>", "<shape>", "</bsdf>", '<ref id="metal"/>', '<include filename="/etc/passwd"/>',
+        '<include filename="written.xml"/>', '<bsdf type="mask"/>', '<bsdf type="blendbsdf"/>',
+        '<texture type="bitmap"/>', "sphere", "bitmap", "envmap", "$rough", "${rough}", "./evil", "..",
+        "&#36;rough", "<!--", "-->", "<![CDATA[", "<?", "<!DOCTYPE a>", "1 2 3", "400:1 700:1", "0 0 0",
+    ),
+    (
+        ('<bsdf type="twosided">', "", "</bsdf>"),
+        ('<default name="rough" value="$rough$rough"/>', "", ""),
+        ("x", "", ""),
+    ),
+)  # fmt: skip
+
+
+class WrongError(Exception):
+    """A reader returned something that it must not."""
+
+
+def _demand(true, text):
+    if not true:
+        raise WrongError(text)
+
+
+def _plain(lines):
+    return all(line.isprintable() and len(line) < 1000 for line in lines)
+
+
+def _each(*calls):
+    """Call all, and raise the first error that a user may see."""
+    errors = []
+    for call in calls:
+        try:
+            call()
+        except EnveditError as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
+
+
+# ---- readers -----------------------------------------------------------------------------------------------
+
+
+def read_map(path: Path, index: int) -> None:
+    """Read as a picture with alpha, and as the map to edit."""
+
+    def stored():
+        pixels, info = images.read_stored(path)
+        _demand(pixels.ndim == 3 and pixels.shape[1::-1] == info["size"], f"shape {pixels.shape}")
+
+    def to_edit():
+        found, info = images.load_envmap(path, 16, repair=bool(index % 2))
+        _demand(found.shape == (8, 16, 3) and found.dtype == np.float32, f"shape {found.shape}")
+        # A file may hold values whose mean float32 cannot; then the map must be refused, not infinite.
+        _demand(np.isfinite(found).all() and (found >= 0).all(), "a map that is not finite, or negative")
+        _demand(_plain(info["warnings"]), f"warnings {info['warnings']!r:.200}")
+
+    _each(stored, to_edit)
+
+
+def read_painted(path: Path, index: int) -> None:
+    """Read as a painted picture, with and without the rendering it was painted on, and as a mask."""
+    initial = np.clip(whole.radiance(), 0, 1) if index % 2 else None
+
+    def look(*values):
+        _demand(all(v.shape[:2] == whole.SIZE and np.isfinite(v).all() for v in values), "not finite")
+        _demand(all(v.dtype == np.float32 and (v >= 0).all() for v in values), "negative")
+
+    def painted():
+        found = painted_image.read(path, whole.SIZE, "gamma", initial)
+        look(found.picture, found.coverage)
+        _demand(_plain(found.warnings), f"warnings {found!r:.200}")
+
+    _each(painted, lambda: look(painted_image.read_mask(path, whole.SIZE)))
+
+
+def read_configuration(path: Path, index: int) -> None:
+    """Read as a configuration; what is understood must come back equal."""
+    found = config.load(path)
+    again = config.loads(config.to_toml(found), "/elsewhere", str(path))
+    _demand(again == found, "it does not come back equal")
+
+
+def read_weights(path: Path, index: int) -> None:
+    """Read as weights of a network."""
+    found = weights.read(path, whole.SHAPES, "the test", "nowhere")
+    shapes = {name: values.shape for name, values in found.items()}
+    finite = all(np.isfinite(values).all() for values in found.values())
+    _demand(shapes == whole.SHAPES and finite, f"shapes {shapes}")
+
+
+def read_scene(path: Path, index: int) -> None:
+    """Load a scene."""
+    _load(path, path)
+
+
+def read_asset(path: Path, index: int) -> None:
+    """Load a scene that names a mesh, a volume or a texture."""
+    named = f'<string name="filename" value="{path}"/>'
+    kind = path.suffix[1:]
+    if kind in ("ply", "obj", "serialized"):
+        shape = f'<shape type="{kind}">{named}</shape>'
+    elif kind == "vol":
+        volume = f'<volume type="gridvolume" name="sigma_t">{named}</volume>'
+        shape = f'<shape type="cube"><medium type="heterogeneous" name="interior">{volume}</medium></shape>'
+    else:
+        bitmap = f'<texture type="bitmap" name="reflectance">{named}</texture>'
+        shape = f'<shape type="sphere"><bsdf type="diffuse">{bitmap}</bsdf></shape>'
+    outer = path.with_name("outer.xml")
+    outer.write_text(f'<scene version="3.0.0">{whole.SENSOR}<emitter type="constant"/>{shape}</scene>')
+    _load(path, outer)
+
+
+def _load(path, file):
+    """Load a scene; an error may name it or the damaged file by the name alone, as those of parameters do."""
+    try:
+        scene.load(file)
+    except EnveditError as error:
+        if str(path) not in str(error) and (path.name in str(error) or file.name in str(error)):
+            raise type(error)(f"{path}: {error}") from None
+        raise
+
+
+def read_entry(path: Path, index: int) -> None:
+    """Take a light transport from disk, or trace it anew, and use it."""
+    whole.recording().write_bytes(path.read_bytes())
+    found = whole.transport()[0]()
+    picture = found.apply(mi.TensorXf(np.ones((8, 16, 3), np.float32))).numpy()
+    back = found.adjoint(mi.TensorXf(np.ones((6, 8, 3), np.float32))).numpy()
+    _demand(np.isfinite(picture).all() and np.isfinite(back).all(), "a transport that is not finite")
+
+
+def read_checkpoint(path: Path, index: int) -> None:
+    """Read as the checkpoint of a run, and continue with the columns of its transport."""
+    found = checkpoint.load(path.parent, "what")
+    _demand(found is not None, "no checkpoint")
+    try:
+        whole.transport()[1].restore(found[2])
+    except EnveditError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+# ---- damage ------------------------------------------------------------------------------------------------
+
+
+def damaged_configuration(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the text of a configuration."""
+    return damage.of_text(data, rng, TOML)
+
+
+def damaged_scene(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the text of a scene."""
+    return damage.of_text(data, rng, XML)
+
+
+def damaged_entry(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the arrays of a cache entry, and make the digests right again."""
+    length = int.from_bytes(data[8:16], "little")
+    text = json.loads(data[array_cache._START : array_cache._START + length])["key"]
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a").write_bytes(data)
+        arrays = damage.of_arrays(array_cache._read(Path(folder) / "a", text), rng)
+    out = array_cache._header(text, arrays)
+    for array in arrays.values():
+        out += array.tobytes().ljust(array_cache._padded(array.nbytes), b"\0")
+    return out
+
+
+def damaged_checkpoint(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage the bytes, or the arrays and the state of a checkpoint whose digest stays right."""
+    if rng.random() < 0.5:
+        return damage.of_bytes(data, rng)
+    with np.load(io.BytesIO(data)) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    meta = json.loads(arrays.pop("meta").tobytes())
+    if rng.random() < 0.3:
+        values = (-1, 2**70, "2", None, [], {}, 0.5, 1e400, True, [5], [{}])
+        meta["state"][str(rng.choice(list(meta["state"])))] = damage.one_of(values, rng)
+    else:
+        arrays = damage.of_arrays(arrays, rng)
+    out = io.BytesIO()
+    np.savez(out, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
+    return out.getvalue()
+
+
+# ---- kinds -------------------------------------------------------------------------------------------------
 
 
 class Kind(NamedTuple):
-    """A kind of files: makes whole ones by name, reads one of a case, and damages the content of one."""
+    """A kind of files: makes whole ones by name, reads one of a case, and damages the content of one.
+
+    Of the files that are requested, one in ``one_in`` is made: to load a scene around each takes long.
+    """
 
     files: Callable[[], dict[str, bytes]]
     read: Callable[[Path, int], None]
-    damage: Callable[[bytes, np.random.Generator], bytes] = mutate.mutated
+    damage: Callable[[bytes, np.random.Generator], bytes] = damage.of_bytes
+    one_in: int = 1
 
 
 KINDS = {
-    "exr": Kind(pictures.exr_files, readers.environment),
-    "hdr": Kind(pictures.hdr_files, readers.environment),
-    "toml": Kind(documents.toml_files, readers.configuration, documents.mutated),
-    "painted": Kind(pictures.painted_files, readers.picture),
-    "weights": Kind(pictures.weight_files, readers.tensors),
-    "checkpoint": Kind(pictures.checkpoint_files, readers.checkpointed),
-    "scene": Kind(scenes.scene_files, readers.scene_file, scenes.mutated_scene),
-    "mesh": Kind(scenes.mesh_files, readers.mesh),
-    "texture": Kind(pictures.painted_files, readers.texture),
-    "entry": Kind(scenes.entry_files, readers.transport, scenes.mutated_entry),
-    "state": Kind(scenes.state_files, readers.continued, scenes.mutated_state),
+    "map": Kind(whole.maps, read_map),
+    "painted": Kind(whole.painted_files, read_painted),
+    "toml": Kind(whole.toml_files, read_configuration, damaged_configuration),
+    "weights": Kind(whole.weight_files, read_weights),
+    "scene": Kind(whole.scene_files, read_scene, damaged_scene),
+    "asset": Kind(whole.asset_files, read_asset, one_in=10),
+    "entry": Kind(whole.entry_files, read_entry, damaged_entry),
+    "checkpoint": Kind(whole.checkpoint_files, read_checkpoint, damaged_checkpoint),
 }
 
 
@@ -38,8 +256,8 @@ def seeds(what: str) -> list[tuple[str, bytes]]:
     return sorted(KINDS[what].files().items())
 
 
-def case(what: str, whole: list[tuple[str, bytes]], seed: int, index: int) -> tuple[str, bytes]:
+def case(what: str, files: list[tuple[str, bytes]], seed: int, index: int) -> tuple[str, bytes]:
     """Return name and content of a damaged file: the same for the same seeds, kind, seed and index."""
     rng = np.random.default_rng([seed, zlib.crc32(what.encode()), index])
-    name, data = mutate.one_of(whole, rng)
+    name, data = damage.one_of(files, rng)
     return name, KINDS[what].damage(data, rng)

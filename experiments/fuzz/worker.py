@@ -18,8 +18,7 @@ import mitsuba as mi
 
 from envedit.core.errors import ConfigError, InputError
 
-from .kinds import KINDS
-from .readers import WrongError
+from .kinds import KINDS, WrongError
 
 MIB = 1 << 20
 MULTIPLE, ROOM = 8, 64 * MIB
@@ -43,6 +42,8 @@ def main(reader: str, answers) -> None:
     read = getattr(importlib.import_module(module), function) if function else KINDS[reader].read
     warnings.simplefilter("always")  # each is a line on a user's terminal
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    answers.write("ready\n")
+    answers.flush()
     for line in sys.stdin:
         request = json.loads(line)
         path, declared = Path(request["path"]), request["declared"]

@@ -74,17 +74,17 @@ def cases(args):
     return picked(made, args)
 
 
-def picked(made: list[Case], args) -> list[Case]:
+def picked(made: list[Case], args, kinds: tuple[str, ...] = ("kind", "turn", "scene")) -> list[Case]:
     """Return the cases that ``--only`` names; with ``--count``, so many of them, evenly from all kinds.
 
-    A kind is a kind of target, with a turn or without, in one scene. The order is always the same.
+    Cases are of one kind if they agree in ``kinds``. The order is always the same.
     """
     made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
     if args.count is None:
         return made
     strata: dict[tuple, list[Case]] = {}
     for case in sorted(made, key=lambda c: _digest(c.name)):
-        strata.setdefault(tuple(case.about[key] for key in ("kind", "turn", "scene")), []).append(case)
+        strata.setdefault(tuple(case.about[key] for key in kinds), []).append(case)
     # Neighbours in a round differ in all of what distinguishes their kinds.
     keys = sorted(strata, key=lambda key: _digest(str(key)))
     rounds = itertools.zip_longest(*(strata[key] for key in keys))

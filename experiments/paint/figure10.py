@@ -4,10 +4,17 @@ The strokes are those of scenes/edits, drawn with the pointer and set with the p
 are as the page has them: ellipses lie straight, a tint is at most 1 (the rest of it goes into the amount),
 and corners beyond the picture lie on its border. A hand's pace: :data:`CORNER_S` a corner,
 :data:`SETTING_S` a tool, a shape or a slider. The case ``page`` is a picture of the page, with the outlines
-of strokes.
+of strokes. Chromium is the file that the environment variable CHROMIUM names, one of the search path, or
+Playwright's.
 """
 
+import contextlib
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
 import time
 import tomllib
 from pathlib import Path
@@ -15,14 +22,20 @@ from pathlib import Path
 import numpy as np
 
 from envedit.core.color import tonemap
+from envedit.core.errors import InputError
 from envedit.images import images
+from envedit.sweep.process import CONFIG
 from experiments import puresky
-from experiments.harness import Done, Experiment, calling, number
-from experiments.paint.browser import browsing, opened, place, prepared
+from experiments.harness import Done, Experiment, calling
+from experiments.summary import values
 
 MAP = "kloofendal_48d_partly_cloudy"
 CORNER_S, SETTING_S = 0.4, 1.0
 STATUS = "() => document.querySelector('[data-testid=status]').textContent.includes"
+DRAWN = (
+    "() => { const of = document.querySelector('[data-testid=status]').dataset;"
+    " return Number(of.frame) > 0 && ['done', 'rendering', 'solving'].includes(of.state); }"
+)
 FEASIBLE, RENDERED = f"{STATUS}('% feasible')", f"{STATUS}('with 256 samples')"
 SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
 TITLES = {
@@ -33,6 +46,52 @@ TITLES = {
     "enhance_shadow": "Enhancing the shadow",
     "blur_shadow": "Blurring the shadow",
 }
+
+
+def prepared(folder: Path) -> Path:
+    """Make the empty folder that the command works in, ``edit.toml`` being the case's configuration."""
+    work = folder / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    shutil.copy(folder / CONFIG, work / "edit.toml")
+    return work
+
+
+@contextlib.contextmanager
+def opened(work: Path):
+    """Start ``envedit paint`` in a folder of :func:`prepared`; yields its page, once strokes are taken."""
+    from playwright.sync_api import sync_playwright
+
+    file = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    gl = ["--no-sandbox", "--enable-unsafe-swiftshader"]  # WebGL by software
+    command = [sys.executable, "-m", "envedit", "paint", "edit.toml", "--no-browser", "--port", "0"]
+    own = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    pipe = subprocess.PIPE
+    with (
+        sync_playwright() as playwright,
+        playwright.chromium.launch(executable_path=file, args=gl) as browser,
+        open(work / "server.log", "a") as log,
+        subprocess.Popen(command, cwd=work, env=own, stdout=pipe, stderr=log, text=True) as process,
+    ):
+        try:
+            line = process.stdout.readline()
+            if "http" not in line:
+                raise InputError(f"the server did not start: see {work / 'server.log'}")
+            with browser.new_page(viewport={"width": 1280, "height": 720}) as page:
+                page.goto(line.split()[-1])
+                page.wait_for_function(DRAWN, timeout=300_000)
+                yield page
+        finally:
+            process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(90)
+            process.kill()
+
+
+def place(page, selector, x, y):
+    """Return where a place of an element, in fractions of its size, lies on the page."""
+    box = page.locator(selector).bounding_box()
+    return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
 
 def choose(page, name):
@@ -100,7 +159,7 @@ def paint(page, stroke):
 def edit(settings, folder, strokes) -> dict:
     """Paint an edit in the page and save it; returns seconds, the edit's figures and the strokes as saved."""
     work = prepared(folder)
-    with browsing() as browser, opened(browser, work) as (page, *_):
+    with opened(work) as page:
         set_to(page, "exposure", 0)  # amounts of light are of what is shown as white
         began = time.perf_counter()
         for stroke in strokes:
@@ -119,7 +178,7 @@ def edit(settings, folder, strokes) -> dict:
 
 def picture(settings, folder, strokes) -> dict:
     """Paint an edit and take the picture of the page, path traced, with the outlines of its strokes."""
-    with browsing() as browser, opened(browser, prepared(folder)) as (page, *_):
+    with opened(prepared(folder)) as page:
         for stroke in strokes:
             paint(page, stroke)
         page.wait_for_function(FEASIBLE, timeout=300_000)
@@ -156,15 +215,15 @@ EXPERIMENT = Experiment(
     "paint.figure10",
     "The six edits of the paper's Figure 10, each painted in the page.",
     cases,
-    lambda done: [] if done.case.name == "page" else done.metrics,
+    lambda done: [] if done.case.name == "page" else values(done.metrics),
     {
         "edit": "{edit}",
         "strokes": lambda row: ", ".join(f"{s['type']} ({shape_of(s) or 'all'})" for s in row["strokes"]),
         "painting + solving, s": "{painted_s:.0f} + {solved_s:.0f}",
         "saving, s": "{saved_s:.0f}",
-        "painted change reached": lambda row: f"{100 * row['towards']:.0f} %",
-        "feasible": lambda row: f"{100 * row['reachable']:.0f} %",
-        "mean change elsewhere": lambda row: number(row["elsewhere"], ".3f"),
+        "painted change reached": "{towards:.0%}",
+        "feasible": "{reachable:.0%}",
+        "mean change elsewhere": "{elsewhere:.3f}",
     },
     panels=panels,
     sheet=lambda case: "page" if case.name == "page" else "figure10",

@@ -18,7 +18,7 @@ from envedit.images import images
 from envedit.scene import scene as scenes
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling, markdown, number
-from experiments.natural.experiment import evenly, psnr
+from experiments.natural.experiment import picked, psnr
 
 SCENES = ("sphere", "statue", "matpreview")
 TURNS = {
@@ -71,8 +71,7 @@ def cases(given):
         about = {"scene": scene, "map": name, "target": label, "kind": kind}
         title = f"{scene}-{name}-{label}".replace(" ", "_")
         found.append(calling(title, "experiments.pictures.experiment:three_ways", tables, about))
-    found = [case for case in found if not given.only or any(text in case.name for text in given.only)]
-    return found if given.count is None else evenly(found, given.count, ("kind", "scene"))
+    return picked(found, given, ("kind", "scene"))
 
 
 def three_ways(settings, folder) -> dict:

@@ -14,7 +14,8 @@ from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.scene import parser, scene
-from experiments.harness import Experiment, calling, number
+from experiments.harness import Experiment, calling
+from experiments.summary import values
 
 WIDTH, MAP = 64, 128
 """Pixels and texels across."""
@@ -108,7 +109,7 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
 
 def summary(rows: list[dict]) -> str:
     loaded = [row for row in rows if not row["refused"]]
-    compared = [row for row in loaded if row["ratio"] is not None]
+    compared = [row for row in loaded if row["ratio"] == row["ratio"]]  # known
     near = sum(abs(row["ratio"] - 1) <= max(NEAR, SIGMA * row["noise"]) for row in compared)
     better = sum(row["psnr"] >= row["initial"] for row in loaded)
     text = f"{len(loaded)} of {len(rows)} scenes are edited; {near} of {len(compared)} initial renderings "
@@ -126,15 +127,16 @@ EXPERIMENT = Experiment(
     "scenes",
     "Load, render and edit every Mitsuba scene of a folder, and compare with Mitsuba.",
     cases,
-    columns={
+    lambda done: values(done.metrics),
+    {
         "scene": "{scene}",
         "refused": lambda m: cell(m["refused"]),
         "light": "{light}",
         "mean over Mitsuba's, with standard error": lambda m: (
-            cell(m["plain"]) if m["ratio"] is None else f"{m['ratio']:.4f} ± {m['noise']:.4f}"
+            cell(m["plain"]) if m["ratio"] != m["ratio"] else f"{m['ratio']:.4f} ± {m['noise']:.4f}"
         ),
-        "rendering (unedited), dB": lambda m: f"{number(m['psnr'])} ({number(m['initial'])})",
-        "map (unedited), dB": lambda m: f"{number(m['map'])} ({number(m['unedited'])})",
+        "rendering (unedited), dB": "{psnr:.1f} ({initial:.1f})",
+        "map (unedited), dB": "{map:.1f} ({unedited:.1f})",
     },
     summary=summary,
     options=options,

@@ -1,1 +1,1 @@
-"""The solver of layers: course of the objective, cost of its parts."""
+"""The solver of layers: nine edits, and how a run grows."""

@@ -1,13 +1,13 @@
-"""Times and errors of nine edits, to compare two versions of the solver.
+"""Times and errors of nine edits, to compare two versions of the solver; and how a run grows with its sizes.
 
 Every edit is run twice and the second time counts: kernels, T and the target's rendering are on disk then.
-Run it on either version, in one go, where nothing else runs.
+Run two versions in one go, where nothing else runs.
 """
 
-import numpy as np
-
+from envedit import pipeline
 from experiments import puresky
-from experiments.harness import Experiment, calling, markdown
+from experiments.harness import Experiment, calling
+from experiments.summary import Summary, values
 
 EDITS = (  # map, scene, target (degrees or another map), whether the sky may turn
     ("sunflowers", "sphere", "60", False),
@@ -20,61 +20,73 @@ EDITS = (  # map, scene, target (degrees or another map), whether the sky may tu
     ("syferfontein_18d_clear", "pair", "kloofendal_48d_partly_cloudy", True),
     ("kloppenheim_06", "sphere", "60", True),
 )
-NUMBERS = {
-    "solve, s": "{solve_s:.2f}",
-    "total, s": "{total_s:.2f}",
-    "steps": "{iterations:.1f}",
-    "a step, ms": "{per_iteration_ms:.0f}",
-    "rendering, dB": "{render:.2f}",
-    "map, dB": "{envmap:.2f}",
-}
+SIZES = ((128, 256), (256, 256), (512, 256), (128, 512), (512, 512))
+"""Pixels and texels across, of the first edit."""
+PARTS = ("target", "fit", "transport", "start", "edit", "judge", "total")
 
 
-def tables(files, name, scene, target, turn) -> dict:
-    """Return the configuration of an edit."""
-    wanted = {"rotate_degrees": float(target)} if target.isdigit() else {"file": str(files[target])}
-    return {
-        "input": {"envmap": str(files[name])},
-        "scene": {"file": scene},
-        "target": wanted,
+def second(settings, folder) -> dict:
+    """Run a configuration twice; returns the metrics of the second run."""
+    pipeline.run(settings)
+    return pipeline.run(settings).metrics
+
+
+def case(group, name, edit, pixels=128, texels=256):
+    """Return the case of an edit at a size."""
+    files = puresky.find()
+    source, scene, target, turn = edit
+    tables = {
+        "input": {"envmap": str(files[source]), "width": texels},
+        "scene": {"file": scene, "width": pixels},
+        "target": {"rotate_degrees": float(target)} if target.isdigit() else {"file": str(files[target])},
         "representation": {"turn": "auto" if turn else False},
     }
+    return calling(name, "experiments.solver.edits:second", tables, {"group": group, "edit": name})
 
 
 def cases(given):
-    files = puresky.find()
-    return [
-        calling(f"{name}, {scene}, {target}", "experiments.solver.growth:second", tables(files, *edit))
-        for edit in EDITS
-        for name, scene, target, _ in [edit]
+    edits = [case("edits", ", ".join(edit[:3]), edit) for edit in EDITS]
+    sizes = [
+        case("sizes", f"{pixels}², {texels}x{texels // 2}", EDITS[0], pixels, texels)
+        for pixels, texels in SIZES
     ]
-
-
-def measure(done) -> dict:
-    found, timing = done.metrics, done.metrics["timing"]
-    return {
-        "edit": done.case.name,
-        "solve_s": timing["solve_s"],
-        "total_s": timing["total_s"],
-        "iterations": found["iterations"],
-        "per_iteration_ms": timing["per_iteration_ms"] or 0,
-        "render": found["render"]["psnr"],
-        "envmap": found["envmap"]["psnr"],
-    }
-
-
-def summary(rows) -> str:
-    means = {key: np.mean([row[key] for row in rows]) for key in rows[0] if key != "edit"}
-    lines = [[f"mean of {len(rows)}", *(form.format_map(means) for form in NUMBERS.values())]]
-    return markdown(["", *NUMBERS], lines)
+    return edits + sizes
 
 
 EXPERIMENT = Experiment(
     "solver.edits",
-    "Times and errors of nine edits, to compare two versions of the solver.",
+    "Times and errors of nine edits, to compare two versions of the solver; growth with sizes.",
     cases,
-    measure,
-    {"edit": "{edit}"} | NUMBERS,
-    summary=summary,
+    lambda done: values(done.metrics),
+    {
+        "edits": {
+            "edit": "{edit}",
+            "solve, s": "{timing[solve_s]:.2f}",
+            "total, s": "{timing[total_s]:.2f}",
+            "steps": "{iterations}",
+            "a step, ms": "{timing[per_iteration_ms]:.0f}",
+            "rendering, dB": "{render[psnr]:.2f}",
+            "map, dB": "{envmap[psnr]:.2f}",
+        },
+        "sizes": {
+            "picture, map": "{edit}",
+            "steps": "{iterations}",
+            "a step, ms": "{timing[per_iteration_ms]:.0f}",
+        }
+        | {part: f"{{timing[{part}_s]:.2f}}" for part in PARTS},
+    },
+    group=lambda row: row["group"],
+    summary=Summary(
+        {"": "{group}"},
+        {
+            "runs": "{runs}",
+            "solve, s": "{timing[solve_s].mean:.2f}",
+            "total, s": "{timing[total_s].mean:.2f}",
+            "steps": "{iterations.mean:.1f}",
+            "a step, ms": "{timing[per_iteration_ms].mean:.0f}",
+            "rendering, dB": "{render[psnr].mean:.2f}",
+            "map, dB": "{envmap[psnr].mean:.2f}",
+        },
+    ),
     alone=True,
 )

@@ -6,35 +6,131 @@ those of the same call. Nothing else should run on the machine meanwhile.
 
 from __future__ import annotations
 
-from experiments.harness import Experiment, calling, done_of, rows_of
+import math
+import statistics
 
-from . import analyse, plan, plot
+from experiments.harness import Done, Experiment, calling
+from experiments.summary import Numbers, Value, values
+
+from . import plan
+
+MOST_PSNR = 55.0
+"""Most dB of a rendering that are shown: beyond, the estimate without noise may itself be noise (57 dB for
+the true map, where the judge has most of it)."""
+PARTS = {
+    "rendering_s": ("target_s", "judge_s"),
+    "tracing_s": ("transport_s", "start_s"),
+    "numbers_s": ("fit_s", "edit_s", "report_s"),
+}
+"""Seconds of a run by part, as ``--budget`` reckons with them, and the timings that each is the sum of."""
 
 
 def cases(given):
-    cells = plan.cells()
-    asked = [(*names, "settings") for names in cells] + [(plan.MAPS[-1], "glossy", "paper")]
     return [
         calling(
-            f"{name}, {scene}: {part}",
-            "experiments.tradeoff.runs:cell",
-            cells[name, scene],
+            f"{name}, {scene}",
+            "experiments.tradeoff.cell:cell",
+            tables,
             {"cell": f"{name}, {scene}"},
-            **{"scene": scene, "part": part, "sets": given.sets},
+            **{"scene": scene, "sets": given.sets},
         )
-        for name, scene, part in asked
+        for (name, scene), tables in plan.cells().items()
     ]
+
+
+def worth(judged: dict) -> dict:
+    """Return how good a map is: dB of the rendering, without the judge's noise, and of the map; its SSIM."""
+    return {
+        "psnr": min(judged["render"]["psnr_without_noise"], MOST_PSNR),
+        "noisy_psnr": judged["render"]["psnr"],
+        "map_psnr": judged["map"]["psnr"],
+        "map_ssim": judged["map"]["ssim"],
+        "sun": judged["sun_degrees"],
+    }
+
+
+def costs(run: dict) -> dict:
+    """Return what a run cost.
+
+    ``again_s`` is the time less what fit and tracing took: a run that finds them on disk takes a tenth of a
+    second to load them, which is left out.
+    """
+    cost, timing = run["cost"], run["judged"]["timing"]
+    return {
+        "s": cost["wall_s"],
+        "again_s": cost["wall_s"] - timing["fit_s"] - timing["transport_s"],
+        "gb": cost["peak_bytes"] / 1e9,
+        "processors": cost["cpu_s"] / cost["wall_s"],
+    } | {part: sum(timing[key] for key in keys) for part, keys in PARTS.items()}
+
+
+def measure(done: Done) -> list[dict]:
+    """Return a row for every run of a cell, and one each for the unedited and for the true map.
+
+    ``time``, ``again``, ``memory``: ratios to the median of the standard preset's runs. ``rendering``,
+    ``map``, ``ssim``: differences from its first run, which has the seed of all other settings: the noise of
+    the target, which both share, is the largest difference under a sun (6 dB between seeds).
+    """
+    rows = [{"setting": run["setting"]} | costs(run) | worth(run["judged"]) for run in done.metrics["runs"]]
+    standard = [row for row in rows if row["setting"] in plan.STANDARD]
+    for row in rows:
+        for ratio, key in {"time": "s", "again": "again_s", "memory": "gb"}.items():
+            row[ratio] = row[key] / statistics.median(one[key] for one in standard)
+        for change, key in {"rendering": "psnr", "map": "map_psnr", "ssim": "map_ssim"}.items():
+            row[change] = row[key] - standard[0][key]
+    unknown = dict.fromkeys(rows[0])
+    bounds = {name: worth(judged) for name, judged in done.metrics["bounds"].items()}
+    rows += [unknown | {"setting": f"({name} map)"} | found for name, found in bounds.items()]
+    return [values(row) for row in rows]
+
+
+def means(rows: list[dict]) -> list[dict]:
+    """Average every setting over its cells: ratios geometrically, differences arithmetically."""
+    found = []
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        some = [row for row in rows if row["setting"] == setting]
+        logs = {key: Numbers([math.log(row[key]) for row in some]) for key in ("time", "again", "memory")}
+        mean = {key: Numbers([row[key] for row in some]).mean for key in ("rendering", "map", "ssim", "sun")}
+        mean |= {key: Value(math.exp(one.mean)) for key, one in logs.items()}
+        found.append({"table": "settings", "setting": setting, "cells": len(some)} | mean)
+    return found
 
 
 EXPERIMENT = Experiment(
     "tradeoff",
     "Measure what speed costs in accuracy: every setting in every cell, one run at a time.",
     cases,
-    analyse.compared,
-    analyse.COLUMNS,
+    measure,
+    {
+        "settings": {
+            "setting": "{setting}",
+            "cells": "{cells}",
+            "time": "{time:.2f}",
+            "again": "{again:.2f}",
+            "memory": "{memory:.2f}",
+            "rendering, dB": "{rendering:+.2f}",
+            "map, dB": "{map:+.2f}",
+            "map SSIM": "{ssim:+.3f}",
+            "sun off, degrees": "{sun:.1f}",
+        },
+        "runs": {
+            "cell": "{cell}",
+            "setting": "{setting}",
+            "s": "{s:.1f}",
+            "s again": "{again_s:.1f}",
+            "rendering s": "{rendering_s:.1f}",
+            "tracing and search s": "{tracing_s:.1f}",
+            "numbers s": "{numbers_s:.1f}",
+            "processors": "{processors:.2f}",
+            "GB": "{gb:.2f}",
+            "rendering, dB": "{psnr:.1f}",
+            "with the judge's noise": "{noisy_psnr:.1f}",
+            "map, dB": "{map_psnr:.1f}",
+            "map SSIM": "{map_ssim:.3f}",
+            "sun off, degrees": "{sun:.1f}",
+        },
+    },
     group=lambda row: row["table"],
-    summary=analyse.summary,
-    combine=analyse.combine,
-    draw=lambda cases, out, to, given: plot.draw(rows_of(EXPERIMENT, done_of(cases, out)), to),
+    combine=lambda rows: means(rows) + [row | {"table": "runs"} for row in rows],
     alone=True,
 )

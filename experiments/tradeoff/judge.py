@@ -7,7 +7,6 @@ rendered with more samples and other seeds: no setting judges itself by its own 
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -59,20 +58,17 @@ class Judge:
         self.target = self._halves(self.true, true_spp, TRUE_SEED)
 
     def __call__(self, folder: Path) -> dict:
-        """Judge what a run left.
+        """Judge what a run left, at the resolution of its file where it has that.
 
         Returns
         -------
         dict
-            ``render``, ``map``, ``sun_degrees`` as :meth:`compare`, of the map at the resolution of its file;
-            ``loss_noise`` as :func:`loss_noise`; ``timing``: seconds by part.
+            As :meth:`compare`, with ``timing``: seconds of the run by part.
         """
         full = folder / "edited_full.exr"
         edited = images.read(str(full if full.exists() else folder / "edited.exr"))[0]
-        with open(folder / "history.csv", newline="") as file:
-            losses = [float(row["loss"]) for row in csv.DictReader(file) if row.get("loss")]
         timing = json.loads((folder / "metrics.json").read_text())["timing"]
-        return self.compare(self._sized(edited)) | {"loss_noise": loss_noise(losses), "timing": timing}
+        return self.compare(self._sized(edited)) | {"timing": timing}
 
     def compare(self, edited: np.ndarray) -> dict:
         """Render a map (H, W, 3) of the judge's size and compare it with the true one.
@@ -99,14 +95,8 @@ class Judge:
         }
 
     def bounds(self) -> dict:
-        """Judge the map as it was before the edit, and the true map: the floor, and the most noise allows.
-
-        Returns
-        -------
-        dict
-            ``unedited`` and ``ceiling``, as :meth:`compare`.
-        """
-        return {"unedited": self.compare(self.original), "ceiling": self.compare(self.true)}
+        """Judge the map as it was before the edit, and the true map: the least, and the most noise allows."""
+        return {"unedited": self.compare(self.original), "true": self.compare(self.true)}
 
     def _sized(self, envmap):
         return latlong.resize(envmap, self.width // 2, self.width)
@@ -127,15 +117,3 @@ def without_noise(halves: np.ndarray, wanted: np.ndarray) -> float:
     a, b = tonemap(halves, "gamma"), tonemap(wanted, "gamma")
     square = float(np.mean((a[0] - b[0]) * (a[1] - b[1])))
     return float(min(metrics.PSNR_CAP, -10 * np.log10(square))) if square > 0 else metrics.PSNR_CAP
-
-
-def loss_noise(losses) -> float | None:
-    """Estimate the relative noise of a loss from step to step over the last third of a run.
-
-    The root mean square of second differences over sqrt(6), which is the standard deviation of independent
-    noise and knows nothing of a linear trend, over the mean. None for fewer than 9 steps or a mean of 0.
-    """
-    last = np.asarray(losses, np.float64)[-(len(losses) // 3) :]
-    if len(losses) < 9 or not last.mean() > 0:
-        return None
-    return float(np.sqrt(np.mean(np.square(np.diff(last, 2))) / 6) / last.mean())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from experiments import puresky
 
 MAPS = ("overcast_soil", "wasteland_clouds", "kloofendal_48d_partly_cloudy")
@@ -35,28 +33,9 @@ def cells() -> dict[tuple[str, str], dict]:
     return {(name, scene): base(puresky.file(name), scene) for name in MAPS for scene in SCENES}
 
 
-@dataclass(frozen=True)
-class Setting:
-    """What is changed in the standard preset.
-
-    Attributes
-    ----------
-    name : str
-        What tables call it; "KNOB: LEVEL" for a knob.
-    group : str
-        "standard", "preset", "knob", "siren" or "joint".
-    tables : dict
-        Tables and keys as in a configuration.
-    """
-
-    name: str
-    group: str
-    tables: dict
-
-
-def knob(name: str, table: str, key: str, *levels) -> list[Setting]:
-    """List a key at several levels, without that of the standard preset."""
-    return [Setting(f"{name}: {level}", "knob", {table: {key: level}}) for level in levels]
+def knob(name: str, table: str, key: str, *levels) -> dict[str, dict]:
+    """Return a key at several levels, without that of the standard preset, by the names of settings."""
+    return {f"{name}: {level}": {table: {key: level}} for level in levels}
 
 
 def samples(count: int) -> dict:
@@ -69,55 +48,35 @@ def sizes(texels: int, pixels: int) -> dict:
     return {"input": {"width": texels}, "scene": {"width": pixels}}
 
 
-STANDARD = [Setting(f"standard, seed {n}", "standard", {"seed": n}) for n in range(3)]
-"""Before, amid and after the others; the seeds show how far results differ by chance."""
-PAPER = Setting("paper", "preset", {"preset": "paper"})
-"""A run takes about twenty minutes."""
-JOINT = ((64, 256, 64, 16), (256, 128, 128, 1024), (128, 64, 96, 64), (16, 96, 32, 64), (32, 384, 48, 256))
-"""Samples of T, width of map and of film, samples of target and result: drawn by Latin hypercube sampling
-(McKay, Beckman and Conover 1979), so that the levels of a knob are met about equally often."""
-SETTINGS = [
-    Setting("draft", "preset", {"preset": "draft"}),
-    *knob("samples of T", "renderer", "spp", 16, 64, 512),
-    *knob("path depth", "renderer", "max_depth", 2),
-    *knob("map width", "input", "width", 64, 128, 512),
+STANDARD = [f"standard, seed {n}" for n in range(3)]
+"""Run before, amid and after the others; the seeds show how far results differ by chance."""
+SETTINGS = {
+    "draft": {"preset": "draft"},
+    **knob("samples of T", "renderer", "spp", 16, 64, 512),
+    **knob("path depth", "renderer", "max_depth", 2),
+    **knob("map width", "input", "width", 64, 128, 512),
     # Larger pictures are solved on a film of 128 pixels: experiments/solver.
-    *knob("film width", "scene", "width", 64),
+    **knob("film width", "scene", "width", 64),
     # Gauss-Newton makes at most 16, Adam, where detail is identifiable, all of them.
-    *knob("steps at most", "optimizer", "iterations", 4, 30, 200),
-    # A number means those cycles and no finer grids, wherever the picture may tell them.
-    *knob("gain without detail, cycles", "representation", "cycles", 4, 12),
-    *knob("optimizer", "optimizer", "kind", "adam"),
-    *(Setting(f"samples of target and result: {n}", "knob", samples(n)) for n in (16, 64)),
+    **knob("steps at most", "optimizer", "iterations", 4, 30, 200),
+    # A number means those cycles and no finer grids, wherever the picture may show them.
+    **knob("gain without detail, cycles", "representation", "cycles", 4, 12),
+    **knob("optimizer", "optimizer", "kind", "adam"),
+    **{f"samples of target and result: {n}": samples(n) for n in (16, 64)},
     # The standard robust SIREN: at 256 texels across it takes ten times as long.
-    Setting("siren, map 128", "siren", {"representation": {"kind": "siren"}, "input": {"width": 128}}),
-    *(
-        Setting(
-            f"joint {i}: T {spp}, map {texels}, film {pixels}, samples {count}",
-            "joint",
-            {"renderer": {"spp": spp}} | sizes(texels, pixels) | samples(count),
-        )
-        for i, (spp, texels, pixels, count) in enumerate(JOINT, 1)
-    ),
-    # The two knobs that are the cheapest alone.
-    Setting("map 96, film 32, samples 64", "joint", sizes(96, 32) | samples(64)),
-    Setting("map 96, film 48, samples 64", "joint", sizes(96, 48) | samples(64)),
-    Setting("map 128, film 64", "joint", sizes(128, 64)),
-    Setting("map 128, film 96", "joint", sizes(128, 96)),
-]
+    "siren, map 128": {"representation": {"kind": "siren"}, "input": {"width": 128}},
+    # Several at once; the second and "draft" are levels of --budget.
+    "map 96, film 32, samples 64": sizes(96, 32) | samples(64),
+    "map 96, film 48, samples 64": sizes(96, 48) | samples(64),
+    "map 128, film 64": sizes(128, 64),
+    "map 128, film 96": sizes(128, 96),
+}
+"""Tables and keys that are changed in the standard preset, as in a configuration, by the name in tables."""
 
 
-def settings(part: str, scene: str) -> list[Setting]:
-    """List what is run in a cell, with the standard preset before, amid and after it.
-
-    Parameters
-    ----------
-    part : str
-        "settings", or "paper": that preset alone.
-    scene : str
-        A SIREN, which takes longer than all others, is run in "glossy".
-    """
-    some = [one for one in SETTINGS if one.group != "siren" or scene == "glossy"]
-    some = [PAPER] if part == "paper" else some
-    half, (before, amid, after) = len(some) // 2, STANDARD
-    return [before, *some[:half], amid, *some[half:], after]
+def settings() -> dict[str, dict]:
+    """Return what is run in a cell, in its order: all settings, and the standard preset three times."""
+    before, amid, after = [(name, {"seed": seed}) for seed, name in enumerate(STANDARD)]
+    others = list(SETTINGS.items())
+    half = len(others) // 2
+    return dict([before, *others[:half], amid, *others[half:], after])

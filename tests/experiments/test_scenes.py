@@ -7,6 +7,7 @@ import pytest
 from envedit import config
 from envedit.core.errors import InputError
 from experiments.scenes import experiment
+from experiments.summary import values
 from tests.oracles import users_scenes
 from tests.oracles.builders import BALL, SENSOR, write_scene
 from tests.oracles.users_scenes import CONSTANT, LAMP, MEDIUM, PATH, VOLUME, light
@@ -57,6 +58,6 @@ def test_scenes_are_counted():
         {"refused": "a.xml (line 3): no film\nmore", "ratio": None},
         {"refused": "b.xml (line 9): no film", "ratio": None},
     ]
-    text = experiment.summary(rows)
+    text = experiment.summary([values(row) for row in rows])
     assert "4 of 6 scenes are edited; 2 of 3 initial" in text and "2 of 4 edited renderings" in text
     assert "- refused, 2: no film" in text

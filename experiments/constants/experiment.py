@@ -1,0 +1,183 @@
+"""What each constant of behaviour does: four small edits with it halved and doubled.
+
+A constant that changes nothing could be another; one that changes much is a choice, whose reason stands in
+its docstring. Constants are the numbers of ``solve`` and ``preparation``.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import envedit
+from envedit import config, pipeline
+from envedit.config import presets
+from experiments.harness import Case, Experiment, calling, number
+
+FACTORS = {"halved": 0.5, "doubled": 2.0}
+NO_SCALE = {"light_places.APART", "prior.DEGREES", "layers_solver.CHECKED_SPP", "normal_equations.ROWS"}
+"""A cosine, the length of a series, and what decides only how long something takes."""
+SHADOW = {"type": "shadow", "ellipse": [0.75, 0.75, 0.2, 0.1], "softness": 0.03, "amount": 0.8}
+EDITS: dict[str, dict] = {
+    "sun lower": {
+        "input": {"azimuth": 240.0, "elevation": 45.0},
+        "target": {"kind": "envmap", "rotate_degrees": 40.0},
+        "representation": {"turn": False},
+    },
+    "sky turned": {"input": {"azimuth": 200.0}, "target": {"kind": "envmap", "rotate_degrees": 75.0}},
+    "mirror": {
+        "input": {"elevation": 25.0},
+        "scene": {"file": "mirror"},
+        "target": {"kind": "envmap", "rotate_degrees": 30.0},
+        "representation": {"turn": False},
+    },
+    "shadow painted": {"target": {"kind": "strokes", "strokes": [SHADOW]}},
+}
+BASE = {
+    "input": {"envmap": "sunsky", "width": 64},
+    "scene": {"file": "sphere", "width": 48},
+    "output": {"report": False},
+}
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A module below ``envedit``, a name there, its number, and the first sentence of its docstring."""
+
+    module: str
+    name: str
+    value: float
+    meaning: str
+
+    @property
+    def label(self) -> str:
+        return f"{self.module.rpartition('.')[2]}.{self.name}"
+
+
+def constants() -> list[Constant]:
+    """List the constants of the solver, in the order of modules and lines."""
+    found = []
+    folder = Path(envedit.__file__).parent
+    for file in [folder / "preparation.py", *sorted((folder / "solve").glob("*.py"))]:
+        module = ".".join(file.relative_to(folder.parent).with_suffix("").parts)
+        body = ast.parse(file.read_text()).body
+        for node, after in zip(body, body[1:], strict=False):
+            if isinstance(node, ast.Assign) and isinstance(after, ast.Expr):
+                text = " ".join(ast.literal_eval(after.value).split())
+                targets = node.targets[0]
+                names = [one.id for one in getattr(targets, "elts", [targets])]
+                values = [getattr(importlib.import_module(module), name) for name in names]
+                found += [
+                    Constant(module, name, value, text)
+                    for name, value in zip(names, values, strict=True)
+                    if isinstance(value, int | float) and not isinstance(value, bool)
+                ]
+    return [one for one in found if one.label not in NO_SCALE]
+
+
+def scaled(value: float, factor: float) -> float:
+    """Return a number times a factor; a count stays a count."""
+    return max(1, round(value * factor)) if isinstance(value, int) else value * factor
+
+
+def measured(
+    settings: config.Config, folder: Path, module: str = "", constant: str = "", factor: float = 1.0
+):
+    """Make the edits with one constant changed wherever it has been imported; return their numbers."""
+    if constant:
+        before = getattr(importlib.import_module(module), constant)
+        importlib.import_module("envedit.pipeline")
+        for other in [m for key, m in sys.modules.items() if key.startswith("envedit.")]:
+            if other.__name__ == module or (
+                hasattr(other, constant)
+                and getattr(other, constant) is before
+                and not hasattr(other, "__path__")
+            ):
+                setattr(other, constant, scaled(before, factor))
+    numbers = {}
+    for edit, tables in EDITS.items():
+        chosen = config.from_dict(
+            presets.overlaid(presets.overlaid(BASE, {"renderer": {"cache": False}}), tables)
+        )
+        try:
+            metrics = pipeline.run(chosen).metrics
+        except Exception as error:  # a constant may make an edit impossible
+            numbers[edit] = {"failed": f"{type(error).__name__}: {error}"}
+            continue
+        painted = metrics["painted"]
+        numbers[edit] = {
+            "rendering": metrics["render"]["psnr"],
+            "map": metrics["envmap"]["psnr"] if metrics["envmap"] else None,
+            "paint": None if painted is None else 100 * painted["towards"],
+        }
+    return {"edits": numbers}
+
+
+def cases(given) -> list[Case]:
+    """Return the edits as they are, and with each constant halved and doubled."""
+    function = "experiments.constants.experiment:measured"
+    found = [calling("as they are", function, BASE, {"constant": None, "change": ""})]
+    for one in constants():
+        for change, factor in FACTORS.items():
+            about = {"constant": one, "change": change}
+            found.append(
+                calling(
+                    f"{one.label} {change}",
+                    function,
+                    BASE,
+                    about,
+                    module=one.module,
+                    constant=one.name,
+                    factor=factor,
+                )
+            )
+    return found
+
+
+def combine(rows: list[dict]) -> list[dict]:
+    """Return a row a constant: by how much numbers differ from those of the edits as they are."""
+    base = next(row["edits"] for row in rows if row["constant"] is None)
+    combined: dict[str, dict] = {}
+    for row in rows:
+        if row["constant"] is None:
+            continue
+        changes: dict[str, float] = {"rendering": 0.0, "map": 0.0, "paint": 0.0}
+        for edit, numbers in row["edits"].items():
+            for kind in changes:
+                if numbers.get(kind) is not None and base[edit].get(kind) is not None:
+                    change = numbers[kind] - base[edit][kind]
+                    changes[kind] = max(changes[kind], change, key=abs)
+            if "failed" in numbers:
+                changes = dict.fromkeys(changes, math.nan)
+        label = row["constant"].label
+        combined.setdefault(label, {"constant": row["constant"]})[row["change"]] = changes
+    return list(combined.values())
+
+
+def _changes(change):
+    def text(row):
+        found = row.get(change)
+        if found is None:
+            return "-"
+        return ", ".join(number(found[kind], "+.1f") for kind in ("rendering", "map", "paint"))
+
+    return text
+
+
+EXPERIMENT = Experiment(
+    "constants",
+    __doc__.splitlines()[0],
+    cases=cases,
+    combine=combine,
+    columns={
+        "constant": lambda row: f"`{row['constant'].label}`",
+        "value": lambda row: f"{row['constant'].value:.4g}",
+        "what it is": lambda row: row["constant"].meaning,
+        "halved: dB, dB, %": _changes("halved"),
+        "doubled: dB, dB, %": _changes("doubled"),
+    },
+)

@@ -1,1 +1,0 @@
-"""The levels of ``envedit run --budget``."""

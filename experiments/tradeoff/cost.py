@@ -1,0 +1,36 @@
+"""Run a command and write what it cost as JSON: ``cost.py FILE COMMAND``.
+
+Needs nothing but the standard library: the most memory of a process, as the system counts it, is no less than
+that of the process which started it.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+
+def main(file: str, command: list[str]) -> int:
+    """Write ``wall_s``, ``cpu_s`` of all threads and ``peak_bytes``; returns the command's exit code."""
+    # Ctrl-C reaches the command as well, which ends by itself; a handler is not inherited.
+    signal.signal(signal.SIGINT, lambda number, frame: None)
+    begun = time.perf_counter()
+    process = subprocess.Popen(command)
+    _, status, used = os.wait4(process.pid, 0)
+    wall = time.perf_counter() - begun
+    process.returncode = os.waitstatus_to_exitcode(status)
+    scale = 1 if sys.platform == "darwin" else 1024  # ru_maxrss: bytes on macOS, KiB elsewhere
+    cost = {
+        "wall_s": round(wall, 3),
+        "cpu_s": round(used.ru_utime + used.ru_stime, 3),
+        "peak_bytes": used.ru_maxrss * scale,
+    }
+    with open(file, "w") as out:
+        json.dump(cost, out)
+    return process.returncode if process.returncode >= 0 else 128 - process.returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], sys.argv[2:]))

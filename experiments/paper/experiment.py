@@ -131,7 +131,7 @@ def measure(done: Done) -> list[dict]:
     unedited = {"envmap": done.metrics["initial_envmap"], "render": done.metrics["initial"]}
     title = (METHODS | PAINTED)[done.case.about["row"]].title
     edited = {**done.metrics, "title": title, **seconds(done)}
-    if done.metrics["painted"]:
+    if done.case.about["row"] in PAINTED:
         return [edited]
     return [
         {"title": "unedited", **unedited},
@@ -175,7 +175,7 @@ def summary(rows: list[dict]) -> str:
         whose = {"paper": "The paper's settings", "ours": "Our settings"}[settings]
         at = "" if roughness is None else f", roughness {roughness:g}"
         over = ", ".join(maps) if len(maps) == 1 else f"{len(maps)} maps"
-        means = PAINT if some[0]["painted"] else MEANS
+        means = PAINT if some[0]["row"] in PAINTED else MEANS
         parts += [f"{whose}{at}, {over}:", means(compared + published(some[0]["table"], roughness))]
     return "\n\n".join(parts)
 

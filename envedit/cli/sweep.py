@@ -36,8 +36,15 @@ def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
 
     def carry_out():
         stream = None if given.quiet else sys.stderr
-        where = given.workers, given.scheduler, given.threads, command, stream
-        outcomes = sweeps.sweep(sweeps.read_jobs(given.jobs), given.out, *where)
+        outcomes = sweeps.sweep(
+            sweeps.read_jobs(given.jobs),
+            given.out,
+            workers=given.workers,
+            scheduler=given.scheduler,
+            threads=given.threads,
+            command=command,
+            stream=stream,
+        )
         missing = [one for one in outcomes if one.state not in ("done", "skipped")]
         if not given.quiet:
             print(sweeps.table(outcomes))

@@ -207,7 +207,7 @@ def _outcome(job, future):
 
 
 class _Progress:
-    """Lines on how far a sweep has come and when it will end, as the rate so far tells.
+    """Lines on how far a sweep has come, and when it will end at the rate so far.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ def level(settings: config.Config, folder: Path) -> dict:
     dict
         As :class:`.Judge`, with ``calibration``, a :class:`.budget.Calibration`.
     """
-    calibration, _ = budget.calibrate(settings, folder)
+    calibration = budget.calibrate(settings, folder)
     carry_out(folder)
     judge = Judge(settings, spp=512, true_spp=2048)
     return {"calibration": dataclasses.asdict(calibration)} | judge(folder)

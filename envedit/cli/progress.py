@@ -72,8 +72,9 @@ class Progress:
         self._first_update = self._first_update or (done, now)
         if now - self._last_line >= LINE_SECONDS:
             self._last_line = now
-            before, since = self._first_update
-            speed = f", {(done - before) / (now - since):.3g}/s" if now > since else ""
+            first_done, first_time = self._first_update
+            seconds = now - first_time
+            speed = f", {(done - first_done) / seconds:.3g}/s" if seconds > 0 else ""
             print(f"{self._stage}: {done}/{total}{speed} {text}".rstrip(), file=self.stream, flush=True)
 
     def _close(self):

@@ -77,8 +77,8 @@ def exit_code(name: str, action: Callable[[], int]) -> int:
     def interrupt(number, frame):
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    previous = signal.signal(signal.SIGTERM, interrupt)
     try:
         return console.exit_code(name, action, "interrupted; run again to continue")
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous)

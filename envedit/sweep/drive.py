@@ -104,7 +104,7 @@ def sweep(
             engine = _on_this_machine(run, workers, threads)
         else:
             engine = _on_a_cluster(run, scheduler, threads)
-        progress = _Progress(len(to_run), stream)
+        progress = Progress(len(to_run), stream)
         with engine as (submit, where):
             progress.say(f"{done_before}: {where}")
             for outcome in _completed(to_run, submit, progress):
@@ -206,7 +206,7 @@ def _outcome(job, future):
 # ---- progress and results ----------------------------------------------------------------------------------
 
 
-class _Progress:
+class Progress:
     """Lines on how far a sweep has come, and when it will end at the rate so far.
 
     Parameters

@@ -23,15 +23,19 @@ from envedit.core.types import FilePath
 
 from .jobs import Job, program
 
-DONE, FAILED, CONFIG, LOG, CHECKPOINT = "done.json", "failed.json", "job.toml", "log.txt", "checkpoint.npz"
+CONFIG = "job.toml"
 LOCK = "lock"
+LOG = "log.txt"
+CHECKPOINT = "checkpoint.npz"
+FAILED = "failed.json"
+DONE = "done.json"
 POLL_SECONDS = 0.2
 """Between looks at whether a job is to be interrupted."""
 GRACE_SECONDS = 15.0
 """What an interrupted job has for its checkpoint."""
 ERROR_LENGTH = 300
 """Characters of an error that are reported."""
-_UNUSABLE_CHECKPOINT = "the checkpoint cannot be read", "belongs to another configuration"
+UNUSABLE_CHECKPOINT = "the checkpoint cannot be read", "belongs to another configuration"
 """What :mod:`envedit.solve.checkpoint` says of a checkpoint that no further try can use."""
 
 COMMAND = (
@@ -151,7 +155,7 @@ def _carry_out(job, folder, command, threads, stop, lock):
     begun = time.monotonic()
     resumed = (folder / CHECKPOINT).exists()
     code, last_line = _run(argv, folder, threads, stop, lock)
-    unusable = code == InputError.exit_code and any(words in last_line for words in _UNUSABLE_CHECKPOINT)
+    unusable = code == InputError.exit_code and any(words in last_line for words in UNUSABLE_CHECKPOINT)
     if resumed and unusable and (folder / CHECKPOINT).exists():
         (folder / CHECKPOINT).unlink()
         code, last_line = _run(argv, folder, threads, stop, lock)

@@ -303,11 +303,11 @@ def test_what_a_checkpoint_that_is_no_use_is_told_by_is_what_envedit_says(tmp_pa
     (tmp_path / checkpoint.NAME).write_bytes(b"no archive")
     with pytest.raises(InputError) as said:
         checkpoint.load(tmp_path, what)
-    assert process._UNUSABLE_CHECKPOINT[0] in str(said.value)
+    assert process.UNUSABLE_CHECKPOINT[0] in str(said.value)
     checkpoint.save(tmp_path, what, adam_loop.State(), {}, {}, np.zeros((1, 1, 3), np.float32))
     with pytest.raises(InputError) as said:
         checkpoint.load(tmp_path, "other")
-    assert process._UNUSABLE_CHECKPOINT[1] in str(said.value)
+    assert process.UNUSABLE_CHECKPOINT[1] in str(said.value)
 
 
 def test_two_drivers_do_not_do_the_same_job(stub):
@@ -528,7 +528,7 @@ def clock(monkeypatch):
 def test_lines_tell_how_far_it_has_come_and_when_it_ends(tmp_path, clock):
     made = [job(f"j{i}", f"seed = {i}") for i in range(6)]
     said = io.StringIO()
-    progress = drive._Progress(6, said)
+    progress = drive.Progress(6, said)
     clock[0] = 40.0
     progress.report(Outcome(made[0], "done", 40.0), tmp_path)
     clock[0] = 400.0
@@ -547,7 +547,7 @@ def test_lines_tell_how_far_it_has_come_and_when_it_ends(tmp_path, clock):
 
 def test_that_the_scheduler_is_gone_is_said_once(tmp_path):
     said = io.StringIO()
-    progress = drive._Progress(3, said)
+    progress = drive.Progress(3, said)
     for i in range(3):
         outcome = Outcome(job(f"j{i}", f"seed = {i}"), "lost", error="the scheduler went away")
         progress.report(outcome, tmp_path)

@@ -24,7 +24,7 @@ from envedit.core.types import FilePath
 from .jobs import Job, program
 
 CONFIG = "job.toml"
-LOCK = "lock"
+LOCK = "job.lock"
 LOG = "log.txt"
 CHECKPOINT = "checkpoint.npz"
 FAILED = "failed.json"

@@ -206,7 +206,7 @@ def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub, held):
     output(driver)
     flying = [pid for seed, pid in stub.noted("begin") if seed in held]
     until(lambda: all(dead(pid) for pid in flying))
-    assert (jobs[1].folder(stub.out) / "lock").exists()  # nobody was left to remove it
+    assert (jobs[1].folder(stub.out) / "job.lock").exists()  # nobody was left to remove it
     stub.free()
     again = stub.driver(5)
     said = output(again)
@@ -579,7 +579,7 @@ def test_a_real_run_is_made(tmp_path):
     assert outcome.state == "done", (one.folder(tmp_path) / "log.txt").read_text()
     left = files(one.folder(tmp_path))
     assert {"metrics.json", "edited.exr", "config.toml", "job.toml", "done.json", "log.txt"} <= set(left)
-    assert not [name for name in left if name.startswith(("earlier", "lock", "checkpoint"))]
+    assert not [name for name in left if name.startswith(("earlier", "job.lock", "checkpoint"))]
     # done.json is lost: the run itself knows that it is complete.
     (one.folder(tmp_path) / "done.json").unlink()
     before = (one.folder(tmp_path) / "metrics.json").stat().st_mtime_ns

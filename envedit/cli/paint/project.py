@@ -109,7 +109,7 @@ class Project:
         self._make_folder()
         with contextlib.ExitStack() as stack:
             try:
-                stack.enter_context(file_locks.locked(self.folder / "lock"))
+                stack.enter_context(file_locks.locked(self.folder / "painted.lock"))
             except file_locks.Busy as busy:
                 raise InputError(
                     f"{self.folder}: {busy} has this painting open: end that `envedit paint`, or "

@@ -1,8 +1,8 @@
 """``envedit run --budget``: the finest settings with which a run is expected to end within so many seconds.
 
 What levels of settings cost and lose was measured on a reference machine, two cores of an AVX-512 Xeon
-(``experiments/tradeoff``). Three renderings and a few products of matrices compare this machine, in this scene
-and under this map, with it.
+(``experiments/tradeoff``). Three renderings and a few products of matrices compare this machine, in this
+scene and under this map, with it.
 """
 
 from __future__ import annotations

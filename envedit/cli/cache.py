@@ -28,8 +28,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     code = 0
     for kind, what in KINDS.items():
-        folder, count, size, failed = _visit(kind, arguments.empty)
-        entries = f"{count} {'entry' if count == 1 else 'entries'}, {size / 1e6:.1f} MB"
+        folder, sizes, failed = _visit(kind, arguments.empty)
+        entries = f"{len(sizes)} {'entry' if len(sizes) == 1 else 'entries'}, {sum(sizes) / 1e6:.1f} MB"
         print(f"{folder}: {what}: {entries}{' deleted' if arguments.empty else ''}")
         if failed is not None:
             where = failed.filename or folder
@@ -47,30 +47,31 @@ def _visit(kind, empty):
     -------
     folder : Path
         Where they lie.
-    count, size : int
-        Entries and their bytes.
+    sizes : list of int
+        Bytes of each entry.
     failed : OSError or None
         The last thing that could not be read or deleted.
     """
     from envedit.core.array_cache import DiskCache, cache_folder
 
-    cache, count, size, failed = DiskCache(cache_folder(kind)), 0, 0, None
+    cache = DiskCache(cache_folder(kind))
+    sizes = []
+    failed = None
     try:
         files = cache.files()
     except OSError as error:
-        return cache.folder, 0, 0, error
+        return cache.folder, [], error
     for file in files:
         try:
-            bytes_ = file.stat().st_size
+            size = file.stat().st_size
             if empty:
                 file.unlink()
+            sizes.append(size)
         except FileNotFoundError:  # another process deleted it first
-            continue
+            pass
         except OSError as error:
             failed = error
-            continue
-        count, size = count + 1, size + bytes_
-    return cache.folder, count, size, failed
+    return cache.folder, sizes, failed
 
 
 if __name__ == "__main__":

@@ -41,12 +41,14 @@ __all__ = ["Diagnosis", "check", "ensure", "main"]
 
 ALBEDO = 0.5
 _VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb")
-_GPUS = {
+_GPU_REMEDIES = {
     "cuda_ad_rgb": ("NVIDIA GPU or driver", "install the NVIDIA driver"),
     "metal_ad_rgb": ("Apple GPU", "use a Mitsuba for macOS that has this variant"),
 }
-_TIMEOUT = 300  # seconds; a cold start on a loaded machine takes ten
-_MEND = "install LLVM 19 (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
+_TIMEOUT_SECONDS = 300  # a cold start on a loaded machine takes ten
+_LLVM_REMEDY = (
+    "install LLVM 19 (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
+)
 # Where Dr.Jit and the dynamic loader find libraries; a change there ends the validity of a remembered probe.
 _LIBRARIES = (
     "/usr/lib/*-linux-gnu/libLLVM*",
@@ -83,12 +85,13 @@ class Diagnosis:
 def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
     """Probe a variant in a child process and explain the outcome; never raises for a broken machine."""
     if variant not in _VARIANTS:
-        wrong = f"envedit does not run on variant {variant!r}"
-        return Diagnosis(False, (wrong, f"use {' or '.join(_VARIANTS)}"))
+        cause = f"envedit does not run on variant {variant!r}"
+        return Diagnosis(False, (cause, f"use {' or '.join(_VARIANTS)}"))
     for package in ("mitsuba", "drjit"):
         if _version(package) is None:
             return Diagnosis(False, (f"the package {package} is missing", f"run: pip install {package}"))
-    # The child finds this package even when it is a source checkout that lies elsewhere and is not installed.
+
+    # ---- The child, which finds this package even in a source checkout that is not installed
     root = str(Path(__file__).resolve().parents[2])
     program = (
         f"import sys; sys.path.append({root!r}); from envedit.cli import doctor; doctor._probe({variant!r})"
@@ -101,28 +104,34 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                timeout=_TIMEOUT,
+                timeout=_TIMEOUT_SECONDS,
             )
-            code, output = child.returncode, child.stdout
+            code = child.returncode
+            output = child.stdout
         except subprocess.TimeoutExpired as error:
-            code, output = None, error.stdout or b""
+            code = None
+            output = error.stdout or b""
         except OSError as error:
             return Diagnosis(False, (f"cannot start {sys.executable}: {error.strerror or error}",))
         errors.seek(0)
-        said = errors.read(200_000).decode(errors="replace")
+        error_output = errors.read(200_000).decode(errors="replace")
+
+    # ---- What it found out before it ended
     versions: dict[str, Any] = {}
     for line in output.decode(errors="replace").splitlines():
         with contextlib.suppress(ValueError):
-            found = json.loads(line)
-            versions |= found if isinstance(found, dict) else {}
+            facts = json.loads(line)
+            versions |= facts if isinstance(facts, dict) else {}
+
+    # ---- Diagnosis
     if code == 0 and versions.get("done"):
         radiance = versions.get("radiance")
         if isinstance(radiance, float) and abs(radiance - ALBEDO) < 1e-3:
             return Diagnosis(True, (), versions)
-        wrong = f"the self test computed {radiance}, not {ALBEDO}, with {_backend(variant, versions)}"
-        remedy = _MEND if variant.startswith("llvm") else "update the driver or the system"
-        return Diagnosis(False, (wrong, remedy), versions)
-    return Diagnosis(False, _explain(variant, code, said, versions), versions)
+        cause = f"the self test computed {radiance}, not {ALBEDO}, with {_backend(variant, versions)}"
+        remedy = _LLVM_REMEDY if variant.startswith("llvm") else "update the driver or the system"
+        return Diagnosis(False, (cause, remedy), versions)
+    return Diagnosis(False, _explain(variant, code, error_output, versions), versions)
 
 
 def ensure(variant: str = "llvm_ad_rgb") -> None:
@@ -132,12 +141,15 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
     Python, mitsuba or drjit, the LLVM library used or those installed change. Only success is remembered. A
     cache that cannot be written costs a probe every time and nothing else.
     """
+    # ---- A success that is remembered
     memory = _memory(variant)
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         with opened(memory or "") as file:  # without a folder: no such file
             known = json.loads(file.read(1 << 16))
         if known["ok"] is True and known["library"] == _stamp(known["library"][0]):
             return
+
+    # ---- A new probe
     diagnosis = check(variant)
     if not diagnosis.ok:
         raise MachineError("\n".join(diagnosis.lines))
@@ -149,35 +161,42 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
             write_atomically(memory, json.dumps({"ok": True, "library": stamp or [None]}).encode())
 
 
-def _explain(variant: str, code: int | None, said: str, versions: dict) -> tuple[str, str]:
-    """Turn how the child ended and what it said into one line of cause and one of remedy."""
+def _explain(variant: str, code: int | None, error_output: str, versions: dict) -> tuple[str, str]:
+    """Turn how the child ended and what it wrote to stderr into one line of cause and one of remedy."""
     backend = _backend(variant, versions)
     library = os.environ.get("DRJIT_LIBLLVM_PATH")
-    errors = [line.strip() for line in said.splitlines() if line.strip()]
+    errors = [line.strip() for line in error_output.splitlines() if line.strip()]
+
+    # ---- Too slow, or a GPU
     if code is None:
-        return f"the self test did not end in {_TIMEOUT} s with {backend}", "try again on an idle machine"
-    if variant in _GPUS:
-        device, remedy = _GPUS[variant]
-        why = _last(errors) if versions.get("selected") else f"no usable {device} was found"
-        return f"{variant}: {why}", f'use variant = "llvm_ad_rgb", or {remedy}'
+        cause = f"the self test did not end in {_TIMEOUT_SECONDS} s with {backend}"
+        return cause, "try again on an idle machine"
+    if variant in _GPU_REMEDIES:
+        device, remedy = _GPU_REMEDIES[variant]
+        reason = _last(errors) if versions.get("selected") else f"no usable {device} was found"
+        return f"{variant}: {reason}", f'use variant = "llvm_ad_rgb", or {remedy}'
+
+    # ---- LLVM that cannot be loaded
     for line in errors:
         if "is too old" in line:
-            found = line.partition("located LLVM version (")[2].partition(")")[0]
+            version = line.partition("located LLVM version (")[2].partition(")")[0]
             named = f" ({library}, from DRJIT_LIBLLVM_PATH)" if library else ""
-            return f"LLVM {found or 'here'}{named} is too old for this Dr.Jit", _MEND
+            return f"LLVM {version or 'here'}{named} is too old for this Dr.Jit", _LLVM_REMEDY
         if "Unable to load" in line and library:
             detail = line.rpartition(": ")[2].rstrip("!")
             return f"LLVM cannot be loaded from DRJIT_LIBLLVM_PATH={library}: {detail}", (
                 "correct or unset DRJIT_LIBLLVM_PATH, or run: apt-get install libllvm19"
             )
-    if "LLVM backend is inactive" in said or "LLVM shared library" in said:
-        return "no LLVM library was found", _MEND
-    if code < 0 or "LLVM ERROR" in said:
+    if "LLVM backend is inactive" in error_output or "LLVM shared library" in error_output:
+        return "no LLVM library was found", _LLVM_REMEDY
+
+    # ---- LLVM that cannot compile the kernels of a rendering
+    if code < 0 or "LLVM ERROR" in error_output:
         name = f"exit code {code}"
         with contextlib.suppress(ValueError):
             name = signal.Signals(-code).name
         words = next((": " + line[:60] for line in errors if "LLVM ERROR" in line), "")
-        return f"{backend} stops the process at the first rendering ({name}{words})", _MEND
+        return f"{backend} stops the process at the first rendering ({name}{words})", _LLVM_REMEDY
     return f"the self test failed with {backend}: {_last(errors)}", "to see more, run: envedit doctor"
 
 
@@ -230,6 +249,7 @@ def _probe(variant: str) -> None:
     def say(**facts):
         print(json.dumps(facts), flush=True)
 
+    # ---- Versions, the variant, and the LLVM library that it has loaded
     say(mitsuba=_version("mitsuba"), drjit=_version("drjit"))
     import drjit as dr
     import mitsuba as mi
@@ -239,15 +259,17 @@ def _probe(variant: str) -> None:
     library = None
     with contextlib.suppress(OSError):
         lines = Path("/proc/self/maps").read_text().splitlines()
-        mapped = [line.split(None, 5)[-1].strip() for line in lines]
-        named = os.environ.get("DRJIT_LIBLLVM_PATH") or "libLLVM"
-        names = {os.path.basename(named), os.path.basename(os.path.realpath(named)), "libLLVM"}
-        library = next((m for m in mapped if any(n in os.path.basename(m) for n in names)), None)
+        mapped_files = [line.split(None, 5)[-1].strip() for line in lines]
+        path = os.environ.get("DRJIT_LIBLLVM_PATH") or "libLLVM"
+        names = {os.path.basename(path), os.path.basename(os.path.realpath(path)), "libLLVM"}
+        candidates = (file for file in mapped_files if any(n in os.path.basename(file) for n in names))
+        library = next(candidates, None)
     facts = {"selected": True, "llvm_path": library}
     if variant.startswith("llvm"):
         facts["llvm"] = ".".join(map(str, dr.detail.llvm_version()))
     say(**facts)
 
+    # ---- A rendering, and the speed of matrix products
     start = time.perf_counter()
     radiance = _self_test(mi)
     say(radiance=radiance, render_s=round(time.perf_counter() - start, 3))
@@ -317,11 +339,15 @@ def main(arguments: list[str] | None = None) -> int:
         help=f"Mitsuba variant: {' or '.join(_VARIANTS)} (default: %(default)s)",
     )
     options = parser.parse_args(arguments)
+
+    # ---- What is installed
     print(f"python    {platform.python_version()} ({sys.executable})")
     for package in ("mitsuba", "drjit", "OpenEXR", "numpy"):
         print(f"{package.lower():9} {_version(package) or 'missing'}")
     print(f"cores     {_cores()}")
     print(f"memory    {_memory_size()}")
+
+    # ---- What the self test found
     diagnosis = check(options.variant)
     versions = diagnosis.versions
     if "llvm" in versions:
@@ -331,6 +357,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"render    {versions['radiance']:.5f}, expected {ALBEDO}; {seconds}")
     if "gflops" in versions:
         print(f"matmul    {versions['gflops']} GFLOP/s (256 x 256, float32)")
+
+    # ---- Verdict
     missing = [name for name in ("OpenEXR", "numpy") if _version(name) is None]
     if diagnosis.ok and missing:
         diagnosis = Diagnosis(False, (f"missing packages; run: pip install {' '.join(missing)}",))

@@ -10,9 +10,9 @@ import mitsuba as mi
 
 from envedit import config, inputs
 from envedit.cli import doctor
+from envedit.cli.console import exit_code
 from envedit.cli.progress import Progress
 from envedit.cli.streams import steady
-from envedit.core.errors import EnveditError, unwrapped
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import manifest, output_folder, preview
@@ -46,21 +46,14 @@ def main(argv: list[str] | None = None) -> int:
         help="change one key of the configuration, such as fit.epochs=500; may be repeated",
     )
     arguments = parser.parse_args(argv)
-    try:
-        with unwrapped():
-            return _run(arguments)
-    except EnveditError as error:
-        print(f"envedit: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        goes_on = "running it again goes on where the fit was last kept"
-        print(f"envedit: interrupted; no results were written ({goes_on})", file=sys.stderr)
-        return 130
+    goes_on = "running it again goes on where the fit was last kept"
+    interrupted = f"interrupted; no results were written ({goes_on})"
+    return exit_code("envedit", lambda: _run(arguments), interrupted)
 
 
 def _run(arguments):
-    chosen = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
-    settings = config.loads("", Path.cwd(), "command line", arguments.preset, chosen)
+    overrides = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
+    settings = config.loads("", Path.cwd(), "command line", arguments.preset, overrides)
     doctor.ensure(settings.variant)
     mi.set_variant(settings.variant)
     original, warnings = inputs.load_map(settings.input)
@@ -73,30 +66,37 @@ def _run(arguments):
 def _fit(arguments, settings, original, warnings, folder):
     """Fit, and leave the results in a folder."""
     rows = inputs.active_rows(settings.input.rows, original.shape[0])
-    crop = original[rows.slice]
+    active = original[rows.slice]
+    network = settings.representation
+
+    # ---- Fit
     with Progress() as progress:
         progress.stage(f"fitting {arguments.map}")
         fitted = fit.fit(
-            crop,
-            settings.representation,
+            active,
+            network,
             settings.fit,
             settings.seed,
             rows.place,
             folder=fit.default_folder(),
             progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
         )
+
+    # ---- The map that the network reproduces
     params = {name: mi.TensorXf(value) for name, value in fitted.params.items()}
-    network = settings.representation
-    shape = crop.shape[:2]
-    x = fit.points(network, shape, rows.place)
-    got = fit.evaluate(params, fitted.normalisation, x, shape, network.omega).numpy()
-    about = {"source": arguments.map, "rows": f"{rows.first} to {rows.last}"}
-    images.write_exr(folder / "fitted.exr", got, about, panorama=len(got) == len(original))
-    preview.preview(folder / "preview.png", {"map": crop, "fit": got}, {})
+    shape = active.shape[:2]
+    points = fit.points(network, shape, rows.place)
+    reproduced = fit.evaluate(params, fitted.normalisation, points, shape, network.omega).numpy()
+    marks = {"source": arguments.map, "rows": f"{rows.first} to {rows.last}"}
+    whole = len(reproduced) == len(original)
+    images.write_exr(folder / "fitted.exr", reproduced, marks, panorama=whole)
+    preview.preview(folder / "preview.png", {"map": active, "fit": reproduced}, {})
+
+    # ---- How good it is
     numbers = {
         "log_psnr": fitted.log_psnr,
         "peak_ratio": fitted.peak_ratio,
-        "mean_luminance_ratio": metrics.mean_luminance_ratio(got, crop),
+        "mean_luminance_ratio": metrics.mean_luminance_ratio(reproduced, active),
         "epochs": fitted.epochs,
         "seconds": round(fitted.seconds, 2),
         "cached": fitted.cached,
@@ -104,10 +104,8 @@ def _fit(arguments, settings, original, warnings, folder):
     manifest.write_metrics(folder / "fit.json", numbers)
     for line in warnings:
         print(f"envedit: warning: {line}", file=sys.stderr)
-    quality, peak = (
-        "undefined" if number is None else f"{number:.{digits}f}"
-        for number, digits in ((fitted.log_psnr, 1), (fitted.peak_ratio, 2))
-    )
-    kept = " (kept from an earlier run)" if fitted.cached else ""
-    print(f"log-PSNR {quality} dB, peak ratio {peak}, {fitted.seconds:.1f} s{kept}; results in {folder}")
+    log_psnr = "undefined" if fitted.log_psnr is None else f"{fitted.log_psnr:.1f}"
+    peak_ratio = "undefined" if fitted.peak_ratio is None else f"{fitted.peak_ratio:.2f}"
+    seconds = f"{fitted.seconds:.1f} s{' (kept from an earlier run)' if fitted.cached else ''}"
+    print(f"log-PSNR {log_psnr} dB, peak ratio {peak_ratio}, {seconds}; results in {folder}")
     return 0

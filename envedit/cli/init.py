@@ -8,6 +8,7 @@ import os
 import sys
 from pathlib import Path
 
+from envedit.cli.console import exit_code
 from envedit.cli.streams import steady
 from envedit.core import shipped
 
@@ -74,15 +75,7 @@ def main(argv: list[str] | None = None) -> int:
         "--out", metavar="FILE", default="edit.toml", help="file to write (default: edit.toml)"
     )
     arguments = parser.parse_args(argv)
-    from envedit.core.errors import EnveditError
-
-    try:
-        _write(arguments)
-    except EnveditError as error:
-        print(f"envedit: {error}", file=sys.stderr)
-        return error.exit_code
-    print(f"{arguments.out}: written; edit it, then: envedit run {arguments.out}")
-    return 0
+    return exit_code("envedit", lambda: _write(arguments))
 
 
 def _write(arguments):
@@ -93,10 +86,9 @@ def _write(arguments):
     file = Path(arguments.out)
     if os.path.lexists(file):
         raise ConfigError(f"{file}: exists already; delete it, or give another name with --out")
-    envmap = _named(
-        "--envmap", arguments.envmap, ("auto", "scene", "sunsky"), "an EXR or Radiance HDR file", file.parent
-    )
-    scene = _named("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML file", file.parent)
+    lights = "auto", "scene", "sunsky"
+    envmap = _file_name("--envmap", arguments.envmap, lights, "an EXR or Radiance HDR file", file.parent)
+    scene = _file_name("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML file", file.parent)
     text = TEMPLATE.format(
         name=file.name,
         envmap=config.quote(envmap),
@@ -106,9 +98,11 @@ def _write(arguments):
     text = _aligned(text)
     config.loads(text, file.absolute().parent, str(file))
     write_atomically(file, text.encode())
+    print(f"{arguments.out}: written; edit it, then: envedit run {arguments.out}")
+    return 0
 
 
-def _named(option, value, names, kind, folder):
+def _file_name(option, value, names, kind, folder):
     """Return what a configuration in a folder calls a file: a bare name as it is, a path relative to it."""
     from envedit.core.errors import InputError
 

@@ -25,18 +25,18 @@ COMMANDS = {
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    given = sys.argv[1:] if argv is None else argv
+    arguments = sys.argv[1:] if argv is None else argv
     parser = _parser()
-    if not given:
+    if not arguments:
         parser.print_help(sys.stderr)
         return 2
-    chosen = parser.parse_args(given[:1]).command
-    if chosen not in COMMANDS:
-        close = difflib.get_close_matches(chosen, COMMANDS, 1)
-        known = f"did you mean {close[0]}?" if close else "see envedit --help"
-        parser.error(f"got command {chosen!r}, expected one of {', '.join(COMMANDS)}; {known}")
+    command = parser.parse_args(arguments[:1]).command
+    if command not in COMMANDS:
+        close = difflib.get_close_matches(command, COMMANDS, 1)
+        hint = f"did you mean {close[0]}?" if close else "see envedit --help"
+        parser.error(f"got command {command!r}, expected one of {', '.join(COMMANDS)}; {hint}")
     try:
-        return importlib.import_module(f"envedit.cli.{chosen}").main(given[1:])
+        return importlib.import_module(f"envedit.cli.{command}").main(arguments[1:])
     except KeyboardInterrupt:
         print("envedit: interrupted", file=sys.stderr)
         return 130

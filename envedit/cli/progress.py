@@ -9,7 +9,8 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-LINE_SECONDS, JSON_SECONDS = 5.0, 0.5
+LINE_SECONDS = 5.0  # between lines of text
+JSON_SECONDS = 0.5  # between lines of JSON
 
 
 class Progress:
@@ -24,11 +25,13 @@ class Progress:
     """
 
     def __init__(self, quiet: bool = False, stream: TextIO | None = None):
-        self.quiet, self.stream = quiet, stream or sys.stderr
-        self._bar: tqdm | None = None
-        self._first: tuple[int, float] | None = None
-        self._stage, self._last_line = "", 0.0
+        self.quiet = quiet
+        self.stream = stream or sys.stderr
         self._terminal = self.stream.isatty()
+        self._bar: tqdm | None = None
+        self._stage = ""
+        self._first_update: tuple[int, float] | None = None  # what was done, and when
+        self._last_line = 0.0
 
     def __enter__(self) -> Progress:
         return self
@@ -39,7 +42,9 @@ class Progress:
     def stage(self, text: str) -> None:
         """Begin a stage."""
         self._close()
-        self._stage, self._first, self._last_line = text, None, time.monotonic()
+        self._stage = text
+        self._first_update = None
+        self._last_line = time.monotonic()
         if not self.quiet and not self._terminal:
             print(text, file=self.stream, flush=True)
 
@@ -64,10 +69,12 @@ class Progress:
             self._bar.update(done - self._bar.n)
             return
         now = time.monotonic()
-        self._first = self._first or (done, now)
+        self._first_update = self._first_update or (done, now)
         if now - self._last_line >= LINE_SECONDS:
-            self._last_line, (before, since) = now, self._first
-            speed = f", {(done - before) / (now - since):.3g}/s" if now > since else ""
+            self._last_line = now
+            first_done, first_time = self._first_update
+            seconds = now - first_time
+            speed = f", {(done - first_done) / seconds:.3g}/s" if seconds > 0 else ""
             print(f"{self._stage}: {done}/{total}{speed} {text}".rstrip(), file=self.stream, flush=True)
 
     def _close(self):
@@ -84,7 +91,9 @@ class JsonProgress:
     """
 
     def __init__(self, stream: TextIO | None = None):
-        self.stream, self._stage, self._last = stream or sys.stderr, "", 0.0
+        self.stream = stream or sys.stderr
+        self._stage = ""
+        self._last_line = 0.0
 
     def __enter__(self) -> JsonProgress:
         return self
@@ -98,12 +107,13 @@ class JsonProgress:
 
     def stage(self, text: str) -> None:
         """Begin a stage."""
-        self._stage, self._last = text, time.monotonic()
+        self._stage = text
+        self._last_line = time.monotonic()
         self.tell("stage", stage=text)
 
     def update(self, done: int, total: int, text: str = "") -> None:
         """Report that ``done`` of ``total`` parts of the stage are done."""
         now = time.monotonic()
-        if now - self._last >= JSON_SECONDS or done == total:
-            self._last = now
+        if now - self._last_line >= JSON_SECONDS or done == total:
+            self._last_line = now
             self.tell("progress", stage=self._stage, done=done, total=total, text=text)

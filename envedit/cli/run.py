@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from envedit.cli import run_options
+from envedit.cli.console import Console
 from envedit.cli.streams import steady
 from envedit.core import shipped
 
@@ -27,53 +28,30 @@ if TYPE_CHECKING:
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    start = time.perf_counter()
+    begun = time.perf_counter()
     from envedit.core.errors import EnveditError, unwrapped
 
-    parser = run_options.parser()
+    parser = run_options.make_parser()
     arguments = parser.parse_args(argv)
     if arguments.config is None:
         known = ", ".join(shipped.configurations())
         parser.error(f"got no CONFIG, expected a file, such as CONFIG.toml, or one of {known}")
-    arguments.facts = {}
+    console = Console(arguments.quiet, arguments.json, arguments.progress == "json")
     try:
         with unwrapped():
-            code = _run(arguments, start)
+            code = _run(arguments, console, begun)
     except EnveditError as error:
-        _tell(arguments, "error", str(error))
+        console.error(str(error))
         code = error.exit_code
     except KeyboardInterrupt:
-        fit = "an unfinished SIREN fit continues from its last saved state"
-        before = f"interrupted before the first checkpoint; --resume would start anew ({fit})"
         if arguments.dry_run or arguments.export_initial is not None:
-            before = "interrupted; run the same command again"
-        _tell(arguments, "error", before)
+            console.error("interrupted; run the same command again")
+        else:
+            fit = "an unfinished SIREN fit continues from its last saved state"
+            console.error(f"interrupted before the first checkpoint; --resume would start anew ({fit})")
         code = 130
-    if arguments.json:
-        print(json.dumps({"ok": code == 0, "exit_code": code, **arguments.facts}))
+    console.close(code)
     return code
-
-
-def _tell(arguments, kind, text):
-    """Write a warning or an error to stderr, and note it for the object of ``--json``."""
-    if kind == "error":
-        arguments.facts["error"] = text
-    else:
-        arguments.facts.setdefault("warnings", []).append(text)
-    if arguments.progress == "json":
-        from envedit.cli.progress import JsonProgress
-
-        JsonProgress().tell(kind, text=text)
-    else:
-        print(f"envedit: {'warning: ' if kind == 'warning' else ''}{text}", file=sys.stderr)
-
-
-def _progress(arguments):
-    """Return what shows progress."""
-    from envedit.cli.progress import JsonProgress, Progress
-
-    as_json = arguments.progress == "json" and not arguments.quiet
-    return JsonProgress() if as_json else Progress(quiet=arguments.quiet)
 
 
 def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[config.Config, Path | None, Path]:
@@ -113,8 +91,9 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
 
 def scene_name(file: Path) -> str:
     """Return the name of a scene: of its file, with the folder's for a ``scene.xml`` that lies elsewhere."""
-    own, folder = file.stem or "scene", file.absolute().parent
-    return f"{folder.name}_{own}" if own == "scene" and folder != Path.cwd() and folder.name else own
+    name = file.stem or "scene"
+    folder = file.absolute().parent
+    return f"{folder.name}_{name}" if name == "scene" and folder != Path.cwd() and folder.name else name
 
 
 def _missing(file):
@@ -128,85 +107,108 @@ def _missing(file):
     return False
 
 
-def _run(arguments, start):
+def _run(arguments, console, begun):
     from envedit import config
     from envedit.core.errors import ConfigError
     from envedit.report import output_folder
 
+    # ---- Configuration
     overrides = [*run_options.quick(arguments), *arguments.overrides]
     if arguments.out:
         overrides.append(f"output.dir={config.quote(str(Path(arguments.out).absolute()))}")
-    settings, arguments.config, arguments.base = load(arguments.config, arguments.preset, overrides)
-    allowed = None if arguments.budget is None else run_options.seconds(arguments.budget)
+    settings, file, base = load(arguments.config, arguments.preset, overrides)
+    budget = None if arguments.budget is None else run_options.seconds(arguments.budget)
+
+    # ---- Only the initial rendering, or the target
     if arguments.export_initial is not None:
-        return _export_initial(settings, arguments)
+        return _export_initial(settings, base, Path(arguments.export_initial), console)
     if arguments.dry_run:
         if settings.target.kind == "none":
             raise ConfigError('--dry-run: got target.kind "none", expected a target to write: run without it')
-        return _dry_run(settings, arguments)
+        return _dry_run(settings, base, console)
+
+    # ---- The edit
     folder = Path(settings.output.dir)
     with output_folder.alone(folder):
-        return _edit(settings, arguments, folder, allowed, start)
+        read = output_folder.inputs_of(settings, base)
+        spare = [] if file is None else [file]
+        output_folder.prepare_folder(folder, output_folder.names(folder), read, arguments.resume, spare)
+        unfinished = (folder / "checkpoint.npz").exists() or not (folder / "metrics.json").exists()
+        if arguments.resume and not unfinished:
+            _check_same(settings, folder)
+            console.say(f"{folder}: this run is complete, there is nothing to resume")
+            _note_results(console, folder)
+            return 0
+        return _edit(settings, base, budget, arguments.resume, console, begun)
 
 
-def _edit(settings, arguments, folder, allowed, start):
-    """Carry out an edit and leave its results in a folder."""
-    from envedit.cli import doctor
-    from envedit.report import output_folder
-
-    spare = [] if arguments.config is None else [arguments.config]
-    read = output_folder.inputs_of(settings, arguments.base)
-    output_folder.prepare_folder(folder, output_folder.names(folder), read, arguments.resume, spare)
-    if arguments.resume and not (folder / "checkpoint.npz").exists() and (folder / "metrics.json").exists():
-        _check_same(settings, folder)
-        _say(arguments, f"{folder}: this run is complete, there is nothing to resume")
-        _note_results(arguments, folder)
-        return 0
-
-    doctor.ensure(settings.variant)
-    import mitsuba as mi
-
-    mi.set_variant(settings.variant)
-    mi.set_log_level(mi.LogLevel.Error)
+def _edit(settings, base, budget, resume, console, begun):
+    """Carry out an edit and leave its results in its folder, in which nobody else works."""
+    _select_variant(settings.variant)
     from envedit import pipeline
 
-    import_s = time.perf_counter() - start
-    said, base = [], arguments.base
-    if allowed is not None:
-        from envedit.cli import budget
+    folder = Path(settings.output.dir)
+    import_s = time.perf_counter() - begun
 
-        settings, note = budget.apply(settings, allowed, import_s, base)
-        said.append(note)
-        _say(arguments, note)
+    # ---- Settings that fit a budget, which are not those of the configuration that --resume would continue
+    notes = []
+    again = "; continue with --resume"
+    if budget is not None:
+        from envedit.cli import budget as budgets
 
-    # What a budget has chosen is not in the configuration that would be continued.
-    again = "" if allowed else "; continue with --resume"
-    with _progress(arguments) as progress:
-        try:
-            result = pipeline.run(
-                settings,
-                folder=folder,
-                resume=arguments.resume,
-                base=base,
-                watch=pipeline.Watch(progress.stage, progress.update),
-            )
-        except pipeline.Interrupted as stop:
-            if not (folder / "checkpoint.npz").exists():  # nothing was found yet
-                return _interrupted(arguments, folder, again)
-            _keep_map(folder, stop)
-            _tell(arguments, "error", f"{stop}; checkpoint and edited.exr so far are in {folder}{again}")
-            return 130
-        except KeyboardInterrupt:
-            return _interrupted(arguments, folder, again)
-        except pipeline.Stopped as stop:
-            _keep_map(folder, stop)
-            raise
-        result.metrics["choices"] = result.notes = said + result.notes
-        progress.stage("writing")
+        settings, note = budgets.apply(settings, budget, import_s, base)
+        notes.append(note)
+        console.say(note)
+        again = ""
+
+    # ---- Edit
     try:
-        return _write(arguments, folder, result, import_s, said)
-    except KeyboardInterrupt:
-        return _interrupted(arguments, folder, again)
+        with console.progress() as progress:
+            watch = pipeline.Watch(progress.stage, progress.update)
+            result = pipeline.run(settings, folder=folder, resume=resume, base=base, watch=watch)
+            result.notes = notes + result.notes
+            result.metrics["choices"] = result.notes
+            progress.stage("writing")
+        _write(result, folder, base, import_s, console, result.notes[len(notes) :])
+        return 0
+    except pipeline.Stopped as stop:
+        _keep_map(folder, stop)
+        raise
+    except pipeline.Interrupted as stop:
+        if not (folder / "checkpoint.npz").exists():  # nothing was found yet
+            raise KeyboardInterrupt from None
+        _keep_map(folder, stop)
+        console.error(f"{stop}; checkpoint and edited.exr so far are in {folder}{again}")
+        return 130
+    except KeyboardInterrupt:  # outside the loop of the edit
+        if not (folder / "checkpoint.npz").exists():
+            raise
+        console.error(f"interrupted; a checkpoint is in {folder}{again}")
+        return 130
+
+
+def _write(result, folder, base, import_s, console, notes):
+    """Write the results of an edit, and say what they are."""
+    from envedit.report import run_folder
+
+    for line in run_folder.write(result.settings, folder, result, import_s, base):
+        console.warn(line)
+    for line in notes:
+        console.say(line)
+    console.say(_verdict(result.metrics))
+    console.say(f"results in {folder.resolve()}")
+    _note_results(console, folder)
+
+
+def _select_variant(variant):
+    """Select a variant of Mitsuba that is known to work on this machine."""
+    from envedit.cli import doctor
+
+    doctor.ensure(variant)
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
 
 
 def _keep_map(folder, stop):
@@ -217,102 +219,86 @@ def _keep_map(folder, stop):
     map_files.write_map(config.Output(), folder / "edited", stop.envmap, stop.given)
 
 
-def _interrupted(arguments, folder, again):
-    """Say what a run that was interrupted outside the loop has left; raises if that is nothing."""
-    if not (folder / "checkpoint.npz").exists():
-        raise KeyboardInterrupt
-    _tell(arguments, "error", f"interrupted; a checkpoint is in {folder}{again}")
-    return 130
-
-
-def _export_initial(settings, arguments):
+def _export_initial(settings, base, file, console):
     """Write the picture to paint on, and nothing else."""
-    from envedit.cli import doctor
-
-    file = Path(arguments.export_initial)
-    doctor.ensure(settings.variant)
-    import mitsuba as mi
-
-    mi.set_variant(settings.variant)
-    mi.set_log_level(mi.LogLevel.Error)
+    _select_variant(settings.variant)
     from envedit import inputs
     from envedit.report import output_folder
     from envedit.targets import initial_rendering
 
     initial_rendering.check_export(file)
-    with _progress(arguments) as progress:
+    with console.progress() as progress:
         progress.stage("rendering the picture to paint on")
-        lit = inputs.load_scene(settings.scene, arguments.base)
-        named = output_folder.of_views(file.name, lit.rows)
-        files = [(file.with_name(name), rows) for name, rows in named[1:] or named]
-        for one, _ in files:
-            initial_rendering.check_export(one)
-        envmap, warnings = inputs.load_map(settings.input, lit)
-        notes = inputs.notes(settings.input, lit)
-        source = inputs.source_of(settings.input, lit)  # what the picture is marked as made from
+        scene = inputs.load_scene(settings.scene, base)
+
+        # ---- A file for each view
+        views = output_folder.of_views(file.name, scene.rows)
+        files = [(file.with_name(name), rows) for name, rows in views[1:] or views]
+        for view_file, _ in files:
+            initial_rendering.check_export(view_file)
+
+        # ---- The picture, marked by what it is made from
+        envmap, warnings = inputs.load_map(settings.input, scene)
+        notes = inputs.notes(settings.input, scene)
+        source = inputs.source_of(settings.input, scene)
         settings = replace(settings, input=replace(settings.input, envmap=source))
-        picture = initial_rendering.initial(lit, envmap, settings)
-        under = initial_rendering.export_tonemap(file, picture, settings)
-        for one, rows in files:
-            warnings += initial_rendering.export(one, picture[rows], settings, under)
+        picture = initial_rendering.initial(scene, envmap, settings)
+        tonemap = initial_rendering.export_tonemap(file, picture, settings)
+        for view_file, rows in files:
+            warnings += initial_rendering.export(view_file, picture[rows], settings, tonemap)
+
+    # ---- What to do with it
     for line in warnings:
-        _tell(arguments, "warning", line)
+        console.warn(line)
     for line in notes:
-        _say(arguments, line)
+        console.say(line)
     declared = settings.target.display_tonemap
-    if under not in ("linear", declared):
-        _say(
-            arguments,
-            f"{file}: tonemap '{under}' is used, because '{declared}' would clip highlights; "
-            "the file's metadata names it",
+    if tonemap not in ("linear", declared):
+        console.say(
+            f"{file}: tonemap '{tonemap}' is used, because '{declared}' would clip highlights; "
+            "the file's metadata names it"
         )
-    under = "linear" if under == "linear" else f"under the '{under}' tonemap"
-    for k, (one, rows) in enumerate(files):
-        ask = f'[target] kind = "image", file = "{one.absolute()}"' + (
-            f", view = {k}" if len(files) > 1 else ""
-        )
-        size = f"{lit.width}x{rows.stop - rows.start}"
-        _say(arguments, f"{one}: {size}, {under}; paint on it, then set {ask}")
-    arguments.facts["files"] = {one.name: str(one.absolute()) for one, _ in files}
+    under = "linear" if tonemap == "linear" else f"under the '{tonemap}' tonemap"
+    for k, (view_file, rows) in enumerate(files):
+        size = f"{scene.width}x{rows.stop - rows.start}"
+        view = f", view = {k}" if len(files) > 1 else ""
+        keys = f'[target] kind = "image", file = "{view_file.absolute()}"{view}'
+        console.say(f"{view_file}: {size}, {under}; paint on it, then set {keys}")
+    console.facts["files"] = {view_file.name: str(view_file.absolute()) for view_file, _ in files}
     return 0
 
 
-def _dry_run(settings, arguments):
+def _dry_run(settings, base, console):
     """Write what a run would edit towards, and nothing else: a picture to look at, and linear radiance."""
-    from envedit.cli import doctor
-    from envedit.report import output_folder
-
-    doctor.ensure(settings.variant)
-    import mitsuba as mi
-
-    mi.set_variant(settings.variant)
-    mi.set_log_level(mi.LogLevel.Error)
+    _select_variant(settings.variant)
     from envedit import inputs
     from envedit.images import images
-    from envedit.report import preview
+    from envedit.report import output_folder, preview
     from envedit.targets.target import make as make_target
 
     folder = Path(settings.output.dir)
-    with output_folder.alone(folder), _progress(arguments) as progress:
+    picture_file = folder / "dry_run.png"
+    radiance_file = folder / "dry_run.exr"
+    with output_folder.alone(folder), console.progress() as progress:
         progress.stage("rendering the target")
-        lit = inputs.load_scene(settings.scene, arguments.base)
-        envmap, warnings = inputs.load_map(settings.input, lit)
-        notes = inputs.notes(settings.input, lit)
-        target = make_target(settings, lit, envmap)
-        files = {name: folder / name for name in ("dry_run.png", "dry_run.exr")}
+        scene = inputs.load_scene(settings.scene, base)
+        envmap, warnings = inputs.load_map(settings.input, scene)
+        notes = inputs.notes(settings.input, scene)
+        target = make_target(settings, scene, envmap)
         preview.preview(
-            files["dry_run.png"],
+            picture_file,
             {"initial": target.initial, "target": target.picture},
             {"initial": envmap, "target": target.envmap},
             settings.output.tonemap,
-            views=[view.rows for view in lit.views],
+            views=[view.rows for view in scene.views],
         )
-        images.write_exr(files["dry_run.exr"], target.picture, {"content": "target"}, panorama=False)
+        images.write_exr(radiance_file, target.picture, {"content": "target"}, panorama=False)
     for line in (*warnings, *target.warnings):
-        _tell(arguments, "warning", line)
-    for line in (*notes, target.source, *(str(file.resolve()) for file in files.values())):
-        _say(arguments, line)
-    arguments.facts["files"] = {name: str(file.resolve()) for name, file in files.items()}
+        console.warn(line)
+    files = {file.name: str(file.resolve()) for file in (picture_file, radiance_file)}
+    for line in (*notes, target.source, *files.values()):
+        console.say(line)
+    console.facts["files"] = files
     return 0
 
 
@@ -324,9 +310,9 @@ def _check_same(settings, folder):
     from envedit.report import manifest
 
     try:
-        done = config.load(folder / "config.toml")
-        same_place = replace(done, output=replace(done.output, dir=settings.output.dir))
-        same = same_place == installed.settled(settings)
+        finished = config.load(folder / "config.toml")
+        finished = replace(finished, output=replace(finished.output, dir=settings.output.dir))
+        same = finished == installed.settled(settings)
     except ConfigError:
         same = False
     if not same:
@@ -335,64 +321,55 @@ def _check_same(settings, folder):
         raise InputError(f"{changed[0]}: has changed since the run in {folder}: run without --resume")
 
 
-def _write(arguments, folder, result, import_s, said):
-    from envedit.report import run_folder
-
-    for line in run_folder.write(result.settings, folder, result, import_s, arguments.base):
-        _tell(arguments, "warning", line)
-    for line in result.notes[len(said) :]:
-        _say(arguments, line)
-    _say(arguments, _verdict(result.metrics))
-    _say(arguments, f"results in {folder.resolve()}")
-    _note_results(arguments, folder)
-    return 0
-
-
-def _note_results(arguments, folder):
+def _note_results(console, folder):
     """Note a finished run for the object of ``--json``: its folder, files and metrics.json."""
     from envedit.report import output_folder
 
     names = output_folder.names(folder)
-    here = {name: str((folder / name).resolve()) for name in names if (folder / name).is_file()}
-    measured = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    arguments.facts |= {"folder": str(folder.resolve()), "files": here, "metrics": measured}
+    files = {name: str((folder / name).resolve()) for name in names if (folder / name).is_file()}
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    console.facts |= {"folder": str(folder.resolve()), "files": files, "metrics": metrics}
 
 
 def _verdict(measured):
+    """Return the last line of a run: how near its rendering came to the target."""
     from envedit.losses import metrics
 
-    def change(before, after):
-        pair = measured[before], measured[after]
-        first, last = (metrics.score(one, pair) for one in pair)
-        beyond = " (most of the difference is outside the display's range)"
-        what = beyond if metrics.saturated(pair) else ""
-        return f"{first.rpartition(' ')[0]} -> {last}{what}"
-
     painted = measured["painted"]
-    if painted and painted["towards"] is None:
-        line = "share of the painted change reached: unknown"
-    elif painted:
-        line = f"{100 * painted['towards']:.0f} % of the painted change reached"
-        if painted["reachable"] is not None:
-            line += f" ({100 * painted['reachable']:.0f} % feasible)"
-        if painted["elsewhere"] is not None:
-            line += f", mean change elsewhere {painted['elsewhere']:.3f}"
+    if painted:
+        line = _painted_verdict(painted)
     elif not measured["iterations"] and measured["initial"]["log_rmse"] == 0:
         measure = "log RMSE" if metrics.saturated([measured["render"]]) else "PSNR"
-        line = f"no target; {measure} of the rendering against the initial one "
-        line += metrics.score(measured["render"], [])
+        score = metrics.score(measured["render"], [])
+        line = f"no target; {measure} of the rendering against the initial one {score}"
     else:
-        line = f"rendering {change('initial', 'render')}"
+        line = f"rendering {_change(measured['initial'], measured['render'])}"
         if measured["envmap"]:
-            line += f", map {change('initial_envmap', 'envmap')}"
+            line += f", map {_change(measured['initial_envmap'], measured['envmap'])}"
         if measured["ceiling"]:
             line += f", noise alone leaves {metrics.score(measured['ceiling'], [measured['render']])}"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 
-def _say(arguments, line):
-    if not (arguments.quiet or arguments.json):
-        print(line)
+def _painted_verdict(painted):
+    if painted["towards"] is None:
+        return "share of the painted change reached: unknown"
+    line = f"{100 * painted['towards']:.0f} % of the painted change reached"
+    if painted["reachable"] is not None:
+        line += f" ({100 * painted['reachable']:.0f} % feasible)"
+    if painted["elsewhere"] is not None:
+        line += f", mean change elsewhere {painted['elsewhere']:.3f}"
+    return line
+
+
+def _change(before, after):
+    """Return two scores, "20.1 -> 35.2 dB", and whether most of the difference is beyond their measure."""
+    from envedit.losses import metrics
+
+    pair = before, after
+    first, last = (metrics.score(one, pair) for one in pair)
+    saturated = " (most of the difference is outside the display's range)" if metrics.saturated(pair) else ""
+    return f"{first.rpartition(' ')[0]} -> {last}{saturated}"
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ import re
 from envedit.core import shipped
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    made = argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         prog="envedit run",
         description="Edit an HDR environment map so that a scene renders like a target.",
         epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n"
@@ -25,14 +25,16 @@ def parser() -> argparse.ArgumentParser:
         "run it; 5 the optimisation could not proceed; 130 interrupted, after writing a checkpoint",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument(
+    parser.add_argument(
         "config",
         metavar="CONFIG",
         nargs="?",
         help="a file, CONFIG.toml, or the name of a shipped one; or SCENE.xml, or the name of a shipped "
         "scene, with --envmap and one of --paint, --target and --rotate",
     )
-    quick = made.add_argument_group(
+
+    # ---- An edit of a scene
+    quick = parser.add_argument_group(
         "edits of a scene without a configuration",
         "config.toml among the results records the run; without a target option the target is the map "
         "turned by 60 degrees",
@@ -56,20 +58,22 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         help="target: the rendering under the map turned by DEGREES about the vertical",
     )
-    made.add_argument(
+
+    # ---- Settings and results
+    parser.add_argument(
         "--out",
         metavar="DIR",
         help="folder for the results (default: CONFIG_out beside the configuration; "
         "in the working folder, for a shipped one runs/NAME, for a scene SCENE_out, "
         "for FOLDER/scene.xml FOLDER_scene_out)",
     )
-    made.add_argument(
+    parser.add_argument(
         "--preset",
         choices=("draft", "standard", "paper"),
         help="named set of defaults: standard; draft, smaller, in two fifths of the time; paper, settings "
         "of D'Orazio et al. 2024",
     )
-    made.add_argument(
+    parser.add_argument(
         "--set",
         metavar="table.key=value",
         action="append",
@@ -77,7 +81,9 @@ def parser() -> argparse.ArgumentParser:
         dest="overrides",
         help="change one key of the configuration, such as optimizer.iterations=50; may be repeated",
     )
-    instead = made.add_mutually_exclusive_group()
+
+    # ---- One of several things to do
+    instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
         "--resume", action="store_true", help="continue an interrupted run from its checkpoint"
     )
@@ -97,19 +103,21 @@ def parser() -> argparse.ArgumentParser:
         metavar="TIME",
         help="choose widths and samples so that the run ends within 30, 30s or 2m",
     )
-    made.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    made.add_argument(
+
+    # ---- Output
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument(
         "--json",
         action="store_true",
         help="print one JSON object at the end: folder, files, metrics, or error",
     )
-    made.add_argument(
+    parser.add_argument(
         "--progress",
         choices=("text", "json"),
         default="text",
         help="progress on stderr as text or JSON lines",
     )
-    return made
+    return parser
 
 
 def is_scene(name: str) -> bool:
@@ -129,28 +137,28 @@ def quick(arguments: argparse.Namespace) -> list[str]:
     from envedit import config
     from envedit.core.errors import ConfigError
 
-    asked = {
+    keys = {
         "envmap": (("input.envmap", arguments.envmap),),
         "paint": (("target.kind", "image"), ("target.file", arguments.paint)),
         "target": (("target.file", arguments.target),),
         "rotate": (("target.rotate_degrees", arguments.rotate),),
     }
-    given = [name for name in asked if getattr(arguments, name) is not None]
-    if given and not is_scene(arguments.config):
-        key = asked[given[0]][-1][0]
+    options = [name for name in keys if getattr(arguments, name) is not None]
+    if options and not is_scene(arguments.config):
+        key = keys[options[0]][-1][0]
         raise ConfigError(
-            f"--{given[0]}: got it beside a configuration, expected it beside a scene: "
+            f"--{options[0]}: got it beside a configuration, expected it beside a scene: "
             f"set {key} in {arguments.config}, or --set {key}=..."
         )
-    return [f"{key}={config.quote(value)}" for name in given for key, value in asked[name]]
+    return [f"{key}={config.quote(value)}" for name in options for key, value in keys[name]]
 
 
 def seconds(text: str) -> float:
     """Read --budget."""
     from envedit.core.errors import ConfigError
 
-    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
-    value = float(found[1]) * (60 if found[2].startswith("m") else 1) if found else 0
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
+    value = float(match[1]) * (60 if match[2].startswith("m") else 1) if match else 0
     if not 0 < value < 1e6:
         raise ConfigError(f"--budget: got {text!r}, expected seconds or minutes, such as 30s or 2m")
     return value

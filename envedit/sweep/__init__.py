@@ -7,12 +7,12 @@ folder: ``job.toml``, what the run leaves, ``log.txt``, and ``done.json``, writt
 
 Jobs that are done are skipped; an interrupted one continues from the run's own checkpoint; a failed one
 leaves ``failed.json``, does not stop the others, and is tried again by the next call. Any process may be
-killed at any time: only the jobs in flight are lost. Two calls may work on one folder; locks keep them off
-each other's jobs.
+killed at any time: only the jobs in flight are lost. Two calls may work on one folder: whoever carries out a
+job holds ``job.lock`` in its folder.
 
-Every job is a process. One at a time needs nothing but envedit; several are tasks of Dask
-(``pip install '.[cluster]'``), of a cluster inside this process or of a scheduler's. On Linux a job
-dies with whoever started it; on macOS an orphan runs on, under its lock.
+Every job is a process, started by a thread of this process or by a worker of a Dask cluster
+(``pip install '.[cluster]'``). On Linux a job dies with whoever started it; on macOS an orphan runs on, and
+holds its lock.
 """
 
 from .drive import sweep, table

@@ -6,126 +6,27 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
-import importlib.util
 import logging
 import re
+import threading
 import time
-import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 
-from .board import Board
 from .jobs import Job
-from .process import DONE, GRACE, LONGEST, POLL, STOPPED, Outcome, cores, run_job
+from .process import DONE, ERROR_LENGTH, LOG, Outcome, cores, run_job
 
-CORES_A_JOB = 4
+CORES_PER_JOB = 4
 """A run is parallel kernels with serial stretches between: two jobs on eight cores beat one."""
-AGAIN = 2.0
-"""Seconds until a job that another call holds is looked at again."""
-FOREVER = 1e9
-"""Seconds that this process's own workers may be silent: the machine may have been suspended."""
-CONNECT = 10.0
-"""Seconds in which a scheduler must answer at first."""
-
-
-class _OneByOne:
-    """Jobs of this machine, one at a time; needs no Dask."""
-
-    slots = 1
-
-    def __init__(self, run: Callable[..., Outcome], threads: int | None):
-        self._stop, self._pool = uuid.uuid4().hex, concurrent.futures.ThreadPoolExecutor(1)
-        self._run = functools.partial(run, threads=threads or cores(), stop=self._stop)
-        self.description = f"1 at a time, {threads or cores()} threads"
-
-    def submit(self, job: Job, waited: bool = False) -> Any:
-        """Return a future of an outcome."""
-        return self._pool.submit(self._run, job, waited=waited)
-
-    def close(self) -> None:
-        """Interrupt what runs, and wait until it has written its checkpoint."""
-        STOPPED.add(self._stop)
-        self._pool.shutdown(cancel_futures=True)
-        STOPPED.discard(self._stop)
-
-
-class _Dask:
-    """Jobs as tasks of Dask: of a cluster in this process, or of the scheduler at an address."""
-
-    def __init__(self, run: Callable[..., Outcome], workers: int, address: str | None, threads: int | None):
-        asked = f"--scheduler {address}" if address else f"--workers {workers}"
-        try:
-            from distributed import Client, LocalCluster
-        except ImportError:
-            missing = "dask.distributed is missing: run pip install '.[cluster]' in the checkout"
-            raise ConfigError(f"{asked}: {missing}") from None
-        # Its tracebacks when a scheduler is gone.
-        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-        self._submitted: list[Any] = []
-        self._stop, self._cluster = uuid.uuid4().hex, None
-        self.slots = None if address else workers  # a cluster's workers come and go
-        if address is None:
-            threads = threads or max(1, cores() // workers)
-            self.description = f"{workers} at a time, {threads} threads each"
-            # Threads of this process, each of which waits for the process of a job.
-            shape: dict[str, Any] = {"n_workers": 1, "threads_per_worker": workers, "processes": False}
-            shape |= dict.fromkeys(("dashboard_address", "worker_dashboard_address"), "127.0.0.1:0")
-            shape |= {"scheduler_kwargs": {"dashboard": False, "worker_ttl": FOREVER}}
-            self._cluster = LocalCluster(**shape, silence_logs=logging.CRITICAL)
-            self._client = Client(self._cluster, set_as_default=False)
-        else:
-            if not re.fullmatch(r"((tcp|tls|wss?|ucx)://)?[^\s/]+:\d+", address):
-                raise ConfigError(f"{asked}: got {address}, expected HOST:PORT or tcp://HOST:PORT")
-            try:
-                self._client = Client(address, timeout=CONNECT, set_as_default=False)
-                jobs = sum(self._client.nthreads().values())
-            except (OSError, ValueError) as error:
-                raise ConfigError(f"{asked}: no scheduler there ({error})") from None
-            self.description = f"{jobs} at a time on {address}" if jobs else f"no workers at {address} yet"
-        self._run = functools.partial(run, threads=threads, stop=self._stop)
-
-    def submit(self, job: Job, waited: bool = False) -> Any:
-        """Return a future of an outcome."""
-        # A key of its own for every try: the scheduler remembers results by their keys.
-        key = f"{job.key}-{uuid.uuid4().hex}"
-        how = {"key": key, "pure": False, "retries": 2}
-        how["priority"] = -len(self._submitted)  # in the order of the jobs, which Dask does not keep itself
-        future = self._client.submit(self._run, job, waited=waited, **how)
-        self._submitted.append(future)
-        return future
-
-    def close(self) -> None:
-        """Give back what has not begun.
-
-        What runs in this process is interrupted, and awaited until it has written its checkpoint; what runs
-        on the workers of a scheduler runs to its end.
-        """
-        with contextlib.suppress(Exception):  # a scheduler that is gone
-            if self._cluster is not None:
-                STOPPED.add(self._stop)
-                until = time.monotonic() + GRACE + POLL
-                while not all(future.done() for future in self._submitted) and time.monotonic() < until:
-                    time.sleep(POLL)
-            self._client.close(timeout=2)
-        if self._cluster is not None:
-            self._cluster.close()
-            STOPPED.discard(self._stop)
-
-
-def _outcome(job, future):
-    """Return what became of a job whose future is done."""
-    if getattr(future, "status", "") == "cancelled":
-        return Outcome(job, "lost", error="the scheduler went away")
-    try:
-        return future.result()
-    except Exception as error:  # a full disk, a folder of somebody else, the death of workers
-        words = " ".join(f"{type(error).__name__}: {error}".split())
-        return Outcome(job, "failed", error=words[:LONGEST])
+RETRY_SECONDS = 1.0
+"""Until a job that another call holds is tried again."""
+CONNECT_SECONDS = 10.0
+"""In which a scheduler must answer at first."""
 
 
 def sweep(
@@ -155,8 +56,7 @@ def sweep(
     out : path
         Folder of the jobs' folders; ``sweep.tsv`` in it lists names, states, seconds, folders and errors.
     workers : int, optional
-        Jobs at a time on this machine; None: one for every four cores, or one where Dask is missing. Several
-        need Dask.
+        Jobs at a time on this machine; None: one for every four cores.
     scheduler : str, optional
         Address of a Dask scheduler; ``workers`` does not count then.
     threads : int, optional
@@ -164,7 +64,7 @@ def sweep(
     command : sequence of str
         What carries out every job, as :data:`.process.COMMAND`; empty: what each job says.
     stream : file, optional
-        Where the progress is written, as a bar if it is a terminal; None: nowhere.
+        Where a line on each job is written as it ends; None: nowhere.
 
     Returns
     -------
@@ -178,7 +78,8 @@ def sweep(
     KeyboardInterrupt
         After the running jobs have had time for their checkpoints.
     """
-    jobs, out = list(jobs), Path(out).absolute()
+    jobs = list(jobs)
+    out = Path(out).absolute()
     names = [job.name for job in jobs]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigError(f"two jobs are called {twice[0]}")
@@ -186,52 +87,181 @@ def sweep(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be made ({error.strerror}): give another --out") from None
+
+    # ---- What is to be done: one job of each content
     distinct = {job.key: job for job in reversed(jobs)}
-    found = {
+    outcomes = {
         key: Outcome(job, "skipped") for key, job in distinct.items() if (job.folder(out) / DONE).exists()
     }
-    todo = [job for job in jobs if distinct[job.key] is job and job.key not in found]
-    if todo:
+    to_run = [job for job in jobs if distinct[job.key] is job and job.key not in outcomes]
+
+    # ---- Carry it out
+    if to_run:
+        done_before = f"{len(distinct)} jobs, {len(outcomes)} done before, {len(to_run)} to run"
         run = functools.partial(run_job, out=out, command=tuple(command))
-        if workers is None:
-            workers = max(1, cores() // CORES_A_JOB) if importlib.util.find_spec("distributed") else 1
-        workers = min(workers, len(todo))
-        alone = workers == 1 and scheduler is None
-        engine = _OneByOne(run, threads) if alone else _Dask(run, workers, scheduler, threads)
-        board = Board(len(todo), engine.slots, stream)
-        board.begin(
-            f"{len(distinct)} jobs, {len(found)} done before, {len(todo)} to run: {engine.description}"
-        )
-        try:
-            for outcome in _drive(todo, engine, board):
-                found[outcome.job.key] = outcome
-                board.tell(outcome, out)
-        finally:
-            engine.close()
-            board.close()
-    outcomes = [dataclasses.replace(found[job.key], job=job) for job in jobs]
-    write_atomically(out / "sweep.tsv", _tsv(outcomes).encode())
-    return outcomes
+        if scheduler is None:
+            workers = min(workers or max(1, cores() // CORES_PER_JOB), len(to_run))
+            engine = _on_this_machine(run, workers, threads)
+        else:
+            engine = _on_a_cluster(run, scheduler, threads)
+        progress = Progress(len(to_run), stream)
+        with engine as (submit, where):
+            progress.say(f"{done_before}: {where}")
+            for outcome in _completed(to_run, submit, progress):
+                outcomes[outcome.job.key] = outcome
+                progress.report(outcome, out)
+
+    # ---- Sum up, under the names that were asked for
+    every = [dataclasses.replace(outcomes[job.key], job=job) for job in jobs]
+    write_atomically(out / "sweep.tsv", _tsv(every).encode())
+    return every
 
 
-def _drive(todo, engine, board):
-    """Submit jobs and yield outcomes as they come; what another call holds is looked at again and again."""
-    running = {engine.submit(job): job for job in todo}
-    held: list[Any] = []
+@contextlib.contextmanager
+def _on_this_machine(run, workers, threads):
+    """Yield a function job -> future of its outcome, run by threads of this process, and a description."""
+    threads = threads or max(1, cores() // workers)
+    stop = threading.Event()
+    executor = concurrent.futures.ThreadPoolExecutor(workers)
+    run = functools.partial(run, threads=threads, stop=stop)
+    each = " each" if workers > 1 else ""
+    try:
+        yield lambda job: executor.submit(run, job), f"{workers} at a time, {threads} threads{each}"
+    finally:  # interrupt what runs, and wait until it has written its checkpoint
+        stop.set()
+        executor.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _on_a_cluster(run, address, threads):
+    """Yield the same as :func:`_on_this_machine` for the workers of a Dask scheduler.
+
+    At the end what has not begun is withdrawn, and what runs goes on to its end.
+    """
+    if not re.fullmatch(r"((tcp|tls|wss?|ucx)://)?[^\s/]+:\d+", address):
+        raise ConfigError(f"--scheduler: got {address}, expected HOST:PORT or tcp://HOST:PORT")
+    try:
+        from distributed import Client
+    except ImportError:
+        missing = "dask.distributed is missing: run pip install '.[cluster]' in the checkout"
+        raise ConfigError(f"--scheduler {address}: {missing}") from None
+    # Its tracebacks when a scheduler is gone.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        slots = sum(client.nthreads().values())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--scheduler {address}: no scheduler there ({error})") from None
+    executor = client.get_executor(pure=False, retries=2)
+    run = functools.partial(run, threads=threads)
+    submitted = []
+
+    def submit(job):
+        submitted.append(job)
+        # In the order of the jobs, which Dask does not keep itself.
+        return executor.submit(run, job, priority=-len(submitted))
+
+    try:
+        yield submit, f"{slots} at a time on {address}" if slots else f"no workers at {address} yet"
+    finally:
+        with contextlib.suppress(Exception):  # a scheduler that is gone
+            executor.shutdown(wait=False)
+            client.close(timeout=2)
+
+
+def _completed(jobs, submit, progress):
+    """Submit jobs and yield outcomes as they come; what another call holds is tried again and again."""
+    running = {submit(job): job for job in jobs}
+    held: list[Job] = []
     while running or held:
-        for future in [future for future in running if future.done()]:
+        if running:
+            done, _ = concurrent.futures.wait(running, RETRY_SECONDS, concurrent.futures.FIRST_COMPLETED)
+        else:
+            time.sleep(RETRY_SECONDS)
+            done = set()
+        for future in done:
             job = running.pop(future)
             outcome = _outcome(job, future)
             if outcome.state == "held":
-                board.once(f"{job.name}: waiting, {outcome.error} is at it")
-                held.append((time.monotonic() + AGAIN, job))
+                progress.say_once(f"{job.name}: waiting, {outcome.error} is at it")
+                held.append(job)
             else:
                 yield outcome
-        due = [job for when, job in held if when <= time.monotonic()]
-        held = [(when, job) for when, job in held if job not in due]
-        running |= {engine.submit(job, waited=True): job for job in due}
-        board.refresh()
-        time.sleep(POLL)
+        if not done:
+            running |= {submit(job): job for job in held}
+            held = []
+
+
+def _outcome(job, future):
+    """Return what became of a job whose future is done."""
+    try:
+        return future.result()
+    except concurrent.futures.CancelledError:
+        return Outcome(job, "lost", error="the scheduler went away")
+    except Exception as error:  # a full disk, a folder of somebody else, the death of workers
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        return Outcome(job, "failed", error=words[:ERROR_LENGTH])
+
+
+# ---- progress and results ----------------------------------------------------------------------------------
+
+
+class Progress:
+    """Lines on how far a sweep has come, and when it will end at the rate so far.
+
+    Parameters
+    ----------
+    total : int
+        Jobs that are to run.
+    stream : file or None
+        Where to; None: nowhere.
+    """
+
+    def __init__(self, total: int, stream: TextIO | None):
+        self._total = total
+        self._stream = stream
+        self._begun = time.monotonic()
+        self._ended = 0
+        self._failed = 0
+        self._said: set[str] = set()
+
+    def report(self, outcome: Outcome, out: Path) -> None:
+        """Say what became of a job."""
+        if outcome.state == "lost":  # and so is all the rest
+            self.say_once(f"{outcome.error}: run again to complete the table")
+            return
+        self._ended += 1
+        line = f"[{self._ended}/{self._total}] {outcome.job.name}: {outcome.state}"
+        if outcome.state in ("done", "failed"):
+            line += f", {outcome.seconds:.0f} s"
+        if outcome.error:
+            line += f": {outcome.error}"
+        if outcome.state == "failed":
+            self._failed += 1
+            line += f" ({outcome.job.folder(out) / LOG})"
+        remarks = [f"{self._failed} failed"] if self._failed else []
+        if self._ended < self._total:
+            left = (self._total - self._ended) * (time.monotonic() - self._begun) / self._ended
+            until = time.strftime("%H:%M", time.localtime(time.time() + left))
+            remarks.append(f"about {_duration(left)} left, until {until}")
+        self.say(f"{line}; {', '.join(remarks)}" if remarks else line)
+
+    def say(self, line: str) -> None:
+        """Write a line."""
+        if self._stream is not None:
+            print(line, file=self._stream, flush=True)
+
+    def say_once(self, line: str) -> None:
+        """Write a line that was not written before."""
+        if line not in self._said:
+            self._said.add(line)
+            self.say(line)
+
+
+def _duration(seconds):
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
@@ -248,7 +278,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 def _tsv(outcomes):
     rows = [("name", "state", "seconds", "folder", "error")]
-    rows += [
-        (o.job.name, o.state, f"{o.seconds:.1f}", o.job.key, " ".join(o.error.split())) for o in outcomes
-    ]
+    for one in outcomes:
+        error = " ".join(one.error.split())
+        rows.append((one.job.name, one.state, f"{one.seconds:.1f}", one.job.key, error))
     return "".join("\t".join(row) + "\n" for row in rows)

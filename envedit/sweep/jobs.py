@@ -17,7 +17,7 @@ from pathlib import Path
 import envedit
 from envedit import config
 from envedit.config import presets
-from envedit.core import atomic_files
+from envedit.core import atomic_files, shipped
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 from envedit.losses.perceptual import installed
@@ -55,10 +55,11 @@ class Job:
 @functools.cache
 def program() -> str:
     """Return the version of envedit and 12 digits of its files' SHA-256: ``1.0.0+0123456789ab``."""
-    package, found = Path(envedit.__file__).parent, hashlib.sha256()
+    package = Path(envedit.__file__).parent
+    sha = hashlib.sha256()
     for path in sorted(path for path in package.rglob("*.*") if path.is_file() and path.suffix != ".pyc"):
-        found.update(f"{path.relative_to(package).as_posix()}\0{_digest(path)}\n".encode())
-    return f"{envedit.__version__}+{found.hexdigest()[:12]}"
+        sha.update(f"{path.relative_to(package).as_posix()}\0{_digest(path)}\n".encode())
+    return f"{envedit.__version__}+{sha.hexdigest()[:12]}"
 
 
 def job(
@@ -93,22 +94,32 @@ def job(
     if not name or not name.isprintable():
         raise ConfigError(f"job {name!r}: got no printable text, expected a name")
     base = Path(base).absolute()
-    said = base, f"job {name}"
-    settings = config.loads(toml, *said) if isinstance(toml, str) else config.from_dict(toml, *said)
-    scene, given, files = settings.scene, dict(settings.scene.parameters), {}
-    for key, value in given.items():
+    if isinstance(toml, str):
+        settings = config.loads(toml, base, f"job {name}")
+    else:
+        settings = config.from_dict(toml, base, f"job {name}")
+
+    # ---- Files in the scene's parameters: by absolute paths in the job, by their contents in the key
+    scene = settings.scene
+    parameters = dict(scene.parameters)
+    contents = {}
+    for key, value in scene.parameters.items():
         # The run looks beside the scene, then beside the configuration, which will lie in the job's folder.
-        if file := _beside(Path(scene.file).parent, value) if os.path.isabs(scene.file) else None:
-            files[key] = _digest(file)
-        elif file := _beside(base, value):
-            given[key], files[key] = str(file), _digest(file)
+        beside_scene = _file_in(Path(scene.file).parent, value) if os.path.isabs(scene.file) else None
+        if beside_scene:
+            contents[key] = _digest(beside_scene)
+        elif file := _file_in(base, value):
+            parameters[key] = str(file)
+            contents[key] = _digest(file)
     settings = dataclasses.replace(
         installed.settled(settings),
-        scene=dataclasses.replace(scene, parameters=given),
+        scene=dataclasses.replace(scene, parameters=parameters),
         output=dataclasses.replace(settings.output, dir=""),
     )
+
+    # ---- The key
     content = _with_contents(dataclasses.asdict(settings) | {"weights": installed.files(settings)})
-    content["scene"] |= {"file": _scene_digest(scene.file), "parameters": given | files}
+    content["scene"] |= {"file": _scene_digests(scene.file), "parameters": parameters | contents}
     content["program"] = [program(), version]
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
     return Job(name, config.to_toml(settings), key, program(), tuple(command))
@@ -133,13 +144,15 @@ def read_jobs(path: FilePath) -> list[Job]:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path}: not TOML: {error}") from None
-    common, jobs = tables.pop("common", {}), tables.pop("jobs", {})
+    common = tables.pop("common", {})
+    jobs = tables.pop("jobs", {})
     if tables:
         raise ConfigError(f"{path}: unknown table or key {next(iter(tables))}; known: common, jobs.NAME")
     if not isinstance(jobs, dict) or not jobs:
         raise ConfigError(f"{path}: no job in it, expected a table [jobs.NAME] for each")
-    if wrong := [name for name, table in ({"common": common} | jobs).items() if not isinstance(table, dict)]:
-        raise ConfigError(f"{path}: {wrong[0]}: expected a table")
+    for name, table in ({"common": common} | jobs).items():
+        if not isinstance(table, dict):
+            raise ConfigError(f"{path}: {name}: expected a table")
     return [job(name, presets.overlaid(common, table), path.parent) for name, table in jobs.items()]
 
 
@@ -153,7 +166,7 @@ def _text(path):
 # ---- contents ----------------------------------------------------------------------------------------------
 
 
-def _beside(folder, value):
+def _file_in(folder, value):
     """Return the file in a folder that a value names; None for anything else."""
     if not isinstance(value, str) or not value or "\0" in value:
         return None
@@ -169,34 +182,37 @@ def _with_contents(value):
         return {key: _with_contents(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_with_contents(item) for item in value]
-    if isinstance(value, str) and os.path.isabs(value) and (file := _beside(Path("/"), value)):
+    if isinstance(value, str) and os.path.isabs(value) and (file := _file_in(Path("/"), value)):
         return _digest(file)
     return value
 
 
-def _scene_digest(name):
-    """Digests of a scene and of all that it names; its path where there is no such file."""
-    package = Path(envedit.__file__).parent
-    shipped = [folder / f"{name}.xml" for folder in (package / "scenes", package.parent / "scenes")]
-    choice = [Path(name)] if os.path.isabs(name) else shipped
-    found = next((path for path in choice if path.is_file()), None)
-    return name if found is None else sorted(_scene_files(found, {}).values())
+def _scene_digests(name):
+    """Return the digests of a scene and of all that it names; its path where there is no such file.
 
-
-def _scene_files(path, found):
-    """Digests of a scene's XML, of the files it names, and so on; those that it never uses count too."""
-    found[path] = _digest(path)
-    if path.suffix.lower() == ".xml":
-        for name in re.findall(r"""(?:value|filename)\s*=\s*["']([^"'$]+)["']""", _text(path)):
-            if (file := _beside(path.parent, name)) and file not in found:
-                _scene_files(file, found)
-    return found
+    Files that it names and never uses count as well.
+    """
+    folder = shipped.folder()
+    scene = Path(name) if os.path.isabs(name) or folder is None else folder / f"{name}.xml"
+    if not scene.is_file():
+        return name
+    digests: dict[Path, str] = {}
+    pending = [scene]
+    while pending:
+        path = pending.pop()
+        if path in digests:
+            continue
+        digests[path] = _digest(path)
+        if path.suffix.lower() == ".xml":
+            names = re.findall(r"""(?:value|filename)\s*=\s*["']([^"'$]+)["']""", _text(path))
+            pending += filter(None, (_file_in(path.parent, one) for one in names))
+    return sorted(digests.values())
 
 
 def _digest(path):
     try:
-        about = os.stat(path)
-        return _sha256(path, about.st_size, about.st_mtime_ns)
+        status = os.stat(path)
+        return _sha256(path, status.st_size, status.st_mtime_ns)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 

@@ -1,6 +1,7 @@
 """The command ``envedit``: its sub-commands, a configuration to start from, what is kept between runs."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from tests.oracles import ROOT
 def test_results_of_a_shipped_configuration_lie_where_the_command_was_called(tmp_path, monkeypatch):
     asked = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run, "_edit", lambda settings, arguments, folder, *_: asked.append(folder) or 0)
+    monkeypatch.setattr(run, "_edit", lambda settings, *_: asked.append(Path(settings.output.dir)) or 0)
     assert main.main(["run", "quickstart"]) == main.main(["run", "edits/warmer"]) == 0
     assert main.main(["run", "quickstart", "--out", "mine"]) == 0
     assert asked == [tmp_path / name for name in ("runs/quickstart", "runs/warmer", "mine")]

@@ -11,9 +11,8 @@ from pathlib import Path
 from envedit import config
 from envedit.cli import run
 from envedit.cli.paint.protocol import Document
-from envedit.core import array_cache, atomic_files
+from envedit.core import array_cache, atomic_files, file_locks
 from envedit.core.errors import ConfigError, InputError
-from envedit.sweep import locks
 
 NAME, SOLUTION = "painted.toml", "painted.npz"
 """Files of a painting: what was painted, and the solution that was saved last."""
@@ -99,7 +98,7 @@ class Project:
         return value
 
     @contextlib.contextmanager
-    def alone(self) -> Iterator[locks.Lock]:
+    def alone(self) -> Iterator[None]:
         """Make the folder, and let no other server paint in it meanwhile.
 
         Raises
@@ -108,13 +107,15 @@ class Project:
             It cannot be made, or another server has it.
         """
         self._make_folder()
-        with locks.Lock(self.folder) as lock:
-            if lock.holder:
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(file_locks.locked(self.folder / "painted.lock"))
+            except file_locks.Busy as busy:
                 raise InputError(
-                    f"{self.folder}: {lock.holder} has this painting open: end that `envedit paint`, or "
+                    f"{self.folder}: {busy} has this painting open: end that `envedit paint`, or "
                     "give a configuration of another [output] dir"
-                )
-            yield lock
+                ) from None
+            yield
 
     def _make_folder(self):
         try:

@@ -13,7 +13,6 @@ from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Choose, Edit, Open, Pick, Save
 from envedit.cli.paint.session import Session, SupersededError, Tell
 from envedit.core.errors import EnveditError, unwrapped
-from envedit.sweep import locks
 
 ORDER = (Open, Pick, Edit, Choose, Save)
 """Of requests that wait, which kind goes first: what is saved has all edits."""
@@ -43,7 +42,6 @@ class Worker(threading.Thread):
         self._over = self._owed = False
         self._painting = 0
         self._held = contextlib.ExitStack()  # the folder of the painting that is open
-        self._folder_lock: locks.Lock | None = None
         self.faults: list[Exception] = []  # of ours, no user's mistakes
 
     def post(self, request: object) -> None:
@@ -77,8 +75,7 @@ class Worker(threading.Thread):
         while not self._over:
             with self._lock:
                 while not (self._waiting or busy or self._over):
-                    self._lock.wait(locks.BEAT)
-                    self._beat()
+                    self._lock.wait()
                 kinds = [kind for kind in (*ORDER, Again) if kind in self._waiting]
                 owed, self._owed = self._owed and busy, False
                 request = self._waiting.pop(kinds[0]) if kinds and not owed else None
@@ -91,12 +88,6 @@ class Worker(threading.Thread):
                 busy = self.session is not None
             else:
                 busy = self.session is not None and bool(self._attempt(self.session.advance))
-            self._beat()
-
-    def _beat(self):
-        """Give a sign of life to servers of other machines, as often as one is due."""
-        if self._folder_lock is not None:
-            self._folder_lock.beat()
 
     def _carry_out(self, request):
         if isinstance(request, Open):
@@ -135,14 +126,15 @@ class Worker(threading.Thread):
         again = before is not None and before.project.folder == opened.folder
         try:
             with contextlib.ExitStack() as stack:
-                lock = self._folder_lock if again else stack.enter_context(opened.alone())
+                if not again:
+                    stack.enter_context(opened.alone())
                 doctor.ensure(opened.settings.variant)
                 mi.set_variant(opened.settings.variant)
                 mi.set_log_level(mi.LogLevel.Error)
                 session = Session(opened, self.tell, lambda: self.newer)
                 if not again:
                     self._held.close()
-                    self._held, self._folder_lock = stack.pop_all(), lock
+                    self._held = stack.pop_all()
         except BaseException:
             if before is not None:
                 mi.set_variant(variant)

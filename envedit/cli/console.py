@@ -1,0 +1,86 @@
+"""What commands write to the terminal, and the exit codes of errors."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from envedit.core.errors import EnveditError, unwrapped
+
+if TYPE_CHECKING:
+    from envedit.cli.progress import JsonProgress, Progress
+
+
+def exit_code(name: str, action: Callable[[], int], interrupted: str = "interrupted") -> int:
+    """Return the exit code of an action, or of a user's error or of Ctrl-C, which are reported on stderr.
+
+    Parameters
+    ----------
+    name : str
+        What the lines on stderr begin with.
+    action : callable
+        Returns the exit code where nothing fails.
+    interrupted : str
+        What is said after Ctrl-C.
+    """
+    try:
+        with unwrapped():
+            return action()
+    except EnveditError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print(f"{name}: {interrupted}", file=sys.stderr)
+        return 130
+
+
+class Console:
+    """What a run writes: lines to stdout, progress, warnings and errors to stderr, the object of ``--json``.
+
+    Attributes
+    ----------
+    facts : dict
+        What the object of ``--json`` will have beside the exit code.
+    """
+
+    def __init__(self, quiet: bool = False, one_object: bool = False, json_lines: bool = False):
+        self._quiet = quiet
+        self._one_object = one_object
+        self._json_lines = json_lines
+        self.facts: dict[str, Any] = {}
+
+    def say(self, line: str) -> None:
+        """Write a line of text, unless there will be an object."""
+        if not (self._quiet or self._one_object):
+            print(line)
+
+    def warn(self, text: str) -> None:
+        """Report a warning."""
+        self.facts.setdefault("warnings", []).append(text)
+        self._report("warning", text, f"envedit: warning: {text}")
+
+    def error(self, text: str) -> None:
+        """Report an error."""
+        self.facts["error"] = text
+        self._report("error", text, f"envedit: {text}")
+
+    def _report(self, kind, text, line):
+        if self._json_lines:
+            from envedit.cli.progress import JsonProgress
+
+            JsonProgress().tell(kind, text=text)
+        else:
+            print(line, file=sys.stderr)
+
+    def progress(self) -> Progress | JsonProgress:
+        """Return what shows progress."""
+        from envedit.cli.progress import JsonProgress, Progress
+
+        return JsonProgress() if self._json_lines and not self._quiet else Progress(quiet=self._quiet)
+
+    def close(self, code: int) -> None:
+        """Write the object, if one is asked for."""
+        if self._one_object:
+            print(json.dumps({"ok": code == 0, "exit_code": code, **self.facts}))

@@ -74,8 +74,8 @@ class Explanation:
     @property
     def name(self) -> str:
         """What was done to the map's lights, for a note."""
-        said = [what if what == ADDED else f"light {k + 1} {what}" for k, what in sorted(self.done.items())]
-        return ", ".join(said) or "lights left where they are"
+        names = [what if what == ADDED else f"light {k + 1} {what}" for k, what in sorted(self.done.items())]
+        return ", ".join(names) or "lights left where they are"
 
 
 @dataclass(frozen=True)
@@ -120,18 +120,18 @@ def search(
     steps = min(most, EXPLANATION_STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
-    seen: list[Explanation] = [best]
+    compared: list[Explanation] = [best]
     better = best if best.point.residual is not None else None
     while better:
         best = better
         moves = _moves(problem, best, sigma)
         promising = [move for move in moves if move.gain > 0]
-        if not promising and len(seen) == 1 and _unfollowed(problem, best, sigma):
-            promising = moves  # what else there is, is seen
-        found = _neighbours(problem, best, promising, sigma, after_step, steps, cleared)
-        seen += found
-        better = _likelier(best, found)
-    return replace(best, others=_others(best, seen))
+        if not promising and len(compared) == 1 and _unfollowed(problem, best, sigma):
+            promising = moves  # for other explanations to be shown
+        neighbours = _neighbours(problem, best, promising, sigma, after_step, steps, cleared)
+        compared += neighbours
+        better = _likelier(best, neighbours)
+    return replace(best, others=_others(best, compared))
 
 
 def further(
@@ -152,16 +152,16 @@ def further(
     return _likelier(best, _neighbours(problem, best, promising, sigma, after_step, EXPLANATION_STEPS, {}))
 
 
-def _likelier(best, found):
+def _likelier(best, explanations):
     """Return the likeliest of some explanations if it is likelier than the best so far, else None."""
-    likeliest = min([best, *found], key=lambda one: one.score)
+    likeliest = min([best, *explanations], key=lambda one: one.score)
     return likeliest if likeliest.score < best.score - POSITIVE_EVIDENCE else None
 
 
-def _others(best, seen):
+def _others(best, compared):
     """List the likeliest explanation of each other name, likeliest first."""
     others: dict[str, Explanation] = {}
-    for one in sorted(seen, key=lambda one: one.score):
+    for one in sorted(compared, key=lambda one: one.score):
         if one.name != best.name and np.isfinite(one.score):
             others.setdefault(one.name, one)
     return tuple(others.values())[:MOST_OTHERS]
@@ -175,15 +175,15 @@ def _unfollowed(problem, best, sigma):
 
 def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
     """List the explanations one of some moves from another, begun under a sky."""
-    found = []
+    neighbours = []
     for move in moves:
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)
-        found.append(_descended(problem, done, run, sigma, steps))
+        neighbours.append(_descended(problem, done, run, sigma, steps))
         if after_step:
             after_step()
-    return found
+    return neighbours
 
 
 def of_light(problem: Problem) -> float:
@@ -196,14 +196,19 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     """Return -2 log evidence at a point, but for a constant; inf where it is not finite."""
     if point.residual is None:
         return np.inf
+    # ---- -2 log of likelihood and prior, at the most likely noise
     noise = problem.noise(point.residual, sigma)
+    unlikeliness = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
+    # ---- log det H - log det K
     normal = problem.normal(point, run.start, noise, descent=False)
-    (_, known), (_, expected) = np.linalg.slogdet(normal.hessian), np.linalg.slogdet(normal.precision)
-    likelihood = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
-    found = float(likelihood + known - expected + of_light(problem) * len(problem.added(run.state)))
+    _, posterior = np.linalg.slogdet(normal.hessian)
+    _, prior = np.linalg.slogdet(normal.precision)
+    # ---- What lights cost
+    cost = of_light(problem) * len(problem.added(run.state))
     if problem.likelihood.robust:
-        found += FADED_LIGHT_COST * len(_faded(problem, run.state))
-    return found if np.isfinite(found) else np.inf
+        cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
+    evidence = float(unlikeliness + posterior - prior + cost)
+    return evidence if np.isfinite(evidence) else np.inf
 
 
 def _faded(problem, state):
@@ -226,12 +231,13 @@ def _descended(problem, done, run, sigma, steps):
 def _moves(problem, best, sigma):
     """List the most promising move of each kind from an explanation."""
     painted = not problem.likelihood.robust
-    found: dict[tuple[int, str], _Move] = {}
+    most_promising: dict[tuple[int, str], _Move] = {}
     for move in (_under_the_original if painted else _beside_the_sky)(problem, best, sigma):
         kind = move.light, move.what
-        if move.gain > (found[kind].gain if kind in found else -np.inf):
-            found[kind] = move
-    return list(found.values())
+        least = most_promising[kind].gain if kind in most_promising else -np.inf
+        if move.gain > least:
+            most_promising[kind] = move
+    return list(most_promising.values())
 
 
 def _beside_the_sky(problem, best, sigma):

@@ -210,12 +210,12 @@ def run(
             changed, _ = adjustments.adjust(job.map_of(other), settings.lights, settings.output, given.scale)
             in_file = given.as_stored(changed, edit.degrees)
             curve = settings.output.tonemap
-            others.append(variants.seen(other, changed, in_file, lit, target, curve, seed))
+            others.append(variants.rendered(other, changed, in_file, lit, target, curve, seed))
 
     # ---- Notes
     notes += [job.note] if job.note else []
     if others:
-        notes.append(f"other explanations: {', '.join(one.said for one in others)}")
+        notes.append(f"other explanations: {', '.join(one.summary for one in others)}")
     notes += [said_of] if (said_of := light_list.summary(lights, height)) else []
     if representation.models_edit:
         kept = 100 * float((found_map == job.original)[rows.slice].all(axis=2).mean())

@@ -13,7 +13,6 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core.errors import MachineError
 from envedit.export import file_resolution
-from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import preview
 from envedit.report.variants import Variant
@@ -128,7 +127,7 @@ class Result:
     def _repr_png_(self) -> bytes:
         """Show the renderings over their maps in a notebook."""
         views = [view.rows for view in self.views]
-        return images.png(preview.drawn(self.renders, self.maps, self._settings.output.tonemap, views=views))
+        return preview.sheet(self.renders, self.maps, self._settings.output.tonemap, views)
 
     @property
     def _settings(self) -> config.Config:
@@ -169,8 +168,7 @@ class Result:
                 if picture is None:
                     axis.axis("off")
                     continue
-                size = len(picture), picture.shape[1]
-                axis.imshow(preview.display(picture, *size, curve, stops), extent=extent)
+                axis.imshow(preview.display(picture, curve, stops), extent=extent)
                 if extent is None:
                     axis.set(title=f"{name}{preview.exposed(stops)}", xticks=[], yticks=[])
                 else:

@@ -9,7 +9,7 @@ import numpy as np
 from envedit.core.color import luminance
 from envedit.core.latlong import solid_angles
 from envedit.report.curves import escape, number
-from envedit.report.html_parts import NUMBERS, STAGES, show, show_list, table
+from envedit.report.html_parts import NUMBERS, STAGES, show, table
 
 _MEASURES = {
     "psnr": "PSNR (dB)",
@@ -64,7 +64,7 @@ def numbers(metrics: dict) -> str:
     ]
     for part in ("natural", "painted", "fit", "transport"):
         others += [(f"{part} {key}", value) for key, value in (metrics.get(part) or {}).items()]
-    rows = [[NUMBERS.get(key, key.replace("_", " ")), show_list(value)] for key, value in others]
+    rows = [[NUMBERS.get(key, key.replace("_", " ")), show(value)] for key, value in others]
     return f"<details><summary>Numbers of the run</summary>{table(['', ''], rows)}</details>" if rows else ""
 
 
@@ -76,8 +76,8 @@ def timing(metrics: dict) -> str:
     for key, seconds in timing.items():
         unit = "ms" if key.endswith("_ms") else "s"
         share = max(seconds, 0) / longest * 12 if seconds and longest and unit == "s" else 0
-        label = key.removesuffix("_ms").removesuffix("_s")
-        label = STAGES.get(label, label.replace("_", " "))
+        stage = key.removesuffix("_ms").removesuffix("_s")
+        label = STAGES.get(stage, stage.replace("_", " "))
         cell = f"{show(seconds, 3)} {unit}" if seconds is not None else "–"
         rows.append([label, cell, f'<span class="bar" style="width:{share:.2f}rem"></span>'])
     return f"<h2>Time</h2>{table(['', '', ''], rows)}" if rows else ""

@@ -50,8 +50,8 @@ def of_views(name: str, views: Views) -> list[tuple[str, slice]]:
 
 def names(folder: Path) -> tuple[str, ...]:
     """Return :data:`RESULTS`, with the numbered renderings that are in a folder before the last."""
-    found = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
-    return (*RESULTS[:-1], *found, RESULTS[-1])
+    numbered = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
+    return (*RESULTS[:-1], *numbered, RESULTS[-1])
 
 
 def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[FilePath]:

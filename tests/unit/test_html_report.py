@@ -10,8 +10,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envedit import config
 from envedit.report import html_report, html_tables
 from envedit.report.curves import normalised
+from envedit.results import Result
+from envedit.solve.feasibility import Reach
 from tests.oracles import ROOT
 from tests.oracles.builders import grey
 
@@ -46,10 +49,9 @@ class Page(HTMLParser):
             self.words.append(data)
 
 
-def write(path, **changes):
-    settings = {
-        "title": "sphere",
-        "config_toml": 'preset = "standard"\n',
+def write(path, settings=None, manifest=None, **changes):
+    found = {
+        "envmap": grey(2.0),
         "metrics": {
             "render": {"psnr": 38.71, "ssim": 0.98, "mse": 1e-4, "lpips": None},
             "initial": {"psnr": 19.2, "ssim": 0.7, "mse": 1e-2, "lpips": None},
@@ -61,19 +63,18 @@ def write(path, **changes):
             "tonemap": "gamma",
             "active_rows": [0, 7],
         },
-        "manifest": {"variant": "llvm_ad_rgb"},
         "history": [{"iteration": 0, "loss": 1.0}, {"iteration": 1, "loss": 0.1}],
         "renders": {"initial": grey(0.1), "target": grey(0.5), "edited": grey(0.4)},
         "maps": {"initial": grey(1.0), "target": None, "edited": grey(2.0)},
-        "influence": None,
-        "frozen": None,
-        "unreachable": None,
         "lights": {},
+        "core": grey(0.0),
+        "views": (),
         "warnings": [],
         "notes": ["renderer.spp = 64"],
     }
-    assert not set(changes) - set(settings)
-    html_report.write_report(path, html_report.Report(**{**settings, **changes}))
+    result = Result(**{**found, **changes})
+    manifest = {"variant": "llvm_ad_rgb"} if manifest is None else manifest
+    html_report.write_report(path, result, settings or config.Config(), manifest)
     return Page(path)
 
 
@@ -130,8 +131,8 @@ def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
 def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
     psnr = {"initial": {"psnr": 30.0}, "render": {"psnr": 25.0}}
     painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
-    unreachable = np.full((8, 8, 3), 0.5)
-    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, unreachable=unreachable)
+    reach = Reach(share=0.9, picture=grey(0.5), residual=grey(0.1), envmap=grey(1.0))
+    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, reach=reach)
     assert "81 % of the painted change reached (90 % feasible) · mean change elsewhere 0.012" in page.text
     assert "What was painted" in page.text and "90 % of the painted change is feasible" in page.text
     assert "further from" not in page.text  # the whole picture may well be
@@ -157,10 +158,10 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
 
 def test_report_escapes_all_text(tmp_path):
     nasty = "<script>alert('&')</script> Gemälde/заря \udcff \0"
+    file = "<script>alert('&') Gemälde"  # a configuration has no control characters
     page = write(
         tmp_path / "r.html",
-        title=nasty,
-        config_toml=nasty,
+        settings=config.Config(scene=config.Scene(file=file)),
         manifest={nasty: nasty},
         metrics={nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}, "timing": {nasty: 1.0}},
         history=[{nasty: 1.0}],
@@ -170,6 +171,7 @@ def test_report_escapes_all_text(tmp_path):
     )
     assert "script" not in page.tags
     assert page.text.count("<script>alert('&')</script> Gemälde/заря") >= 9
+    assert page.text.count(file) == 3  # title, heading and configuration
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, None])

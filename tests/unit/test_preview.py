@@ -7,10 +7,16 @@ from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.core.errors import InputError
 from envedit.core.resampling import fit
+from envedit.images import images
 from envedit.report import preview
 from tests.oracles.builders import grey, read_png
 
 BAD = [np.nan, np.inf, -np.inf]
+
+
+def described(path):
+    """Text ``Description`` of a PNG."""
+    return images.read_stored(path)[1]["metadata"]["Description"]
 
 
 def test_shrinking_averages_areas_and_enlarging_repeats_texels(rng):
@@ -26,31 +32,30 @@ def test_shrinking_averages_areas_and_enlarging_repeats_texels(rng):
 def test_preview_places_tonemapped_renderings_above_their_maps(tmp_path):
     renders = {"initial": grey(0.25, 320, 320), "target": grey(0.5, 320, 320), "edited": grey(7.0, 320, 320)}
     maps = {"initial": grey(1e-30), "target": None, "edited": grey(0.125)}
-    preview.preview(tmp_path / "preview.png", renders, maps, exposure=1.0)
+    preview.preview(tmp_path / "preview.png", renders, maps)
     png, gap = read_png(tmp_path / "preview.png"), preview.GAP
-    top = gap + 14 + gap  # a margin and the label, 7 dots at scale 2
-    assert png.shape == (top + 320 + gap + 160 + gap, gap + 3 * (320 + gap), 3)
+    assert png.shape == (gap + 320 + gap + 160 + gap, gap + 3 * (320 + gap), 3)
     centres = [gap + 160 + i * (320 + gap) for i in range(3)]
-    # round(255 * E^(1/2.2)): 0.25 -> 135.8, 0.5 -> 186.1, the map 0.125 exposed by a stop as 0.25
-    assert [png[top + 160, x].tolist() for x in centres] == [[136] * 3, [186] * 3, [255] * 3]
-    maps_row = [png[top + 320 + gap + 80, x].tolist() for x in centres]
-    assert maps_row == [[0] * 3, list(preview.PLACEHOLDER), [136] * 3]
-    assert (png[gap : gap + 14, gap : gap + 320] == preview.INK).all(axis=2).any(), "label"
-    preview.preview(tmp_path / "bare.png", renders, maps, labels=False)
-    assert read_png(tmp_path / "bare.png").shape[0] == png.shape[0] - 14 - gap
+    # round(255 * E^(1/2.2)): 0.25 -> 135.8, 0.5 -> 186.1, 0.125 -> 99.1
+    assert [png[gap + 160, x].tolist() for x in centres] == [[136] * 3, [186] * 3, [255] * 3]
+    maps_row = [png[gap + 320 + gap + 80, x].tolist() for x in centres]
+    assert maps_row == [[0] * 3, list(preview.PLACEHOLDER), [99] * 3]
 
 
 @pytest.mark.parametrize("factor", [1e-6, 0.3, 1.0, 800.0, 1e20])
-def test_pictures_that_would_be_white_or_black_are_exposed(factor, rng):
+def test_pictures_that_would_be_white_or_black_are_exposed(factor, rng, tmp_path):
     """Most pixels are between 5 % and 95 % of white, whatever the unit; and the caption says how."""
     image = (rng.random((8, 16, 3)).astype(np.float32) + 0.1) * np.float32(factor)
     stops = preview.stops_of([image])
-    shown = preview.display(image, 8, 16, "gamma", stops).mean(axis=2)
+    shown = preview.display(image, "gamma", stops).mean(axis=2)
     assert ((shown > 12) & (shown < 243)).mean() > 0.8
     assert (stops == 0) == (0.1 < factor < 2)
     assert preview.exposed(stops) == (f", {stops:+d} stops" if stops else "")
-    drawn = preview.drawn({"edited": image}, {"edited": image}, labels=False)
+    preview.preview(tmp_path / "p.png", {"edited": image}, {"edited": image})
+    drawn = read_png(tmp_path / "p.png")
     assert 12 < np.median(drawn[drawn != preview.BACKGROUND[0]]) < 243
+    text = f"edited; renderings{preview.exposed(stops)} over maps{preview.exposed(stops)}"
+    assert described(tmp_path / "p.png").endswith(text)
     assert preview.stops_of([np.zeros((4, 8, 3))]) == preview.stops_of([]) == 0
 
 
@@ -71,26 +76,11 @@ def test_preview_shows_what_is_not_finite(tmp_path):
         assert (png == preview.NOT_FINITE).all(axis=2).sum() >= 2
 
 
-def test_preview_with_labels_of_any_text(tmp_path):
+def test_preview_names_its_columns_whatever_their_text(tmp_path):
     names = ["x" * 500, "zażółć ☀ \n\0 \udcff", "", "edited"]
     preview.preview(tmp_path / "p.png", {name: grey(0.5) for name in names}, {})
     assert read_png(tmp_path / "p.png").ndim == 3
-
-
-def test_label_is_drawn_dot_by_dot_and_cut_to_its_width():
-    drawn = ["".join(".#"[int(dot)] for dot in row) for row in preview._text("il", 12, 1)]
-    assert drawn == [
-        ".###..#.....",
-        "..#...#.....",
-        "..#...#.....",
-        "..#...#.....",
-        "..#...#.....",
-        "..#...#.....",
-        ".###..#####.",
-    ]
-    doubled = preview._text("il", 24, 2)
-    np.testing.assert_array_equal(doubled[::2, ::2], preview._text("il", 12, 1))
-    np.testing.assert_array_equal(preview._text("illusion", 24, 1), preview._text("il..", 24, 1))
+    assert "x" * 500 in described(tmp_path / "p.png")
 
 
 def test_wrong_pictures_are_refused(tmp_path):
@@ -162,14 +152,20 @@ def test_influence_is_drawn_per_solid_angle_and_logarithmically():
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 1e30])
-def test_influence_picture_has_texels_over_a_scale(value, tmp_path):
+def test_influence_picture_has_texels_and_says_what_they_are(value, tmp_path):
     preview.influence(tmp_path / "influence.png", np.full((8, 16), value, np.float32))
-    png, gap = read_png(tmp_path / "influence.png"), preview.GAP
-    top = gap + 14 + gap
-    assert png.shape == (top + 256 + gap + 14 + gap, 512 + 2 * gap, 3)
-    assert (png[gap : top - gap] == preview.INK).all(axis=2).any(), "title"
-    foot = png[top + 256 + gap + 7]
-    assert foot[256 + gap].tolist() == preview.RISING[4].tolist()  # the middle of the bar
+    png = read_png(tmp_path / "influence.png")
+    assert png.shape == (256, 512, 3) and (png[:32, :32] == png[0, 0]).all()
+    text = described(tmp_path / "influence.png")
+    assert "1 is the mean" in text and "violet: at most 0.001, yellow: at least 10" in text
+    assert "grey" not in text
+
+
+@pytest.mark.parametrize("stops, rounded", [(0.01, 0.1), (0.1, 0.1), (0.11, 0.2), (3, 5), (5.1, 10)])
+def test_the_scale_of_a_difference_is_round(stops, rounded):
+    b = grey(1.0)
+    a = (b + 1e-3) * 2**stops - 1e-3  # both are lifted by a thousandth of the median
+    assert preview.difference_image(a, b, "stops")[1] == pytest.approx(rounded)
 
 
 def test_difference_refuses_other_shapes_and_kinds():

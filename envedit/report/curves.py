@@ -6,6 +6,8 @@ import html
 import math
 from typing import Any
 
+import numpy as np
+
 from envedit.losses.optimizer import ramp
 from envedit.report.manifest import columns
 
@@ -144,16 +146,11 @@ def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dic
 
 
 def number(value: Any) -> float | None:
-    """Read a cell as a finite float, or None for whatever else it may hold."""
-    if isinstance(value, (bool, str)) or value is None:
-        return None
-    try:
-        read = float(value)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return read if math.isfinite(read) else None
+    """Return a finite number as float; None for whatever else a cell may hold."""
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return float(value) if is_number and math.isfinite(value) else None
 
 
 def escape(text: object) -> str:
-    """Escape text for HTML and SVG, control characters included."""
-    return html.escape("".join(c if c >= " " or c in "\n\t" else "\ufffd" for c in str(text)))
+    """Escape text for HTML and SVG."""
+    return html.escape(str(text))

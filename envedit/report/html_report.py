@@ -10,8 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from envedit import config
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
@@ -19,7 +17,7 @@ from envedit.losses.metrics import saturated, score, worse
 from envedit.report import html_parts as parts
 from envedit.report import html_tables as tables
 from envedit.report import preview
-from envedit.report.curves import curves_svg, escape, normalised, number
+from envedit.report.curves import curves_svg, escape, normalised
 from envedit.report.manifest import plain
 from envedit.solve import feasibility
 
@@ -38,7 +36,7 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
     path : path-like
         The file.
     result : results.Result
-        What was found; whatever is missing in its metrics is shown as a dash.
+        What was found.
     settings : config.Config
         What was carried out.
     manifest : dict
@@ -47,9 +45,7 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
     Raises
     ------
     InputError
-        If a picture is not ``(H, W, 3)`` or the file cannot be written.
-    ConfigError
-        If there is no such tonemap.
+        If the file cannot be written.
     """
     lost: list[str] = []
     metrics = plain(result.metrics, "metrics", lost)
@@ -60,8 +56,10 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
     names = list(dict.fromkeys([*result.renders, *result.maps]))
     by_view = _by_view(renders, result.views)
 
-    differences, sizes = _differences(by_view, maps, tonemap)
-    warnings = [*map(str, result.warnings), *_not_finite(lost, renders, maps), *sizes]
+    warnings = [*result.warnings]
+    if lost:
+        more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
+        warnings.append(f"Not finite, shown as missing: {', '.join(lost[:NAMED])}{more}.")
     source = result.given.source if result.given else settings.input.envmap
     title = escape(f"{Path(source).stem}, {Path(settings.scene.file).stem}")
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
@@ -72,16 +70,16 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
         f"<h1>{title}</h1>{_verdict(metrics)}",
         f'<div class="warnings"><strong>Warnings</strong>{parts.listing(warnings)}</div>' if warnings else "",
         _pictures(names, by_view, maps, tonemap),
-        _section("Differences", differences, 2),
-        _section("Lights and background", _lights(result, maps, tonemap), 1),
+        _section("Differences", _differences(by_view, maps, tonemap), 2),
+        _section("Lights and background", parts.lights_figure(maps["edited"], result.lights, tonemap), 1),
         _section("", parts.separation_figures(result.separation, tonemap)),
         _section("What this view determines", _determined(result)),
         _section("What was painted", _painted(result, metrics)),
         _section("Other explanations", _variants(result, tonemap)),
         f"<h2>Losses</h2>{_losses(result.history, settings)}",
-        tables.quality(metrics, tonemap),
+        tables.quality(metrics),
         tables.numbers(metrics),
-        tables.map_table(maps, names),
+        tables.map_table(maps),
         tables.timing(metrics),
         f"<h2>Choices made</h2>{parts.listing(result.notes)}" if result.notes else "",
         f"<h2>Configuration</h2><pre>{escape(config.to_toml(settings))}</pre>",
@@ -112,9 +110,7 @@ def _by_view(renders, views):
 
 
 def _pictures(names, by_view, maps, tonemap):
-    """Show renderings, a row for each view, and maps; nothing where there are none."""
-    if not names:
-        return ""
+    """Show renderings, a row for each view, and maps."""
     rows = []
     for view, renders in by_view.items():
         what = f"rendering of {view}" if view else "rendering"
@@ -127,31 +123,17 @@ def _pictures(names, by_view, maps, tonemap):
 
 
 def _differences(by_view, maps, tonemap):
-    """Draw the edited pictures less others; also return what to warn of."""
-    pairs = [
-        (renders, "target", "tonemapped", f"{view}: renderings" if view else "renderings")
-        for view, renders in by_view.items()
-    ]
-    pairs += [(maps, other, "stops", "maps") for other in ("initial", "target")]
+    """Draw the edited pictures less others."""
     figures = []
-    warnings = []
-    for pictures, other, kind, what in pairs:
-        if "edited" not in pictures or other not in pictures:
-            continue
-        a, b = pictures["edited"], pictures[other]
-        if a.shape != b.shape:
-            sizes = f"{a.shape[:2]} and {b.shape[:2]}"
-            warnings.append(f"{what} edited and {other} differ in size, {sizes}: no difference is drawn.")
-            continue
-        unit = "luminance in stops" if kind == "stops" else "tonemapped luminance"
-        caption = f"{what}, edited − {other}: {unit}"
-        figures.append(parts.difference_figure(a, b, caption, kind, tonemap))
-    return figures, warnings
-
-
-def _lights(result, maps, tonemap):
-    """Draw where lights were and are."""
-    return parts.lights_figure(maps["edited"], result.lights, tonemap) if "edited" in maps else []
+    for view, renders in by_view.items():
+        what = f"{view}: renderings, edited − target: tonemapped luminance".removeprefix(": ")
+        figures.append(
+            parts.difference_figure(renders["edited"], renders["target"], what, "tonemapped", tonemap)
+        )
+    for other in [name for name in maps if name != "edited"]:
+        what = f"maps, edited − {other}: luminance in stops"
+        figures.append(parts.difference_figure(maps["edited"], maps[other], what, "stops", tonemap))
+    return figures
 
 
 def _determined(result):
@@ -170,7 +152,7 @@ def _painted(result, metrics):
         return []
     pixels = feasibility.unreachable(result.reach)
     views = [view.rows for view in result.views] if len(result.views) > 1 else [slice(None)]
-    feasible = (metrics.get("painted") or {}).get("reachable")
+    feasible = metrics["painted"]["reachable"]
     return [parts.unreachable_figure(pixels[rows], feasible) for rows in views]
 
 
@@ -199,61 +181,38 @@ def _losses(history, settings):
 # Text
 
 
-def _not_finite(lost, renders, maps):
-    """Say which numbers and pixels are not finite."""
-    warnings = []
-    if lost:
-        more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
-        warnings.append(f"Not finite, shown as missing: {', '.join(lost[:NAMED])}{more}.")
-    for kind, pictures in (("rendering", renders), ("map", maps)):
-        for name, image in pictures.items():
-            if bad := int((~np.isfinite(image).all(axis=2)).sum()):
-                warnings.append(f"{kind} {name}: {bad} pixels are not finite, drawn in magenta.")
-    return warnings
-
-
 def _verdict(metrics):
     """Say in one line how good the result is, and under it, in red, if it is worse than none."""
-
-    def compared(name):
-        measured = metrics.get(name) or {}
-        return measured if number(measured.get("psnr")) is not None else None
-
-    before = compared("initial")
-    after = compared("render")
-    rendered = [one for one in (before, after) if one]
-    painted = metrics.get("painted") or {}
-    towards = number(painted.get("towards"))
+    before = metrics["initial"]
+    after = metrics["render"]
+    rendered = before, after
+    painted = metrics["painted"]
     alarm = ""
 
     # ---- The rendering, or of a painted target the share of the paint
-    if towards is not None:
-        verdict = f"<strong>{100 * towards:.0f} %</strong> of the painted change reached"
-        feasible = number(painted.get("reachable"))
-        verdict += f" ({100 * feasible:.0f} % feasible)" if feasible is not None else ""
-        alarm = "further from the paint than the unedited one" if towards < 0 else ""
-    elif painted:
+    if painted is None:
+        kind = "log RMSE: a display shows little of what differs" if saturated(rendered) else "PSNR"
+        verdict = f"Rendering against the target: {score(before, rendered)} → "
+        verdict += f"<strong>{score(after, rendered)}</strong> {kind}"
+        if metrics["ceiling"]:
+            verdict += f" (noise alone: {score(metrics['ceiling'], rendered)})"
+        if worse(after, before):
+            alarm = "further from the target than the unedited one"
+    elif painted["towards"] is None:
         verdict = "The painted change is below the noise of the renderings"
     else:
-        first, last = ("unknown" if one is None else score(one, rendered) for one in (before, after))
-        kind = "log RMSE: a display shows little of what differs" if saturated(rendered) else "PSNR"
-        verdict = f"Rendering against the target: {first} → <strong>{last}</strong> {kind}"
-        if ceiling := compared("ceiling"):
-            verdict += f" (noise alone: {score(ceiling, rendered)})"
-        if before and after and worse(after, before):
-            alarm = "further from the target than the unedited one"
-    statements = [verdict]
+        verdict = f"<strong>{100 * painted['towards']:.0f} %</strong> of the painted change reached"
+        if painted["reachable"] is not None:
+            verdict += f" ({100 * painted['reachable']:.0f} % feasible)"
+        if painted["elsewhere"] is not None:
+            verdict += f" · mean change elsewhere {painted['elsewhere']:.3f}"
+        if painted["towards"] < 0:
+            alarm = "further from the paint than the unedited one"
 
-    # ---- The map, what was not painted, the time
-    if true_map := compared("envmap"):
-        unedited = compared("initial_envmap")
-        since = f"{score(unedited, [])} → " if unedited else ""
-        statements.append(f"map against the true one: {since}{score(true_map, [])}")
-    elsewhere = number(painted.get("elsewhere"))
-    if towards is not None and elsewhere is not None:
-        statements.append(f"mean change elsewhere {elsewhere:.3f}")
-    total = number((metrics.get("timing") or {}).get("total_s"))
-    if total is not None:
-        statements.append(f"{total:.1f} s in total")
-    line = f'<p class="verdict">{" · ".join(statements)}</p>'
+    # ---- The map, and the time
+    if metrics["envmap"]:
+        maps = f"{score(metrics['initial_envmap'], [])} → {score(metrics['envmap'], [])}"
+        verdict += f" · map against the true one: {maps}"
+    verdict += f" · {metrics['timing']['total_s']:.1f} s in total"
+    line = f'<p class="verdict">{verdict}</p>'
     return line + (f'<p class="alarm">The edited rendering is {alarm}.</p>' if alarm else "")

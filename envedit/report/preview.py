@@ -1,30 +1,30 @@
 """Pictures of a run as 8-bit display values: renderings and maps, their differences, influence of texels.
 
 Every picture of the preview, the report and the sheet of variants is made here, from linear radiance
-``(H, W, 3)``. They have no text: what they show stands in captions, and in a PNG's text ``Description``.
+``(H, W, 3)``, finite. They have no text: what they show stands in captions, and in a PNG's text
+``Description``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Literal
 
 import numpy as np
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
-from envedit.core.errors import InputError
 from envedit.core.resampling import fit
-from envedit.core.types import ArrayLike, FilePath, Views
+from envedit.core.types import FilePath, Views
 from envedit.images.images import png
 from envedit.transport.influence import per_solid_angle
 
-NOT_FINITE = (255, 0, 255)
-"""Colour of a NaN or Inf, a magenta that no photograph has: it is shown, never painted over."""
-PLACEHOLDER = (216, 216, 216)
-"""Colour of a picture that is not known, and of texels that were kept."""
-BACKGROUND = (250, 250, 250)
+UNKNOWN = 216
+"""Grey level of a picture that is not known, and of texels that were kept."""
+BACKGROUND = 250
+"""Grey level between the pictures of a sheet."""
 GAP = 6
 """Pixels between the pictures of a sheet."""
 WIDEST = 1024
@@ -35,31 +35,21 @@ WIDEST = 1024
 # One picture
 
 
-def checked(image: ArrayLike, name: str) -> np.ndarray:
-    """Return a picture as an array, refusing what is not ``(H, W, 3)``."""
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise InputError(f"report: picture {name!r} has shape {image.shape}, expected (H, W, 3)")
-    return image
-
-
-def known(pictures: Mapping[str, ArrayLike | None]) -> dict[str, np.ndarray]:
-    """Return those of some pictures that are known, as arrays; errors as of :func:`checked`."""
-    return {name: checked(image, name) for name, image in pictures.items() if image is not None}
+def known(pictures: Mapping[str, np.ndarray | None]) -> dict[str, np.ndarray]:
+    """Return those of some pictures that are known."""
+    return {name: image for name, image in pictures.items() if image is not None}
 
 
 def display(
     image: np.ndarray, tonemap: str = "gamma", stops: float = 0.0, size: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """Scale, expose and tonemap linear radiance (H, W, 3) to 8 bits; what holds a NaN or Inf is magenta.
+    """Scale, expose and tonemap linear radiance (H, W, 3) to 8 bits.
 
     ``size`` is height and width; by default the picture's own, or :data:`WIDEST` pixels across.
     """
-    scaled, bad = _fit_finite(image, size or _shown_size(image))
+    scaled = fit(image, *(size or _shown_size(image)))
     shown = apply_tonemap(scaled.astype(np.float64) * 2.0**stops, tonemap)
-    pixels = np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8)
-    pixels[bad] = NOT_FINITE
-    return pixels
+    return np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8)
 
 
 def _shown_size(image):
@@ -69,27 +59,19 @@ def _shown_size(image):
     return max(round(height * factor), 1), max(round(width * factor), 1)
 
 
-def _fit_finite(image, size):
-    """Scale what is finite, and return the mask of pixels that hold a NaN or Inf as well."""
-    finite = np.isfinite(image).all(axis=2, keepdims=True)
-    if finite.all():
-        return fit(image, *size), np.zeros(size, bool)
-    return fit(np.where(finite, image, 0), *size), fit(np.asarray(~finite), *size)[..., 0] > 0
-
-
 SHOWN = 2e-3, 1.0
 """Median luminance between which pictures are shown as they are; display values 0.06 and 1."""
 GREY = 0.18
 """Luminance near which the median of others is shown."""
 
 
-def stops_of(pictures: Iterable[ArrayLike]) -> int:
+def stops_of(pictures: Iterable[np.ndarray]) -> int:
     """Return the exposure in whole stops at which pictures together are neither white nor black.
 
     0 where the median luminance of what is not black is in :data:`SHOWN`, or where nothing is.
     """
-    values = [luminance(np.where(np.isfinite(image), image, 0)).ravel() for image in pictures]
-    bright = np.concatenate([np.zeros(0), *(one[one > 0] for one in values)])
+    values = np.concatenate([np.zeros(0), *(luminance(image).ravel() for image in pictures)])
+    bright = values[values > 0]
     median = float(np.median(bright)) if bright.size else GREY
     return 0 if SHOWN[0] <= median <= SHOWN[1] else round(np.log2(GREY / median))
 
@@ -140,44 +122,38 @@ def sheet(
 
     Raises
     ------
-    InputError
-        If a picture is not ``(H, W, 3)``, or there is none.
     ConfigError
         If there is no such tonemap.
     """
     names = list(dict.fromkeys([*renders, *maps]))
     renders = known(renders)
     maps = known(maps)
-    if not renders and not maps:
-        raise InputError("report: no picture to preview")
     stops = stops_of(renders.values())
     map_stops = stops_of(maps.values())
 
     # ---- Columns of 214 to 768 pixels; small pictures are enlarged by a whole factor
     widest = max((image.shape[1] for image in renders.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
-    columns = {}
-    for name, image in renders.items():
-        parts = [image[rows] for rows in views or (slice(None),)]
-        columns[name] = [display(part, tonemap, stops, (_height(part, width), width)) for part in parts]
-    heights = [sum(len(part) + GAP for part in parts) for parts in columns.values()]
-    map_top = GAP + max(heights, default=0)
-
-    # ---- The sheet
-    canvas = np.full((map_top + width // 2 + GAP, GAP + len(names) * (width + GAP), 3), BACKGROUND, np.uint8)
-    for i, name in enumerate(names):
-        column = canvas[:, GAP + i * (width + GAP) :][:, :width]
-        column[GAP : map_top - GAP] = BACKGROUND if name in columns else PLACEHOLDER
-        top = GAP
-        for part in columns.get(name, []):
-            column[top : top + len(part)] = part
-            top += len(part) + GAP
-        below = column[map_top : map_top + width // 2]
-        below[:] = PLACEHOLDER
+    parts = views or (slice(None),)
+    heights = [_height(image[rows], width) for image in [*renders.values()][:1] for rows in parts]
+    columns = []
+    for name in names:
+        tiles = [np.full((height, width, 3), UNKNOWN, np.uint8) for height in heights]
+        if name in renders:
+            sizes = zip(parts, heights, strict=True)
+            tiles = [display(renders[name][rows], tonemap, stops, (height, width)) for rows, height in sizes]
         if name in maps:
-            below[:] = display(maps[name], tonemap, map_stops, below.shape[:2])
+            tiles.append(display(maps[name], tonemap, map_stops, (width // 2, width)))
+        elif maps:
+            tiles.append(np.full((width // 2, width, 3), UNKNOWN, np.uint8))
+        columns.append(np.concatenate([_framed(tile, (GAP, 0)) for tile in tiles]))
     text = f"from left to right: {', '.join(names)}; renderings{exposed(stops)} over maps{exposed(map_stops)}"
-    return png(canvas, {"Description": text})
+    return png(_framed(np.hstack(columns), (0, GAP)), {"Description": text})
+
+
+def _framed(pixels, width):
+    """Add a frame on top and left, and at bottom and right, of the given widths."""
+    return np.pad(pixels, (width, width, (0, 0)), constant_values=BACKGROUND)
 
 
 def _height(image, width):
@@ -193,7 +169,7 @@ DIVERGING = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 16
 
 
 def difference_image(
-    a: ArrayLike, b: ArrayLike, kind: str = "tonemapped", tonemap: str = "gamma", scale: float | None = None
+    a: np.ndarray, b: np.ndarray, kind: Literal["tonemapped", "stops"] = "tonemapped", tonemap: str = "gamma"
 ) -> tuple[np.ndarray, float]:
     """Draw the difference a - b in luminance: red where a is brighter, blue where it is darker.
 
@@ -207,48 +183,30 @@ def difference_image(
         lifted by a thousandth of b's median so that a black texel is dark and not minus infinity.
     tonemap : str
         A name of `envedit.core.color.TONEMAPS`, for ``"tonemapped"``.
-    scale : float, optional
-        Difference drawn in full red or blue. By default the 99.5th percentile, rounded up to 1, 2 or 5
-        times a power of ten, and at least 0.01 (tonemapped) or 0.1 (stops): rounding is no edit.
 
     Returns
     -------
     pixels : array
-        ``(H, W, 3)`` uint8, at most :data:`WIDEST` across; magenta where a or b is not finite.
+        ``(H, W, 3)`` uint8, at most :data:`WIDEST` across.
     scale : float
-        The scale used, to be printed beside the picture.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ.
+        Difference drawn in full red or blue: the 99.5th percentile, rounded up to 1, 2 or 5 times a power of
+        ten, and at least 0.01 (tonemapped) or 0.1 (stops): rounding is no edit.
     """
-    a, b = checked(a, "a"), checked(b, "b")
-    if a.shape != b.shape:
-        raise InputError(f"report: cannot subtract a picture of shape {b.shape} from one of {a.shape}")
     size = _shown_size(a)
-    (a, bad_a), (b, bad_b) = (_fit_finite(image, size) for image in (a, b))
-    a, b, finite = a.astype(np.float64), b.astype(np.float64), ~(bad_a | bad_b)
-
-    # ---- The difference, and what is drawn in full colour
+    a = fit(a, *size).astype(np.float64)
+    b = fit(b, *size).astype(np.float64)
     if kind == "stops":
         luminance_a = np.maximum(luminance(a), 0)
         luminance_b = np.maximum(luminance(b), 0)
-        lift = max(1e-3 * float(np.median(luminance_b[finite])) if finite.any() else 0.0, 1e-9)
+        lift = max(1e-3 * float(np.median(luminance_b)), 1e-9)
         difference = np.log2((luminance_a + lift) / (luminance_b + lift))
         least = 0.1
-    elif kind == "tonemapped":
+    else:
         difference = luminance(apply_tonemap(a, tonemap)) - luminance(apply_tonemap(b, tonemap))
         least = 0.01
-    else:
-        raise ValueError(f"difference_image: kind {kind!r} is neither 'tonemapped' nor 'stops'")
-    if scale is None:
-        typical = float(np.percentile(np.abs(difference[finite]), 99.5)) if finite.any() else 0.0
-        scale = _round_up(max(typical, least))
-
-    pixels = _colours(DIVERGING, difference / scale / 2 + 0.5)
-    pixels[~finite] = NOT_FINITE
-    return pixels, float(scale)
+    typical = float(np.percentile(np.abs(difference), 99.5))
+    scale = _round_up(max(typical, least))
+    return _colours(DIVERGING, difference / scale / 2 + 0.5), scale
 
 
 def _round_up(value):
@@ -295,7 +253,7 @@ def influence_image(influence: np.ndarray, frozen: np.ndarray | None = None) -> 
     level = np.log10(np.maximum(per_solid_angle(influence) / max(mean, 1e-300), INFLUENCE_RANGE[0]))
     pixels = share_image((level - low) / (high - low))
     if frozen is not None:
-        pixels[frozen] = PLACEHOLDER
+        pixels[frozen] = UNKNOWN
     return pixels
 
 

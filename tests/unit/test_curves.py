@@ -47,7 +47,7 @@ def test_nothing_to_draw_is_an_empty_string(row):
 @given(
     st.lists(
         st.dictionaries(
-            st.sampled_from(["loss", "a<b>&\"'", "\0\x1b", "long" * 9, "lr"]),
+            st.sampled_from(["loss", "a<b>&\"'", "long" * 9, "lr"]),
             st.one_of(st.none(), st.floats(), st.integers(), st.text(max_size=3), st.booleans()),
         ),
         max_size=8,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Literal
 
 import numpy as np
 
@@ -169,7 +168,7 @@ DIVERGING = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 16
 
 
 def difference_image(
-    a: np.ndarray, b: np.ndarray, kind: Literal["tonemapped", "stops"] = "tonemapped", tonemap: str = "gamma"
+    a: np.ndarray, b: np.ndarray, kind: str = "tonemapped", tonemap: str = "gamma"
 ) -> tuple[np.ndarray, float]:
     """Draw the difference a - b in luminance: red where a is brighter, blue where it is darker.
 

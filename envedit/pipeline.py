@@ -182,17 +182,16 @@ class _Edit:
             self.small = working_size.smaller(settings, self.scene)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")
-            given = self.memory
-            self.target = make_target(
-                settings, self.scene, self.original, given.picture, given.mask, given.target_map
-            )
+            arrays = self.memory.picture, self.memory.mask, self.memory.target_map
+            self.target = make_target(settings, self.scene, self.original, *arrays)
             self.warnings += self.target.warnings
 
     @property
     def to_solve(self):
         """Whether there is a target, and another map than the target's own."""
-        envmap = None if self.target is None else self.target.envmap
-        return self.target is not None and not (envmap is not None and np.array_equal(envmap, self.original))
+        if self.target is None:
+            return False
+        return self.target.envmap is None or not np.array_equal(self.target.envmap, self.original)
 
     def leave(self):
         """Leave the map as it is: without a target it is compared with the initial rendering."""
@@ -207,8 +206,8 @@ class _Edit:
             self.target = Target(initial, None, None, "", initial=initial)
             self.notes.append("no target: the result is compared with the initial rendering")
         else:
-            said = "that is the input map, bit for bit: nothing is solved"
-            self.notes.append(f"{self.target.source}; {said}")
+            source = self.target.source
+            self.notes.append(f"{source}; that is the input map, bit for bit: nothing is solved")
 
     def prepare(self):
         """Trace the light transport, at the size that the edit is solved at, and find where it starts."""

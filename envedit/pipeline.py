@@ -358,6 +358,7 @@ class _Edit:
 
     def measure(self):
         """Set the metrics: how good renderings and map are, and what the solver did."""
+        # ---- Renderings and maps
         tonemap = self.settings.output.tonemap
         with self._carrying(self.edited):
             self.stored = self.map.as_stored(self.edited, self.degrees)
@@ -380,6 +381,8 @@ class _Edit:
                 self.metrics["envmap"] = metrics.compare(edited, target, tonemap, self.lpips)
                 self.metrics["sun_offset_texels"] = metrics.sun_offset(edited, target)
                 self.metrics["initial_envmap"] = metrics.compare(initial, target, tonemap, self.lpips)
+
+        # ---- The solver
         fitted = self.job.representation.fitted if self.job else None
         self.metrics |= {
             "variants": [one.measures for one in self.others],
@@ -469,15 +472,14 @@ class _Edit:
 
     def result(self):
         """Return what the run has found."""
+        # ---- What is said of the edit
         job, notes = self.job, self.notes
-        found = None
-        if job:
-            found = Found(job.representation, self.params, job.free, self.degrees, self.solved_map)
-            notes += [job.note] if job.note else []
+        if job and job.note:
+            notes.append(job.note)
         if self.others:
             notes.append(f"other explanations: {', '.join(one.summary for one in self.others)}")
-        lights = light_list.summary(self.lights, len(self.original))
-        notes += [lights] if lights else []
+        if lights := light_list.summary(self.lights, len(self.original)):
+            notes.append(lights)
         if job and job.representation.models_edit:
             kept = (self.solved_map == job.original)[self.rows.slice].all(axis=2).mean()
             notes.append(f"{100 * float(kept):.3g} % of the active texels are unchanged, bit for bit")
@@ -492,6 +494,11 @@ class _Edit:
             notes.append(f"{share:.3g} % of the active texels keep their value: {least}")
         self.metrics["timing"] = self.clock.table(self.state.history, time.perf_counter() - self.begun)
         self.metrics["choices"] = notes
+
+        # ---- All that was found
+        found = None
+        if job:
+            found = Found(job.representation, self.params, job.free, self.degrees, self.solved_map)
         return Result(
             envmap=self.stored,
             renders=self.renders,

@@ -47,6 +47,7 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
     InputError
         If the file cannot be written.
     """
+    # ---- What is shown
     lost: list[str] = []
     metrics = plain(result.metrics, "metrics", lost)
     plain(result.history, "history", lost)
@@ -63,6 +64,8 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
     source = result.given.source if result.given else settings.input.envmap
     title = escape(f"{Path(source).stem}, {Path(settings.scene.file).stem}")
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
+
+    # ---- The page
     page = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',

@@ -10,7 +10,6 @@ import numpy as np
 from envedit.images.images import png
 from envedit.report import preview
 from envedit.report.curves import escape, number
-from envedit.representations.layers.separation import Separation
 
 STYLE = """
 :root { --ink: #22223b; --soft: #6b6b7b; --line: #e4e4ea; --alarm: #a63d2f; }
@@ -165,57 +164,6 @@ def scale(words: Iterable[str], colours: np.ndarray | None = None) -> str:
         stops = ", ".join(f"rgb({r},{g},{b})" for r, g, b in colours)
         bar = f'<div class="scale" style="background:linear-gradient(90deg, {stops})"></div>'
     return f'{bar}<div class="ends">{ends}</div>'
-
-
-def figure_of(pictures: Mapping[str, np.ndarray], name: str, what: str, tonemap: str) -> str:
-    """Show one of some pictures at the exposure of all, or that it is not known."""
-    if name not in pictures:
-        return f'<div class="unknown">{escape(f"{name}, {what}: not known")}</div>'
-    stops = preview.stops_of(pictures.values())
-    pixels = preview.display(pictures[name], tonemap, stops)
-    return figure(pixels, f"{name}, {what}{preview.exposed(stops)}")
-
-
-def difference_figure(a: np.ndarray, b: np.ndarray, caption: str, kind: str, tonemap: str) -> str:
-    """Show the difference a - b of two pictures; ``kind`` as of :func:`.preview.difference_image`."""
-    pixels, most = preview.difference_image(a, b, kind, tonemap)
-    unit = " stops" if kind == "stops" else ""
-    return figure(pixels, caption, scale((f"−{most:g}{unit}", "0", f"+{most:g}{unit}"), preview.DIVERGING))
-
-
-def identified_figure(identified: np.ndarray) -> str:
-    """Show how well the rendering determines the sky: shares (H, W) in [0, 1]."""
-    caption = "how well the rendering determines the brightness of the sky, smoothed over some 15 degrees"
-    return figure(preview.share_image(identified), caption, scale(("not at all", "fully"), preview.RISING))
-
-
-def influence_figure(influence: np.ndarray, frozen: np.ndarray | None) -> str:
-    """Show the influence of each texel; see :func:`.preview.influence_image`."""
-    pixels = preview.influence_image(influence, frozen)
-    ends = (f"{share:g}" for share in preview.INFLUENCE_RANGE)
-    return figure(pixels, preview.influence_caption(frozen), scale(ends, preview.RISING))
-
-
-def unreachable_figure(pixels: np.ndarray, share: float | None) -> str:
-    """Show what is not feasible, display values (h, w, 3); ``share`` of the painted change is feasible."""
-    within = "" if share is None else f"; {100 * share:.0f} % of the painted change is feasible"
-    codes = np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8)
-    words = "marked red: stays darker than painted", "marked blue: brighter"
-    return figure(codes, f"what is not feasible{within}", scale(words))
-
-
-def separation_figures(separation: Separation | None, tonemap: str) -> list[str]:
-    """Draw background, glow and cores of a separation, or nothing where no light was found."""
-    if separation is None or not separation.lights:
-        return []
-    count = len(separation.lights)
-    pictures = {
-        "background: the map without its lights": separation.background,
-        "glow: what the lights add to the sky": separation.background * (separation.glow - 1),
-        "the light" if count == 1 else f"the {count} lights": separation.core,
-    }
-    stops = preview.stops_of([separation.background])
-    return [figure(preview.display(image, tonemap, stops), text) for text, image in pictures.items()]
 
 
 def lights_figure(envmap: np.ndarray, lights: Mapping[str, list[dict]], tonemap: str) -> list[str]:

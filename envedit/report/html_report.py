@@ -10,6 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from envedit import config
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
@@ -75,9 +77,9 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
         _pictures(names, by_view, maps, tonemap),
         _section("Differences", _differences(by_view, maps, tonemap), 2),
         _section("Lights and background", parts.lights_figure(maps["edited"], result.lights, tonemap), 1),
-        _section("", parts.separation_figures(result.separation, tonemap)),
+        _section("", _separation(result.separation, tonemap)),
         _section("What this view determines", _determined(result)),
-        _section("What was painted", _painted(result, metrics)),
+        _section("What was painted", _painted(result)),
         _section("Other explanations", _variants(result, tonemap)),
         f"<h2>Losses</h2>{_losses(result.history, settings)}",
         tables.quality(metrics),
@@ -114,11 +116,23 @@ def _by_view(renders, views):
 
 def _pictures(names, by_view, maps, tonemap):
     """Show renderings, a row for each view, and maps."""
-    rows = []
-    for view, renders in by_view.items():
-        what = f"rendering of {view}" if view else "rendering"
-        rows.append(parts.grid([parts.figure_of(renders, name, what, tonemap) for name in names]))
-    rows.append(parts.grid([parts.figure_of(maps, name, "environment map", tonemap) for name in names], 1))
+
+    def shown(pictures, what):
+        stops = preview.stops_of(pictures.values())
+        return [
+            parts.figure(
+                preview.display(pictures[name], tonemap, stops), f"{name}, {what}{preview.exposed(stops)}"
+            )
+            if name in pictures
+            else f'<div class="unknown">{escape(f"{name}, {what}: not known")}</div>'
+            for name in names
+        ]
+
+    rows = [
+        parts.grid(shown(renders, f"rendering of {view}" if view else "rendering"))
+        for view, renders in by_view.items()
+    ]
+    rows.append(parts.grid(shown(maps, "environment map"), 1))
     return (
         f"<h2>Renderings and maps</h2>{'<p></p>'.join(rows)}\n"
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>'
@@ -129,34 +143,55 @@ def _differences(by_view, maps, tonemap):
     """Draw the edited pictures less others."""
     figures = []
     for view, renders in by_view.items():
-        what = f"{view}: renderings, edited − target: tonemapped luminance".removeprefix(": ")
-        figures.append(
-            parts.difference_figure(renders["edited"], renders["target"], what, "tonemapped", tonemap)
-        )
-    for other in [name for name in maps if name != "edited"]:
-        what = f"maps, edited − {other}: luminance in stops"
-        figures.append(parts.difference_figure(maps["edited"], maps[other], what, "stops", tonemap))
+        pixels, most = preview.difference_image(renders["edited"], renders["target"], "tonemapped", tonemap)
+        caption = f"{view}: renderings, edited − target: tonemapped luminance".removeprefix(": ")
+        bar = parts.scale((f"−{most:g}", "0", f"+{most:g}"), preview.DIVERGING)
+        figures.append(parts.figure(pixels, caption, bar))
+    for name in [name for name in maps if name != "edited"]:
+        pixels, most = preview.difference_image(maps["edited"], maps[name], "stops")
+        bar = parts.scale((f"−{most:g} stops", "0", f"+{most:g} stops"), preview.DIVERGING)
+        figures.append(parts.figure(pixels, f"maps, edited − {name}: luminance in stops", bar))
     return figures
+
+
+def _separation(separation, tonemap):
+    """Draw background, glow and cores of a separation; nothing where no light was found."""
+    if separation is None or not separation.lights:
+        return []
+    count = len(separation.lights)
+    pictures = {
+        "background: the map without its lights": separation.background,
+        "glow: what the lights add to the sky": separation.background * (separation.glow - 1),
+        "the light" if count == 1 else f"the {count} lights": separation.core,
+    }
+    stops = preview.stops_of([separation.background])
+    return [parts.figure(preview.display(image, tonemap, stops), text) for text, image in pictures.items()]
 
 
 def _determined(result):
     """Draw what the picture says of the sky."""
-    figures = []
-    if result.influence is not None:
-        figures.append(parts.influence_figure(result.influence, result.frozen))
-        if result.posterior is not None and result.posterior.identified is not None:
-            figures.append(parts.identified_figure(result.posterior.identified))
+    if result.influence is None:
+        return []
+    pixels = preview.influence_image(result.influence, result.frozen)
+    bar = parts.scale((f"{share:g}" for share in preview.INFLUENCE_RANGE), preview.RISING)
+    figures = [parts.figure(pixels, preview.influence_caption(result.frozen), bar)]
+    if result.posterior is not None and result.posterior.identified is not None:
+        pixels = preview.share_image(result.posterior.identified)
+        caption = "how well the rendering determines the brightness of the sky, smoothed over some 15 degrees"
+        bar = parts.scale(("not at all", "fully"), preview.RISING)
+        figures.append(parts.figure(pixels, caption, bar))
     return figures
 
 
-def _painted(result, metrics):
-    """Draw what of the paint is not feasible."""
+def _painted(result):
+    """Draw what of the paint is not feasible, of each view."""
     if result.reach is None:
         return []
-    pixels = feasibility.unreachable(result.reach)
+    codes = np.rint(255 * feasibility.unreachable(result.reach)).astype(np.uint8)
     views = [view.rows for view in result.views] if len(result.views) > 1 else [slice(None)]
-    feasible = metrics["painted"]["reachable"]
-    return [parts.unreachable_figure(pixels[rows], feasible) for rows in views]
+    caption = f"what is not feasible; {100 * result.reach.share:.0f} % of the painted change is feasible"
+    words = parts.scale(("marked red: stays darker than painted", "marked blue: brighter"))
+    return [parts.figure(codes[rows], caption, words) for rows in views]
 
 
 def _variants(result, tonemap):

@@ -113,7 +113,8 @@ def edit(
         in_order = (arrays.get(name) for name in ("envmap", "target_map", "target", "mask"))
         memory = inputs.Given(loaded, *in_order)
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
-    result.warnings[:0] = filter(None, warnings)
+    if any(warnings):
+        result.warnings[:0] = filter(None, warnings)
     return result
 
 

@@ -154,11 +154,11 @@ class _Edit:
         self.others: list[variants.Variant] = []
         self.state = adam_loop.State()
         self.dists, self.lpips = _perceptual(self.settings)
-        if missing := installed.missing(settings):
-            if self.settings.loss.dists:
-                self.warnings.append(f"{missing}, or set loss.dists to 0")
-            else:
-                self.notes.append(missing)
+        missing = installed.missing(settings)
+        if self.settings.loss.dists and self.dists is None:
+            self.warnings.append(f"{missing}, or set loss.dists to 0")
+        elif missing and not self.settings.loss.dists:
+            self.notes.append(missing)
 
     def load(self):
         """Load the scene and the map, and make the target; ``small`` is the scene at the size to solve at."""

@@ -174,19 +174,17 @@ def difference_image(
 
     Parameters
     ----------
-    a, b : array
-        Linear radiance, ``(H, W, 3)``.
-    kind : str
-        ``"tonemapped"``: difference of the luminance of the tonemapped pictures, for renderings.
-        ``"stops"``: log2 of the ratio of luminances, for maps, whose sun the tonemap clips; both are
-        lifted by a thousandth of b's median so that a black texel is dark and not minus infinity.
-    tonemap : str
-        A name of `envedit.core.color.TONEMAPS`, for ``"tonemapped"``.
+    a, b : ndarray (H, W, 3)
+        Linear radiance.
+    kind : "tonemapped" or "stops"
+        Difference of the luminance under ``tonemap``, for renderings; or log2 of the ratio of luminances, for
+        maps, whose sun a tonemap clips. There both are lifted by a thousandth of b's median, so that a black
+        texel is dark and not minus infinity.
 
     Returns
     -------
-    pixels : array
-        ``(H, W, 3)`` uint8, at most :data:`WIDEST` across.
+    pixels : ndarray (H, W, 3) uint8
+        At most :data:`WIDEST` across.
     scale : float
         Difference drawn in full red or blue: the 99.5th percentile, rounded up to 1, 2 or 5 times a power of
         ten, and at least 0.01 (tonemapped) or 0.1 (stops): rounding is no edit.
@@ -234,18 +232,10 @@ INFLUENCE_WIDTH = 512
 
 
 def influence_image(influence: np.ndarray, frozen: np.ndarray | None = None) -> np.ndarray:
-    """Draw the influence of texels per solid angle, as shares of its mean over the sphere, logarithmically.
+    """Draw the influence (H, W) of texels per solid angle, as shares of its mean over the sphere, as uint8.
 
-    Parameters
-    ----------
-    influence : ndarray (H, W)
-        T' 1 of :class:`.light_transport.LightTransport`.
-    frozen : ndarray of bool (H, W), optional
-        Texels that were kept, drawn in grey.
-
-    Returns
-    -------
-    array (H, W, 3) uint8
+    ``influence`` is T' 1 of :class:`.light_transport.LightTransport`; colours follow its logarithm. Texels that
+    were kept, ``frozen`` (H, W), are grey.
     """
     mean = influence.sum(dtype=np.float64) / (4 * np.pi)
     low, high = np.log10(INFLUENCE_RANGE)

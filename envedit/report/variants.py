@@ -82,22 +82,10 @@ def rendered(
     tonemap: str,
     seed: int,
 ) -> Variant:
-    """Render an explanation of paint, and measure it.
+    """Render an explanation of paint, and measure how far it follows ``target``.
 
-    Parameters
-    ----------
-    explanation : Explanation
-        Of the search.
-    edited, stored : ndarray (H, W, 3)
-        Its map, radiance that reaches the scene, and in the units of its file.
-    scene : Scene
-        What it lights.
-    target : Target
-        With what was painted.
-    tonemap : str
-        Of the display values that are compared.
-    seed : int
-        Of the rendering.
+    Its map (H, W, 3) is ``edited``, the radiance that reaches the scene, and ``stored``, in the units of its
+    file.
     """
     render = scene.render(edited, SPP, seed)
     seen = None if scene.alpha is None else scene.alpha > 0

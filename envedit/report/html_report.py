@@ -33,8 +33,8 @@ NAMED = 5
 def write_report(path: FilePath, result: Result, settings: config.Config, manifest: dict) -> None:
     """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
 
-    ``settings`` are what was carried out, ``manifest`` is that of :func:`.manifest.manifest`. Raises InputError
-    if the file cannot be written.
+    ``settings`` are what was carried out, ``manifest`` is that of :func:`.manifest.manifest`. Raises
+    InputError if the file cannot be written.
     """
     # ---- What is shown
     lost: list[str] = []

@@ -234,8 +234,8 @@ INFLUENCE_WIDTH = 512
 def influence_image(influence: np.ndarray, frozen: np.ndarray | None = None) -> np.ndarray:
     """Draw the influence (H, W) of texels per solid angle, as shares of its mean over the sphere, as uint8.
 
-    ``influence`` is T' 1 of :class:`.light_transport.LightTransport`; colours follow its logarithm. Texels that
-    were kept, ``frozen`` (H, W), are grey.
+    ``influence`` is T' 1 of :class:`.light_transport.LightTransport`; colours follow its logarithm. Texels
+    that were kept, ``frozen`` (H, W), are grey.
     """
     mean = influence.sum(dtype=np.float64) / (4 * np.pi)
     low, high = np.log10(INFLUENCE_RANGE)

@@ -91,30 +91,30 @@ def edit(
     --------
     >>> result = envedit.edit({"preset": "draft"}, envmap=sky, target=picture)  # doctest: +SKIP
     """
-    arrays = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
     if mask is not None and target is None:
         raise ConfigError("mask: got one without a target; expected both: it says where that was painted")
     if target is not None and target_map is not None:
         raise ConfigError("target, target_map: got both, expected one: a picture, or a map to render under")
-    chosen, found = _settings(settings)
-    given = {name: _array(name, value) for name, value in arrays.items() if value is not None}
-    codes = [_said_of_codes(name, arrays[name]) for name in given if name != "mask"]
+    named = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
+    arrays = {name: _array(name, value) for name, value in named.items() if value is not None}
+    warnings = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
+    chosen, folder = _settings(settings)
+    base = base or folder
     mi.set_variant(chosen.variant)
     with contextlib.ExitStack() as stack:
-        lit = None
+        loaded = None
         if scene is not None:
             if built_scene.is_built(scene):
-                own = chosen.input.envmap in (inputs.AUTO, inputs.SCENE)
-                if own and envmap is None:
-                    given["envmap"] = built_scene.own_map(scene)
+                if envmap is None and chosen.input.envmap in (inputs.AUTO, inputs.SCENE):
+                    arrays["envmap"] = built_scene.own_map(scene)
                 stack.enter_context(built_scene.kept(scene))
-            lit = _lit(scene, chosen.scene, base or found)
-            chosen = _of_scene(chosen, lit)
-        arguments = (given.get(name) for name in ("envmap", "target_map", "target", "mask"))
-        memory = inputs.Given(lit, *arguments)
-        result = run(_of_arrays(chosen, given), base=base or found, watch=watch, memory=memory)
-    if any(codes):
-        result.warnings[:0] = filter(None, codes)
+            loaded = _loaded(scene, chosen.scene, base)
+            chosen = _of_scene(chosen, loaded)
+        in_order = (arrays.get(name) for name in ("envmap", "target_map", "target", "mask"))
+        memory = inputs.Given(loaded, *in_order)
+        result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
+    if any(warnings):
+        result.warnings[:0] = filter(None, warnings)
     return result
 
 
@@ -212,9 +212,13 @@ def load_scene(
     """
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
-    named = sensors if isinstance(sensors, str) else tuple(sensors)
-    given = config.Scene(width=width, height=height, parameters=dict(parameters or {}), sensors=named)
-    return _lit(scene, given, base)
+    settings = config.Scene(
+        width=width,
+        height=height,
+        parameters=dict(parameters or {}),
+        sensors=sensors if isinstance(sensors, str) else tuple(sensors),
+    )
+    return _loaded(scene, settings, base)
 
 
 def load_map(file: str | PathLike[str], width: int | None = None) -> np.ndarray:
@@ -266,13 +270,13 @@ def sunsky(
     ConfigError
         A value is out of its range.
     """
-    given = config.Input(width=width, azimuth=azimuth, elevation=elevation, turbidity=turbidity)
+    checked = config.Input(width=width, azimuth=azimuth, elevation=elevation, turbidity=turbidity)
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
-    return analytic_sky.sunsky(given.width, given.azimuth, given.elevation, given.turbidity)
+    return analytic_sky.sunsky(checked.width, checked.azimuth, checked.elevation, checked.turbidity)
 
 
-def _lit(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
+def _loaded(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
     """Load a scene in any form."""
     size = settings.width, settings.height
     scene = dict(scene) if isinstance(scene, Mapping) else scene
@@ -280,64 +284,73 @@ def _lit(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
     return built_scene.load(scene, *size, settings.parameters, base, settings.sensors, up, scale)
 
 
-def _of_scene(settings: config.Config, lit: Scene) -> config.Config:
+def _of_scene(settings: config.Config, scene: Scene) -> config.Config:
     """Describe a scene in a configuration as far as that is possible; a built one is not kept on disk."""
-    heights = {rows.stop - rows.start for rows in lit.rows}
-    given: dict[str, Any] = {"width": lit.width, "height": heights.pop() if len(heights) == 1 else 0}
-    if lit.path is None:
-        if lit.digest.startswith(built_scene.UNKNOWN):
+    heights = {rows.stop - rows.start for rows in scene.rows}
+    height = heights.pop() if len(heights) == 1 else 0
+    if scene.path is None:
+        if scene.digest.startswith(built_scene.UNKNOWN):
             settings = replace(settings, renderer=replace(settings.renderer, cache=False))
-        return replace(settings, scene=config.Scene(file=GIVEN, **given))
-    given["sensors"] = settings.scene.sensors if len(lit.views) == 1 else "all"
-    given |= {"parameters": lit.parameters, "up": settings.scene.up, "scale": settings.scene.scale}
-    return replace(settings, scene=config.Scene(file=str(lit.path), **given))
+        return replace(settings, scene=config.Scene(file=GIVEN, width=scene.width, height=height))
+    described = config.Scene(
+        file=str(scene.path),
+        width=scene.width,
+        height=height,
+        sensors=settings.scene.sensors if len(scene.views) == 1 else "all",
+        parameters=scene.parameters,
+        up=settings.scene.up,
+        scale=settings.scene.scale,
+    )
+    return replace(settings, scene=described)
 
 
-def _settings(given: object) -> tuple[config.Config, Path | None]:
+def _settings(settings: object) -> tuple[config.Config, Path | None]:
     """Return a configuration, and the folder that its files are relative to."""
-    if given is None:
+    if settings is None:
         return config.from_dict({}), None
-    if isinstance(given, config.Config):
-        return given, None
-    if isinstance(given, Mapping):
-        return config.from_dict(dict(given), name="settings"), None
-    if isinstance(given, str | PathLike):
-        return config.load(given), Path(given).absolute().parent
-    wanted = "a Config, a dict of tables, or the path of a TOML file"
-    raise ConfigError(f"settings: got {show(given)}, expected {wanted}")
+    if isinstance(settings, config.Config):
+        return settings, None
+    if isinstance(settings, Mapping):
+        return config.from_dict(dict(settings), name="settings"), None
+    if isinstance(settings, str | PathLike):
+        return config.load(settings), Path(settings).absolute().parent
+    kinds = "a Config, a dict of tables, or the path of a TOML file"
+    raise ConfigError(f"settings: got {show(settings)}, expected {kinds}")
 
 
 def _array(name: str, value: ArrayLike) -> np.ndarray:
     """Return an argument as float32, as which it is saved; shape and values are checked where it is used."""
     require_unmasked(value, name)
     try:
-        found = np.asarray(value)
+        array = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths
-        found = np.asarray(None)
-    if found.dtype.kind not in "fiu":
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiu":
         raise InputError(f"{name}: got {show(value)}, expected an array of numbers")
     with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is refused as such
-        return found.astype(np.float32)
+        return array.astype(np.float32)
 
 
-def _said_of_codes(name: str, value: ArrayLike | None) -> str:
+def _warning_of_codes(name: str, value: ArrayLike | None) -> str:
     """Return a warning of an array that may hold codes of a picture, not radiance; "" for others."""
-    found = np.asarray(value)
-    if found.dtype not in (np.uint8, np.uint16) or not (found > 1).any():
+    array = np.asarray(value)
+    if array.dtype not in (np.uint8, np.uint16) or not (array > 1).any():
         return ""
-    what = f"{name}: got {found.dtype} up to {found.max()}, taken as linear radiance as it is"
-    return f"{what}; if it holds codes of a picture, undo their display curve first"
+    return (
+        f"{name}: got {array.dtype} up to {array.max()}, taken as linear radiance as it is; "
+        "if it holds codes of a picture, undo their display curve first"
+    )
 
 
-def _of_arrays(settings: config.Config, given: Mapping[str, np.ndarray]) -> config.Config:
+def _of_arrays(settings: config.Config, arrays: Mapping[str, np.ndarray]) -> config.Config:
     """Say in a configuration what comes as an array, so that presets and reports know."""
-    if "envmap" in given:
+    if "envmap" in arrays:
         settings = replace(settings, input=replace(settings.input, envmap=images.ARRAY))
-    if "target" in given or "target_map" in given:
+    if "target" in arrays or "target_map" in arrays:
         table = settings.target
         kept = {key: getattr(table, key) for key in table.given & {"tonemap", "paint", "rest", "hold", "spp"}}
         kind = "envmap"
-        if "target" in given:
+        if "target" in arrays:
             kind = "rendering" if table.kind == "rendering" else "image"
         settings = replace(settings, target=config.Target(kind=kind, file=images.ARRAY, **kept))
     return settings

@@ -17,7 +17,9 @@ from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images
 from envedit.representations.layers.placed_lights import PlacedLights, missing
-from envedit.scene import scene, supported
+from envedit.scene import scene as scenes
+from envedit.scene import supported
+from envedit.scene.scene import Scene
 
 SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
 """Words for ``[input] envmap``: Mitsuba's analytic sky; the scene's own light; that one if there is one."""
@@ -30,7 +32,7 @@ class Given:
 
     Attributes
     ----------
-    scene : scene.Scene, optional
+    scene : Scene, optional
         The scene.
     envmap : ndarray (H, 2 H, 3), optional
         The map to edit, linear radiance in the units of a file: the scene's ``scale`` multiplies it.
@@ -42,7 +44,7 @@ class Given:
         Where it was painted, in [0, 1]; None: where it differs from the initial rendering.
     """
 
-    scene: scene.Scene | None = None
+    scene: Scene | None = None
     envmap: np.ndarray | None = None
     target_map: np.ndarray | None = None
     picture: np.ndarray | None = None
@@ -97,23 +99,25 @@ class InputMap:
         InputError
             It is more than :data:`.radiance.BRIGHTEST` somewhere.
         """
-        return scaled(self._converted, self.scale, self.source)
+        colours = self._in_rec709
+        if self.chromaticities is not None:
+            colours = np.maximum(colours, 0)
+            require_radiance(colours, f"{self.source} in Rec. 709", brightest=BRIGHTEST)
+        return scaled(colours, self.scale, self.source)
 
     @functools.cached_property
-    def _converted(self):
+    def _in_rec709(self):
+        """The stored values in Rec. 709, where colours outside it have negative channels."""
         if self.chromaticities is None:
             return self.stored
-        colours = primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))
-        colours = np.maximum(colours, 0)
-        require_radiance(colours, f"{self.source} in Rec. 709", brightest=BRIGHTEST)
-        return colours
+        return primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))
 
     @property
     def outside(self) -> float:
         """Share of the texels whose colour is outside Rec. 709: a channel of theirs is taken as 0."""
         if self.chromaticities is None:
             return 0.0
-        colours = primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))
+        colours = self._in_rec709
         return float((colours < -_ROUNDING * np.abs(colours).max(axis=2, keepdims=True)).any(axis=2).mean())
 
     def at_file_size(self, settings: config.Input) -> InputMap:
@@ -140,17 +144,17 @@ class InputMap:
         if self.scale == 1 and self.chromaticities is None:
             return edited
         with np.errstate(over="ignore"):
-            found = (edited / np.float64(self.scale)).astype(np.float32)
+            stored = (edited / np.float64(self.scale)).astype(np.float32)
         if self.chromaticities is not None:
             back = np.linalg.inv(primaries.to_rec709(self.chromaticities))
-            found = np.maximum(primaries.converted(found, back), 0)
-        if not np.isfinite(found).all():
+            stored = np.maximum(primaries.converted(stored, back), 0)
+        if not np.isfinite(stored).all():
             raise NumericalError(
                 f"the edited map divided by the scene's scale {self.scale:g} overflows float32: "
                 "raise the emitter's scale"
             )
         same = (edited == latlong.rotate(self.radiance, degrees)).all(axis=2, keepdims=True)
-        return np.where(same, latlong.rotate(self.stored, degrees), found)
+        return np.where(same, latlong.rotate(self.stored, degrees), stored)
 
 
 def scaled(stored: np.ndarray, scale: float, source: str) -> np.ndarray:
@@ -163,7 +167,7 @@ def scaled(stored: np.ndarray, scale: float, source: str) -> np.ndarray:
     return radiance
 
 
-def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
+def source_of(settings: config.Input, scene: Scene | None) -> str:
     """Return the file of a configuration's map, "sunsky", or "scene" for a light of its own that is no file.
 
     Raises
@@ -175,7 +179,7 @@ def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
     """
     if settings.envmap not in (AUTO, SCENE):
         return settings.envmap
-    own = supported.OwnMap(None, 1.0) if lit is None else lit.own
+    own = supported.OwnMap(None, 1.0) if scene is None else scene.own
     if own.missing:
         raise InputError(own.missing)
     if own.light is not None:
@@ -183,7 +187,7 @@ def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
     if own.file is None:
         if settings.envmap == AUTO:
             return SUNSKY
-        where = "no scene is given" if lit is None else f"{lit.path} has no light of its own"
+        where = "no scene is given" if scene is None else f"{scene.path} has no light of its own"
         raise ConfigError(f'input.envmap: got "scene", but {where}: name a map, or "sunsky"')
     if not os.path.isfile(own.file):  # no error for a name that no file can have
         raise InputError(f"{own.file}: the scene's own map is missing; name another with [input] envmap")
@@ -192,7 +196,7 @@ def source_of(settings: config.Input, lit: scene.Scene | None) -> str:
 
 def read_map(
     settings: config.Input,
-    lit: scene.Scene | None,
+    scene: Scene | None,
     width: int | None = None,
     array: np.ndarray | None = None,
 ) -> InputMap:
@@ -202,7 +206,7 @@ def read_map(
     ----------
     settings : config.Input
         Which map.
-    lit : scene.Scene, optional
+    scene : Scene, optional
         Whose own light and scale; None: none, and 1.
     width : int, optional
         Texels across; None: as many as the file has (of a map that is made: the working width).
@@ -214,61 +218,68 @@ def read_map(
     ConfigError, InputError
         As of :func:`source_of` and :func:`.images.load_envmap`.
     """
-    scale = 1.0 if lit is None else lit.own.scale
+    scale = 1.0 if scene is None else scene.own.scale
     if array is not None:
-        return by_hand(settings, _read(array, width, settings, scale))
-    source = source_of(settings, lit)
+        return _by_hand(settings, _read(array, width, settings, scale))
+    source = source_of(settings, scene)
     if source == SUNSKY:
         width = width or settings.width
         sky = analytic_sky.sunsky(width, settings.azimuth, settings.elevation, settings.turbidity)
-        return by_hand(settings, InputMap(source, sky, scale, (width, width // 2), []))
-    if source == SCENE and lit is not None and lit.own.light is not None:
-        made = lit.own.light.map(width or settings.width, lit.to_world)
-        return by_hand(settings, replace(_read(made, width, settings, scale), source=SCENE))
-    return by_hand(settings, _read(source, width, settings, scale))
+        input_map = InputMap(source, sky, scale, (width, width // 2), [])
+    elif source == SCENE and scene is not None and scene.own.light is not None:
+        light = scene.own.light.map(width or settings.width, scene.to_world)
+        input_map = replace(_read(light, width, settings, scale), source=SCENE)
+    else:
+        input_map = _read(source, width, settings, scale)
+    return _by_hand(settings, input_map)
 
 
-def by_hand(settings: config.Input, given: InputMap) -> InputMap:
+def _by_hand(settings, input_map):
     """Return a map with its lights placed and turned as ``lights`` and ``rotate_degrees`` ask."""
     if not settings.lights and not settings.rotate_degrees:
-        return given
-    placed, found, warnings = None, given, list(given.warnings)
+        return input_map
+    stored = input_map.stored
+    placed = None
+    warnings = [*input_map.warnings]
     if settings.lights:
-        placed = PlacedLights(given.radiance, settings.horizon)
+        placed = PlacedLights(input_map.radiance, settings.horizon)
+        stored = input_map.as_stored(placed.place(settings.lights))
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
-            had = f"the map has {count} light{'s' if count != 1 else ''}"
-            named = ", ".join(map(str, lacking))
+            lights = f"the map has {count} light{'s' if count != 1 else ''}"
             entries = "entry is" if len(lacking) == 1 else "entries are"
-            warnings.append(f"input.lights: got light = {named}, but {had}; the {entries} ignored")
-        found = replace(given, stored=given.as_stored(placed.place(settings.lights)))
-    turned = latlong.rotate(found.stored, settings.rotate_degrees)
-    return replace(given, stored=turned, warnings=warnings, placed=placed, unmoved=given.radiance)
+            numbers = ", ".join(map(str, lacking))
+            warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
+    turned = latlong.rotate(stored, settings.rotate_degrees)
+    return replace(input_map, stored=turned, warnings=warnings, placed=placed, unmoved=input_map.radiance)
 
 
 def _read(source, width, settings, scale):
+    """Read a map from its file, or take it from an array (H, 2 H, 3)."""
     stored, info = images.load_envmap(
         source, width, settings.repair, convert=False, name="envmap", space=settings.colour_space
     )
-    about = scale, info["size"], list(info["warnings"]), info["chromaticities"]
     array = source if isinstance(source, np.ndarray) else None
-    found = InputMap(source if array is None else images.ARRAY, stored, *about, array=array)
-    if found.outside > 0:
-        space = primaries.name_of(found.chromaticities)
-        share = f"{100 * found.outside:.2g} % of its texels have colours of {space} outside Rec. 709"
-        kept = "their negative channels are set to 0 while editing; unedited texels keep their colour"
-        found.warnings.append(f"{share}: {kept}")
-    return found
+    name = source if array is None else images.ARRAY
+    warnings = [*info["warnings"]]
+    input_map = InputMap(name, stored, scale, info["size"], warnings, info["chromaticities"], array=array)
+    if input_map.outside > 0:
+        space = primaries.name_of(input_map.chromaticities)
+        warnings.append(
+            f"{100 * input_map.outside:.2g} % of its texels have colours of {space} outside Rec. 709: "
+            "their negative channels are set to 0 while editing; unedited texels keep their colour"
+        )
+    return input_map
 
 
-def load_map(settings: config.Input, lit: scene.Scene | None = None) -> tuple[np.ndarray, list[str]]:
+def load_map(settings: config.Input, scene: Scene | None = None) -> tuple[np.ndarray, list[str]]:
     """Load the map of a configuration at working width.
 
     Parameters
     ----------
     settings : config.Input
         Which map.
-    lit : scene.Scene, optional
+    scene : Scene, optional
         The scene whose own map and scale count.
 
     Returns
@@ -283,35 +294,40 @@ def load_map(settings: config.Input, lit: scene.Scene | None = None) -> tuple[np
     ConfigError, InputError
         As of :func:`read_map` and :class:`InputMap`.
     """
-    found = read_map(settings, lit, settings.width)
-    return found.radiance, found.warnings
+    input_map = read_map(settings, scene, settings.width)
+    return input_map.radiance, input_map.warnings
 
 
-def notes(settings: config.Input, lit: scene.Scene, given: InputMap | None = None) -> list[str]:
+def notes(settings: config.Input, scene: Scene, input_map: InputMap | None = None) -> list[str]:
     """Say which map a run took and what the scene's file has that is used otherwise."""
-    said, own = list(lit.notes), lit.own
-    source = source_of(settings, lit) if given is None else given.source
+    own = scene.own
+    source = source_of(settings, scene) if input_map is None else input_map.source
+    first = []
+    last = []
     if source == SCENE and own.light is not None:
-        said.insert(0, f"map: the scene's own light, {own.light.plugin}")
+        first.append(f"map: the scene's own light, {own.light.plugin}")
+    elif settings.envmap == AUTO and source == SUNSKY:
+        first.append("map: the analytic sky, as the scene is made for any map")
     elif settings.envmap == AUTO:
-        made = "the analytic sky, as the scene is made for any map"
-        said.insert(0, f"map: {made}" if source == SUNSKY else f"map: the scene's own, {source}")
-    if given is not None and given.chromaticities is not None:
-        space = primaries.name_of(given.chromaticities)
-        said.append(f"map in {space}: edited in Rec. 709, written in {space}")
-    if own.scale != 1:
-        of_scene = source in (str(own.file), SCENE)
-        whose = "it" if of_scene else "the map (which is not the scene's own)"
-        drop = "" if of_scene else "; scene.scale = 1 drops that"
-        said.insert(1, f"the scene multiplies {whose} by scale {own.scale:g}{drop}")
-    return said
+        first.append(f"map: the scene's own, {source}")
+    if own.scale != 1 and source in (str(own.file), SCENE):
+        first.append(f"the scene multiplies it by scale {own.scale:g}")
+    elif own.scale != 1:
+        first.append(
+            f"the scene multiplies the map (which is not the scene's own) by scale {own.scale:g}; "
+            "scene.scale = 1 drops that"
+        )
+    if input_map is not None and input_map.chromaticities is not None:
+        space = primaries.name_of(input_map.chromaticities)
+        last.append(f"map in {space}: edited in Rec. 709, written in {space}")
+    return [*first, *scene.notes, *last]
 
 
-def share(lit: scene.Scene, radiance: np.ndarray, seed: int) -> float:
+def share(scene: Scene, radiance: np.ndarray, seed: int) -> float:
     """Return the share of the picture's radiance that the map gives; 1 where the scene has no other lamps."""
     spp = 16  # a pixel
-    black = lit.render(np.zeros((4, 8, 3), np.float32), spp, seed).mean(dtype=np.float64)
-    return float(1 - black / max(lit.render(radiance, spp, seed).mean(dtype=np.float64), 1e-30))
+    black = scene.render(np.zeros((4, 8, 3), np.float32), spp, seed).mean(dtype=np.float64)
+    return float(1 - black / max(scene.render(radiance, spp, seed).mean(dtype=np.float64), 1e-30))
 
 
 def active_rows(rows: str | tuple[int, int], height: int) -> Rows:
@@ -321,13 +337,13 @@ def active_rows(rows: str | tuple[int, int], height: int) -> Rows:
     return Rows.of(height, *rows)
 
 
-def load_scene(settings: config.Scene, base: Path | None = None) -> scene.Scene:
+def load_scene(settings: config.Scene, base: Path | None = None) -> Scene:
     """Load the scene of a configuration; ``base`` and errors as of :func:`.scene.load`."""
-    size, filled = (settings.width, settings.height), dict(settings.parameters)
-    return scene.load(
+    return scenes.load(
         settings.file,
-        *size,
-        filled,
+        settings.width,
+        settings.height,
+        dict(settings.parameters),
         base,
         sensors=settings.sensors,
         up=settings.up,

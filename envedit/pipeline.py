@@ -1,13 +1,12 @@
-"""One run from configuration to result: load, prepare, optimise, judge.
+"""One run from configuration to result: load, solve, adjust, render, measure.
 
 Nothing here prints or writes but the checkpoint; ``cli`` and ``report`` do, with what this returns.
-Longer than 400 lines: runs with and without an edit stand side by side, with what both are judged by.
+Longer than 400 lines: the stages of a run stand in the order in which they are made.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -29,8 +28,7 @@ from envedit.preparation import Preparation
 from envedit.report import variants
 from envedit.results import Result
 from envedit.scene.renderings import rendered
-from envedit.solve import adam_solver, task
-from envedit.solve import feasibility as reaches
+from envedit.solve import adam_loop, adam_solver, feasibility, task
 from envedit.solve.edit_state import Interrupted, Stopped, Watch, keeping
 from envedit.targets import working_size
 from envedit.targets.target import Target
@@ -39,36 +37,12 @@ from envedit.targets.working_size import at_size
 
 __all__ = ["Interrupted", "Stopped", "Watch", "run"]
 
+OF_FIT = ("log_psnr", "peak_ratio", "epochs", "cached", "seconds")
+"""What the metrics have of the fit of a network."""
+TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
+"""What the metrics call a tonemap, where that is not its name."""
 LEAST_GAIN = 0.05
 """Share of the residual below which an edit has achieved nothing, or made nothing worse: 0.45 dB."""
-
-
-@dataclass
-class _Clock:
-    """Wall seconds by name."""
-
-    seconds: dict = field(default_factory=dict)
-
-    @contextlib.contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-
-    def table(self, history: list[dict], total: float) -> dict:
-        """Return the timing of the metrics, but for what the command line adds."""
-        parts = ("target", "fit", "transport", "reach", "start", "edit", "judge")
-        steps = [row["step_ms"] for row in history]
-        return {
-            "import_s": None,
-            **{f"{part}_s": round(self.seconds.get(f"{part}_s", 0.0), 3) for part in parts},
-            "solve_s": round(self.seconds.get("start_s", 0.0) + self.seconds.get("edit_s", 0.0), 3),
-            "report_s": None,
-            "total_s": round(total, 3),
-            "per_iteration_ms": float(np.median(steps)) if steps else None,
-        }
 
 
 @unwrapped()
@@ -107,362 +81,456 @@ def run(
     Stopped
         If the optimisation cannot go on.
     """
-    watch, clock, begun = watch or Watch(), _Clock(), time.perf_counter()
-    memory = memory or inputs.Given()
-    warnings: list[str] = []
-    without = installed.missing(settings)
-    settings = installed.settled(settings)
-    dists, lpips = _perceptual(settings)
-    if settings.loss.dists and dists is None:
-        warnings.append(f"{without}, or set loss.dists to 0")
-
-    # ---- Scene, map and target
-    with clock("target_s"):
-        watch.stage("loading")
-        lit = memory.scene or inputs.load_scene(settings.scene, base)
-        given = inputs.read_map(settings.input, lit, settings.input.width, memory.envmap)
-        original, said = given.radiance, inputs.notes(settings.input, lit, given)
-        said += [without] if without and not settings.loss.dists else []
-        warnings += given.warnings
-        if lit.own.added:
-            part = 100 * inputs.share(lit, original, Seeds.of(settings.seed).judged)
-            said.append(f"the map gives {part:.3g} % of the picture's light; scene.scale changes that")
-        height, width, _ = original.shape
-        rows = inputs.active_rows(settings.input.rows, height)
-        target = None
-        if settings.target.kind != "none":
-            small = working_size.smaller(settings, lit)
-            renderers.check(settings, small, (height, width))
-            watch.stage("rendering the target")
-            target = make_target(settings, lit, original, memory.picture, memory.mask, memory.target_map)
-            warnings += target.warnings
-        if target is None or (target.envmap is not None and np.array_equal(target.envmap, original)):
-            warnings += config.unused(settings)
-            found = _adjusted(settings, lit, given, target, warnings, watch, clock, begun, lpips)
-            return replace(found, memory=memory, base=base)
-        solved = target if small is lit else working_size.worked_on(settings, lit, small, original, target)
-
-    # ---- Transport, at the size that the edit is solved at
-    start = Preparation(settings, small, original, rows, folder, watch, dists, clock)
-    start.trace()
-    if small is not lit:
-        if start.detailed(solved):
-            small, solved = lit, target
-            start = Preparation(settings, lit, original, rows, folder, watch, dists, clock)
-            start.trace()
-        else:
-            said.append(f"solved on a picture of {small.width}x{small.height} pixels")
-    traced = start.renderer.transport
-    if traced and solved.coverage is not None:
-        traced.resolve(original)
-        solved = solved.seen_as(traced.apply(mi.TensorXf(original)).numpy(), solved.initial)
-
-    # ---- The edit: where it starts, and its optimisation
-    edit = start.edit(solved)
-    job, frozen, representation = edit.job, edit.frozen, edit.job.representation
-    renderer, within, notes = job.renderer, None, list(edit.notes)
-    traced = renderer.transport
-    solver = "gauss-newton" if job.newton else "adam"
-    warnings += config.unused(settings, solver if job.settings is settings else None)  # None: no step is made
-    in_file_units = functools.partial(_in_file_units, given, edit.degrees)
-    with clock("edit_s"), in_file_units():
-        watch.stage("editing")
-        params, state = job.optimise(edit.params, edit.crop, resume)
-        found_map = job.decode(params)
-        with keeping(found_map):
-            edited, adjusted = adjustments.adjust(found_map, settings.lights, settings.output, given.scale)
-        solved = job.target  # a resumed run has the picture that it began with
-        if small is lit:
-            target = solved
-    predicted = None
-    if traced:
-        warnings += traced.warnings
-        with in_file_units(), keeping(edited):
-            predicted = traced.coarse_error(edited)
-
-    # ---- What any light can do, under the weights of paint and rest that the edit has come to
-    if traced and solved.coverage is not None:
-        with clock("reach_s"):
-            watch.stage("estimating how much of the target is feasible")
-            within = reaches.reachable(
-                traced,
-                original,
-                solved.picture,
-                task.likelihood(solved),
-                rows,
-                painted=solved.coverage[..., 0],
-                rendered=solved.initial,
-                known=found_map,
-            )
-            picture, residual = (at_size(one, small, lit) for one in (within.picture, within.residual))
-            within = replace(within, picture=picture, residual=residual)
-            notes.append(within.note)
-            warnings += [within.warning] if within.warning else []
-
-    # ---- The result, rendered with fresh samples
-    with clock("judge_s"), in_file_units(), keeping(edited):
-        watch.stage("rendering the result")
-        spp, seed = settings.output.spp, Seeds.of(settings.seed).judged
-        final, judged, noise = lit.sampled(edited, spp, seed)
-        # The same samples: what differs is the map.
-        unedited, _, _ = rendered(lit, original, spp, seed, settings.renderer.cache, judged)
-        initial = unedited if target.initial is None else target.initial
-        by_hand = settings.input.rotate_degrees
-        alike = _alike(settings, lit, target, original, judged)
-        lights, core = light_list.of_edit(given, edited, lit.to_world, by_hand, edit.degrees)
-
-    # ---- Other explanations of paint
-    others = []
-    with clock("judge_s"), in_file_units(), keeping(edited):
-        for other in job.layers.others:
-            watch.stage("rendering other explanations")
-            envmap = job.layers.map_of(other)
-            changed, _ = adjustments.adjust(envmap, settings.lights, settings.output, given.scale)
-            in_file = given.as_stored(changed, edit.degrees)
-            curve = settings.output.tonemap
-            others.append(variants.seen(other, changed, in_file, lit, target, curve, seed))
-
-    # ---- Notes
-    notes += [job.layers.note] if job.layers.note else []
-    if others:
-        notes.append(f"other explanations: {', '.join(one.said for one in others)}")
-    notes += [said_of] if (said_of := light_list.summary(lights, height)) else []
-    if representation.models_edit:
-        kept = 100 * float((found_map == job.original)[rows.slice].all(axis=2).mean())
-        notes.append(f"{kept:.3g} % of the active texels are unchanged, bit for bit")
-    notes = [*said, target.source, *renderer.choices, *notes, *adjusted]
-    notes.append(f"result rendered with {judged} samples a pixel")
-
-    # ---- Measures, and what to warn of
-    renders = {"initial": initial, "target": target.picture, "edited": final}
-    maps = {"initial": original, "target": target.envmap, "edited": edited}
-    with in_file_units(), keeping(edited):
-        stored = given.as_stored(edited, edit.degrees)
-        measured = _measure(settings, renders, maps, rows, alike, target.coverage, within, lpips, lit, noise)
-    if measured["painted"] and measured["painted"]["towards"] is None:
-        notes.append("the painted change is below the noise of the renderings: no share of it is measured")
-    measured["variants"] = [one.measures for one in others]
-    if measured["painted"] and (unnatural := naturalness.warning(measured["natural"])):
-        warnings.append(unnatural)
-    rate = "; lower optimizer.lr" if adam_solver.raised_rate(job) else ""
-    pair, where = [measured[name] for name in ("render", "initial")], ""
-    if target.coverage is not None:
-        painted, where = target.coverage[..., 0] > 0, " where painted"
-        tonemap = settings.output.tonemap
-        pair = [metrics.compare(one, target.picture, tonemap, None, painted) for one in (final, unedited)]
-    after, before = (metrics.score(one, pair, 2) for one in pair)
-    measured["worse"] = metrics.worse(*pair)
-    if measured["worse"]:
-        warnings.append(
-            f"the result is farther from the target than the input{where}: {after} now, {before} before; "
-            f"the edited map is kept anyway: look at it before you use it{rate}"
-        )
-    of_maps = [measured.get(name) for name in ("envmap", "initial_envmap")]
-    if all(of_maps) and metrics.gained(*of_maps) < -LEAST_GAIN:
-        after_map, before_map = (metrics.score(one, [], 2) for one in of_maps)
-        warnings.append(
-            f"the edited map is farther from the target's than the input is: {after_map} now, {before_map} "
-            "before: the picture does not determine it"
-        )
-    solving = job.settings.optimizer.iterations > 0 and not measured["worse"]
-    if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
-        warnings.append(
-            f"the edit achieved nothing in {state.step} steps: {after} from the target{where} now, {before} "
-            "before; check the target's exposure, and that the map lights what is to change"
-        )
-    if state.bad_steps:
-        warnings.append(
-            f"{state.bad_steps} of {state.step} iterations had a non-finite loss or gradient and were "
-            f"undone, and the learning rate was lowered for a while{rate}"
-        )
-    measured |= {
-        "fit": _of_fit(representation.fitted),
-        "timing": clock.table(state.history, time.perf_counter() - begun),
-        "iterations": state.step,
-        "non_finite_steps": state.bad_steps,
-        "transport": None,
-        "turn_degrees": edit.degrees,
-    }
-    if traced:
-        share = float(frozen[rows.slice].mean())
-        measured["transport"] = {**traced.summary(), "predicted_error": predicted, "frozen": share}
-        if share:
-            least = f"their influence is below {settings.renderer.influence_threshold:g} of the mean"
-            notes.append(f"{100 * share:.3g} % of the active texels keep their value: {least}")
-    measured["choices"] = notes
-    return Result(
-        envmap=stored,
-        given=given,
-        to_world=lit.to_world,
-        alpha=lit.alpha,
-        renders=renders,
-        maps=maps,
-        metrics=measured,
-        history=state.history,
-        notes=notes,
-        warnings=warnings,
-        views=lit.views,
-        lights=lights,
-        core=core,
-        influence=traced.influence if traced else None,
-        frozen=frozen,
-        separation=representation.separation,
-        scene=lit.path,
-        reach=within,
-        found=Found(representation, params, job.free, edit.degrees, found_map),
-        posterior=job.layers.posterior,
-        variants=others,
-        settings=settings,
-        memory=memory,
-        base=base,
-    )
+    edit = _Edit(settings, folder, base, watch or Watch(), memory or inputs.Given())
+    edit.load()
+    if edit.to_solve:
+        edit.prepare()
+        edit.solve(resume)
+    else:
+        edit.leave()
+    edit.adjust()
+    if edit.transport and edit.target.coverage is not None:
+        edit.check_feasibility()
+    edit.render()
+    edit.render_variants()
+    edit.measure()
+    if edit.job:
+        edit.warn_of_quality()
+    return edit.result()
 
 
-def _adjusted(settings, lit, given, target, warnings, watch, clock, begun, lpips):
-    """Adjust a map that is not edited: there is no target, or the map is the target's own.
+@dataclass
+class _Clock:
+    """Wall seconds by name."""
 
-    Without a target it is compared with the initial rendering.
-    """
-    original = given.radiance
-    with clock("edit_s"):
-        watch.stage("adjusting the map")
-        edited, notes = adjustments.adjust(original, settings.lights, settings.output, given.scale)
-    with clock("judge_s"), _in_file_units(given), keeping(edited):
-        watch.stage("rendering the result")
-        seeds, spp, keep = Seeds.of(settings.seed), settings.output.spp, settings.renderer.cache
-        final, judged, _ = lit.sampled(edited, spp, seeds.judged)
-        if target is None:
-            initial, _, _ = rendered(lit, original, spp, seeds.painted_initial, keep)
-            source = "no target: the result is compared with the initial rendering"
-            target = Target(initial, None, None, source, initial=initial)
-        else:
-            initial, _, _ = rendered(lit, original, spp, seeds.judged, keep, judged)
-            source = f"{target.source}; that is the input map, bit for bit: nothing is solved"
-        renders = {"initial": initial, "target": target.picture, "edited": final}
-        maps, rows = {"initial": original, "target": target.envmap, "edited": edited}, Rows.of(len(original))
-        alike = _alike(settings, lit, target, original, judged)
-        measured = _measure(settings, renders, maps, rows, alike, None, None, lpips, lit)
-        stored = given.as_stored(edited)
-        lights, core = light_list.of_edit(given, edited, lit.to_world, settings.input.rotate_degrees)
-    notes = [
-        *inputs.notes(settings.input, lit, given),
-        source,
-        *notes,
-        *filter(None, [light_list.summary(lights, len(original))]),
-        f"rendered with {judged} samples a pixel",
-    ]
-    measured |= {
-        "fit": None,
-        "timing": clock.table([], time.perf_counter() - begun),
-        "iterations": 0,
-        "non_finite_steps": 0,
-        "worse": False,
-        "transport": None,
-        "turn_degrees": 0.0,
-        "choices": notes,
-    }
-    more = {"scene": lit.path, "given": given, "to_world": lit.to_world, "alpha": lit.alpha}
-    more |= {"settings": settings}
-    return Result(stored, renders, maps, measured, [], notes, warnings, lit.views, lights, core, **more)
+    seconds: dict = field(default_factory=dict)
 
-
-def _alike(settings, lit, target, original, judged):
-    """Return two pictures that differ by noise alone: a map rendered as the result is, and as the target was.
-
-    The map is that of the target; where the picture was painted, the one whose rendering was painted on; of a
-    picture of the scene it is not known: None.
-    """
-    envmap, picture = target.envmap, target.picture
-    if envmap is None:
-        envmap, picture = original, target.initial
-    if picture is None:
-        return None
-    spp, seed, keep = settings.output.spp, Seeds.of(settings.seed).judged, settings.renderer.cache
-    again, _, _ = rendered(lit, envmap, spp, seed, keep, judged)
-    return again, picture
-
-
-@contextlib.contextmanager
-def _in_file_units(given, degrees=0.0):
-    """Let an edit that is cut short carry its map in the units of the file, and whose units these are.
-
-    Where they leave float32, the map is cut at what the file could have been read with.
-    """
-    try:
-        yield
-    except (Interrupted, Stopped) as stop:
-        stop.given = given
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
         try:
-            stop.envmap = given.as_stored(stop.envmap, degrees)
-        except NumericalError:
-            most = np.float32(BRIGHTEST * min(given.scale, 1.0))
-            stop.envmap = given.as_stored(np.minimum(stop.envmap, most), degrees)
-        raise
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def table(self, history: list[dict], total: float) -> dict:
+        """Return the timing of the metrics, but for what the command line adds."""
+        parts = ("target", "fit", "transport", "reach", "start", "edit", "judge")
+        steps = [row["step_ms"] for row in history]
+        return {
+            "import_s": None,
+            **{f"{part}_s": round(self.seconds.get(f"{part}_s", 0.0), 3) for part in parts},
+            "solve_s": round(self.seconds.get("start_s", 0.0) + self.seconds.get("edit_s", 0.0), 3),
+            "report_s": None,
+            "total_s": round(total, 3),
+            "per_iteration_ms": float(np.median(steps)) if steps else None,
+        }
+
+
+class _Edit:
+    """A run: its stages are methods, which are called in the order in which they stand.
+
+    ``transport`` and ``job`` are None where the map is left as it is; ``notes`` and ``warnings`` grow from
+    stage to stage.
+    """
+
+    transport = None
+    job = None
+    feasible = None
+    frozen = None
+    degrees = 0.0
+
+    def __init__(self, settings, folder, base, watch, memory):
+        self.begun = time.perf_counter()
+        self.clock = _Clock()
+        self.settings = installed.settled(settings)
+        self.folder = folder
+        self.base = base
+        self.watch = watch
+        self.memory = memory
+        self.seeds = Seeds.of(settings.seed)
+        self.notes: list[str] = []
+        self.warnings: list[str] = []
+        self.others: list[variants.Variant] = []
+        self.state = adam_loop.State()
+        self.dists, self.lpips = _perceptual(self.settings)
+        missing = installed.missing(settings)
+        if self.settings.loss.dists and self.dists is None:
+            self.warnings.append(f"{missing}, or set loss.dists to 0")
+        elif missing and not self.settings.loss.dists:
+            self.notes.append(missing)
+
+    def load(self):
+        """Load the scene and the map, and make the target; ``small`` is the scene at the size to solve at."""
+        settings = self.settings
+        with self.clock("target_s"):
+            self.watch.stage("loading")
+            self.scene = self.small = self.memory.scene or inputs.load_scene(settings.scene, self.base)
+            self.map = inputs.read_map(settings.input, self.scene, settings.input.width, self.memory.envmap)
+            self.original = self.map.radiance
+            self.rows = inputs.active_rows(settings.input.rows, len(self.original))
+            self.warnings += self.map.warnings
+            self.notes[:0] = inputs.notes(settings.input, self.scene, self.map)
+            if self.scene.own.added:
+                share = 100 * inputs.share(self.scene, self.original, self.seeds.judged)
+                self.notes.append(
+                    f"the map gives {share:.3g} % of the picture's light; scene.scale changes that"
+                )
+            self.target = None
+            if settings.target.kind == "none":
+                return
+            self.small = working_size.smaller(settings, self.scene)
+            renderers.check(settings, self.small, self.original.shape[:2])
+            self.watch.stage("rendering the target")
+            arrays = self.memory.picture, self.memory.mask, self.memory.target_map
+            self.target = make_target(settings, self.scene, self.original, *arrays)
+            self.warnings += self.target.warnings
+
+    @property
+    def to_solve(self):
+        """Whether there is a target, and another map than the target's own."""
+        if self.target is None:
+            return False
+        return self.target.envmap is None or not np.array_equal(self.target.envmap, self.original)
+
+    def leave(self):
+        """Leave the map as it is: without a target it is compared with the initial rendering."""
+        self.warnings += config.unused(self.settings)
+        self.rows = Rows.of(len(self.original))
+        self.solved_map = self.original
+        self.watch.stage("adjusting the map")
+        if self.target is None:
+            with self.clock("judge_s"):
+                spp, cache = self.settings.output.spp, self.settings.renderer.cache
+                initial, _, _ = rendered(self.scene, self.original, spp, self.seeds.painted_initial, cache)
+            self.target = Target(initial, None, None, "", initial=initial)
+            self.notes.append("no target: the result is compared with the initial rendering")
+        else:
+            source = self.target.source
+            self.notes.append(f"{source}; that is the input map, bit for bit: nothing is solved")
+
+    def prepare(self):
+        """Trace the light transport, at the size that the edit is solved at, and find where it starts."""
+        target = self.target
+        if self.small is not self.scene:
+            with self.clock("target_s"):
+                target = working_size.worked_on(self.settings, self.scene, self.small, self.original, target)
+        preparation = self._traced()
+        if self.small is not self.scene and preparation.detailed(target):
+            self.small = self.scene
+            target = self.target
+            preparation = self._traced()
+        if self.small is not self.scene:
+            self.notes.append(f"solved on a picture of {self.small.width}x{self.small.height} pixels")
+        self.notes.append(self.target.source)
+        transport = preparation.renderer.transport
+        if transport and target.coverage is not None:
+            transport.resolve(self.original)
+            target = target.seen_as(transport.apply(mi.TensorXf(self.original)).numpy(), target.initial)
+        self.start = preparation.edit(target)
+        self.job = self.start.job
+        self.degrees = self.start.degrees
+        self.frozen = self.start.frozen
+        self.transport = self.job.renderer.transport
+        self.notes += [*self.job.renderer.choices, *self.start.notes]
+
+    def _traced(self):
+        preparation = Preparation(
+            self.settings,
+            self.small,
+            self.original,
+            self.rows,
+            self.folder,
+            self.watch,
+            self.dists,
+            self.clock,
+        )
+        preparation.trace()
+        return preparation
+
+    def solve(self, resume):
+        """Find the map that explains the target."""
+        solver = "gauss-newton" if self.job.newton else "adam"
+        no_step = self.job.settings is not self.settings
+        self.warnings += config.unused(self.settings, None if no_step else solver)
+        with self.clock("edit_s"), self._carrying():
+            self.watch.stage("editing")
+            self.params, self.state = self.job.optimise(self.start.params, self.start.crop, resume)
+            self.solved_map = self.job.decode(self.params)
+        if self.small is self.scene:
+            self.target = self.job.target  # a resumed run has the picture that it began with
+
+    @contextlib.contextmanager
+    def _carrying(self, envmap=None):
+        """Let an edit that is cut short carry its map in the units of the file, and whose units these are.
+
+        It is ``envmap`` where numbers fail after the loop. Where its units leave float32, it is cut at what
+        the file could have been read with.
+        """
+        try:
+            with contextlib.nullcontext() if envmap is None else keeping(envmap):
+                yield
+        except (Interrupted, Stopped) as stop:
+            stop.given = self.map
+            try:
+                stop.envmap = self.map.as_stored(stop.envmap, self.degrees)
+            except NumericalError:
+                most = np.float32(BRIGHTEST * min(self.map.scale, 1.0))
+                stop.envmap = self.map.as_stored(np.minimum(stop.envmap, most), self.degrees)
+            raise
+
+    def adjust(self):
+        """Adjust lights, exposure and colours as the configuration asks; predict the transport's error."""
+        with self.clock("edit_s"), self._carrying(self.solved_map):
+            self.edited, self.adjustments = self._adjusted(self.solved_map)
+        if self.transport:
+            self.warnings += self.transport.warnings
+            with self._carrying(self.edited):
+                self.predicted_error = self.transport.coarse_error(self.edited)
+
+    def _adjusted(self, envmap):
+        return adjustments.adjust(envmap, self.settings.lights, self.settings.output, self.map.scale)
+
+    def check_feasibility(self):
+        """Estimate what any light can do for the paint, under the weights that the edit has come to."""
+        target = self.job.target
+        with self.clock("reach_s"):
+            self.watch.stage("estimating how much of the target is feasible")
+            feasible = feasibility.reachable(
+                self.transport,
+                self.original,
+                target.picture,
+                task.likelihood(target),
+                self.rows,
+                painted=target.coverage[..., 0],
+                rendered=target.initial,
+                known=self.solved_map,
+            )
+            picture = at_size(feasible.picture, self.small, self.scene)
+            residual = at_size(feasible.residual, self.small, self.scene)
+        self.feasible = replace(feasible, picture=picture, residual=residual)
+        self.notes.append(feasible.note)
+        self.warnings += [feasible.warning] if feasible.warning else []
+
+    def render(self):
+        """Render the result with fresh samples, and what it is compared with."""
+        target = self.target
+        with self.clock("judge_s"), self._carrying(self.edited):
+            self.watch.stage("rendering the result")
+            spp = self.settings.output.spp
+            edited, samples, noise = self.scene.sampled(self.edited, spp, self.seeds.judged)
+            self.samples = samples
+            self.noise = noise
+            self.unedited = self._rendered(self.original)
+            initial = self.unedited if target.initial is None else target.initial
+            self.renders = {"initial": initial, "target": target.picture, "edited": edited}
+            self.maps = {"initial": self.original, "target": target.envmap, "edited": self.edited}
+            # Pictures that differ by noise alone: of the target's map, or of the one that was painted on.
+            self.ceiling = None
+            if target.envmap is not None:
+                self.ceiling = self._rendered(target.envmap), target.picture
+            elif target.initial is not None:
+                self.ceiling = self.unedited, target.initial
+            by_hand = self.settings.input.rotate_degrees
+            self.lights, self.core = light_list.of_edit(
+                self.map, self.edited, self.scene.to_world, by_hand, self.degrees
+            )
+
+    def _rendered(self, envmap):
+        """Render a map with the same samples as the result: what differs is the map."""
+        spp, cache = self.settings.output.spp, self.settings.renderer.cache
+        return rendered(self.scene, envmap, spp, self.seeds.judged, cache, self.samples)[0]
+
+    def render_variants(self):
+        """Render the other explanations of paint."""
+        for explanation in self.job.layers.others if self.job else ():
+            with self.clock("judge_s"), self._carrying(self.edited):
+                self.watch.stage("rendering other explanations")
+                changed, _ = self._adjusted(self.job.layers.map_of(explanation))
+                stored = self.map.as_stored(changed, self.degrees)
+                tonemap = self.settings.output.tonemap
+                self.others.append(
+                    variants.rendered(
+                        explanation, changed, stored, self.scene, self.target, tonemap, self.seeds.judged
+                    )
+                )
+
+    def measure(self):
+        """Set the metrics: how good renderings and map are, and what the solver did."""
+        # ---- Renderings and maps
+        tonemap = self.settings.output.tonemap
+        with self._carrying(self.edited):
+            self.stored = self.map.as_stored(self.edited, self.degrees)
+            self.metrics = self._compared(slice(None), self.scene.rows)
+            self.metrics |= {
+                "envmap": None,
+                "tonemap": TONEMAP_TEXT.get(tonemap, tonemap),
+                "active_rows": [self.rows.first, self.rows.last],
+                "natural": naturalness.natural(self.edited, self.original, self.target.envmap),
+            }
+            if len(self.scene.views) > 1:
+                views = [{"name": view.name, **self._compared(view.rows)} for view in self.scene.views]
+                self.metrics["views"] = views
+            if self.metrics["painted"]:
+                self.metrics["painted"]["reachable"] = self.feasible.share if self.feasible else None
+            if self.target.envmap is not None:
+                initial, target, edited = (
+                    self.maps[name][self.rows.slice] for name in ("initial", "target", "edited")
+                )
+                self.metrics["envmap"] = metrics.compare(edited, target, tonemap, self.lpips)
+                self.metrics["sun_offset_texels"] = metrics.sun_offset(edited, target)
+                self.metrics["initial_envmap"] = metrics.compare(initial, target, tonemap, self.lpips)
+
+        # ---- The solver
+        fitted = self.job.representation.fitted if self.job else None
+        self.metrics |= {
+            "variants": [one.measures for one in self.others],
+            "worse": False,
+            "fit": fitted and {name: getattr(fitted, name) for name in OF_FIT},
+            "iterations": self.state.step,
+            "non_finite_steps": self.state.bad_steps,
+            "transport": None,
+            "turn_degrees": self.degrees,
+        }
+        if self.transport:
+            frozen = float(self.frozen[self.rows.slice].mean())
+            self.metrics["transport"] = {
+                **self.transport.summary(),
+                "predicted_error": self.predicted_error,
+                "frozen": frozen,
+            }
+
+    def _compared(self, rows, views=()):
+        """Compare rows of the renderings with those of the target."""
+        initial, target, edited = (self.renders[name][rows] for name in ("initial", "target", "edited"))
+        seen = None if self.scene.alpha is None else self.scene.alpha[rows] > 0
+        tonemap = self.settings.output.tonemap
+        how = (tonemap, self.lpips, seen, views)
+        measures = {
+            "render": metrics.compare(edited, target, *how),
+            "initial": metrics.compare(initial, target, *how),
+            "ceiling": None,
+            "painted": None,
+        }
+        if self.ceiling:
+            again, picture = self.ceiling
+            measures["ceiling"] = metrics.compare(again[rows], picture[rows], *how)
+        if self.target.coverage is not None:
+            noise = None if self.noise is None else self.noise[rows]
+            coverage = self.target.coverage[rows]
+            measures["painted"] = metrics.painted(edited, target, initial, coverage, tonemap, seen, noise)
+        return measures
+
+    def warn_of_quality(self):
+        """Warn of an edit that has made things worse, or nothing better; set ``worse`` of the metrics."""
+        measures, state = self.metrics, self.state
+        if measures["painted"] and (unnatural := naturalness.warning(measures["natural"])):
+            self.warnings.append(unnatural)
+
+        # ---- The rendering, of painted targets on the painted pixels
+        pair = [measures["render"], measures["initial"]]
+        where = ""
+        if self.target.coverage is not None:
+            where = " where painted"
+            tonemap = self.settings.output.tonemap
+            painted = self.target.coverage[..., 0] > 0
+            pair = [
+                metrics.compare(picture, self.target.picture, tonemap, None, painted)
+                for picture in (self.renders["edited"], self.unedited)
+            ]
+        after, before = (metrics.score(one, pair, 2) for one in pair)
+        rate = "; lower optimizer.lr" if adam_solver.raised_rate(self.job) else ""
+        measures["worse"] = metrics.worse(*pair)
+        if measures["worse"]:
+            self.warnings.append(
+                f"the result is farther from the target than the input{where}: {after} now, {before} before; "
+                f"the edited map is kept anyway: look at it before you use it{rate}"
+            )
+
+        # ---- The map
+        of_maps = [measures.get(name) for name in ("envmap", "initial_envmap")]
+        if all(of_maps) and metrics.gained(*of_maps) < -LEAST_GAIN:
+            after_map, before_map = (metrics.score(one, [], 2) for one in of_maps)
+            self.warnings.append(
+                f"the edited map is farther from the target's than the input is: {after_map} now, "
+                f"{before_map} before: the picture does not determine it"
+            )
+
+        # ---- The solver
+        solving = self.job.settings.optimizer.iterations > 0 and not measures["worse"]
+        if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
+            self.warnings.append(
+                f"the edit achieved nothing in {state.step} steps: {after} from the target{where} now, "
+                f"{before} before; check the target's exposure, and that the map lights what is to change"
+            )
+        if state.bad_steps:
+            self.warnings.append(
+                f"{state.bad_steps} of {state.step} iterations had a non-finite loss or gradient and were "
+                f"undone, and the learning rate was lowered for a while{rate}"
+            )
+
+    def result(self):
+        """Return what the run has found."""
+        # ---- What is said of the edit
+        job, notes = self.job, self.notes
+        if job and job.layers.note:
+            notes.append(job.layers.note)
+        if self.others:
+            notes.append(f"other explanations: {', '.join(one.summary for one in self.others)}")
+        if lights := light_list.summary(self.lights, len(self.original)):
+            notes.append(lights)
+        if job and job.representation.models_edit:
+            kept = (self.solved_map == job.original)[self.rows.slice].all(axis=2).mean()
+            notes.append(f"{100 * float(kept):.3g} % of the active texels are unchanged, bit for bit")
+        notes += [*self.adjustments, f"result rendered with {self.samples} samples a pixel"]
+        if self.metrics["painted"] and self.metrics["painted"]["towards"] is None:
+            notes.append(
+                "the painted change is below the noise of the renderings: no share of it is measured"
+            )
+        if self.transport and self.metrics["transport"]["frozen"]:
+            share = 100 * self.metrics["transport"]["frozen"]
+            least = f"their influence is below {self.settings.renderer.influence_threshold:g} of the mean"
+            notes.append(f"{share:.3g} % of the active texels keep their value: {least}")
+        self.metrics["timing"] = self.clock.table(self.state.history, time.perf_counter() - self.begun)
+        self.metrics["choices"] = notes
+
+        # ---- All that was found
+        found = None
+        if job:
+            found = Found(job.representation, self.params, job.free, self.degrees, self.solved_map)
+        return Result(
+            envmap=self.stored,
+            renders=self.renders,
+            maps=self.maps,
+            metrics=self.metrics,
+            history=self.state.history,
+            notes=notes,
+            warnings=self.warnings,
+            views=self.scene.views,
+            lights=self.lights,
+            core=self.core,
+            influence=self.transport.influence if self.transport else None,
+            frozen=self.frozen,
+            scene=self.scene.path,
+            reach=self.feasible,
+            given=self.map,
+            alpha=self.scene.alpha,
+            found=found,
+            posterior=job.layers.posterior if job else None,
+            variants=self.others,
+            settings=self.settings,
+            memory=self.memory,
+            base=self.base,
+        )
 
 
 def _perceptual(settings):
     """Load DISTS, where the loss has it, and LPIPS; None where there are no weights."""
-    files, dists, lpips = installed.files(settings), None, None
+    files = installed.files(settings)
+    dists = None
+    lpips = None
     if "vgg" in files:
         dists = distances.Dists(backbones.Backbone.load("vgg", files["vgg"]), files["dists"])
     if "backbone" in files:
         lpips = distances.Lpips(settings.perceptual.network, files["backbone"], files["heads"])
     return dists, lpips
-
-
-def _measure(settings, renders, maps, rows, alike, coverage, within, lpips, lit, noise=None):
-    """Compare renderings and maps: the part of the metrics that says how good the result is.
-
-    ``alike`` are two pictures that differ by noise alone: no rendering can be expected to do better.
-    """
-    tonemap = settings.output.tonemap
-    before, target, after = (renders[name] for name in ("initial", "target", "edited"))
-    seen = None if lit.alpha is None else lit.alpha > 0
-    measured = {
-        "render": metrics.compare(after, target, tonemap, lpips, seen, lit.rows),
-        "initial": metrics.compare(before, target, tonemap, lpips, seen, lit.rows),
-        "ceiling": alike and metrics.compare(alike[0], alike[1], tonemap, lpips, seen, lit.rows),
-        "envmap": None,
-        "tonemap": _TONEMAP_TEXT.get(tonemap, tonemap),
-        "active_rows": [rows.first, rows.last],
-        "natural": naturalness.natural(maps["edited"], maps["initial"], maps["target"]),
-        "painted": None,
-    }
-    if len(lit.views) > 1:
-        measured["views"] = _of_views(lit.views, renders, alike, coverage, lpips, seen, tonemap, noise)
-    if coverage is not None:
-        measured["painted"] = metrics.painted(after, target, before, coverage, tonemap, seen, noise)
-        measured["painted"]["reachable"] = None if within is None else within.share
-    if maps["target"] is not None:
-        original, true, edited = (maps[name][rows.slice] for name in ("initial", "target", "edited"))
-        measured["envmap"] = metrics.compare(edited, true, tonemap, lpips)
-        measured["sun_offset_texels"] = metrics.sun_offset(edited, true)
-        measured["initial_envmap"] = metrics.compare(original, true, tonemap, lpips)
-    return measured
-
-
-def _of_views(views, renders, alike, coverage, lpips, seen, tonemap, noise):
-    """Compare the renderings of each view."""
-    found = []
-    for view in views:
-        before, target, after = (renders[name][view.rows] for name in ("initial", "target", "edited"))
-        counts = None if seen is None else seen[view.rows]
-        some = tonemap, lpips, counts
-        of_view = {"name": view.name}
-        of_view |= {"render": metrics.compare(after, target, *some)}
-        of_view |= {"initial": metrics.compare(before, target, *some), "painted": None}
-        of_view["ceiling"] = alike and metrics.compare(alike[0][view.rows], alike[1][view.rows], *some)
-        if coverage is not None:
-            error = None if noise is None else noise[view.rows]
-            cover = coverage[view.rows]
-            of_view["painted"] = metrics.painted(after, target, before, cover, tonemap, counts, error)
-        found.append(of_view)
-    return found
-
-
-def _of_fit(fitted):
-    names = "log_psnr", "peak_ratio", "epochs", "cached", "seconds"
-    return None if fitted is None else {name: getattr(fitted, name) for name in names}
-
-
-_TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}

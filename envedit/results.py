@@ -13,7 +13,6 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core.errors import MachineError
 from envedit.export import file_resolution
-from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import preview
 from envedit.report.variants import Variant
@@ -56,8 +55,6 @@ class Result:
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
         Active texels that were kept, as this view does not determine them; None as above.
-    separation : separation.Separation, optional
-        Lights and background of the active rows, where the representation has them.
     scene : Path, optional
         The scene's file.
     reach : feasibility.Reach, optional
@@ -66,8 +63,6 @@ class Result:
         How well the target determines the sky; None where that is not known.
     given : inputs.InputMap, optional
         The map that was edited.
-    to_world : ndarray (3, 3), optional
-        Rotation from the map's frame to the scene's.
     alpha : ndarray (h, w), optional
         Share of each pixel that sees a surface, where the scene hides what lights it.
     found : file_resolution.Found, optional
@@ -94,11 +89,9 @@ class Result:
     core: np.ndarray
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
-    separation: Separation | None = None
     scene: Path | None = None
     reach: Reach | None = None
     given: inputs.InputMap | None = None
-    to_world: np.ndarray | None = None
     alpha: np.ndarray | None = None
     found: file_resolution.Found | None = None
     posterior: Posterior | None = None
@@ -106,6 +99,11 @@ class Result:
     settings: config.Config | None = None
     memory: inputs.Given | None = None
     base: Path | None = None
+
+    @property
+    def separation(self) -> Separation | None:
+        """Lights and background of the active rows, where the representation has them."""
+        return self.found.representation.separation if self.found else None
 
     @property
     def render(self) -> np.ndarray:
@@ -128,7 +126,7 @@ class Result:
     def _repr_png_(self) -> bytes:
         """Show the renderings over their maps in a notebook."""
         views = [view.rows for view in self.views]
-        return images.png(preview.drawn(self.renders, self.maps, self._settings.output.tonemap, views=views))
+        return preview.sheet(self.renders, self.maps, self._settings.output.tonemap, views)
 
     @property
     def _settings(self) -> config.Config:
@@ -155,22 +153,16 @@ class Result:
         except ImportError:
             how = "run pip install '.[report]' in the checkout"
             raise MachineError(f"Result.plot: needs matplotlib, which is not installed: {how}") from None
-        figure, curve = Figure(figsize=(12, 6.5), layout="constrained"), self._settings.output.tonemap
-        axes = figure.subplots(2, 3, squeeze=False)
-        at = [
-            preview.stops_of(one for one in pictures.values() if one is not None)
-            for pictures in (self.renders, self.maps)
-        ]
-        for column, name in enumerate(("initial", "target", "edited")):
-            for axis, picture, extent, stops in (
-                (axes[0, column], self.renders[name], None, at[0]),
-                (axes[1, column], self.maps[name], (0, 360, -90, 90), at[1]),
-            ):
-                if picture is None:
+        figure = Figure(figsize=(12, 6.5), layout="constrained")
+        rows = (self.renders, None), (self.maps, (0, 360, -90, 90))
+        for axes, (pictures, extent) in zip(figure.subplots(2, 3), rows, strict=True):
+            shown = preview.known(pictures)
+            stops = preview.stops_of(shown.values())
+            for axis, name in zip(axes, ("initial", "target", "edited"), strict=True):
+                if name not in shown:
                     axis.axis("off")
                     continue
-                size = len(picture), picture.shape[1]
-                axis.imshow(preview.display(picture, *size, curve, stops), extent=extent)
+                axis.imshow(preview.display(shown[name], self._settings.output.tonemap, stops), extent=extent)
                 if extent is None:
                     axis.set(title=f"{name}{preview.exposed(stops)}", xticks=[], yticks=[])
                 else:

@@ -101,7 +101,7 @@ def _fit(arguments, settings, original, warnings, folder):
         "seconds": round(fitted.seconds, 2),
         "cached": fitted.cached,
     }
-    manifest.write_metrics(folder / "fit.json", numbers)
+    manifest.write_json(folder / "fit.json", numbers)
     for line in warnings:
         print(f"envedit: warning: {line}", file=sys.stderr)
     log_psnr = "undefined" if fitted.log_psnr is None else f"{fitted.log_psnr:.1f}"

@@ -381,14 +381,11 @@ def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | 
     image = np.asarray(image)
     image = _checked(name, np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image)
     codes = np.rint(np.clip(image, 0, 1) * np.float32(2**bits - 1))
-    data = png(codes.astype({8: np.uint8, 16: np.uint16}[bits]))
-    # By hand: Mitsuba puts its own texts in quotation marks.
-    texts = b"".join(_text_chunk(*item) for item in (metadata or {}).items())
-    write_atomically(name, data[:_PNG_HEADER] + texts + data[_PNG_HEADER:])
+    write_atomically(name, png(codes.astype({8: np.uint8, 16: np.uint16}[bits]), metadata))
 
 
-def png(codes: np.ndarray) -> bytes:
-    """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG.
+def png(codes: np.ndarray, metadata: dict | None = None) -> bytes:
+    """Encode (H, W, 3) uint8 or uint16, already tonemapped, as PNG; ``metadata`` as of :func:`write_png`.
 
     In memory: Mitsuba does not report that the last bytes of a file did not fit on the disk.
     """
@@ -396,7 +393,10 @@ def png(codes: np.ndarray) -> bytes:
 
     stream = mi.MemoryStream()
     mi.Bitmap(np.ascontiguousarray(codes)).write(stream, mi.Bitmap.FileFormat.PNG)
-    return stream.raw_buffer()
+    data = stream.raw_buffer()
+    # By hand: Mitsuba puts its own texts in quotation marks.
+    texts = b"".join(_text_chunk(*item) for item in (metadata or {}).items())
+    return data[:_PNG_HEADER] + texts + data[_PNG_HEADER:]
 
 
 _PNG_HEADER = 8 + 25  # magic and IHDR

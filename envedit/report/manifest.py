@@ -45,8 +45,7 @@ def plain(value: Any, where: str, lost: list[str]) -> Any:
     if isinstance(value, np.floating) and np.isfinite(value):
         return float(str(value))  # the shortest decimal that is this float32, not its 17 digits as a double
     if isinstance(value, np.generic):
-        value = value.item()
-        return plain(value, where, lost)
+        return plain(value.item(), where, lost)
     if isinstance(value, float):
         if math.isfinite(value):
             return value
@@ -55,15 +54,8 @@ def plain(value: Any, where: str, lost: list[str]) -> Any:
     raise TypeError(f"{where}: {type(value).__name__} cannot be written as JSON")
 
 
-def _write_json(path: FilePath, value: Any) -> list[str]:
-    lost: list[str] = []
-    text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
-    write_atomically(path, text.encode("ascii") + b"\n")
-    return lost
-
-
-def write_metrics(path: FilePath, metrics: dict) -> list[str]:
-    """Write ``metrics.json``; numbers are finite or null.
+def write_json(path: FilePath, value: Any) -> list[str]:
+    """Write ``metrics.json``, ``manifest.json`` or ``lights.json``; numbers are finite or null.
 
     Returns
     -------
@@ -77,12 +69,10 @@ def write_metrics(path: FilePath, metrics: dict) -> list[str]:
     TypeError
         If a value is neither number, text, list, dict, path nor NumPy scalar or array.
     """
-    return _write_json(path, metrics)
-
-
-def write_manifest(path: FilePath, manifest: dict) -> list[str]:
-    """Write ``manifest.json``; returns and raises as `write_metrics`."""
-    return _write_json(path, manifest)
+    lost: list[str] = []
+    text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
+    write_atomically(path, text.encode("ascii") + b"\n")
+    return lost
 
 
 def write_history(path: FilePath, rows: list[dict]) -> list[str]:
@@ -134,9 +124,9 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
     Returns
     -------
     dict
-        Ready for `write_manifest`. ``commit`` is None unless the package runs from its own git checkout.
+        Ready for :func:`write_json`. ``commit`` is None unless the package runs from its own git checkout.
     """
-    versions = {"envedit": _envedit_version(), "python": platform.python_version()}
+    versions: dict[str, str | None] = {"envedit": envedit.__version__, "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy", "OpenEXR"):
         try:
             versions[package] = importlib.metadata.version(package)
@@ -155,12 +145,6 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
         "inputs": {role: _digest(path) for role, path in inputs.items() if path is not None},
         "config": config_summary,
     }
-
-
-def _envedit_version():
-    import envedit  # here: the package may import its modules before it has its version
-
-    return getattr(envedit, "__version__", None)
 
 
 def changed(file: FilePath) -> list[str]:

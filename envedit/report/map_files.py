@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from envedit import results
 
 
-def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: inputs.InputMap) -> list[str]:
+def write_map(
+    settings: config.Output, path: Path, envmap: np.ndarray, input_map: inputs.InputMap
+) -> list[str]:
     """Write a map in the format asked for.
 
     Parameters
@@ -31,7 +33,7 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: in
         File without its ending.
     envmap : ndarray (H, W, 3)
         Linear values, in the units and colours of the file that was edited.
-    given : inputs.InputMap
+    input_map : inputs.InputMap
         That file.
 
     Returns
@@ -39,7 +41,8 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: in
     list of str
         Warnings: what half could not hold.
     """
-    source, space = {"source": given.source}, given.chromaticities
+    source = {"source": input_map.source}
+    space = input_map.chromaticities
     if settings.format == "hdr":  # its colours are Rec. 709 to nearly every program
         shown = envmap if space is None else primaries.converted(envmap, primaries.to_rec709(space))
         images.write_hdr(path.with_suffix(".hdr"), shown)
@@ -64,11 +67,12 @@ def write_map(settings: config.Output, path: Path, envmap: np.ndarray, given: in
 
 def write_lights(folder: Path, result: results.Result) -> None:
     """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
-    source, space = {"source": result.given.source}, result.given.chromaticities
+    source = {"source": result.given.source}
+    space = result.given.chromaticities
     sky, lights = light_list.split(result.envmap, result.given.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
-    manifest.write_metrics(folder / "lights.json", result.lights)
+    manifest.write_json(folder / "lights.json", result.lights)
 
 
 def write_scene(settings: config.Config, folder: Path, base: Path | None = None) -> list[str]:
@@ -81,8 +85,14 @@ def write_scene(settings: config.Config, folder: Path, base: Path | None = None)
     """
     chosen = settings.scene
     try:
-        file, filled = f"edited.{settings.output.format}", dict(chosen.parameters)
-        text = scene.relit(chosen.file, file, filled, base, chosen.up, chosen.scale)
+        text = scene.relit(
+            chosen.file,
+            f"edited.{settings.output.format}",
+            dict(chosen.parameters),
+            base,
+            chosen.up,
+            chosen.scale,
+        )
     except InputError as error:  # the scene's files may be gone by now
         return [f"edited.xml is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())

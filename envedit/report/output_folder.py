@@ -45,8 +45,8 @@ def of_views(name: str, views: Views) -> list[tuple[str, slice]]:
 
 def names(folder: Path) -> tuple[str, ...]:
     """Return :data:`RESULTS`, with the numbered renderings that are in a folder before the last."""
-    found = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
-    return (*RESULTS[:-1], *found, RESULTS[-1])
+    numbered = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
+    return (*RESULTS[:-1], *numbered, RESULTS[-1])
 
 
 def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[FilePath]:
@@ -143,15 +143,18 @@ def prepare_folder(
         An input lies where a result would go, or the folder cannot be used.
     """
     try:
+        # ---- What lies there, and whether an input is among it
         old = [folder / name for name in names if (folder / name).exists()]
         read = {os.path.realpath(path) for path in inputs} if old else set()
         read |= {os.path.dirname(path) for path in read}  # a result may be a folder
         if mine := [path for path in old if os.path.realpath(path) in read]:
             raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
+
+        # ---- What is moved or copied
         if keep and {folder / names[0], folder / names[-1]} & set(old):
             old = []
-        stay = {os.path.realpath(path) for path in spare}
-        kept = [path for path in old if os.path.realpath(path) in stay]
+        spared = {os.path.realpath(path) for path in spare}
+        kept = [path for path in old if os.path.realpath(path) in spared]
         if len(kept) < len(old) or not all(_copied(path) for path in kept):
             numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{EARLIER}-*")]
             number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)

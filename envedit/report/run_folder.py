@@ -46,38 +46,43 @@ def write(
     list of str
         Warnings: the result's, and numbers that were not finite.
     """
+    # ---- Maps and renderings
     start = time.perf_counter()
-    timing = result.metrics["timing"]
-    _maps(settings, folder, result)
+    _write_maps(settings, folder, result)
+    _write_renderings(settings, folder, result)
+    _write_full_resolution(settings, folder, result)
     map_files.write_lights(folder, result)
     if settings.output.scene:
         result.warnings += map_files.write_scene(settings, folder, base)
-    timing["full_s"] = round(time.perf_counter() - start, 3)
-    start = time.perf_counter()
+    maps_written = time.perf_counter()
+
+    # ---- What explains the run later
     atomic_files.write_atomically(folder / "config.toml", config.to_toml(settings).encode())
     manifest.write_history(folder / "history.csv", result.history)
-    named = {
-        "envmap": result.given.source,
-        "scene": result.scene or "",
-        **_roles("target", settings.target.files),
-        **_roles("mask", settings.target.masks),
-        "start": settings.optimizer.start,
-        **installed.files(settings),
-    }
-    files = {role: path for role, path in named.items() if os.path.isfile(path)}
-    facts = manifest.manifest({"seed": settings.seed, "preset": settings.preset}, files, settings.variant)
-    manifest.write_manifest(folder / "manifest.json", facts)
+    facts = manifest.manifest(
+        {"seed": settings.seed, "preset": settings.preset}, _inputs(settings, result), settings.variant
+    )
+    manifest.write_json(folder / "manifest.json", facts)
+
+    # ---- The report, which shows the time but for its own
+    timing = result.metrics["timing"]
+    timing["full_s"] = round(maps_written - start, 3)
     timing["import_s"] = round(import_s, 3)
-    timing["total_s"] = round(sum(timing[f"{part}_s"] for part in ("total", "import", "full")), 3)
+    timing["total_s"] = round(timing["total_s"] + timing["import_s"] + timing["full_s"], 3)
     if settings.output.report:
-        views = [view.rows for view in result.views]
-        drawn = result.renders, result.maps, settings.output.tonemap
-        preview.preview(folder / "preview.png", *drawn, views=views)
-        report = html_report.Report.of(result, settings, facts)
-        html_report.write_report(folder / "report.html", report)
-    timing["report_s"] = round(time.perf_counter() - start, 3)
+        preview.preview(
+            folder / "preview.png",
+            result.renders,
+            result.maps,
+            settings.output.tonemap,
+            views=[view.rows for view in result.views],
+        )
+        html_report.write_report(folder / "report.html", result, settings, facts)
+    timing["report_s"] = round(time.perf_counter() - maps_written, 3)
     timing["total_s"] = round(timing["total_s"] + timing["report_s"], 3)
-    lost = manifest.write_metrics(folder / "metrics.json", result.metrics)
+
+    # ---- metrics.json, which says that the run is complete, and what is no longer needed
+    lost = manifest.write_json(folder / "metrics.json", result.metrics)
     checkpoint.remove(folder)
     output_folder.tidy(folder)
     return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
@@ -113,26 +118,24 @@ def write_given(
     return settings
 
 
-def _roles(name, files):
-    """Name files by what they are to a run, numbered where there are several."""
-    return {name if len(files) == 1 else f"{name} {i}": file for i, file in enumerate(files)}
+def _inputs(settings, result):
+    """Return the files that a run has read, by what they are to it; several of a kind are numbered."""
+    paths = {"envmap": result.given.source, "scene": result.scene or "", "start": settings.optimizer.start}
+    for role, files in (("target", settings.target.files), ("mask", settings.target.masks)):
+        paths |= {role if len(files) == 1 else f"{role} {i}": file for i, file in enumerate(files)}
+    paths |= installed.files(settings)
+    return {role: path for role, path in paths.items() if os.path.isfile(path)}
 
 
-def _maps(settings, folder, result):
-    """Write maps and renderings."""
-    given = result.given
-    result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, given)
-    for name, picture in result.renders.items():
-        for file, rows in output_folder.of_views(f"render_{name}.exr", [v.rows for v in result.views]):
-            images.write_exr(
-                folder / file,
-                picture[rows],
-                {"source": settings.scene.file},
-                panorama=False,
-                alpha=None if result.alpha is None else result.alpha[rows],
-            )
-    initial = result.given.stored
-    layers = {"edited": result.envmap, "initial": initial, "difference": result.envmap - initial}
+def _write_maps(settings, folder, result):
+    """Write the edited map, its layers, its other explanations, and what the target determines of it."""
+    input_map = result.given
+    result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, input_map)
+    layers = {
+        "edited": result.envmap,
+        "initial": input_map.stored,
+        "difference": result.envmap - input_map.stored,
+    }
     if result.influence is not None:
         grey = result.influence[..., None].repeat(3, axis=2)
         images.write_exr(folder / "influence.exr", grey, {"content": "T' 1: influence per texel"})
@@ -140,22 +143,42 @@ def _maps(settings, folder, result):
         layers["influence"] = result.influence
     if result.posterior is not None:
         layers["deviation"] = result.posterior.deviation
-    layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=given.chromaticities)
-    result.warnings += variants.write(folder / variants.FOLDER, result.variants, settings.output, given)
+    layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=input_map.chromaticities)
+    result.warnings += variants.write(folder / variants.FOLDER, result.variants, settings.output, input_map)
     if result.reach is not None:
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
-    if settings.output.full:
-        try:
-            full = file_resolution.at_full_resolution(settings, result)
-            if full is not None:
-                asked = settings.output, folder / "edited_full", full, given
-                result.warnings += map_files.write_map(*asked)
-        except MemoryError:
-            result.warnings.append(
-                f"{result.given.source}: not enough memory to carry the edit to its size; "
-                "edited.exr has it at working resolution"
+
+
+def _write_renderings(settings, folder, result):
+    """Write the renderings, and each view of them where there are several."""
+    views = [view.rows for view in result.views]
+    for name, picture in result.renders.items():
+        for file, rows in output_folder.of_views(f"render_{name}.exr", views):
+            images.write_exr(
+                folder / file,
+                picture[rows],
+                {"source": settings.scene.file},
+                panorama=False,
+                alpha=None if result.alpha is None else result.alpha[rows],
             )
-        except (InputError, NumericalError) as error:  # the file may be gone by now
-            result.warnings.append(
-                f"edited_full.exr is not written: {error}; edited.exr has it at working resolution"
+
+
+def _write_full_resolution(settings, folder, result):
+    """Write the edit at the resolution of its input's file, where that is larger."""
+    if not settings.output.full:
+        return
+    try:
+        full = file_resolution.at_full_resolution(settings, result)
+        if full is not None:
+            result.warnings += map_files.write_map(
+                settings.output, folder / "edited_full", full, result.given
             )
+    except MemoryError:
+        result.warnings.append(
+            f"{result.given.source}: not enough memory to carry the edit to its size; "
+            "edited.exr has it at working resolution"
+        )
+    except (InputError, NumericalError) as error:  # the file may be gone by now
+        result.warnings.append(
+            f"edited_full.exr is not written: {error}; edited.exr has it at working resolution"
+        )

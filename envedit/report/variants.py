@@ -56,7 +56,7 @@ class Variant:
     run: gauss_newton.Run
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """One phrase for a note: what was done, and what it reaches."""
         if self.towards is None:
             return self.name
@@ -73,50 +73,36 @@ class Variant:
         }
 
 
-def seen(
+def rendered(
     explanation: Explanation,
     edited: np.ndarray,
     stored: np.ndarray,
-    lit: Scene,
+    scene: Scene,
     target: Any,
     tonemap: str,
     seed: int,
 ) -> Variant:
-    """Render an explanation of paint, and measure it.
+    """Render an explanation of paint, and measure how far it follows ``target``.
 
-    Parameters
-    ----------
-    explanation : Explanation
-        Of the search.
-    edited, stored : ndarray (H, W, 3)
-        Its map, radiance that reaches the scene, and in the units of its file.
-    lit : Scene
-        The scene.
-    target : Target
-        With what was painted.
-    tonemap : str
-        Of the display values that are compared.
-    seed : int
-        Of the rendering.
+    Its map (H, W, 3) is ``edited``, the radiance that reaches the scene, and ``stored``, in the units of its
+    file.
     """
-    render = lit.render(edited, SPP, seed)
-    counts = None if lit.alpha is None else lit.alpha > 0
-    found = metrics.painted(
-        render, target.picture, target.initial, target.coverage, tonemap=tonemap, seen=counts
-    )
+    render = scene.render(edited, SPP, seed)
+    seen = None if scene.alpha is None else scene.alpha > 0
+    followed = metrics.painted(render, target.picture, target.initial, target.coverage, tonemap, seen)
     return Variant(
         name=explanation.name,
         evidence=explanation.score,
         envmap=stored,
         render=render,
-        towards=found["towards"],
-        elsewhere=found["elsewhere"],
+        towards=followed["towards"],
+        elsewhere=followed["elsewhere"],
         run=explanation.run,
     )
 
 
 def write(
-    folder: Path, variants: Sequence[Variant], settings: config.Output, given: inputs.InputMap
+    folder: Path, variants: Sequence[Variant], settings: config.Output, input_map: inputs.InputMap
 ) -> list[str]:
     """Write the map and the solution of each, numbered from 1, and a sheet; returns warnings.
 
@@ -135,13 +121,12 @@ def write(
         raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from error
     warnings = []
     for number, one in enumerate(variants, 1):
-        warnings += map_files.write_map(settings, folder / str(number), one.envmap, given)
+        warnings += map_files.write_map(settings, folder / str(number), one.envmap, input_map)
         checkpoint.save_solution(folder / f"{number}.npz", one.run)
-    named = {f"{number}: {one.name}": one for number, one in enumerate(variants, 1)}
     preview.preview(
         folder / SHEET,
-        {name: one.render for name, one in named.items()},
-        {name: one.envmap for name, one in named.items()},
+        {f"{number}: {one.name}": one.render for number, one in enumerate(variants, 1)},
+        {f"{number}: {one.name}": one.envmap for number, one in enumerate(variants, 1)},
         settings.tonemap,
     )
     return warnings

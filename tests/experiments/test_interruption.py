@@ -350,7 +350,7 @@ WRITERS = {
     "influence.png": lambda path: preview.influence(path, PICTURE[..., 0], None),
     "preview.png": lambda path: preview.preview(path, RESULT["renders"], RESULT["maps"]),
     "history.csv": lambda path: manifest.write_history(path, ROWS),
-    "metrics.json": lambda path: manifest.write_metrics(path, {"rows": ROWS}),
+    "metrics.json": lambda path: manifest.write_json(path, {"rows": ROWS}),
     "config.toml": lambda path: atomic_files.write_atomically(path, b"# a comment\n" * 100),
     "checkpoint.npz": lambda path: checkpoint.save(path.parent, "what", STATE, {"p": PICTURE}, {}, PICTURE),
     "unreachable.png": lambda path: images.write_png(path, PICTURE[:8, :16]),

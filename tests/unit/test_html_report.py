@@ -10,8 +10,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envedit import config
 from envedit.report import html_report, html_tables
 from envedit.report.curves import normalised
+from envedit.results import Result
+from envedit.solve.feasibility import Reach
 from tests.oracles import ROOT
 from tests.oracles.builders import grey
 
@@ -46,34 +49,38 @@ class Page(HTMLParser):
             self.words.append(data)
 
 
-def write(path, **changes):
-    settings = {
-        "title": "sphere",
-        "config_toml": 'preset = "standard"\n',
-        "metrics": {
-            "render": {"psnr": 38.71, "ssim": 0.98, "mse": 1e-4, "lpips": None},
-            "initial": {"psnr": 19.2, "ssim": 0.7, "mse": 1e-2, "lpips": None},
-            "envmap": None,
-            "fit": {"log_psnr": 45.7, "peak_ratio": 0.88, "epochs": 400, "cached": False},
-            "timing": {"edit_s": 21.4, "total_s": 47.3, "per_iteration_ms": 53.5},
-            "iterations": 2,
-            "non_finite_steps": 0,
-            "tonemap": "gamma",
-            "active_rows": [0, 7],
-        },
-        "manifest": {"variant": "llvm_ad_rgb"},
+SCORES = {"ssim": 0.98, "mse": 1e-4, "lpips": None, "log_rmse": 0.2, "beyond_display": 0.0}
+METRICS = {
+    "render": {"psnr": 38.71, **SCORES},
+    "initial": {"psnr": 19.2, **SCORES},
+    "ceiling": None,
+    "envmap": None,
+    "painted": None,
+    "fit": {"log_psnr": 45.7, "peak_ratio": 0.88, "epochs": 400, "cached": False},
+    "timing": {"edit_s": 21.4, "total_s": 47.3, "report_s": None, "per_iteration_ms": 53.5},
+    "iterations": 2,
+    "non_finite_steps": 0,
+    "tonemap": "gamma",
+    "active_rows": [0, 7],
+}
+
+
+def write(path, settings=None, manifest=None, metrics=None, **changes):
+    found = {
+        "envmap": grey(2.0),
+        "metrics": METRICS | (metrics or {}),
         "history": [{"iteration": 0, "loss": 1.0}, {"iteration": 1, "loss": 0.1}],
         "renders": {"initial": grey(0.1), "target": grey(0.5), "edited": grey(0.4)},
         "maps": {"initial": grey(1.0), "target": None, "edited": grey(2.0)},
-        "influence": None,
-        "frozen": None,
-        "unreachable": None,
         "lights": {},
+        "core": grey(0.0),
+        "views": (),
         "warnings": [],
         "notes": ["renderer.spp = 64"],
     }
-    assert not set(changes) - set(settings)
-    html_report.write_report(path, html_report.Report(**{**settings, **changes}))
+    result = Result(**{**found, **changes})
+    manifest = {"variant": "llvm_ad_rgb"} if manifest is None else manifest
+    html_report.write_report(path, result, settings or config.Config(), manifest)
     return Page(path)
 
 
@@ -128,10 +135,10 @@ def test_report_tells_choices_once_and_the_transport_by_name(tmp_path):
 
 
 def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
-    psnr = {"initial": {"psnr": 30.0}, "render": {"psnr": 25.0}}
+    psnr = {"initial": {"psnr": 30.0, **SCORES}, "render": {"psnr": 25.0, **SCORES}}
     painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
-    unreachable = np.full((8, 8, 3), 0.5)
-    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, unreachable=unreachable)
+    reach = Reach(share=0.9, picture=grey(0.5), residual=grey(0.1), envmap=grey(1.0))
+    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, reach=reach)
     assert "81 % of the painted change reached (90 % feasible) · mean change elsewhere 0.012" in page.text
     assert "What was painted" in page.text and "90 % of the painted change is feasible" in page.text
     assert "further from" not in page.text  # the whole picture may well be
@@ -144,11 +151,10 @@ def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
 def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
     truth = grey(1.0)
     truth[3, 5] = 1e6
-    metrics = {"initial": {"psnr": 20.0}, "render": {"psnr": 15.0}, "envmap": {"psnr": 12.34}}
-    page = write(tmp_path / "r.html", metrics=metrics, maps={"target": truth, "edited": grey(1.0)})
-    assert "map against the true one: 12.3 dB" in page.text
-    metrics["initial_envmap"] = {"psnr": 9.87}
-    page = write(tmp_path / "r.html", metrics=metrics, maps={"target": truth, "edited": grey(1.0)})
+    scores = {"initial": 20.0, "render": 15.0, "initial_envmap": 9.87, "envmap": 12.34}
+    metrics = {name: {"psnr": psnr, **SCORES} for name, psnr in scores.items()}
+    maps = {"initial": grey(1.0), "target": truth, "edited": grey(1.0)}
+    page = write(tmp_path / "r.html", metrics=metrics, maps=maps)
     assert "map against the true one: 9.9 dB → 12.3 dB" in page.text
     assert "unedited map edited map PSNR (dB) 20 15 9.87 12.34" in page.text
     assert "further from the target" in page.text
@@ -156,39 +162,37 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
 
 
 def test_report_escapes_all_text(tmp_path):
-    nasty = "<script>alert('&')</script> Gemälde/заря \udcff \0"
+    nasty = "<script>alert('&')</script> Gemälde/заря \udcff"
+    file = "<script>alert('&') Gemälde"
     page = write(
         tmp_path / "r.html",
-        title=nasty,
-        config_toml=nasty,
+        settings=config.Config(scene=config.Scene(file=file)),
         manifest={nasty: nasty},
-        metrics={nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}, "timing": {nasty: 1.0}},
+        metrics={nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}},
         history=[{nasty: 1.0}],
-        renders={nasty: grey(0.5), "y" * 3000: grey(0.5)},
+        lights={"before": [], "after": [light(1, 20, 30)]},
         warnings=[nasty],
         notes=[nasty],
     )
     assert "script" not in page.tags
-    assert page.text.count("<script>alert('&')</script> Gemälde/заря") >= 9
+    assert page.text.count("<script>alert('&')</script> Gemälde/заря") == 8
+    assert page.text.count(file) == 3  # title, heading and configuration
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, None])
-def test_report_of_a_run_that_went_wrong(tmp_path, bad):
-    picture = grey(0.0 if bad is None else bad, 1, 1)
+def test_report_of_numbers_that_are_not_finite(tmp_path, bad):
+    """Pictures are finite, or they could not have been written before the report."""
+    rendered = {"psnr": 30.0, **SCORES, "ssim": bad}
     page = write(
         tmp_path / "r.html",
-        metrics={"render": {"psnr": bad}, "timing": {"edit_s": bad}, "initial": None, "iterations": bad},
+        metrics={"render": rendered, "iterations": bad},
         history=[{"iteration": 0, "loss": bad}],
-        renders={"initial": picture, "target": grey(0.0, 1, 1), "edited": picture},
-        maps={"initial": picture, "target": picture, "edited": grey(0.0, 2, 4)},
+        renders={name: grey(0.0) for name in ("initial", "target", "edited")},
     )
-    assert "unknown → unknown PSNR" in page.text
-    assert "No loss to draw" in page.text
-    assert "maps edited and initial differ in size, (2, 4) and (1, 1)" in page.text
+    assert "No loss to draw" in page.text and "SSIM 0.98 –" in page.text
     words = {word.strip(".,:()").lower() for word in page.text.split()}
     assert not {"nan", "inf"} & words
-    if bad is not None:
-        assert "history[0].loss" in page.text and "rendering edited: 1 pixels are not finite" in page.text
+    assert ("metrics.render.ssim" in page.text) == ("history[0].loss" in page.text) == (bad is not None)
 
 
 def test_losses_are_drawn_with_their_last_weights():
@@ -212,24 +216,21 @@ def test_every_term_of_ours_in_the_report_is_in_the_glossary(tmp_path):
     for term in ours:
         assert re.search(rf"^(.*, )?{term}\b.*\n:", glossary, re.M), f"{term} is not in the glossary"
         assert re.search(rf"\b{term}s?\b", source), f"{term} is not in the report"
-    metrics = {"transport": {"frozen": 0.5}, "timing": {"judge_s": 1.0}, "painted": {"towards": 0.5}}
+    painted = {"towards": 0.5, "elsewhere": 0.1, "reachable": None}
+    timing = METRICS["timing"] | {"judge_s": 1.0}
+    metrics = {"transport": {"frozen": 0.5}, "timing": timing, "painted": painted}
     page = write(tmp_path / "r.html", metrics=metrics)
     assert not {"towards", "judge", "reach"} & set(page.text.split())
-
-
-def test_report_of_nothing(tmp_path):
-    page = write(tmp_path / "r.html", metrics={}, manifest={}, history=[], renders={}, maps={}, notes=[])
-    assert "No loss to draw" in page.text and "img" not in page.tags
 
 
 def test_map_statistics_weight_the_mean_by_solid_angle():
     image = grey(0.0, 33, 64)
     image[:8] = 2.0
-    cells = html_tables._map_statistics(image)
+    cells = html_tables.map_statistics(image)
     # Eight of 33 rows aligned to the corners are a cap of angle pi * 7.5 / 32 around the pole.
     mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
     assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"]
-    assert cells[4:] == ["0", "0", "0"]
+    assert cells[4:] == ["0", "0"]
 
 
 def test_map_statistics_of_a_real_map(data):
@@ -237,7 +238,7 @@ def test_map_statistics_of_a_real_map(data):
     image = np.array(mi.Bitmap(str(source)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
     light = image.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
     row, column = np.unravel_index(light.argmax(), light.shape)
-    cells = html_tables._map_statistics(image)
+    cells = html_tables.map_statistics(image)
     assert float(cells[1]) == pytest.approx(light.max(), rel=1e-3) and cells[2] == f"{row}, {column}"
 
 

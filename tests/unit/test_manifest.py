@@ -44,7 +44,7 @@ def test_metrics_are_finite_or_null(tmp_path):
         "trace": np.array([1.0, np.inf], np.float32),
         "file": Path("a") / "ö.exr",
     }
-    lost = manifest.write_metrics(tmp_path / "metrics.json", metrics)
+    lost = manifest.write_json(tmp_path / "metrics.json", metrics)
     assert lost == ["render.ssim", "trace[1]"]
 
     def refuse(name):
@@ -59,9 +59,9 @@ def test_metrics_are_finite_or_null(tmp_path):
 
 def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "metrics.json"
-    manifest.write_metrics(path, {"a": 1})
+    manifest.write_json(path, {"a": 1})
     with pytest.raises(TypeError, match=r"b\[1\].c: object cannot be written"):
-        manifest.write_metrics(path, {"b": [0, {"c": object()}]})
+        manifest.write_json(path, {"b": [0, {"c": object()}]})
     assert json.loads(path.read_text()) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
 
@@ -88,7 +88,7 @@ def test_manifest_names_what_explains_a_run(tmp_path):
     assert found["versions"]["mitsuba"] == mi.__version__ and found["versions"]["numpy"] == np.__version__
     assert found["time_utc"].endswith("+00:00") and found["cores"]["usable"] >= 1
     assert int(found["llvm"]["version"].split(".")[0]) >= 17
-    assert manifest.write_manifest(tmp_path / "manifest.json", found) == []
+    assert manifest.write_json(tmp_path / "manifest.json", found) == []
     assert json.loads((tmp_path / "manifest.json").read_text()) == found
 
 

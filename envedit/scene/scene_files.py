@@ -3,7 +3,7 @@
 Mitsuba 3.9 believes the sizes and indices that a file states: it stops the process on a damaged one, takes
 the memory that a header declares, and repeats lines of a file that is something else. Whatever happens to the
 other process becomes an error that names the file. What it has read well is remembered by content, here and
-in the folder of caches, and not tried again.
+in the folder of caches, and not tried again. Why so: ``docs/decisions/files_of_scenes.md``.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from envedit.images import exr, images
 from envedit.images.headers import head_of
 
 MESHES = {"ply", "obj", "serialized"}
+CURVES = {"bsplinecurve", "linearcurve"}
 VOLUMES = {"gridvolume", "sdfgrid"}
-TEXTS = {"bsplinecurve", "linearcurve", "spectrum"}
-PLUGINS = MESHES | VOLUMES | TEXTS | {"bitmap", "ellipsoids", "ellipsoidsmesh"}
+PLUGINS = MESHES | CURVES | VOLUMES | {"bitmap", "ellipsoids", "ellipsoidsmesh", "spectrum"}
 """Those whose files are tried; ``spectrum`` is the XML element."""
 SECONDS, BYTES_PER_SECOND = 60, 2**23
 """Processor time of the other process: 60 s, and a second for every 8 MiB that it reads."""
@@ -45,7 +45,7 @@ sys.path[:], files, seconds = json.load(sys.stdin)
 from envedit.scene import scene_files
 scene_files.main(files, seconds)
 """
-_EXPORT = {"ply": ", with triangles only", "spectrum": ", as NAME.spd"}
+_HINTS = {"ply": ", as triangles", "spectrum": ", as NAME.spd"}  # what Mitsuba reads of these
 _remembered: set[str] = set()
 
 
@@ -112,6 +112,8 @@ def _answers(files):
         ).stdout
     except subprocess.TimeoutExpired as error:
         output = error.stdout or b""
+    except OSError as error:
+        raise MachineError(f"{sys.executable}: cannot be started to read files ({error.strerror})") from None
     begun, *answers = [json.loads(line) for line in output.splitlines()] or [None]
     if begun is None:
         raise MachineError(f"{sys.executable}: the process that reads files of a scene does not start")
@@ -143,11 +145,11 @@ def main(files: Sequence[Sequence], seconds: int) -> None:
         except InputError as error:
             wrong = str(error).removeprefix(f"{path}: ")
         except Exception as error:  # its text may be a line of the file
-            wrong = (
-                f"cannot be read as {plugin}; is this the right file? Export it again, a mesh as triangles"
-            )
             if isinstance(error, MemoryError) or "bad_alloc" in str(error):
                 wrong = "declares more than a file of this size holds; it is damaged: export it again"
+            else:
+                wrong = f"cannot be read as {plugin}; is this the right file? If so, export it again"
+                wrong += _HINTS.get(plugin, "")
         print(json.dumps(wrong), file=answers, flush=True)
 
 
@@ -178,7 +180,7 @@ def _read(plugin, path, shape_index):
 
 
 def _address_space():
-    """Return the bytes of address space that this process has; those of 1 GiB where nobody tells."""
+    """Return the bytes of address space that this process has; 1 GiB where that is unknown."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:

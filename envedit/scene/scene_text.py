@@ -25,9 +25,11 @@ DEEPEST = 20
 """Elements inside one another, and objects that refer to one another: scenes have 10 or so, and Mitsuba's
 time doubles with every ``twosided`` inside another, to 0.3 s at 20."""
 MOST_CHARACTERS = 2**26
-"""Of a scene with all that it includes and fills in for ``$names``. Beside its characters an element counts
-as 64, a file, as often as it is included, and a parameter as 65,536."""
-_ELEMENT, _FILE, _PARAMETER = 2**6, 2**16, 2**16
+"""Of a scene with all that it includes. Beside these an element counts as 64 characters, a file, as often as
+it is included, and a parameter as 65,536, and a character of a value with ``$names`` filled in as 16."""
+_ELEMENT = 2**6
+_FILE = _PARAMETER = 2**16
+_FILLED = 2**4
 _INCLUDES_DEEP = 15  # Mitsuba's own bound
 
 _TOKEN = re.compile(
@@ -180,7 +182,7 @@ class _Reader:
         for key in sorted(self.parameters, key=len, reverse=True):
             name = f"${key}"
             if count := value.count(name):
-                self._spend(len(value) + count * len(self.parameters[key]))
+                self._spend(_FILLED * (len(value) + count * len(self.parameters[key])))
                 value = value.replace(name, self.parameters[key])
         return value.replace("\\$", "$")
 

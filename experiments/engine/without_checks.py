@@ -28,7 +28,8 @@ def main(parts: str, arguments: list[str]) -> int:
     if "checks" in parts:
         array_cache._digest = lambda array: ""
         array_cache.holds = lambda arrays, wanted: True
-        installed_plugins.check = scene_files.check = lambda *_: None
+        installed_plugins.check = lambda *_: None
+        scene_files.errors = lambda files: []
         scene_text.check_references = parser.check_required = lambda *_: None
         metrics.log_rmse = metrics._beyond_display = lambda *_: 0.0
     if "film" in parts:

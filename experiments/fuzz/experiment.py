@@ -4,7 +4,6 @@ Case i of a kind and of the configuration's ``seed`` is always the same file, wh
 Linux only: memory is read from /proc.
 """
 
-import itertools
 from collections import Counter
 
 from experiments.fuzz.drive import FAULTS
@@ -22,11 +21,13 @@ def options(parser):
 
 def cases(given):
     found = []
-    for what, first in itertools.product(KINDS, range(0, given.count, PIECE)):
-        count = min(PIECE, given.count - first)
-        files = {"what": what, "first": first, "count": count, "heap_check": given.heap_check}
-        name = f"{what} {first}-{first + count - 1}"
-        found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
+    for what, kind in KINDS.items():
+        total = given.count // kind.one_in
+        for first in range(0, total, PIECE):
+            count = min(PIECE, total - first)
+            files = {"what": what, "first": first, "count": count, "heap_check": given.heap_check}
+            name = f"{what} {first}-{first + count - 1}"
+            found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
     return found
 
 

@@ -11,11 +11,15 @@ from . import documents, mutate, pictures, readers, scenes
 
 
 class Kind(NamedTuple):
-    """A kind of files: makes whole ones by name, reads one of a case, and damages the content of one."""
+    """A kind of files: makes whole ones by name, reads one of a case, and damages the content of one.
+
+    Of the cases that are asked for, one in ``one_in`` is carried out: a file of a scene takes a process.
+    """
 
     files: Callable[[], dict[str, bytes]]
     read: Callable[[Path, int], None]
     damage: Callable[[bytes, np.random.Generator], bytes] = mutate.mutated
+    one_in: int = 1
 
 
 KINDS = {
@@ -26,8 +30,8 @@ KINDS = {
     "weights": Kind(pictures.weight_files, readers.tensors),
     "checkpoint": Kind(pictures.checkpoint_files, readers.checkpointed),
     "scene": Kind(scenes.scene_files, readers.scene_file, scenes.mutated_scene),
-    "mesh": Kind(scenes.mesh_files, readers.mesh),
-    "texture": Kind(pictures.painted_files, readers.texture),
+    "mesh": Kind(scenes.mesh_files, readers.mesh, one_in=10),
+    "texture": Kind(pictures.painted_files, readers.texture, one_in=10),
     "entry": Kind(scenes.entry_files, readers.transport, scenes.mutated_entry),
     "state": Kind(scenes.state_files, readers.continued, scenes.mutated_state),
 }

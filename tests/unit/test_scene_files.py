@@ -1,6 +1,7 @@
 """Files that a scene names are read by a process of their own before Mitsuba reads them here."""
 
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -29,7 +30,6 @@ end_header
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")
 SECRET = b"root:x:0:0:root:/root:/bin/bash\n" * 3
-BALL = '<shape type="sphere">{}</shape>'
 
 
 def ply(form, face=(3, 0, 1, 2), faces=1, kind="int"):
@@ -67,56 +67,95 @@ def written(path, array):
     return path.read_bytes()
 
 
-def test_a_ply_with_an_index_out_of_range_is_refused_and_a_good_one_loads(tmp_path):
-    found = wrong(tmp_path, "ply", *(ply(form, (3, 0, 1, index)) for index in (2, 3) for form in FORMS))
-    assert found[:3] == [""] * 3 and all("face 0 names vertex 3 of 3" in text for text in found[3:])
-    shape = '<shape type="ply"><string name="filename" value="{}.file"/></shape>'
-    assert scene.load(write_scene(tmp_path, SENSOR, LIGHT, shape.format(0))).mi.shapes()[0].face_count() == 1
-    with pytest.raises(InputError, match="face 0 names vertex 3"):
-        scene.load(write_scene(tmp_path, SENSOR, LIGHT, shape.format(3)))
-
-
-def test_a_ply_that_is_cut_or_declares_too_much_is_refused(tmp_path):
-    bad = []
+def files():
+    """List plugin, content and words of the error, which are empty of a good file; by what is in them."""
+    found = {}
     for form in FORMS:
-        bad += [ply(form)[:-2], *(ply(form, faces=faces) for faces in (2, 4_000_000_000, 10**17))]
-        bad += [ply(form, (4, 0, 1, 2, 2)), ply(form, (3, 0, 1, 99_999_999))]  # no triangle; far beyond
-    assert all(wrong(tmp_path, "ply", *bad))
+        found |= {
+            f"{form}": ("ply", ply(form), ""),
+            f"{form}, an index": ("ply", ply(form, (3, 0, 1, 3)), "face 0 names vertex 3 of 3"),
+            f"{form}, a large index": ("ply", ply(form, (3, 0, 1, 99_999_999)), "face 0 names vertex"),
+            f"{form}, cut": ("ply", ply(form)[:-2], "export it again"),
+            f"{form}, 2 faces": ("ply", ply(form, faces=2), "export it again"),
+            f"{form}, 4e9 faces": ("ply", ply(form, faces=4_000_000_000), "export it again"),
+            f"{form}, 1e17 faces": ("ply", ply(form, faces=10**17), "export it again"),
+            f"{form}, a polygon": ("ply", ply(form, (4, 0, 1, 2, 2)), "export it again, as triangles"),
+        }
+    too_much = "declares more than a file of this size holds"
+    found |= {
+        "serialized": ("serialized", serialized(), ""),
+        "an index": ("serialized", serialized(3), "face 0 names vertex 3 of 3"),
+        "a large index": ("serialized", serialized(99_999_999), "face 0 names vertex 99999999 of 3"),
+        "no table": ("serialized", serialized(99_999_999, count=0), "face 0 names vertex 99999999 of 3"),
+        "1e12 vertices": ("serialized", serialized(vertices=10**12), too_much),
+        "1e12 faces": ("serialized", serialized(faces=10**12), too_much),
+        "volume": ("gridvolume", volume(), ""),
+        "huge": ("gridvolume", volume((30_000, 30_000, 30_000, 1)), too_much),
+        "negative": ("gridvolume", volume((-3, 3, 3, 1)), too_much),
+        "another type": ("gridvolume", volume(kind=7), "cannot be read as gridvolume"),
+        "cut": ("gridvolume", volume(values=7), "cannot be read as gridvolume"),
+        "spectrum": ("spectrum", b"# nm value\n400 0.5\n700 5.e-1\n", ""),
+        "a secret for obj": ("obj", SECRET, "holds no vertex"),
+        "a control character": ("obj", b"v 0 secret\1 0\n", "cannot be read as obj"),
+    }
+    found |= {f"a secret for {p}": (p, SECRET, "again") for p in scene_files.PLUGINS - {"obj", "bitmap"}}
+    return found
 
 
-def test_a_serialized_mesh_is_walked_through(tmp_path):
-    bad = [serialized(3), serialized(99_999_999), serialized(99_999_999, count=0)]
-    bad += [serialized(vertices=10**12), serialized(faces=10**12)]
-    good, *found = wrong(tmp_path, "serialized", serialized(), *bad)
-    assert not good and all(found) and "face 0 names vertex 99999999 of 3" in found[2]
+def textures(folder):
+    """List what :func:`files` does of textures; what is damaged here stops Mitsuba, or its memory is."""
+    shades = np.linspace(0, 1, 3600, dtype=np.float32).reshape(40, 30, 3).round(2)
+    exr = written(folder / "a.exr", shades)
+    # Two chunks of 32 rows: the table holds where the first and the second begin.
+    first = min(n for n in range(8, len(exr)) if exr[n - 16 : n - 8] == struct.pack("<Q", n))
+    outside = exr[: first - 8] + struct.pack("<Q", 1 << 61) + exr[first:]
+    png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">2I", 60_000, 60_000) + b"\x08\2\0\0\0" + bytes(4)
+    hdr = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 16\n\2\2\0\20\xff\1"
+    jpeg = written(folder / "a.jpg", np.full((16, 16, 3), 90, np.uint8))
+    scan = jpeg.index(b"\xff\xda") + 11  # where its coefficients begin
+    return {
+        "OpenEXR": ("bitmap", exr, ""),
+        "JPEG": ("bitmap", jpeg, ""),
+        "a chunk is cut": ("bitmap", exr[:-200], "damaged or truncated"),
+        "a chunk is outside": ("bitmap", outside, "table of chunks points out of the file"),
+        "huge": ("bitmap", png, "the header declares 60000 x 60000 texels"),
+        "a damaged line": ("bitmap", hdr, "damaged or truncated"),
+        "damaged coefficients": ("bitmap", jpeg[:scan] + b"\7" + jpeg[scan + 1 :], "damaged or truncated"),
+        "a secret": ("bitmap", SECRET, "cannot be read as bitmap"),
+    }
 
 
-def test_a_volume_holds_what_it_declares(tmp_path):
-    bad = [{"shape": (30_000, 30_000, 30_000, 1)}, {"shape": (-3, 3, 3, 1)}, {"kind": 7}, {"values": 7}]
-    good, *found = wrong(tmp_path, "gridvolume", volume(), *(volume(**changes) for changes in bad))
-    assert not good and all(found) and "declares more than a file of this size holds" in found[0]
+def test_damaged_files_are_refused_without_their_text_and_nothing_is_printed(tmp_path, capfd):
+    cases = {**files(), **{f"texture, {name}": case for name, case in textures(tmp_path).items()}}
+    listed = []
+    for i, (plugin, content, _) in enumerate(cases.values()):
+        (tmp_path / f"{i}.spd").write_bytes(content)
+        listed.append(SceneFile(plugin, str(tmp_path / f"{i}.spd")))
+    errors = [str(error) for error in scene_files.errors(listed)]
+    for file, (name, (_, _, words)) in zip(listed, cases.items(), strict=True):
+        (error,) = [text for text in errors if text.startswith(f"{file.path}: ")] or [""]
+        assert words in error and bool(words) == bool(error), (name, error)
+        assert len(error.splitlines()) <= 1 and error.isprintable()
+        assert not re.search("root|secret", error.replace(str(tmp_path), "")), (name, error)
+    assert capfd.readouterr() == ("", "")
 
 
-def test_a_file_that_is_something_else_is_not_repeated(tmp_path):
-    (tmp_path / "secret").write_bytes(SECRET)
-    plugins = sorted(scene_files.PLUGINS)
-    found = scene_files.errors([SceneFile(plugin, str(tmp_path / "secret")) for plugin in plugins])
-    assert len(found) == len(plugins) and not any("root:" in str(error) for error in found)
-
-
-def test_a_spectrum_file_that_is_something_else_is_not_repeated(tmp_path):
-    part = '<bsdf type="diffuse"><spectrum name="reflectance" filename="secret.spd"/></bsdf>'
-    named = write_scene(tmp_path, '<path value="."/>', SENSOR, LIGHT, BALL.format(part))
-    (tmp_path / "secret.spd").write_bytes(SECRET)
-    with pytest.raises(InputError, match=r"secret\.spd: cannot be read as spectrum") as caught:
+def test_a_scene_with_a_damaged_file_is_refused_and_with_a_good_one_loads(tmp_path):
+    shape = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    named = write_scene(tmp_path, SENSOR, LIGHT, shape)
+    (tmp_path / "mesh.ply").write_bytes(ply("ascii", (3, 0, 1, 3)))
+    with pytest.raises(InputError, match=r"mesh\.ply: face 0 names vertex 3 of 3"):
         scene.load(named)
-    assert "root:" not in str(caught.value)
-    (tmp_path / "secret.spd").write_text("# nm value\n400 0.5\n700 5.e-1\n")
-    scene.load(named)
+    (tmp_path / "mesh.ply").write_bytes(ply("ascii"))
+    assert scene.load(named).mi.shapes()[0].face_count() == 1
 
 
-def test_a_line_of_an_obj_that_cannot_be_read_is_not_repeated(tmp_path):
-    assert "secret" not in wrong(tmp_path, "obj", b"v 0 secret\1 0\n")[0].replace(str(tmp_path), "")
+def test_a_spectrum_is_read_before_the_scene(tmp_path):
+    part = '<bsdf type="diffuse"><spectrum name="reflectance" filename="secret.spd"/></bsdf>'
+    named = write_scene(tmp_path, SENSOR, LIGHT, f'<shape type="sphere">{part}</shape>')
+    (tmp_path / "secret.spd").write_bytes(SECRET)
+    with pytest.raises(InputError, match=r"secret\.spd: cannot be read as spectrum.*again, as NAME\.spd$"):
+        scene.load(named)
 
 
 def test_a_sparse_file_of_5_gb_and_a_pipe_are_not_read(tmp_path):
@@ -128,34 +167,6 @@ def test_a_sparse_file_of_5_gb_and_a_pipe_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="is no regular file"):
         scene_files.errors([SceneFile("obj", str(tmp_path / "pipe"))])
-
-
-def test_textures_state_sizes_that_can_be_read(tmp_path):
-    png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">2I", 60_000, 60_000) + b"\x08\2\0\0\0" + bytes(4)
-    hdr = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 16\n\2\2\0\20\xff\1"
-    exr = written(tmp_path / "a.exr", np.ones((4, 4, 3), np.float32))
-    good, huge, damaged = wrong(tmp_path, "bitmap", exr, png, hdr)
-    assert not good and "the header declares 60000 x 60000 texels" in huge
-    assert "damaged or truncated" in damaged
-
-
-def test_textures_that_mitsubas_decoder_does_not_survive_are_refused(tmp_path):
-    """A chunk that is cut, and a table of chunks that points out of the file, stop the process."""
-    shades = np.linspace(0, 1, 3600, dtype=np.float32).reshape(40, 30, 3).round(2)
-    whole = written(tmp_path / "a.exr", shades)
-    # Two chunks of 32 rows: the table holds where the first and the second begin.
-    first = min(n for n in range(8, len(whole)) if whole[n - 16 : n - 8] == struct.pack("<Q", n))
-    outside = whole[: first - 8] + struct.pack("<Q", 1 << 61) + whole[first:]
-    good, cut, far = wrong(tmp_path, "bitmap", whole, whole[:-200], outside)
-    assert not good and "damaged or truncated" in cut and "table of chunks points out of the file" in far
-
-
-def test_a_damaged_jpeg_is_refused_and_nothing_is_printed(tmp_path, capfd):
-    whole = written(tmp_path / "a.jpg", np.full((16, 16, 3), 90, np.uint8))
-    scan = whole.index(b"\xff\xda")
-    damaged = whole[: scan + 11] + b"\7" + whole[scan + 12 :]  # where its coefficients begin
-    good, bad = wrong(tmp_path, "bitmap", whole, damaged)
-    assert not good and "damaged or truncated" in bad and capfd.readouterr() == ("", "")
 
 
 # ---- the other process -------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ import numpy as np
 
 from envedit.core import atomic_files
 from envedit.core.errors import ConfigError, InputError
-from envedit.scene import scene_files
+from envedit.scene.scene_files import SceneFile
 
 # Emitters at infinity that shine from every direction, with the axis of their zenith. Mitsuba's sky models
 # stand upright on z; a constant light has no zenith.
@@ -43,10 +43,6 @@ def called(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any
         return call(*arguments, **filled)
     except (RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
         text = re.sub(r"\[[A-Za-z][\w.]*(:\d+)?\] ", "", str(error))
-        # What a mesh holds is not repeated: it may be another file.
-        text = re.sub(
-            r'(could not parse line|unknown token) ".*', r"\1", text, flags=re.DOTALL | re.IGNORECASE
-        )
         text = "".join(c if c.isprintable() else " " for c in text)
         text = " ".join(text.split())
         for prefix in (f"At {where} ", f"Error while loading {where} ", f"While loading {where} ",
@@ -244,24 +240,29 @@ def set_sampler(state: mi.parser.ParserState, sensor: int, plugin: str) -> None:
 
 def find_file(
     state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str, folders: Iterable[Path]
-) -> None:
-    """Make the name of a node's file absolute; an environment map is replaced and need not exist."""
+) -> SceneFile | None:
+    """Make the name of a node's file absolute, and return it with what is to read it.
+
+    An environment map is replaced and need not exist: None, as where a node names no file.
+    """
     if "filename" not in node.props or node.props.plugin_name() == "envmap":
-        return
+        return None
     if not isinstance(name := node.props["filename"], str):
         raise InputError(f"{place_of(state, node, where)}: filename is {name}, expected a text")
-    found = [f / name for f in folders if os.path.isfile(f / name)]
-    if not found:
+    existing = [folder / name for folder in folders if os.path.isfile(folder / name)]
+    if not existing:
         kind = str(node.type).rpartition(".")[2].lower()
         raise InputError(
             f"{place_of(state, node, where)}: the {kind} names a missing file: {name or '(empty)'}\n"
             f"looked in {' and '.join(dict.fromkeys(map(str, folders)))}"
         )
-    kind = node.props.plugin_name()
+    file = existing[0]
+    node.props["filename"] = str(file)
+    plugin = node.props.plugin_name()
     if "fit_height" in node.props:  # a mesh of any kind, see fit_to_stage
-        kind = _MESHES.get(found[0].suffix.lower(), "")
-    scene_files.check(kind, str(found[0]))
-    node.props["filename"] = str(found[0])
+        plugin = _MESHES.get(file.suffix.lower(), "")
+    shape_index = node.props.get("shape_index", 0)
+    return SceneFile(plugin, str(file), shape_index if isinstance(shape_index, int) else 0)
 
 
 def smooth_limit(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> None:

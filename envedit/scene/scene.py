@@ -42,7 +42,8 @@ from envedit.core.errors import ConfigError, EnveditError, InputError, Numerical
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
-from envedit.scene import film, parser, scene_text, supported
+from envedit.scene import film, parser, scene_files, scene_text, supported
+from envedit.scene.scene_files import SceneFile
 
 __all__ = ["Scene", "load"]
 
@@ -396,8 +397,10 @@ def load(
         emitter, to_world, turned = parser.replace_environment(state, where, up)
     for one in state.nodes:
         with refused.collected():
-            parser.find_file(state, one, where, folders)
             parser.smooth_limit(state, one)
+    _find_files(state, where, folders, refused)
+    for one in state.nodes:
+        with refused.collected():
             parser.fit_to_stage(state, one)
     refused.raise_all()
     notes = (*own.notes, *turned, *asked.notes, *supported.polarised(state), *said)
@@ -475,6 +478,18 @@ class _Refusals:
         raise type(self.errors[0])(f"{lines[0]}\nalso: {lines[1]}")
 
 
+def _find_files(state, where, folders, refused):
+    """Find the files that nodes name; raises what was refused if one of them cannot be read."""
+    files = []
+    for node in state.nodes:
+        with refused.collected():
+            if file := parser.find_file(state, node, where, folders):
+                files.append(file)
+    with refused.collected():
+        refused.errors += scene_files.errors(files)
+    refused.raise_all()  # nothing of them is loaded
+
+
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
     """Return the width that all views have, and name and rows of each; ConfigError if widths differ."""
     views, sizes, first = [], [[int(n) for n in s.film().crop_size()] for s in scene.sensors()], 0
@@ -504,8 +519,10 @@ def _parsed(file, parameters, base):
         state = parser.called(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
-        filled, searched = _check_parameters(path, parameters or {})
-        where, folders = str(path), (path.parent, base, *searched)
+        filled, outline = _check_parameters(path, parameters or {})
+        where, folders = str(path), (path.parent, base, *outline.folders)
+        if wrong := scene_files.errors([SceneFile("spectrum", file) for file in outline.spectra]):
+            raise wrong[0]
         with installed_plugins.restored():
             state = parser.called(where, mi.parser.parse_file, config, str(path), **filled)
     scene_text.check_references(state, where)
@@ -551,8 +568,8 @@ def relit(
     _, state, _, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders, scale)
     emitter, _, _ = parser.replace_environment(state, where, up)
+    _find_files(state, where, folders, _Refusals())
     for node in state.nodes:
-        parser.find_file(state, node, where, folders)
         parser.smooth_limit(state, node)
         parser.fit_to_stage(state, node)
     emitter["filename"] = envmap
@@ -597,11 +614,8 @@ def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | Non
     return [path, *(folder / name for name in outline.files for folder in folders)]
 
 
-def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], list[Path]]:
-    """Return the parameters as text, after comparing their names with the ``$names`` of the XML.
-
-    And the folders of ``<path value="...">``, in which files are looked for too.
-    """
+def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], scene_text.Outline]:
+    """Return the parameters as text, after comparing their names with the ``$names`` of the XML; and this."""
     outline = scene_text.read(path, {str(name): str(value) for name, value in parameters.items()})
     used, defaults = outline.used, outline.defaults
     for name in parameters:
@@ -628,7 +642,7 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], lis
             kind = type(value).__name__
             raise ConfigError(f"scene.parameters: {name} is a {kind}, expected text or a number")
         filled[name] = str(value)
-    return filled, outline.folders
+    return filled, outline
 
 
 def _whole(name: str, value: Any, low: int) -> int:

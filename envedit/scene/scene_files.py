@@ -1,249 +1,198 @@
-"""Checks of the files that a scene names, before Mitsuba reads them.
+"""Files that a scene names are read by a process of their own first, before Mitsuba reads them here.
 
-Mitsuba believes the sizes and indices that a file states: it stops the process on an index that no vertex
-has, asks for the memory that a header declares, and repeats lines of a file that is something else.
+Mitsuba 3.9 believes the sizes and indices that a file states: it stops the process on a damaged one, takes
+the memory that a header declares, and repeats lines of a file that is something else. Whatever happens to the
+other process becomes an error that names the file. What it has read well is remembered by content, here and
+in the folder of caches, and not tried again. Why so: ``docs/decisions/files_of_scenes.md``.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import re
-import stat
-import zlib
+import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from envedit.core.errors import InputError
+from envedit.core import atomic_files, installed_plugins, shipped
+from envedit.core.array_cache import DiskCache, cache_folder
+from envedit.core.errors import InputError, MachineError
 from envedit.images import exr, images
-from envedit.images.headers import damaged, head_of
+from envedit.images.headers import head_of
 
-MOST_BYTES = 2**31
-"""Size of a file that a scene may name: 60 million triangles."""
-MOST_VALUES = 2**29
-"""Numbers in a mesh or a volume, 2 GB in single precision."""
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8", "half": "f2", "float16": "f2", "int64": "i8", "long": "i8",
-    "uint64": "u8", "ulong": "u8",
-}  # fmt: skip
-_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+|inf|nan)([eE][-+]?\d+)?", re.IGNORECASE)
+MESHES = {"ply", "obj", "serialized"}
+CURVES = {"bsplinecurve", "linearcurve"}
+VOLUMES = {"gridvolume", "sdfgrid"}
+PLUGINS = MESHES | CURVES | VOLUMES | {"bitmap", "ellipsoids", "ellipsoidsmesh", "spectrum"}
+"""Those whose files are tried; ``spectrum`` is the XML element."""
+SECONDS, BYTES_PER_SECOND = 60, 2**23
+"""Processor time of the other process: 60 s, and a second for every 8 MiB that it reads."""
+MEMORY, MEMORY_PER_BYTE = 2**30, 20
+"""Its address space for a mesh or a volume: 1 GiB, and 20 bytes for each that the file has."""
+IMAGE_MEMORY = 2**34
+"""For an image, whose size is bounded by what its header may declare."""
+_WAIT = 4  # times the processor time, on the clock
+_REMEMBERED_BYTES = 2**20  # of entries in the folder of caches: some 5,000 files
+_CODE = """
+import json, sys
+sys.path[:], files, seconds = json.load(sys.stdin)
+from envedit.scene import scene_files
+scene_files.main(files, seconds)
+"""
+_HINTS = {"ply": ", as triangles", "spectrum": ", as NAME.spd"}  # what Mitsuba reads of these
+_remembered: set[str] = set()
 
 
-def check(plugin: str, path: str) -> None:
-    """Refuse a file that a plugin could not survive, or that is not what the plugin reads.
+class SceneFile(NamedTuple):
+    """A file, by absolute path, the plugin that reads it, and which of several meshes in it."""
 
-    Parameters
-    ----------
-    plugin : str
-        Mitsuba's plugin that names the file.
-    path : str
-        The file; absolute.
+    plugin: str
+    path: str
+    shape_index: int = 0
+
+
+def errors(files: Sequence[SceneFile]) -> list[InputError]:
+    """Return what is wrong with files; no error holds text out of one.
+
+    Files of the package, those of other plugins, and those whose content is known are not tried.
 
     Raises
     ------
     InputError
-        Naming the file and what is wrong; never with text out of it.
+        A file cannot be read from the disk, or is larger than 4 GiB.
+    MachineError
+        No other process can be started.
     """
-    size_of(Path(path), "a file")
-    checks = {
-        "ply": _ply, "serialized": _serialized, "gridvolume": _volume, "bsplinecurve": check_numbers,
-        "linearcurve": check_numbers, "irregular": check_numbers, "bitmap": _texture, "envmap": _texture,
-    }  # fmt: skip
-    if plugin in checks:
-        checks[plugin](Path(path))
+    store = DiskCache(cache_folder("scene_files"), _REMEMBERED_BYTES)
+    unknown: dict[str, SceneFile] = {}
+    for file in files:
+        if file.plugin in PLUGINS and not shipped.holds(Path(file.path)):
+            key = _key(file)
+            if key not in _remembered and store.load({"good": key}) is None:
+                unknown[key] = file
+    wrong = []
+    while unknown:
+        for answer in _answers([*unknown.values()]):  # the others are tried again if a file has none
+            key = next(iter(unknown))
+            path = unknown.pop(key).path
+            if answer:
+                wrong.append(InputError(f"{path}: {answer}"))
+                continue
+            _remembered.add(key)
+            store.store({"good": key}, {})
+    return wrong
 
 
-def size_of(path: Path, wanted: str) -> int:
-    """Return the size of a regular file of a size that can be read."""
+def _key(file):
+    """Return what a file's being good depends on."""
     try:
-        about = os.stat(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
-    if not stat.S_ISREG(about.st_mode):  # opening a pipe would wait for ever
-        raise InputError(f"{path}: is no regular file, expected {wanted}")
-    if about.st_size > MOST_BYTES:
-        raise InputError(f"{path}: {about.st_size} bytes, expected at most {MOST_BYTES}; make it smaller")
-    return about.st_size
+        digest = atomic_files.digest(file.path)
+    except OSError as error:
+        raise InputError(f"{file.path}: cannot be read ({error.strerror})") from None
+    return f"{file.plugin} {file.shape_index} {digest.hex()} Mitsuba {mi.__version__}"
 
 
-def check_numbers(path: Path) -> None:
-    """Check a text of numbers, such as a spectrum or curves; comments begin with #."""
-    size_of(path, "a text of numbers")
-    with open(path, "rb") as file:
-        for number, line in enumerate(iter(lambda: file.readline(1 << 16), b""), 1):
-            text = line.partition(b"#")[0].replace(b",", b" ")
-            if any(_NUMBER.fullmatch(word) is None for word in text.split()):
-                raise InputError(f"{path}, line {number}: expected numbers; is this the right file?")
+def _answers(files):
+    """Return what another process has to say of files: "" or what is wrong, up to the one that ended it."""
+    seconds = SECONDS + sum(os.path.getsize(file.path) for file in files) // BYTES_PER_SECOND
+    try:
+        output = subprocess.run(
+            [sys.executable, "-P", "-c", _CODE],
+            input=json.dumps([[os.fspath(folder) for folder in sys.path], files, seconds]).encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=_WAIT * seconds,
+            start_new_session=True,  # Ctrl-C is for this process
+        ).stdout
+    except subprocess.TimeoutExpired as error:
+        output = error.stdout or b""
+    except OSError as error:
+        raise MachineError(f"{sys.executable}: cannot be started to read files ({error.strerror})") from None
+    begun, *answers = [json.loads(line) for line in output.splitlines()] or [None]
+    if begun is None:
+        raise MachineError(f"{sys.executable}: the process that reads files of a scene does not start")
+    if len(answers) < len(files):
+        answers.append(f"Mitsuba stops as it reads this file, or takes over {seconds} s; export it again")
+    return answers
 
 
 # ----------------------------------------------------------------------------------------------------------
-# Meshes
+# In the other process
 
 
-def _ply(path):
-    with open(path, "rb") as file:
-        head = file.read(1 << 16)
-    end = re.search(rb"(?m)^end_header\r?\n", head)
-    if not re.match(rb"ply\s", head) or end is None:
-        raise InputError(f"{path}: no PLY header; export the mesh again")
-    elements, form = _ply_header(path, head[: end.start()].decode("latin-1"))
-    counted = {name: count for name, count, _ in elements}
-    vertices = counted.get("vertex", 0)
-    place, size = end.end(), os.path.getsize(path)
-    words = None
-    if form == "ascii":
-        raw = np.fromfile(path, np.uint8, offset=place).tobytes()
-        words = raw.split()
-        place = 0
-    for name, count, properties in elements:
-        lists = [p for p in properties if isinstance(p[1], tuple)]
-        indices = [p[0] for p in lists if re.fullmatch(r"vertex_ind(ex|ices)", p[0])]
-        # As Mitsuba reads them: triangles.
-        dtype = np.dtype([
-            field
-            for key, kind in properties
-            for field in ([(f"{key} count", kind[0]), (key, kind[1], (3,))] if isinstance(kind, tuple)
-                          else [(key, kind)])
-        ])  # fmt: skip
-        width = sum(4 if isinstance(kind, tuple) else 1 for _, kind in properties)
-        if count * width > MOST_VALUES:
-            raise damaged(path, f"the header declares {count} x {width} values")
-        if count == 0 or width == 0:
-            continue
-        if words is not None:
-            if place + count * width > len(words):
-                raise damaged(path, f"the file ends before its {count} {name} elements")
-            table = words[place : place + count * width]
-            place += count * width
-            column = 0
-            for key, kind in properties:
-                if isinstance(kind, tuple):
-                    _triangles(path, _whole(path, table[column::width]))
-                    if key in indices:
-                        found = [_whole(path, table[column + i :: width]) for i in (1, 2, 3)]
-                        _in_range(path, np.stack(found, axis=-1), vertices)
-                column += 4 if isinstance(kind, tuple) else 1
-            continue
-        if place + count * dtype.itemsize > size:
-            raise damaged(path, f"the file ends before its {count} {name} elements")
-        if indices:
-            order: Literal["<", ">"] = ">" if form == "binary_big_endian" else "<"
-            rows = np.fromfile(path, dtype.newbyteorder(order), count, offset=place)
-            for key, _ in lists:
-                _triangles(path, rows[f"{key} count"])
-            for key in indices:
-                _in_range(path, rows[key], vertices)
-        place += count * dtype.itemsize
-
-
-def _ply_header(path, text):
-    """Return [(element, count, [(property, type or (type of count, type))])] and the format."""
-    elements: list = []
-    form = None
-    for line in text.splitlines()[1:]:
-        match line.split():
-            case ["comment" | "obj_info", *_] | []:
-                pass
-            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as form, *_]:
-                pass
-            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 19:
-                elements.append((name, int(count), []))
-            case ["property", "list", count, kind, name] if elements and {count, kind} <= _TYPES.keys():
-                elements[-1][2].append((name, (_TYPES[count], _TYPES[kind])))
-            case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1][2].append((name, _TYPES[kind]))
-            case _:
-                raise InputError(f"{path}: a line of the PLY header is not understood; export the mesh again")
-    if form is None or any(len({p[0] for p in e[2]}) != len(e[2]) for e in elements):
-        raise InputError(f"{path}: the PLY header has no format or names a property twice; export it again")
-    return elements, form
-
-
-def _whole(path, words):
-    try:
-        return np.array([int(word) for word in words], np.int64)
-    except (ValueError, OverflowError):
-        raise damaged(path, "an index is no whole number") from None
-
-
-def _triangles(path, counts):
-    if (np.asarray(counts) != 3).any():
-        raise InputError(f"{path}: holds polygons that are no triangles; triangulate the mesh")
-
-
-def _in_range(path, indices, vertices):
-    bad = (indices.astype(np.float64) < 0) | (indices.astype(np.float64) >= vertices)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise InputError(
-            f"{path}: face {row} names vertex {indices[row, column]} of {vertices}; export the mesh again"
-        )
-
-
-def _serialized(path):
-    """Walk through every mesh of Mitsuba 0.x's format: magic, zlib, then counts, coordinates, indices."""
-    with open(path, "rb") as file:
-        data = file.read()
-    if len(data) < 12 or data[:2] != b"\x1c\x04" or int.from_bytes(data[2:4], "little") not in (3, 4):
-        raise InputError(f"{path}: no serialized mesh; export it again")
-    version, meshes = int.from_bytes(data[2:4], "little"), int.from_bytes(data[-4:], "little")
-    wide = 8 if version == 4 else 4
-    if meshes * wide + 4 > len(data):
-        raise damaged(path, f"{meshes} meshes are declared")
-    table = np.frombuffer(data[len(data) - 4 - meshes * wide : -4], f"<u{wide}")
-    for offset in {0, *map(int, table)}:  # Mitsuba reads the first mesh wherever the table has it
-        if offset + 4 > len(data):
-            raise damaged(path, "a mesh begins after the end of the file")
-        unpacked = zlib.decompressobj()
+def main(files: Sequence[Sequence], seconds: int) -> None:
+    """Read files in turn, and write lines of JSON: one at the beginning, and what is wrong with each file."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # libraries print about odd files
+    mi.set_variant("scalar_rgb" if "scalar_rgb" in mi.variants() else mi.variants()[0])
+    mi.set_log_level(mi.LogLevel.Error)
+    dr.set_thread_count(2)  # on one, Mitsuba waits for ever for an EXR texture
+    installed_plugins.come_first()
+    _limit("RLIMIT_CPU", seconds)
+    print(json.dumps("begun"), file=answers, flush=True)
+    for plugin, path, shape_index in files:
+        memory = IMAGE_MEMORY if plugin == "bitmap" else MEMORY + MEMORY_PER_BYTE * os.path.getsize(path)
+        _limit("RLIMIT_AS", _address_space() + memory)
+        wrong = ""
         try:
-            body = unpacked.decompress(data[offset + 4 :], 4 * MOST_VALUES)
-        except zlib.error as error:
-            raise damaged(path, error) from None
-        _serialized_mesh(path, version, body)
+            _read(plugin, path, shape_index)
+        except InputError as error:
+            wrong = str(error).removeprefix(f"{path}: ")
+        except Exception as error:  # its text may be a line of the file
+            if isinstance(error, MemoryError) or "bad_alloc" in str(error):
+                wrong = "declares more than a file of this size holds; it is damaged: export it again"
+            else:
+                wrong = f"cannot be read as {plugin}; is this the right file? If so, export it again"
+                wrong += _HINTS.get(plugin, "")
+        print(json.dumps(wrong), file=answers, flush=True)
 
 
-def _serialized_mesh(path, version, body):
-    flags = int.from_bytes(body[:4], "little")
-    place = 4
-    if version == 4:
-        place = body.find(b"\0", 4) + 1
-        if place == 0:
-            raise damaged(path, "a mesh's name does not end")
-    vertices, faces = (int.from_bytes(body[place + i : place + i + 8], "little") for i in (0, 8))
-    real = 8 if flags & 0x2000 else 4
-    numbers = 3 + (3 if flags & 1 else 0) + (2 if flags & 2 else 0) + (3 if flags & 8 else 0)
-    place += 16 + vertices * numbers * real
-    index = 8 if vertices > 0xFFFFFFFF else 4
-    if place + 3 * faces * index > len(body):
-        raise damaged(path, f"the file ends before its {vertices} vertices and {faces} faces")
-    found = np.frombuffer(body, f"<u{index}", 3 * faces, place).reshape(-1, 3)
-    _in_range(path, found, vertices)
+def _read(plugin, path, shape_index):
+    """Read a file as a scene does; raises if it cannot be, or is a mesh with an index that no vertex has."""
+    if plugin == "spectrum":
+        mi.spectrum_from_file(path)
+        return
+    if plugin == "bitmap":  # Mitsuba's decoders write beyond their memory on damaged ones: ours come first
+        head = head_of(path)
+        if head.startswith(b"v/1\x01"):
+            exr.require_whole(path)
+        elif head.startswith((b"#?", b"\x89PNG", b"\xff\xd8")):
+            images.read_stored(path)
+    properties = {"type": plugin, "filename": path}
+    if plugin == "serialized":
+        properties["shape_index"] = shape_index
+    if plugin not in MESHES:
+        mi.load_dict(properties)
+        return
+    mesh = mi.load_dict(properties | {"face_normals": True})  # computed from indices otherwise
+    if mesh.vertex_count() == 0:
+        raise InputError("holds no vertex; is this the right file?")
+    faces = np.array(mi.traverse(mesh)["faces"])
+    if faces.size and faces.max() >= mesh.vertex_count():
+        face = int(faces.argmax()) // 3
+        raise InputError(f"face {face} names vertex {faces.max()} of {mesh.vertex_count()}; export it again")
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Volumes and textures
+def _address_space():
+    """Return the bytes of address space that this process has; 1 GiB where that is unknown."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 2**30
 
 
-def _volume(path):
-    with open(path, "rb") as file:
-        head = file.read(48)
-    if len(head) < 48 or head[:4] != b"VOL\3":
-        raise InputError(f"{path}: no volume of Mitsuba's format")
-    kind, *shape = np.frombuffer(head[4:24], "<i4").tolist()
-    if kind != 1 or min(shape) < 1:
-        raise damaged(path, f"the header declares {shape} values of type {kind}")
-    count = shape[0] * shape[1] * shape[2] * shape[3]
-    if count > MOST_VALUES or 48 + 4 * count > os.path.getsize(path):
-        raise damaged(path, f"the header declares {count} values")
-
-
-def _texture(path):
-    """Decode a texture: Mitsuba's decoders print, stop the process or corrupt memory on damaged ones."""
-    head = head_of(str(path))
-    if head.startswith(b"v/1\x01"):
-        exr.require_whole(str(path))
-    elif head.startswith((b"#?", b"\x89PNG", b"\xff\xd8")):
-        images.read_stored(path)
+def _limit(name, most):
+    """Bound a resource of this process, where the platform has bounds."""
+    try:
+        import resource
+    except ImportError:
+        return
+    kind = getattr(resource, name)
+    hard = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))

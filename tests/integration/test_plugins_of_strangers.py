@@ -25,6 +25,7 @@ OVERRIDDEN = [
     "multijitter",
     "perspective",
     "rectangle",
+    "ply",
     "evil",
 ]
 SOURCE = """
@@ -79,7 +80,9 @@ def provide(shared_object, folder):
 
 def test_no_plugin_of_a_scenes_or_the_working_folder_runs(shared_object, mark, tmp_path):
     provide(shared_object, tmp_path)
-    parts = '<path value="."/>', SENSOR, BALL, LIGHT
+    shutil.copy(ROOT / "scenes" / "statue.ply", tmp_path)  # read by another process first, with these folders
+    mesh = '<shape type="ply"><string name="filename" value="statue.ply"/></shape>'
+    parts = '<path value="."/>', SENSOR, BALL, mesh, LIGHT
     named = write_scene(tmp_path, *parts)
     child = [sys.executable, "-P", "-c", CHILD.format(root=str(ROOT)), "sphere", str(named)]
     done = subprocess.run(child, cwd=tmp_path, capture_output=True, text=True, timeout=250)

@@ -1,15 +1,19 @@
-"""Meshes, textures, volumes, curves and spectra are checked before Mitsuba reads them."""
+"""Files that a scene names are read by a process of their own before Mitsuba reads them here."""
 
 import os
+import re
 import struct
+import subprocess
+import sys
 import zlib
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core.errors import InputError
+from envedit.core.errors import InputError, MachineError
 from envedit.scene import scene, scene_files
+from envedit.scene.scene_files import SceneFile
 from tests.oracles.builders import LIGHT, SENSOR, write_scene
 
 HEADER = """ply
@@ -24,173 +28,180 @@ property list uchar {kind} vertex_indices
 end_header
 """
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
-
-
-def ply(path, face, form="ascii", faces=1, kind="int"):
-    head = HEADER.format(form=form, faces=faces, kind=kind)
-    if form == "ascii":
-        path.write_text(head + "0 0 0\n1 0 0\n0 1 0\n" + " ".join(map(str, face)) + "\n")
-    else:
-        order = "<" if "little" in form else ">"
-        indices = np.array(face[1:], np.int64).astype(f"{order}u4").tobytes()
-        path.write_bytes(head.encode() + POINTS.astype(f"{order}f4").tobytes() + bytes([face[0]]) + indices)
-    return path
-
-
-def serialized(path, index=2, vertices=3, faces=1, flags=0x1000, count=1, offset=0):
-    body = struct.pack("<I", flags) + b"x\0" + struct.pack("<QQ", vertices, faces)
-    body += POINTS.tobytes() + np.array([0, 1, index], "<u4").tobytes()
-    path.write_bytes(struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", offset, count))
-    return path
-
-
-def volume(path, shape=(2, 2, 2, 1), kind=1, values=8):
-    head = b"VOL\3" + struct.pack("<5i", kind, *shape) + struct.pack("<6f", 0, 0, 0, 1, 1, 1)
-    path.write_bytes(head + bytes(4 * values))
-    return path
-
-
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")
+SECRET = b"root:x:0:0:root:/root:/bin/bash\n" * 3
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_ply_with_an_index_out_of_range_is_refused_and_a_good_one_loads(tmp_path, form):
-    path = tmp_path / "mesh.ply"
-    file = f'<shape type="ply"><string name="filename" value="{path.name}"/></shape>'
-    named = write_scene(tmp_path, SENSOR, LIGHT, file)
-    for bad in (3, 99_999_999, -1):
-        ply(path, (3, 0, 1, bad), form)
-        with pytest.raises(InputError, match=rf"mesh\.ply: face 0 names vertex {bad} of 3"):
-            scene.load(named)
-    ply(path, (3, 0, 1, 2), form)
-    assert scene.load(named).mi.shapes()[0].face_count() == 1
-
-
-@pytest.mark.parametrize("form", FORMS[:2])
-def test_a_ply_that_is_cut_or_declares_too_much_is_refused(tmp_path, form):
-    path = ply(tmp_path / "mesh.ply", (3, 0, 1, 2), form)
-    os.truncate(path, path.stat().st_size - (2 if form == "ascii" else 1))
-    with pytest.raises(InputError, match=r"the file ends before its 1 face elements"):
-        scene_files.check("ply", str(path))
-    for faces in (4_000_000_000, 10**17):
-        with pytest.raises(InputError, match="the header declares"):
-            scene_files.check("ply", str(ply(path, (3, 0, 1, 2), form, faces)))
-    with pytest.raises(InputError, match="polygons that are no triangles"):
-        scene_files.check("ply", str(ply(path, (4, 0, 1, 2, 2), form)))
-    with pytest.raises(InputError, match="a line of the PLY header"):
-        scene_files.check("ply", str(ply(path, (3, 0, 1, 2), form, kind="root:x:0:0")))
+def ply(form, face=(3, 0, 1, 2), faces=1, kind="int"):
+    head = HEADER.format(form=form, faces=faces, kind=kind).encode()
     if form == "ascii":
-        with pytest.raises(InputError, match="no whole number"):
-            scene_files.check("ply", str(ply(path, (3, 0, 1, "2x"), form)))
+        return head + b"0 0 0\n1 0 0\n0 1 0\n" + " ".join(map(str, face)).encode() + b"\n"
+    order = "<" if "little" in form else ">"
+    indices = np.array(face[1:], np.int64).astype(f"{order}u4").tobytes()
+    return head + POINTS.astype(f"{order}f4").tobytes() + bytes([face[0]]) + indices
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"index": 99_999_999}, "face 0 names vertex 99999999 of 3"),
-        ({"index": 99_999_999, "count": 0}, "face 0 names vertex 99999999 of 3"),
-        ({"vertices": 10**12}, "the file ends before"),
-        ({"faces": 10**12}, "the file ends before"),
-        ({"count": 10**9}, "1000000000 meshes are declared"),
-        ({"offset": 10**9}, "begins after the end"),
-        ({"offset": 3}, "damaged or truncated"),
-    ],
-)
-def test_a_serialized_mesh_is_walked_through(tmp_path, changes, says):
-    """Also the first mesh of a table that is empty."""
-    path = serialized(tmp_path / "a.serialized")
-    scene_files.check("serialized", str(path))
-    assert mi.load_dict({"type": "serialized", "filename": str(path)}).face_count() == 1
-    with pytest.raises(InputError, match=says):
-        scene_files.check("serialized", str(serialized(path, **changes)))
+def serialized(index=2, vertices=3, faces=1, count=1):
+    body = struct.pack("<I", 0x1000) + b"x\0" + struct.pack("<QQ", vertices, faces)
+    body += POINTS.tobytes() + np.array([0, 1, index], "<u4").tobytes()
+    return struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, count)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"shape": (30_000, 30_000, 30_000, 1)}, {"shape": (-3, 3, 3, 1)}, {"kind": 7}, {"values": 7}]
-)
-def test_a_volume_holds_what_it_declares(tmp_path, changes):
-    scene_files.check("gridvolume", str(volume(tmp_path / "a.vol")))
-    with pytest.raises(InputError, match="the header declares"):
-        scene_files.check("gridvolume", str(volume(tmp_path / "a.vol", **changes)))
+def volume(shape=(2, 2, 2, 1), kind=1, values=8):
+    return b"VOL\3" + struct.pack("<5i6f", kind, *shape, 0, 0, 0, 1, 1, 1) + bytes(4 * values)
 
 
-@pytest.mark.parametrize("plugin", ["ply", "obj", "serialized", "gridvolume", "bsplinecurve", "linearcurve"])
-def test_a_file_that_is_something_else_is_not_repeated(tmp_path, plugin):
-    (tmp_path / "secret").write_text("root:x:0:0:root:/root:/bin/bash\n" * 3)
-    shape = f'<shape type="{plugin}"><string name="filename" value="secret"/></shape>'
-    if plugin == "gridvolume":
-        shape = (
-            '<shape type="sphere"><medium type="heterogeneous" name="interior"><volume type="gridvolume" '
-            'name="sigma_t"><string name="filename" value="secret"/></volume></medium></shape>'
-        )
-    with pytest.raises(InputError) as caught:
-        scene.load(write_scene(tmp_path, SENSOR, LIGHT, shape))
-    assert "root" not in str(caught.value).replace(str(tmp_path), "")
+def wrong(folder, plugin, *contents):
+    """Return what is wrong with files of these contents: their errors in turn, "" of a good one."""
+    files = [SceneFile(plugin, str(folder / f"{i}.file")) for i in range(len(contents))]
+    for file, data in zip(files, contents, strict=True):
+        with open(file.path, "wb") as opened:
+            opened.write(data)
+    found = [str(error) for error in scene_files.errors(files)]
+    assert len({*found}) == len(found) and all(len(text.splitlines()) == 1 for text in found)
+    return ["".join(text for text in found if text.startswith(f"{file.path}: ")) for file in files]
 
 
-def test_a_spectrum_file_that_is_something_else_is_not_repeated(tmp_path):
-    (tmp_path / "secret").write_text("root:x:0:0:root:/root:/bin/bash\n")
-    part = '<bsdf type="diffuse"><spectrum name="reflectance" filename="secret"/></bsdf>'
-    with pytest.raises(InputError, match="secret, line 1: expected numbers") as caught:
-        scene.load(write_scene(tmp_path, SENSOR, LIGHT, f'<shape type="sphere">{part}</shape>'))
-    assert "root:" not in str(caught.value)
-    (tmp_path / "secret").write_text("# nm value\n400 0.5\n700, 5.e-1\n")
-    scene_files.check_numbers(tmp_path / "secret")
+def written(path, array):
+    mi.Bitmap(array).write(str(path))
+    return path.read_bytes()
 
 
-def test_a_sparse_file_of_5_gb_and_a_pipe_are_not_read(tmp_path):
-    path = ply(tmp_path / "mesh.ply", (3, 0, 1, 2))
-    os.truncate(path, 5 << 30)
-    with pytest.raises(InputError, match="5368709120 bytes, expected at most 2147483648"):
-        scene_files.check("ply", str(path))
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="is no regular file"):
-        scene_files.check("obj", str(tmp_path / "pipe"))
+def files():
+    """List plugin, content and words of the error, which are empty of a good file; by what is in them."""
+    found = {}
+    for form in FORMS:
+        found |= {
+            f"{form}": ("ply", ply(form), ""),
+            f"{form}, an index": ("ply", ply(form, (3, 0, 1, 3)), "face 0 names vertex 3 of 3"),
+            f"{form}, a large index": ("ply", ply(form, (3, 0, 1, 99_999_999)), "face 0 names vertex"),
+            f"{form}, cut": ("ply", ply(form)[:-2], "export it again"),
+            f"{form}, 2 faces": ("ply", ply(form, faces=2), "export it again"),
+            f"{form}, 4e9 faces": ("ply", ply(form, faces=4_000_000_000), "export it again"),
+            f"{form}, 1e17 faces": ("ply", ply(form, faces=10**17), "export it again"),
+            f"{form}, a polygon": ("ply", ply(form, (4, 0, 1, 2, 2)), "export it again, as triangles"),
+        }
+    too_much = "declares more than a file of this size holds"
+    found |= {
+        "serialized": ("serialized", serialized(), ""),
+        "an index": ("serialized", serialized(3), "face 0 names vertex 3 of 3"),
+        "a large index": ("serialized", serialized(99_999_999), "face 0 names vertex 99999999 of 3"),
+        "no table": ("serialized", serialized(99_999_999, count=0), "face 0 names vertex 99999999 of 3"),
+        "1e12 vertices": ("serialized", serialized(vertices=10**12), too_much),
+        "1e12 faces": ("serialized", serialized(faces=10**12), too_much),
+        "volume": ("gridvolume", volume(), ""),
+        "huge": ("gridvolume", volume((30_000, 30_000, 30_000, 1)), too_much),
+        "negative": ("gridvolume", volume((-3, 3, 3, 1)), too_much),
+        "another type": ("gridvolume", volume(kind=7), "cannot be read as gridvolume"),
+        "cut": ("gridvolume", volume(values=7), "cannot be read as gridvolume"),
+        "spectrum": ("spectrum", b"# nm value\n400 0.5\n700 5.e-1\n", ""),
+        "a secret for obj": ("obj", SECRET, "holds no vertex"),
+        "a control character": ("obj", b"v 0 secret\1 0\n", "cannot be read as obj"),
+    }
+    found |= {f"a secret for {p}": (p, SECRET, "again") for p in scene_files.PLUGINS - {"obj", "bitmap"}}
+    return found
 
 
-def test_textures_state_sizes_that_can_be_read(tmp_path):
-    png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">2I", 60_000, 60_000) + b"\x08\2\0\0\0" + bytes(4)
-    (tmp_path / "a.png").write_bytes(png)
-    with pytest.raises(InputError, match="the header declares 60000 x 60000 texels"):
-        scene_files.check("bitmap", str(tmp_path / "a.png"))
-    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 16\n\2\2\0\20\xff\1")
-    with pytest.raises(InputError, match="damaged or truncated"):
-        scene_files.check("bitmap", str(tmp_path / "a.hdr"))
-    mi.Bitmap(np.ones((4, 4, 3), np.float32)).write(str(tmp_path / "a.exr"))
-    scene_files.check("bitmap", str(tmp_path / "a.exr"))
-
-
-def test_textures_that_mitsubas_decoder_does_not_survive_are_refused(tmp_path):
-    """A chunk that is cut, and a table of chunks that points out of the file, stop the process."""
-    path = tmp_path / "a.exr"
-    mi.Bitmap(np.linspace(0, 1, 3600, dtype=np.float32).reshape(40, 30, 3).round(2)).write(str(path))
-    scene_files.check("bitmap", str(path))
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-200])
-    with pytest.raises(InputError, match="damaged or truncated"):
-        scene_files.check("bitmap", str(path))
+def textures(folder):
+    """List what :func:`files` does of textures; what is damaged here stops Mitsuba, or its memory is."""
+    shades = np.linspace(0, 1, 3600, dtype=np.float32).reshape(40, 30, 3).round(2)
+    exr = written(folder / "a.exr", shades)
     # Two chunks of 32 rows: the table holds where the first and the second begin.
-    first = min(n for n in range(8, len(whole)) if whole[n - 16 : n - 8] == struct.pack("<Q", n))
-    path.write_bytes(whole[: first - 8] + struct.pack("<Q", 1 << 61) + whole[first:])
-    with pytest.raises(InputError, match="table of chunks points out of the file"):
-        scene_files.check("bitmap", str(path))
+    first = min(n for n in range(8, len(exr)) if exr[n - 16 : n - 8] == struct.pack("<Q", n))
+    outside = exr[: first - 8] + struct.pack("<Q", 1 << 61) + exr[first:]
+    png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">2I", 60_000, 60_000) + b"\x08\2\0\0\0" + bytes(4)
+    hdr = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 16\n\2\2\0\20\xff\1"
+    jpeg = written(folder / "a.jpg", np.full((16, 16, 3), 90, np.uint8))
+    scan = jpeg.index(b"\xff\xda") + 11  # where its coefficients begin
+    return {
+        "OpenEXR": ("bitmap", exr, ""),
+        "JPEG": ("bitmap", jpeg, ""),
+        "a chunk is cut": ("bitmap", exr[:-200], "damaged or truncated"),
+        "a chunk is outside": ("bitmap", outside, "table of chunks points out of the file"),
+        "huge": ("bitmap", png, "the header declares 60000 x 60000 texels"),
+        "a damaged line": ("bitmap", hdr, "damaged or truncated"),
+        "damaged coefficients": ("bitmap", jpeg[:scan] + b"\7" + jpeg[scan + 1 :], "damaged or truncated"),
+        "a secret": ("bitmap", SECRET, "cannot be read as bitmap"),
+    }
 
 
-def test_a_damaged_jpeg_is_refused_and_nothing_is_printed(tmp_path, capfd):
-    path = tmp_path / "a.jpg"
-    mi.Bitmap(np.full((16, 16, 3), 90, np.uint8)).write(str(path))
-    scene_files.check("bitmap", str(path))
-    whole = path.read_bytes()
-    scan = whole.index(b"\xff\xda")
-    path.write_bytes(whole[: scan + 11] + b"\7" + whole[scan + 12 :])  # where its coefficients begin
-    with pytest.raises(InputError, match="damaged or truncated"):
-        scene_files.check("bitmap", str(path))
+def test_damaged_files_are_refused_without_their_text_and_nothing_is_printed(tmp_path, capfd):
+    cases = {**files(), **{f"texture, {name}": case for name, case in textures(tmp_path).items()}}
+    listed = []
+    for i, (plugin, content, _) in enumerate(cases.values()):
+        (tmp_path / f"{i}.spd").write_bytes(content)
+        listed.append(SceneFile(plugin, str(tmp_path / f"{i}.spd")))
+    errors = [str(error) for error in scene_files.errors(listed)]
+    for file, (name, (_, _, words)) in zip(listed, cases.items(), strict=True):
+        (error,) = [text for text in errors if text.startswith(f"{file.path}: ")] or [""]
+        assert words in error and bool(words) == bool(error), (name, error)
+        assert len(error.splitlines()) <= 1 and error.isprintable()
+        assert not re.search("root|secret", error.replace(str(tmp_path), "")), (name, error)
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_line_of_an_obj_that_cannot_be_read_is_not_repeated(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 secret\1 0\n")
-    shape = '<shape type="obj"><string name="filename" value="a.obj"/></shape>'
-    with pytest.raises(InputError, match="could not parse line$") as caught:
-        scene.load(write_scene(tmp_path, SENSOR, LIGHT, shape))
-    assert str(caught.value).isprintable()
+def test_a_scene_with_a_damaged_file_is_refused_and_with_a_good_one_loads(tmp_path):
+    shape = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    named = write_scene(tmp_path, SENSOR, LIGHT, shape)
+    (tmp_path / "mesh.ply").write_bytes(ply("ascii", (3, 0, 1, 3)))
+    with pytest.raises(InputError, match=r"mesh\.ply: face 0 names vertex 3 of 3"):
+        scene.load(named)
+    (tmp_path / "mesh.ply").write_bytes(ply("ascii"))
+    assert scene.load(named).mi.shapes()[0].face_count() == 1
+
+
+def test_a_spectrum_is_read_before_the_scene(tmp_path):
+    part = '<bsdf type="diffuse"><spectrum name="reflectance" filename="secret.spd"/></bsdf>'
+    named = write_scene(tmp_path, SENSOR, LIGHT, f'<shape type="sphere">{part}</shape>')
+    (tmp_path / "secret.spd").write_bytes(SECRET)
+    with pytest.raises(InputError, match=r"secret\.spd: cannot be read as spectrum.*again, as NAME\.spd$"):
+        scene.load(named)
+
+
+def test_a_sparse_file_of_5_gb_and_a_pipe_are_not_read(tmp_path):
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(ply("ascii"))
+    os.truncate(path, 5 << 30)
+    with pytest.raises(InputError, match="5368709120 bytes, expected at most 4294967296"):
+        scene_files.errors([SceneFile("ply", str(path))])
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is no regular file"):
+        scene_files.errors([SceneFile("obj", str(tmp_path / "pipe"))])
+
+
+# ---- the other process -------------------------------------------------------------------------------------
+
+
+def stand_in(folder, monkeypatch, script):
+    """Put a script in place of Python in the other process."""
+    (folder / "python").write_text(f"#!/bin/sh\n{script}\n")
+    (folder / "python").chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_what_is_known_to_be_good_is_not_read_again(tmp_path, monkeypatch):
+    python = sys.executable
+    contents = [ply("ascii", (3, 2, 1, 0)), ply("ascii", (3, 0, 1, 7))]
+    good, bad = wrong(tmp_path, "ply", *contents)
+    assert not good and bad
+    stand_in(tmp_path, monkeypatch, "exit 1")
+    assert wrong(tmp_path, "ply", contents[0]) == [""]
+    with pytest.raises(MachineError, match="python: the process that reads files of a scene does not start"):
+        wrong(tmp_path, "ply", *contents)  # damaged ones are not remembered
+    # A new process finds it in the folder of caches.
+    code = f"""import sys
+sys.path[:], sys.executable = {sys.path!r}, "/nowhere"
+from envedit.scene.scene_files import SceneFile, errors
+assert errors([SceneFile("ply", {str(tmp_path / "0.file")!r})]) == []"""
+    subprocess.run([python, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("end", ["kill -SEGV $$", "exec sleep 600"])
+def test_a_file_that_ends_or_holds_up_the_process_is_named(tmp_path, monkeypatch, end):
+    monkeypatch.setattr(scene_files, "SECONDS", 2)  # 8 on the clock
+    first = f"mkdir {tmp_path}/begun && {end}"
+    stand_in(tmp_path, monkeypatch, f"echo '\"begun\"'; echo '\"is bad\"'; {first}")
+    bad, culprit, last = wrong(tmp_path, "ply", *(ply("ascii", (3, 1, 2, i)) for i in range(3)))
+    assert bad.endswith("is bad") and last.endswith("is bad")  # the last one in a second process
+    assert "Mitsuba stops as it reads this file, or takes over" in culprit

@@ -43,7 +43,7 @@ def test_references_in_a_circle_are_refused(tmp_path):
         '<bsdf type="twosided" id="a"><ref id="b"/></bsdf>',
         '<bsdf type="twosided" id="b"><ref id="a"/></bsdf>',
     )
-    refused(write_scene(tmp_path, SENSOR, LIGHT, *parts), "circular reference")
+    refused(write_scene(tmp_path, SENSOR, LIGHT, *parts), "refer to one another in a circle")
 
 
 @pytest.mark.parametrize(
@@ -69,9 +69,8 @@ def test_what_is_included_and_no_xml_is_told_with_the_scene(tmp_path):
 @pytest.mark.parametrize("name", ["test.xml", "x/../test.xml", "./x/.././x/../test.xml"])
 def test_an_include_of_itself_is_refused(tmp_path, name):
     (tmp_path / "x").mkdir()
-    refused(
-        write_scene(tmp_path, SENSOR, LIGHT, f'<include filename="{name}"/>'), r"test\.xml: includes itself"
-    )
+    path = write_scene(tmp_path, SENSOR, LIGHT, f'<include filename="{name}"/>')
+    refused(path, r"test\.xml, .*more than 15 deep; does a file include itself\?")
 
 
 def test_includes_that_double_are_refused(tmp_path):
@@ -79,26 +78,25 @@ def test_includes_that_double_are_refused(tmp_path):
         twice = f'<include filename="{i + 1}.xml"/>' * 2
         write_scene(tmp_path, twice, name=f"{i}.xml")
     write_scene(tmp_path, BALL, name="13.xml")
-    refused(tmp_path / "0.xml", "more than 1000 files are included")
+    refused(tmp_path / "0.xml", "includes and fills in has more than 64 MB")
 
 
 def test_defaults_that_expand_into_each_other_are_refused(tmp_path):
     first = '<default name="a0" value="0123456789"/>'
     doubled = [f'<default name="a{i + 1}" value="$a{i}$a{i}"/>' for i in range(30)]
-    refused(write_scene(tmp_path, first, *doubled, SENSOR, LIGHT), r"line \d+: \$a\d+ makes a value longer")
+    refused(write_scene(tmp_path, first, *doubled, SENSOR, LIGHT), r"line \d+: .*more than 64 MB")
     # The same at the place of use: longer names are filled in first, and what they hold after them.
     held = [("\\$" + "a" * (29 - i)) * 2 for i in range(29)] + ["x"]
     grown = [f'<default name="{"a" * (30 - i)}" value="{text}"/>' for i, text in enumerate(held)]
     use = f'<string name="s" value="${"a" * 30}"/>'
-    refused(write_scene(tmp_path, *grown, SENSOR, LIGHT, use), "makes a value longer")
-    refused(write_scene(tmp_path, SENSOR, LIGHT, '<string name="s" value="$t$t"/>'), "longer", t="x" * 40_000)
+    refused(write_scene(tmp_path, *grown, SENSOR, LIGHT, use), "more than 64 MB")
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("<!--" * 40_000, "line 1: a comment is not closed"),
-        ("<![CDATA[" * 20_000, "line 1: a CDATA section is not closed"),
+        ("<!--" * 40_000, "Error parsing comment"),
+        ("<![CDATA[" * 20_000, "Error parsing CDATA section"),
         ('<a b="' * 40_000, "line 1: a tag is not well formed"),
         ("<" * 160_000, "line 1: a tag is not well formed"),
         ("<a " + "b " * 80_000, "line 1: a tag is not well formed"),
@@ -120,13 +118,11 @@ def test_sizes_are_bounded(tmp_path, monkeypatch):
     path = tmp_path / "test.xml"
     path.write_text("<scene>")
     with open(path, "r+b") as file:
-        file.truncate(scene_text.MOST_BYTES + 1)  # sparse
-    refused(path, "more than 64 MB of XML")
-    monkeypatch.setattr(scene_text, "MOST_ELEMENTS", 20)
-    refused(write_scene(tmp_path, *["<integer/>"] * 21), "more than 20 elements")
-    monkeypatch.setattr(scene_text, "MOST_DEFAULTS", 3)
-    defaults = [f'<default name="a{i}" value=""/>' for i in range(4)]
-    refused(write_scene(tmp_path, *defaults), "more than 3 parameters")
+        file.truncate(scene_text.MOST_CHARACTERS + 1)  # sparse
+    refused(path, "more than 64 MB")
+    monkeypatch.setattr(scene_text, "MOST_CHARACTERS", 2**18)  # for short tests
+    refused(write_scene(tmp_path, *["<integer/>"] * 5_000), "more than")
+    refused(write_scene(tmp_path, *[f'<default name="a{i}" value=""/>' for i in range(4)]), "more than")
 
 
 def test_what_mitsuba_reads_is_read_alike(tmp_path):

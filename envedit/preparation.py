@@ -23,8 +23,8 @@ from envedit.core.seeds import Seeds
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
-from envedit.scene import scene
 from envedit.scene.renderings import rendered
+from envedit.scene.scene import Scene
 from envedit.solve import initialization, turning
 from envedit.solve.edit_job import Job
 from envedit.solve.edit_state import Watch
@@ -79,8 +79,8 @@ class Preparation:
     ----------
     settings : config.Config
         What is to be done.
-    lit : scene.Scene
-        The scene.
+    scene : Scene
+        What is lit.
     original : ndarray (H, W, 3)
         The map.
     rows : Rows
@@ -96,7 +96,7 @@ class Preparation:
     """
 
     settings: config.Config
-    lit: scene.Scene
+    scene: Scene
     original: np.ndarray
     rows: Rows
     folder: Path | None
@@ -112,20 +112,18 @@ class Preparation:
             stored = self.settings.renderer.kind == "transport"
             self.watch.stage("tracing light transport" if stored else "preparing the path tracer")
             shape = self.original.shape[:2]
-            self.renderer = renderers.make(self.settings, self.lit, shape, self._count)
+            self.renderer = renderers.make(self.settings, self.scene, shape, self._count)
 
     def detailed(self, target: Target) -> bool:
         """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""
         if self.settings.representation.kind != "layers" or self._started_before:
             return False
         with self.clock("fit_s"):
-            representation: Any = representations.make(
-                self.settings, fit.default_folder(), None, self.rows.place, self._horizon()
-            )
+            representation = self._representation()
             representation.encode(self.original[self.rows.slice], self.settings.seed)
         with self.clock("transport_s"):
-            found = self._recorded(representation, target)
-        return bool(found and found.octaves)
+            recordings = self._recorded(representation, target)
+        return bool(recordings and recordings.octaves)
 
     def edit(self, target: Target) -> Edit:
         """Prepare the edit; the sky is turned where that explains the target better.
@@ -133,26 +131,26 @@ class Preparation:
         One that goes on from a solution on disk is of the map and the layers as they are.
         """
         if self._started_before:
-            edit = self._prepared(target, 0.0, [], search=False, ask=False)
+            edit = self._prepared(target, 0.0, [], search=False)
             edit.job.layers.go_on_from(self.settings.optimizer.start, edit.params)
             return edit
         # ---- Maps that explain the target to its noise are taken as they are
         if self._explains(0.0, target):
-            said = "nothing changed: the map already renders to the target within noise"
-            return self._idle(target, 0.0, said)
+            note = "nothing changed: the map already renders to the target within noise"
+            return self._idle(target, 0.0, note)
         turn = self._turn(target)
         if turn is None or turn.degrees == 0:
             return self._prepared(target, 0.0, [])
-        said = f"sky turned by {turn.degrees:.2f} degrees"
-        said += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
+        note = f"sky turned by {turn.degrees:.2f} degrees"
+        note += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
         if self._explains(turn.degrees, target):
-            return self._idle(target, turn.degrees, f"{said}; the rest is noise, nothing else changed")
+            return self._idle(target, turn.degrees, f"{note}; the rest is noise, nothing else changed")
 
         # ---- Edits of the turned and of the unturned map
         always = self.settings.representation.turn is True
         if not always and turn.left >= TURNED:
             return self._prepared(target, 0.0, [])
-        turned = self._prepared(target, turn.degrees, [said])
+        turned = self._prepared(target, turn.degrees, [note])
         if always or turned.job.layers.begun is None:
             return turned
         still = self._prepared(target, 0.0, [])
@@ -170,32 +168,33 @@ class Preparation:
     @property
     def _started_before(self):
         """Whether a solution on disk is what Gauss-Newton steps go on from."""
-        chosen, stored = self.settings.optimizer, self.settings.renderer.kind == "transport"
+        optimizer = self.settings.optimizer
         layers = self.settings.representation.kind == "layers"
-        return bool(chosen.start) and chosen.kind != "adam" and layers and stored
+        stored = self.settings.renderer.kind == "transport"
+        return bool(optimizer.start) and optimizer.kind != "adam" and layers and stored
 
     def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""
-        asked, transport = self.settings.representation.turn, self.renderer.transport
-        if asked is False or transport is None or not self.rows.all:
+        chosen, transport = self.settings.representation.turn, self.renderer.transport
+        if chosen is False or transport is None or not self.rows.all:
             return None
-        if asked == "auto" and target.coverage is not None:  # most of a painted picture is to stay
+        if chosen == "auto" and target.coverage is not None:  # most of a painted picture is to stay
             return None
         with self.clock("start_s"):
             self.watch.stage("testing turns of the sky")
             seeds = Seeds.of(self.settings.seed)
             drawn = seeds.turn_check, seeds.target_again
             # A power of four, for as many strata across as down.
-            spp = 4 ** (max(1, TURN_PATHS // (self.lit.width * self.lit.height)).bit_length() // 2)
+            spp = 4 ** (max(1, TURN_PATHS // (self.scene.width * self.scene.height)).bit_length() // 2)
             known = target.spp is not None and target.envmap is not None
             spp = min(spp, target.spp) if known else spp
             return turning.find(
                 transport,
-                lambda envmap, k: self.lit.render(envmap, spp, drawn[k]),
+                lambda envmap, k: self.scene.render(envmap, spp, drawn[k]),
                 self.original,
                 target.picture,
                 target.weight,
-                thorough=asked is True,
+                thorough=chosen is True,
             )
 
     def _explains(self, degrees, target):
@@ -217,46 +216,38 @@ class Preparation:
 
     def _shown(self, envmap, target, seed):
         """Render a map with as many samples as the target had."""
-        asked, seed = self.settings.target.spp, getattr(Seeds.of(self.settings.seed), seed)
-        return rendered(self.lit, envmap, asked, seed, self.settings.renderer.cache, target.spp)[0]
+        spp, drawn = self.settings.target.spp, getattr(Seeds.of(self.settings.seed), seed)
+        return rendered(self.scene, envmap, spp, drawn, self.settings.renderer.cache, target.spp)[0]
 
     def _idle(self, target, degrees, note):
         """Prepare an edit that leaves the turned map as it is, whatever the representation asked for."""
-        chosen = self.settings
-        chosen = replace(
-            chosen,
-            representation=replace(chosen.representation, kind="layers"),
-            optimizer=replace(chosen.optimizer, iterations=0),
+        settings = replace(
+            self.settings,
+            representation=replace(self.settings.representation, kind="layers"),
+            optimizer=replace(self.settings.optimizer, iterations=0),
         )
-        idle = replace(self, settings=chosen)
-        return idle._prepared(target, degrees, [note], search=False, ask=False)
+        return replace(self, settings=settings)._prepared(target, degrees, [note], search=False)
 
-    def _prepared(self, target, degrees, notes, search=True, ask=True):
-        """Prepare the edit of the turned map; ``ask``: how fine its gain may be."""
-        settings = self.settings
+    def _prepared(self, target, degrees, notes, search=True):
+        """Prepare the edit of the turned map; ``search``: for lights, and for how fine its gain may be."""
+        settings, rows, notes = self.settings, self.rows.slice, list(notes)
         original = latlong.rotate(self.original, degrees)
-        rows = self.rows.slice
-        crop, notes = original[rows], list(notes)
+        crop = original[rows]
+
+        # ---- The representation of the map
         with self.clock("fit_s"):
             kind = settings.representation.kind
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
-            horizon = self._horizon()
-            representation: Any = representations.make(
-                settings,
-                fit.default_folder(),
-                lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
-                self.rows.place,
-                horizon,
-            )
+            representation = self._representation()
             params = representation.encode(crop, settings.seed)
             if kind == "layers" and representation.below is not None:
                 notes.append(f"rows below the horizon {representation.below.said}")
         with self.clock("transport_s"):
-            recordings = self._recorded(representation, target) if ask else None
-        traced = self.renderer.transport
+            recordings = self._recorded(representation, target) if search else None
+        octaves = recordings.octaves if recordings else []
         job = Job(
             settings=settings,
-            lit=self.lit,
+            scene=self.scene,
             original=original,
             first=self.rows.first,
             free=None,
@@ -267,38 +258,48 @@ class Preparation:
             watch=self.watch,
             dists=self.dists,
         )
+
         # ---- Which texels keep their value: none for Gauss-Newton, whose prior holds what is not determined
-        octaves, frozen = recordings.octaves if recordings else [], None
-        if traced:
+        frozen = None
+        if traced := self.renderer.transport:
             frozen = np.zeros(original.shape[:2], bool)
             if octaves or not job.newton:
-                known = traced.determined(rows, settings.renderer.influence_threshold)
-                frozen[rows] = ~known[rows]
+                frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
             job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
             representation.keep(job.free)
             job.free = None  # the gain keeps to them, while a light may move across the others
             notes += recordings.notes
-        # ---- Which lights, and where
-        if recordings and search and (settings.optimizer.iterations or not job.newton):
+
+        # ---- Which lights, and where; then which pixels count, and finer grids
+        if recordings and (settings.optimizer.iterations or not job.newton):
             with self.clock("start_s"):
                 params = self._explained(job, params, octaves, notes, recordings.transport)
             if octaves:
-                began = original.copy()
-                began[representation.active] = representation.decode(params).numpy()
-                job.target, said = initialization.trusted(began, recordings, target)
-                notes += said
+                envmap = original.copy()
+                envmap[representation.active] = representation.decode(params).numpy()
+                job.target, more = initialization.trusted(envmap, recordings, target)
+                notes += more
         params = representation.refine(params, octaves) if octaves else params
         return Edit(job, params, crop, degrees, frozen, notes)
+
+    def _representation(self) -> Any:
+        """Make the representation; a fit reports its progress."""
+        return representations.make(
+            self.settings,
+            fit.default_folder(),
+            lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
+            self.rows.place,
+            self._horizon(),
+        )
 
     def _explained(self, job, params, octaves, notes, transport):
         """Find the lights that explain the target, and for Adam the sky; returns parameters."""
         self.watch.stage("searching for lights")
         explanation = job.layers.explain(params, transport)
-        said = "the target" if job.target.coverage is None else "the paint"
-        notes.append(
-            f"likeliest explanation of {said}: {explanation.name} (-2 log evidence {explanation.score:.1f})"
-        )
+        subject = "the target" if job.rendered else "the paint"
+        evidence = f"-2 log evidence {explanation.score:.1f}"
+        notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
         if job.newton and not octaves:
             job.layers.begun = explanation.run
             return params
@@ -315,19 +316,25 @@ class Preparation:
         if not representation.models_edit:
             return None
         if self._recordings is None:
-            shape, traced = self.original.shape[:2], self.renderer.transport
-            asked = self.settings, self.lit, shape, representation, target, traced, self._count
-            self._recordings = initialization.recordings(*asked)
+            traced = self.renderer.transport
+            self._recordings = initialization.recordings(
+                self.settings,
+                self.scene,
+                self.original.shape[:2],
+                representation,
+                target,
+                traced,
+                self._count,
+            )
             if traced:
                 self.renderer = self._recordings.transport
         return self._recordings
 
     def _horizon(self):
         """Return what the rows below the horizon do."""
-        given = self.settings.input
         if self.settings.representation.kind != "layers":
             return "free"
-        return below_horizon.treatment(given.horizon, given.rows, self.original)
+        return below_horizon.treatment(self.settings.input.horizon, self.settings.input.rows, self.original)
 
     def _count(self, done, total):
         self.watch.progress(done, total, "")

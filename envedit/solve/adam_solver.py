@@ -47,7 +47,7 @@ def optimise(
     settings = edit.settings.optimizer
     adam = adam_loop.adam_for(edit.representation, params, settings)
     state = adam_loop.State()
-    digest = checkpoint.digest(edit.settings, edit.lit.digest, [edit.original, *edit.target.asked])
+    digest = checkpoint.digest(edit.settings, edit.scene.digest, [edit.original, *edit.target.asked])
     if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
         state, moments, traced, picture = stored
         adam.load_state_dict(moments)
@@ -62,7 +62,7 @@ def optimise(
         settings.iterations,
         dists=edit.dists,
         every=edit.settings.perceptual.dists_every,
-        views=edit.lit.rows,
+        views=edit.scene.rows,
     )
     objective.resume(state.history)
     saved = time.perf_counter()

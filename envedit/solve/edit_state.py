@@ -17,7 +17,7 @@ from envedit.losses.perceptual import distances
 from envedit.renderers import Renderer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.unseen import unseen_kept
-from envedit.scene import scene
+from envedit.scene.scene import Scene
 from envedit.solve import block_jacobian, task
 from envedit.solve.map_problem import Problem
 from envedit.targets.target import Target
@@ -66,8 +66,8 @@ class EditState:
     ----------
     settings : config.Config
         What is carried out.
-    lit : scene.Scene
-        The scene.
+    scene : Scene
+        What is lit.
     original : ndarray (H, W, 3)
         The map.
     first : int
@@ -87,7 +87,7 @@ class EditState:
     """
 
     settings: config.Config
-    lit: scene.Scene
+    scene: Scene
     original: np.ndarray
     first: int
     free: np.ndarray | None

@@ -133,7 +133,7 @@ class LayersSolver:
         # ---- Where it starts
         edit, run = self.edit, self.begun
         settings = edit.settings.optimizer
-        digest = checkpoint.digest(edit.settings, edit.lit.digest, [edit.original, *edit.target.asked])
+        digest = checkpoint.digest(edit.settings, edit.scene.digest, [edit.original, *edit.target.asked])
         if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
             state, arrays, traced, picture = stored
             edit.renderer.restore(traced)
@@ -207,7 +207,7 @@ class LayersSolver:
         point = edit.problem().evaluate(run.state)
         edit.target = transport_error.corrected(
             edit.target,
-            edit.lit,
+            edit.scene,
             point.edited,
             point.rendering,
             edit.settings.seed,
@@ -259,7 +259,7 @@ class LayersSolver:
     def _missed(self, envmap):
         """Return display values of Mitsuba's rendering of a map less the target's."""
         edit, seed = self.edit, Seeds.of(self.edit.settings.seed).step_check
-        shown = display_curve.to_display(tensor(edit.lit.render(envmap, CHECKED_SPP, seed)))
+        shown = display_curve.to_display(tensor(edit.scene.render(envmap, CHECKED_SPP, seed)))
         return shown.numpy() - display_curve.to_display(tensor(edit.target.picture)).numpy()
 
 

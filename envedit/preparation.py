@@ -118,10 +118,10 @@ class Preparation:
         if self.settings.representation.kind != "layers" or self._started_before:
             return False
         with self.clock("fit_s"):
-            representation: Any = representations.make(
-                self.settings, fit.default_folder(), None, self.rows.place, self._horizon()
+            crop = self.original[self.rows.slice]
+            representation, _ = representations.encoded(
+                crop, self.settings, rows=self.rows.place, horizon=self._horizon()
             )
-            representation.encode(self.original[self.rows.slice], self.settings.seed)
         with self.clock("transport_s"):
             found = self._recorded(representation, target)
         return bool(found and found.octaves)
@@ -240,14 +240,15 @@ class Preparation:
             kind = settings.representation.kind
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
             horizon = self._horizon()
-            representation: Any = representations.make(
+            representation: Any
+            representation, params = representations.encoded(
+                crop,
                 settings,
                 fit.default_folder(),
                 lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
                 self.rows.place,
                 horizon,
             )
-            params = representation.encode(crop, settings.seed)
             if kind == "layers" and representation.below is not None:
                 notes.append(f"rows below the horizon {representation.below.said}")
         with self.clock("transport_s"):
@@ -275,7 +276,8 @@ class Preparation:
                 frozen[rows] = ~known[rows]
             job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
-            representation.keep(job.free)
+            representation = representation.keeping(job.free)
+            job.representation = representation
             job.free = None  # the gain keeps to them, while a light may move across the others
             notes += recordings.notes
         # ---- Which lights, and where
@@ -287,7 +289,9 @@ class Preparation:
                 began[representation.active] = representation.decode(params).numpy()
                 job.target, said = initialization.trusted(began, recordings, target)
                 notes += said
-        params = representation.refine(params, octaves) if octaves else params
+        if octaves:
+            job.representation = representation.refined(octaves)
+            params = job.representation.start() | params
         return Edit(job, params, crop, degrees, frozen, notes)
 
     def _explained(self, job, params, octaves, notes, transport):

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotated, rotation_vector
-from envedit.representations.layers.gain import VEIL
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.unknowns import Point, Unknowns
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
@@ -81,15 +79,8 @@ class Derivatives:
 
     def _slopes(self, point):
         """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        # In double precision: products of three radiances leave the range of the other.
         slopes = point.sky.astype(np.float64)
-        own = self.layers.shape[0]
-        params = self.unknowns.params(point.state)
-        sky, base = slopes[:own], self.layers.before_gain(params).astype(np.float64)
-        gain = np.exp(np.float64(self.layers.log_gain(params)))
-        grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
-        more = base + (gain - 1) * grey
-        slopes[:own] = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
+        slopes[: self.layers.shape[0]] = self.layers.gain_slope(self.unknowns.params(point.state))
         return slopes.reshape(-1, 3)
 
     def _profile(self, point, cores):
@@ -140,15 +131,7 @@ class Derivatives:
 
     def _by_saturation(self, point, profile):
         """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
-        params, own = self.unknowns.params(point.state), self.layers.shape[0]
-        base, change = self.layers.by_saturation(params)
-        # Of what a gain brightens a part is luminance, which stays.
-        more = np.maximum(np.exp(self.layers.log_gain(params)) - 1, 0)
-        luminance = base[:own] @ np.array(LUMINANCE, np.float32)
-        grey = (1 - VEIL) * base[:own] + VEIL * luminance[..., None]
-        base[:own] += more * grey
-        change[:own] *= 1 + (1 - VEIL) * more
-        change *= np.divide(point.sky, base, out=np.zeros_like(base), where=base > 0)
+        change = self.layers.saturation_slope(self.unknowns.params(point.state))
         change = self._with_lit_ground(point, np.zeros_like(change[None]), change[None])
         return (self.blocks.pictures(change) * profile.reshape(-1, 3))[0]
 

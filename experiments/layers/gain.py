@@ -6,6 +6,7 @@ Mitsuba with fresh samples; "sharp" is the energy of high frequencies over the o
 """
 
 import time
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,6 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core import array_cache, latlong
 from envedit.losses import metrics
-from envedit.representations.layers.gain import GridGain
 from envedit.representations.layers.layers import Layers
 from envedit.representations.siren import network as siren
 from envedit.solve import adam_loop, map_problem, search
@@ -36,10 +36,6 @@ class SirenGain:
 
     def __init__(self, omega, hidden, depth, rate):
         self.omega, self.hidden, self.depth, self.rate = omega, hidden, depth, rate
-
-    def __call__(self, cycles, share, top=True):
-        """Stand in for the class that the representation makes its gain of."""
-        return self
 
     def init(self):
         """Weights whose field is zero."""
@@ -70,7 +66,7 @@ class SirenGain:
 
 
 VARIANTS = {
-    "grids, 12 cycles": GridGain,
+    "grids, 12 cycles": None,
     "SIREN 32x1, omega 8 (5 cycles)": SirenGain(8.0, 32, 1, 0.1),
     "SIREN 32x1, omega 16 (9 cycles)": SirenGain(16.0, 32, 1, 0.1),
     "SIREN 64x2, omega 16": SirenGain(16.0, 64, 2, 0.05),
@@ -91,12 +87,11 @@ def compare(settings, folder, variant) -> dict:
     kept = array_cache.cache_folder("transport")
     transport = LightTransport.build(lit, height, width, few=True, folder=kept)
     crop, rows = original[: height // 2], (0, height)
-    plain = Layers(rows)
-    encoded = plain.encode(crop)
+    plain = Layers.of(crop, rows)
     problem = map_problem.Problem(plain, transport, original, picture)
-    begun = problem.found(search.search(problem, problem.state(encoded)).run.state)
-    layers = type("Variant", (Layers,), {"Gain": VARIANTS.get(variant, GridGain)})(rows)
-    params = layers.encode(crop)
+    begun = problem.found(search.search(problem, problem.state(plain.start())).run.state)
+    layers = replace(plain, gain=VARIANTS.get(variant) or plain.gain)
+    params = layers.start()
     params |= {k: v for k, v in begun.items() if variant == SEARCHED or not k.startswith("gain")}
     chosen = config.Optimizer(iterations=ITERATIONS)
     objective = adam_loop.Objective(config.Loss(), picture, None, crop, ITERATIONS)

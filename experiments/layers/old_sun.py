@@ -33,8 +33,8 @@ BRIGHT = 1.5
 """Glow from which on the membrane fills in."""
 
 
-def under(made: layers.Layers, way: str) -> None:
-    """Let layers, just encoded, show what they do under one of the :data:`WAYS`."""
+def under(made: layers.Layers, way: str) -> layers.Layers:
+    """Return layers that show what they do under one of the :data:`WAYS`."""
     behind, background = made.behind, made.separation.background
     logs = np.log(background + behind.faint)
     low, none = product._blurred(logs, product.BLUR, made.rows), np.zeros_like(logs)
@@ -47,10 +47,11 @@ def under(made: layers.Layers, way: str) -> None:
         "elevation, no texture": (behind.offset + (behind.slope + 1) * low, none - 1),
         "membrane": (np.log(filled + behind.faint) - logs, none),
     }[way]
-    made.behind, made._prepared = replace(behind, offset=offset, slope=slope), {}
+    made = replace(made, behind=replace(behind, offset=offset, slope=slope))
     if made.mirrored and way in WAYS[:2]:
         gone, near = np.ones((*made.below.shape, 1)), np.zeros((*made.below.shape, 1))
         made.below.reveal(np.zeros((*made.below.shape, 3)), gone, near)
+    return made
 
 
 def turned(made: layers.Layers, params: dict, columns: int, width: int) -> dict:
@@ -91,11 +92,11 @@ def compare(settings, folder) -> dict:
     height, width, _ = original.shape
     tiles, found = [], {}
     for way in WAYS:
-        made = layers.Layers((0, height), horizon=below_horizon.kind_of(original))
-        params = made.encode(original)
+        made = layers.Layers.of(original, horizon=below_horizon.kind_of(original))
+        params = made.start()
         if made.behind is None:
             return {"numbers": {}}
-        under(made, way)
+        made = under(made, way)
         found[way] = []
         for columns in TURNS:
             params = turned(made, params, columns, width)

@@ -28,10 +28,9 @@ def trace(settings, folder) -> dict:
     transport = renderers.trace(settings, lit, original.shape[:2])
     active = inputs.active_rows(settings.input.rows, original.shape[0])
     rows = active.slice
-    layers = Layers(active.place)
-    params = layers.encode(original[rows])
+    layers = Layers.of(original[rows], active.place)
     problem = map_problem.Problem(layers, transport, original, wanted.picture)
-    lights = search.search(problem, problem.state(params)).run.state
+    lights = search.search(problem, problem.state(layers.start())).run.state
     # Both start from the lights that were found, under the sky of the original.
     params = problem.found(lights | {name: 0 * lights[name] for name in ("gain", "saturation")})
 

@@ -1,5 +1,7 @@
 """The scripts beside ``experiments layers`` run against the representation as it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,10 +21,10 @@ def sky():
 
 @pytest.mark.parametrize("way", old_sun.WAYS)
 def test_every_way_to_fill_the_old_place_of_a_sun_gives_a_finite_map(sky, way):
-    made = Layers((0, len(sky)), horizon="mirror")
-    params = made.encode(sky)
+    made = Layers.of(sky, horizon="mirror")
+    params = made.start()
     assert made.behind is not None
-    old_sun.under(made, way)
+    made = old_sun.under(made, way)
     np.testing.assert_allclose(made.decode(params).numpy(), sky, rtol=1e-3)  # nothing has moved yet
     turned = made.decode(old_sun.turned(made, params, WIDTH // 3, WIDTH)).numpy()
     assert np.isfinite(turned).all()
@@ -32,8 +34,9 @@ def test_every_way_to_fill_the_old_place_of_a_sun_gives_a_finite_map(sky, way):
 @pytest.mark.parametrize("name", gain.VARIANTS)
 def test_every_gain_that_is_compared_starts_from_no_change(sky, name):
     up = sky[: len(sky) // 2]
-    made = type("Variant", (Layers,), {"Gain": gain.VARIANTS[name]})((0, len(sky)))
-    params = made.encode(up)
+    made = Layers.of(up, (0, len(sky)))
+    made = replace(made, gain=gain.VARIANTS[name] or made.gain)
+    params = made.start()
     np.testing.assert_allclose(made.decode(params).numpy(), up, rtol=1e-3)
     # The last of the gain's parameters is a bias, or the nodes of the finest grid.
     last = max(key for key in params if key.startswith("gain."))

@@ -57,10 +57,8 @@ def small(source, size=WORKING):
 
 def encoded(working, rows=ROWS, free=None):
     first, count = rows
-    made = Layers((first, len(working)))
-    params = {k: v.numpy().copy() for k, v in made.encode(working[first : first + count]).items()}
-    made.keep(free)
-    return made, params
+    made = Layers.of(working[first : first + count], (first, len(working))).keeping(free)
+    return made, {k: v.numpy().copy() for k, v in made.start().items()}
 
 
 def sent(made, params, v, light=0):
@@ -511,8 +509,8 @@ def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer, satur
     up = sky(height, width, sun=(20.0, 200.0), seed=1)[: height // 2]
     source = np.concatenate([up, np.minimum(up[::-1], 3)])
     working = latlong.resize(source, *WORKING)
-    made = Layers((0, WORKING[0]), horizon=kind)
-    params = made.encode(working)
+    made = Layers.of(working, horizon=kind)
+    params = made.start()
     turn = np.zeros((made.lights.count, 3))
     turn[0] = rotation_vector(made.lights.centres[0], toward(25.0, 90.0))
     params = params | {"turn": mi.TensorXf(np.float32(turn / made.scales["turn"]))}

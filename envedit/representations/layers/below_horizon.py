@@ -209,11 +209,6 @@ class Below:
         change = change if ground is None else change + ground
         return dr.matmul(self._lit, dr.matmul(change, self._around))
 
-    def reshaped(self, log_factor: mi.TensorXf | float) -> mi.TensorXf:
-        """Return a log factor (rows, 3 W), or one number for all, as (rows, W, 3)."""
-        rows, width = self.shape
-        return dr.reshape(dr.zeros(mi.TensorXf, (rows, 3 * width)) + log_factor, (rows, width, 3))
-
     def log_factor(
         self,
         sky: mi.TensorXf | Averaged,
@@ -298,12 +293,17 @@ class _Around(dr.CustomOp):
     """
 
     def eval(self, coarse, kernel, adjoint, shifted):
-        self._adjoint, self._shifted = adjoint, shifted
+        self._kernel = kernel
+        self._adjoint = adjoint
+        self._shifted = shifted
         return self._product(coarse, kernel)
 
     def _product(self, coarse, kernel):
         laid_out = dr.gather(mi.Float, coarse.array, self._shifted)
         return dr.matmul(kernel, mi.TensorXf(laid_out, (kernel.shape[1], coarse.shape[1])))
+
+    def forward(self):
+        self.set_grad_out(self._product(self.grad_in("coarse"), self._kernel))
 
     def backward(self):
         self.set_grad_in("coarse", self._product(self.grad_out(), self._adjoint))

@@ -8,6 +8,7 @@ Finer ones are added where they are identifiable from the picture.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -112,11 +113,13 @@ class GridGain:
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
         self._units: list[Any] = [0.5**level for level in range(LEVELS)]
 
-    def refine(self, octaves: Sequence[Octave]) -> None:
-        """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
-        for octave in octaves:
-            self.sizes.append(octave.size)
-            self._units.append(DETAIL * np.repeat(octave.known[..., None], 3, axis=2).astype(np.float32))
+    def refined(self, octaves: Sequence[Octave]) -> GridGain:
+        """Return this gain with finer grids; a step of a node of theirs counts as far as it is known."""
+        finer = copy.copy(self)
+        finer.sizes = [*self.sizes, *(octave.size for octave in octaves)]
+        units = [DETAIL * np.repeat(octave.known[..., None], 3, axis=2) for octave in octaves]
+        finer._units = [*self._units, *(unit.astype(np.float32) for unit in units)]
+        return finer
 
     def init(self) -> dict:
         """Return its parameters: all zero."""

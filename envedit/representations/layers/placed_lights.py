@@ -45,8 +45,8 @@ class PlacedLights:
     def __init__(self, envmap: np.ndarray, horizon: str = "auto"):
         self.envmap = envmap
         kind: Any = below_horizon.kind_of(envmap) if horizon == "auto" else horizon
-        self.layers = Layers(horizon=kind)
-        self._still = self.layers.encode(envmap)
+        self.layers = Layers.of(envmap, horizon=kind)
+        self._still = self.layers.start()
         self.lights = self.layers.separation.lights
 
     def params(self, placed: Sequence[dict]) -> dict:

@@ -37,7 +37,7 @@ def under(made: layers.Layers, way: str) -> layers.Layers:
     """Return layers that show what they do under one of the :data:`WAYS`."""
     behind, background = made.behind, made.separation.background
     logs = np.log(background + behind.faint)
-    low, none = product._blurred(logs, product.BLUR, made.rows), np.zeros_like(logs)
+    low, none = product._blurred(logs, product.BLUR_DEGREES, made.rows), np.zeros_like(logs)
     filled = separation.filled(background, made.separation.glow.max(axis=2) > BRIGHT)
     offset, slope = {
         "glow divided out": (none, none),

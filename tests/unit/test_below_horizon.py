@@ -95,14 +95,14 @@ def test_a_mirror_turns_with_its_sky():
 def test_the_width_is_that_under_which_the_original_mirrors_itself():
     low, sky = halves(mirror((64, 128)))
     sharp = np.ascontiguousarray(sky[::-1])
-    assert Below(sharp, sky, "mirror").widest == below_horizon.WIDEST[0]
-    for widest in below_horizon.WIDEST[1:3]:
-        blur = below_horizon._Blur(sky.shape[:2], 64, below_horizon.COARSE)
+    assert Below(sharp, sky, "mirror").widest == below_horizon.BLUR_MOST_DEGREES[0]
+    for widest in below_horizon.BLUR_MOST_DEGREES[1:3]:
+        blur = below_horizon._Blur(sky.shape[:2], 64, below_horizon.CHOICE_COLUMNS)
         blur.widen(widest)
         soft = blur(tensor(sky)).numpy().reshape(*blur.grid, 3)
         made = np.einsum("ri,ijx,cj->rcx", blur.down[::-1], soft, blur.across)
         assert Below(np.float32(made), sky, "mirror").widest == widest
-    assert Below(low, sky, "keep").widest in below_horizon.WIDEST
+    assert Below(low, sky, "keep").widest in below_horizon.BLUR_MOST_DEGREES
 
 
 @pytest.mark.parametrize("kind", below_horizon.KINDS)

@@ -161,7 +161,7 @@ class GridGain:
 
     def prepare(self, shape: tuple[int, int], rows: object = None) -> list:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
-        found = []
+        matrices = []
         for size in self.sizes:
             down, across = splines(size, shape)
             at_pole = np.zeros_like(down)
@@ -170,8 +170,8 @@ class GridGain:
             around[:, 0] = 1
             channels = np.eye(3)  # one apart from the other
             wide = [np.kron(m.T, channels) for m in (across, around)]
-            found.append([tensor(m) for m in (down, wide[0], at_pole, wide[1])])
-        return found
+            matrices.append([tensor(m) for m in (down, wide[0], at_pole, wide[1])])
+        return matrices
 
     def evaluate(self, params: dict, prepared: Sequence) -> mi.Color3f:
         """Return the log gain at every texel.

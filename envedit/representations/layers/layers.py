@@ -40,6 +40,11 @@ GROUND = 0.3
 which has no prior, made ground pink under a mirror (three edits of the analytic sky: maps 34.3, 27.1 and
 22.1 dB; with 0.3 36.5, 33.4 and 28.9)."""
 
+SATURATION_STEP = 0.05
+"""Step of the difference by the log saturation, towards grey. Not measured beside other steps. The tangent in
+its place (forward-mode derivative) differs by 0.2 to 0.7 % of the largest value; with it two of four small
+edits towards renderings ended 1.0 and 0.7 dB lower, one of them after 22 steps in place of 14."""
+
 
 @dataclass(frozen=True)
 class TexelFields:
@@ -342,23 +347,24 @@ class Layers:
             return self._image(dr.grad(sky)).numpy()
 
     def saturation_slope(self, params: dict) -> np.ndarray:
-        """Return the derivative of the map without cores by the log saturation, (rows, W, 3).
+        """Return the derivative of the map without cores by the log saturation, (rows, W, 3): a difference.
 
         Of the saturation itself, in all rows that have it: what rows below the horizon follow is held.
         """
         real = self._real(params)
+        fields = self._fields(real)
+        followed = self._log_below(real, self._above(real), None) if self.mirrored else None
+
+        def sky_at(log_saturation):
+            sky = dr.ravel(self._above(real, replace(fields, log_saturation=log_saturation)).sky)
+            if followed:
+                sky = dr.concat((sky, dr.ravel(self._low(log_saturation, *followed).sky)))
+            return sky.numpy().reshape(-1, self.whole[1], 3)
+
+        log_saturation = real["saturation"].array
+        here = sky_at(log_saturation)
         slopes = np.zeros((*self.whole, 3), np.float32)
-        with dr.isolate_grad():
-            log_saturation = mi.Float(real["saturation"].array)
-            dr.enable_grad(log_saturation)
-            dr.set_grad(log_saturation, 1)
-            sky = self._above(real, replace(self._fields(real), log_saturation=log_saturation)).sky
-            if self.mirrored:
-                followed = self._log_below(real, self._above(real), None)
-                sky = dr.concat([dr.ravel(sky), dr.ravel(self._low(log_saturation, *followed).sky)])
-            dr.forward_to(sky)
-            slope = dr.ravel(dr.grad(sky)).numpy().reshape(-1, *slopes.shape[1:])
-        slopes[: len(slope)] = slope
+        slopes[: len(here)] = (here - sky_at(log_saturation - SATURATION_STEP)) / np.float32(SATURATION_STEP)
         return slopes
 
     def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:

@@ -46,7 +46,7 @@ GLOW_MOST_DEGREES = 90.0
 """Largest radius of a glow. Not measured."""
 GLOW_SMOOTHING = 1 / 12
 """Standard deviation by which a glow is smoothed, over the angle: 5 degrees, a ring, at 60. Derived from
-:data:`RING_EDGES`: kinks between rings are visible as arcs."""
+``_RINGS``: kinks between rings are visible as arcs."""
 GLOW_END = 1.05
 """A glow ends where its ring is at most this many times as bright as the darkest ring farther out. Not
 measured."""
@@ -54,9 +54,9 @@ LEAST_EXPLAINED = 0.2
 """A glow is used only if it explains this share of the variance of log luminance. Not measured."""
 GLOW_DEGREES = np.arange(0.0, 121.0)
 """Angles at which a glow is tabulated; 0 from the last on."""
-RING_EDGES = np.concatenate(
+_RINGS = np.concatenate(
     [[0, 1, 1.5], np.arange(2.0, 10), np.arange(10.0, 20, 2), np.arange(20.0, 121, 5)]
-)
+)  # edges, degrees
 """Edges of the rings in which a glow is measured, degrees: finer near the light. Not measured."""
 MEDIAN_COLUMNS = 64
 """Columns of the grid on which the median of the surroundings is taken. Not measured."""
@@ -393,18 +393,17 @@ def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarra
     # ---- The colour of the sky in rings around the centre
     angle = np.degrees(np.arccos(np.clip(small.directions @ centre, -1, 1)))
     lum = image @ LUMINANCE
-    ring = np.digitize(angle, RING_EDGES) - 1
+    ring = np.digitize(angle, _RINGS) - 1
     middles, colours = [], []
-    for i in range(len(RING_EDGES) - 1):
+    for i in range(len(_RINGS) - 1):
         inside = (ring == i) & ~cores
         if inside.sum() < 4:
             continue
         values = lum[inside]
         low, high = np.quantile(values, RING_SHARE)
-        middles.append((RING_EDGES[i] + RING_EDGES[i + 1]) / 2)
+        middles.append((_RINGS[i] + _RINGS[i + 1]) / 2)
         colours.append(image[inside][(values >= low) & (values <= high)].mean(axis=0))
-    middle = np.array(middles)
-    colour = np.array(colours).reshape(-1, 3)
+    middle, colour = np.array(middles), np.array(colours).reshape(-1, 3)
     bright = colour @ LUMINANCE
 
     # ---- The widest glow that explains enough

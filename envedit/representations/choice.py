@@ -26,12 +26,19 @@ def make(
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
 
     Not layers, which are made of a map: :func:`encoded`.
+
+    Raises
+    ------
+    ValueError
+        Of any other kind.
     """
     kind = settings.representation.kind
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":
         return LogPixels()
+    if kind != "siren":
+        raise ValueError(f"make: got kind {kind!r}, expected siren, pixels or log-pixels")
     recipe = settings.fit if settings.fit.polish == "always" else fit.unpolished(settings.fit)
     return Siren(settings.representation, recipe, folder, progress, rows)
 

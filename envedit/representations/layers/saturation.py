@@ -16,7 +16,7 @@ import mitsuba as mi
 from envedit.representations.layers.gain import VEIL
 
 LEAST = 1e-4
-"""Least b, where k is near 1."""
+"""Least b, where k is near 1: keeps logarithms finite. Not measured."""
 
 
 def saturated(radiance: mi.Color3f, exponent: mi.Float) -> mi.Color3f:

@@ -107,6 +107,22 @@ def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
     assert carried(made, params, working, source)[0].tobytes() == source.tobytes()
 
 
+def test_saturation_and_gain_leave_kept_texels_their_bits():
+    source = sky(256, 512, sun=None)
+    working = small(source)
+    free = np.ones((ROWS[1], WORKING[1]), bool)
+    free[:, :64] = False
+    made, params = encoded(working, free=free)
+    params["saturation"] = np.full((1, 1), -1, np.float32)
+    params["gain.0"] += 0.5
+    result = carried(made, params, working, source)[0]
+    kept = np.repeat(free, 4, axis=1)[0] == 0
+    rows = active(source)
+    np.testing.assert_array_equal(result[rows][:, kept], source[rows][:, kept])
+    changed = np.abs(result - source)[rows][:, ~kept]
+    assert (changed > 1e-3).all(axis=2).mean() > 0.9
+
+
 @pytest.mark.slow
 def test_bands_do_not_show(sunny, rng, monkeypatch):
     source, working, made, params = sunny

@@ -119,8 +119,7 @@ class Preparation:
         if self.settings.representation.kind != "layers" or self._started_before:
             return False
         with self.clock("fit_s"):
-            representation = self._representation()
-            representation.encode(self.original[self.rows.slice], self.settings.seed)
+            representation, _ = self._encoded(self.original[self.rows.slice])
         with self.clock("transport_s"):
             recordings = self._recorded(representation, target)
         return bool(recordings and recordings.octaves)
@@ -238,8 +237,7 @@ class Preparation:
         with self.clock("fit_s"):
             kind = settings.representation.kind
             self.watch.stage("separating lights" if kind == "layers" else f"fitting ({kind})")
-            representation = self._representation()
-            params = representation.encode(crop, settings.seed)
+            representation, params = self._encoded(crop)
             if kind == "layers" and representation.below is not None:
                 notes.append(f"rows below the horizon {representation.below.said}")
         with self.clock("transport_s"):
@@ -267,7 +265,8 @@ class Preparation:
                 frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
             job.free = ~frozen[rows] if frozen.any() else None
         if recordings:
-            representation.keep(job.free)
+            representation = representation.keeping(job.free)
+            job.representation = representation
             job.free = None  # the gain keeps to them, while a light may move across the others
             notes += recordings.notes
 
@@ -280,12 +279,15 @@ class Preparation:
                 envmap[representation.active] = representation.decode(params).numpy()
                 job.target, more = initialization.trusted(envmap, recordings, target)
                 notes += more
-        params = representation.refine(params, octaves) if octaves else params
+        if octaves:
+            job.representation = representation.refined(octaves)
+            params = job.representation.start() | params
         return Edit(job, params, crop, degrees, frozen, notes)
 
-    def _representation(self) -> Any:
-        """Make the representation; a fit reports its progress."""
-        return representations.make(
+    def _encoded(self, crop: np.ndarray) -> tuple[Any, dict]:
+        """Return the representation of a map's active rows, and parameters; a fit reports its progress."""
+        return representations.encoded(
+            crop,
             self.settings,
             fit.default_folder(),
             lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),

@@ -20,10 +20,8 @@ from envedit.export.source_cores import SourceCores
 from envedit.export.texel_maps import Places, as_colours, as_image
 from envedit.representations.base import Representation
 from envedit.representations.layers import lights
-from envedit.representations.layers.behind_glow import gone_of
-from envedit.representations.layers.gain import brightened
+from envedit.representations.layers.composition import Fields, Glows, compose
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.saturation import saturated
 from envedit.representations.layers.unseen import unseen_kept
 
 
@@ -68,7 +66,7 @@ def carry(
         Active rows of the working map.
     free : ndarray of bool (rows, w), optional
         Active working texels that may change at all; None: all. Layers know which keep their gain
-        (:meth:`.layers.Layers.keep`): a light may move across those.
+        (:meth:`.layers.Layers.keeping`): a light may move across those.
 
     Returns
     -------
@@ -124,49 +122,49 @@ def carry(
 
 
 class _LayersAt:
-    """Layers at the resolution of a source, band by band.
+    """Layers at the resolution of a source, band by band: :func:`.compose` of fields that are interpolated.
 
     Attributes
     ----------
-    gain : ndarray (rows, W, 3)
-        Log gain of the working map; of rows that follow those above the horizon, all that they are multiplied
-        by.
+    fields : TexelFields
+        Of the working map.
     edge : int or None
-        Working row from which rows follow.
+        Working row from which rows follow those above the horizon.
+    free : ndarray of bool (rows, w) or None
+        Working texels that gain and saturation act on; None: all.
     relit : bool
-        The glow has changed; then ``behind`` and ``faint`` are what it had hidden, and ``by_lights`` is the
-        log factor of rows that follow.
-    exponent : Float or None
-        k of ``saturation.py``, where the sky's colours change by it.
+        The glow of a light has changed.
     strength : Float
         Of lights that stay, what their cores are multiplied by; of those that move, nothing is left.
     """
 
     def __init__(self, layers: Layers, params: dict, grid: Places):
-        self.layers, self.grid = layers, grid
+        self.layers = layers
+        self.grid = grid
+        self.fields = layers.texel_fields(params)
         self.placed = {name: params[name] * layers.scales[name] for name in ("turn", "flux", "size")}
-        turn, flux, size = (value.numpy() for value in self.placed.values())
-        self.exponent = None
+        self.log_saturation = None
         if "saturation" in params:
-            self.exponent = dr.opaque(mi.Float, float(np.exp(params["saturation"].numpy()[0, 0])))
-        by_lights, further = layers.log_below(params)
-        self.gain = np.concatenate([layers.log_gain(params), further])
-        self.edge = None if layers.below is None else layers.shape[0]
+            log_saturation = params["saturation"].numpy()[0, 0] * layers.scales["saturation"]
+            self.log_saturation = dr.opaque(mi.Float, float(log_saturation))
+
+        # ---- Rows that follow those above the horizon
+        self.edge = None
         self.free = layers.free
-        if self.edge is not None and self.free is not None:
-            self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
+        if layers.below is not None:
+            self.edge = layers.shape[0]
+            if self.free is not None:
+                self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
+
+        # ---- Lights: which there are, which have moved, and what is left of the others' cores
+        turn, flux, size = (value.numpy() for value in self.placed.values())
         own = layers.lights.own
-        self._lit = (flux > lights.DARK).any(axis=1)
-        self.relit = layers.lights.glowing and bool(
-            turn[self._lit].any() or flux[:own].any() or self._lit[own:].any()
-        )
-        if self.relit:
-            none = np.zeros_like(further)
-            self.behind = [np.concatenate([f, none]) for f in (layers.behind.offset, layers.behind.slope)]
-            self.by_lights = np.concatenate([np.zeros_like(layers.behind.offset), by_lights])
-            self.faint = dr.opaque(mi.Float, layers.behind.faint)
+        self._present = (flux > lights.DARK).any(axis=1)
+        changed = turn[self._present].any() or flux[:own].any() or self._present[own:].any()
+        self.relit = layers.lights.glowing and bool(changed)
         moved = (turn != 0).any(axis=1) | (size != 0).any(axis=1)
         strength = np.where(moved[:own, None], 0, lights.flux_factor(flux[:own]))
+        # The last is 1, for texels of no light.
         self.strength = flat(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
         self.cores = SourceCores(layers, grid, self.edge)
         self.moved = MovedLights(layers, grid.shape, turn, flux, size)
@@ -174,25 +172,26 @@ class _LayersAt:
 
     def collect(self, source):
         """Gather the texels of lights that move, and place them."""
-        found: dict[int, list] = {int(i): [] for i in self._leaving}
-        for start, fresh, size in self.grid.bands() if found else ():
+        texels: dict[int, list] = {int(i): [] for i in self._leaving}
+        for start, fresh, size in self.grid.bands() if texels else ():
             if not self.cores.any(start, size):
                 continue
             row, column = self.grid.texels(size)
-            d, image = self.cores.directions(start, row, column), as_colours(source[start : start + size])
-            light, share, core = self.cores.of(image, row, column, d, start, size)
+            directions = self.cores.directions(start, row, column)
+            image = as_colours(source[start : start + size])
+            light, share, core = self.cores.of(image, row, column, directions, start, size)
             light, share = (v.numpy().reshape(size, self.grid.shape[1]) for v in (light, share))
             core = as_image(core, size, self.grid.shape[1]).numpy()
             light[: fresh - start] = -1
-            for i, parts in found.items():
+            for i, parts in texels.items():
                 r, c = np.nonzero(light == i)
                 parts.append((r + start, c, core[r, c], share[r, c]))
-        for i, parts in found.items():
+        for i, parts in texels.items():
             if any(part[2].any() for part in parts):
                 self.moved.place_texels(i, *(np.concatenate(p) for p in zip(*parts, strict=True)))
         own = self.layers.lights.own
         for spare in range(own, self.layers.lights.count):
-            if self._lit[spare]:
+            if self._present[spare]:
                 self.moved.place_lobe(spare)
         self.moved.level(self.grid)
 
@@ -201,45 +200,66 @@ class _LayersAt:
         size = len(source)
         image = as_colours(source)
         row, column = self.grid.texels(size)
-        gain = flat(mi.Float, self.grid.smooth_rows(self.gain, start, size, self.edge))
-        log = self.grid.smooth_across(mi.Color3f, gain, row, column)
-        if self.free is not None:
-            inner = flat(mi.Float, self.grid.inner(self.free, start, size))
-            log *= self.grid.across(mi.Float, inner, row, column, corners=True)
-        factor = dr.exp(log)
-        same = factor == 1
-        base, core, d = image, None, self.cores.directions(start, row, column)
+        directions = self.cores.directions(start, row, column)
+
+        # ---- The source without its cores, and those of lights that stay
+        base, core = image, None
         if self.cores.any(start, size):
-            light, _, core = self.cores.of(image, row, column, d, start, size)
-            base = image - core
-        colours = base
-        if self.relit:
-            offset, slope, by_lights = (
-                self.grid.smooth_across(mi.Color3f, flat(mi.Float, field), row, column)
-                for field in (
-                    self.grid.smooth_rows(f, start, size, self.edge) for f in (*self.behind, self.by_lights)
-                )
-            )
-            before, follow = self.layers.lights.glow_before(d), self.cores.follow(start, row)
-            ratio = self.layers.lights.glow_ratio(self.placed["turn"], self.placed["flux"], d, before)
-            revealed = dr.exp(gone_of(ratio) * (offset + slope * dr.log(base / before + self.faint)))
-            ratio = dr.select(follow, dr.exp(by_lights), ratio * revealed)
-            colours = base * ratio
-            same &= ratio == 1
-        if self.exponent is not None:
-            kept = self.cores.follow(start, row) & (not self.layers.mirrored)
-            colours, same = dr.select(kept, colours, saturated(colours, self.exponent)), same & kept
-        sky = brightened(colours, factor)
-        if core is not None:
-            # The last is 1, for texels of no light.
+            light, _, own_core = self.cores.of(image, row, column, directions, start, size)
+            base = image - own_core
             which = dr.select(light < 0, dr.opaque(mi.Int32, self.layers.lights.own), light)
             strength = dr.gather(mi.Color3f, self.strength, mi.UInt32(which))
-            sky += core * strength
-            same &= (strength == 1) | (core == 0)
+            core = own_core * strength
+
+        # ---- The sky
+        fields = self._fields_at(directions, start, size, row, column)
+        sky = compose(base, directions, fields).sky
+        same = sky == base
+        if core is not None:
+            sky += core
+            same &= (strength == 1) | (own_core == 0)
         sky = dr.select(same, image, sky)
-        for light in self.moved.lobes_at(d):
-            sky += light
-        made = as_image(sky, size, self.grid.shape[1])
-        for light in self.moved.radiance(start, size):
-            made += light
-        return made.numpy()
+
+        # ---- Lights that have moved or were added
+        for lobe in self.moved.lobes_at(directions):
+            sky += lobe
+        edited = as_image(sky, size, self.grid.shape[1])
+        for radiance in self.moved.radiance(start, size):
+            edited += radiance
+        return edited.numpy()
+
+    def _fields_at(self, directions, start, size, row, column):
+        """Interpolate what the edit does at the texels of a band."""
+
+        def smooth(field):
+            table = flat(mi.Float, self.grid.smooth_rows(field, start, size, self.edge))
+            return self.grid.smooth_across(mi.Color3f, table, row, column)
+
+        follows = self.cores.follow(start, row)
+        share = None
+        if self.free is not None:
+            inner = flat(mi.Float, self.grid.inner(self.free, start, size))
+            share = self.grid.across(mi.Float, inner, row, column, corners=True)
+        log_saturation = self.log_saturation
+        if log_saturation is not None and not self.layers.mirrored:
+            log_saturation = dr.select(follows, 0, log_saturation)
+        glows, log_followed = None, None
+        if self.relit:
+            log_followed = smooth(self.fields.log_followed)
+            glows = Glows(
+                self.layers.lights,
+                self.placed["turn"],
+                self.placed["flux"],
+                self.layers.lights.glow_before(directions),
+                smooth(self.fields.offset),
+                smooth(self.fields.slope),
+                dr.opaque(mi.Float, self.layers.behind.faint),
+            )
+        return Fields(
+            glows=glows,
+            log_followed=log_followed,
+            follows=follows,
+            log_saturation=log_saturation,
+            log_gain=smooth(self.fields.log_gain),
+            share=share,
+        )

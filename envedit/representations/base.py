@@ -28,9 +28,9 @@ class Representation(Protocol):
         The parameters describe the edit and not the map: they start at "no change", are searched for before
         they are optimised, and apply to the original at any resolution.
     fitted : Fitted or None
-        How well the map was fitted, where :meth:`encode` fits.
+        How well the map was fitted, where it is.
     separation : Separation or None
-        Lights and background of the map, where :meth:`encode` separates them.
+        Lights and background of the map, where they are separated.
     """
 
     @property
@@ -45,14 +45,18 @@ class Representation(Protocol):
     @property
     def separation(self) -> Separation | None: ...  # noqa: D102
 
+    def decode(self, params: Params) -> mi.TensorXf:
+        """Return (H, W, 3) linear radiance, finite and not negative, differentiable in the parameters."""
+
+
+class Encoder(Representation, Protocol):
+    """A representation that is made before it is known of which map."""
+
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Return the parameters that reproduce an image (H, W, 3) as well as the representation can.
 
         Raises
         ------
         InputError
-            If the image is not radiance, or holds what :meth:`decode` could not give back.
+            If the image is not radiance, or holds what :meth:`.Representation.decode` could not give back.
         """
-
-    def decode(self, params: Params) -> mi.TensorXf:
-        """Return (H, W, 3) linear radiance, finite and not negative, differentiable in the parameters."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from envedit import config
-from envedit.representations.base import Representation
+from envedit.core.types import Params
+from envedit.representations.base import Encoder, Representation
 from envedit.representations.layers.gain import CYCLES
 from envedit.representations.layers.layers import Horizon, Layers
 from envedit.representations.pixels import LogPixels, Pixels
@@ -19,21 +22,44 @@ def make(
     folder: Path | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     rows: tuple[int, int] | None = None,
-    horizon: Horizon = "free",
-) -> Representation:
+) -> Encoder:
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
 
-    ``horizon`` is of layers alone (:class:`.Layers`).
+    Not layers, which are made of a map: :func:`encoded`.
+
+    Raises
+    ------
+    ValueError
+        Of any other kind.
     """
     kind = settings.representation.kind
-    if kind == "layers":
-        cycles = settings.representation.cycles
-        # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
-        painted = settings.target.kind in ("image", "strokes")
-        return Layers(rows, CYCLES if isinstance(cycles, str) else cycles, horizon, aureoles=painted)
     if kind == "pixels":
         return Pixels()
     if kind == "log-pixels":
         return LogPixels()
+    if kind != "siren":
+        raise ValueError(f"make: got kind {kind!r}, expected siren, pixels or log-pixels")
     recipe = settings.fit if settings.fit.polish == "always" else fit.unpolished(settings.fit)
     return Siren(settings.representation, recipe, folder, progress, rows)
+
+
+def encoded(
+    image: np.ndarray,
+    settings: config.Config,
+    folder: Path | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    rows: tuple[int, int] | None = None,
+    horizon: Horizon = "free",
+) -> tuple[Representation, Params]:
+    """Return an image (rows, W, 3) in the representation that a configuration asks for, and its parameters.
+
+    ``horizon`` is of layers alone (:meth:`.Layers.of`); the others are as for :func:`make`.
+    """
+    if settings.representation.kind != "layers":
+        fitted = make(settings, folder, progress, rows)
+        return fitted, fitted.encode(image, settings.seed)
+    cycles = settings.representation.cycles
+    # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
+    painted = settings.target.kind in ("image", "strokes")
+    layers = Layers.of(image, rows, CYCLES if isinstance(cycles, str) else cycles, horizon, aureoles=painted)
+    return layers, layers.start()

@@ -1,7 +1,8 @@
 """Derivatives of a rendering by the unknowns of an edit, at a point.
 
-By the gain they are those of the block transport (``block_jacobian.py``). A light's core is seen through T,
-by finite differences of its place and size, its glow and the saturation through the blocks.
+What the map does is asked of the layers: by the gain in forward mode (:meth:`.Layers.gain_slope`), by the
+saturation, and by place and size of a light as differences. What that does to the rendering goes through the
+block transport (``block_jacobian.py``) for the sky, through T itself for the core of a light.
 """
 
 from __future__ import annotations
@@ -11,9 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotated, rotation_vector
-from envedit.representations.layers.gain import VEIL
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.unknowns import Point, Unknowns
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
@@ -21,6 +20,9 @@ from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 NARROW_ANGLE, WIDE_ANGLE = np.radians(0.7), np.radians(2.1)
 """Rotations of the finite difference by a light's direction: half a texel of a map of 256, and, where that
 leads no further, as much as the noise of single columns of T does not hide."""
+
+SIZE_STEP = 0.1
+"""Step of the difference by a light's log size. Not measured."""
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,8 @@ class Derivatives:
 
     def _slopes(self, point):
         """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        # In double precision: products of three radiances leave the range of the other.
         slopes = point.sky.astype(np.float64)
-        own = self.layers.shape[0]
-        params = self.unknowns.params(point.state)
-        sky, base = slopes[:own], self.layers.before_gain(params).astype(np.float64)
-        gain = np.exp(np.float64(self.layers.log_gain(params)))
-        grey = base * (1 - VEIL) + (base @ LUMINANCE)[..., None] * VEIL
-        more = base + (gain - 1) * grey
-        slopes[:own] = np.where(gain > 1, sky * gain * grey / np.maximum(more, 1e-30), sky)
+        slopes[: self.layers.shape[0]] = self.layers.gain_slope(self.unknowns.params(point.state))
         return slopes.reshape(-1, 3)
 
     def _profile(self, point, cores):
@@ -105,87 +100,91 @@ class Derivatives:
 
     def _lights(self, point):
         """Return derivatives by lights and saturation, what these are, and the profile."""
-        state, layers, sky, found, unknowns = point.state, self.layers, point.sky, [], []
+        # ---- Cores through T: rendered, and by two angles and by size
+        state, layers, sky = point.state, self.layers, point.sky
+        lights: list = []
+        names: list = []
         # Columns of one light must not take the place of another's.
         lit = self.unknowns.shining(state)
         most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
         for i in lit:
             turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])
-            axes, turns = self._tangents(state, i), [turn]
+            axes = self._tangents(state, i)
+            turns = [turn]
             for axis in axes:
                 for sign in (1, -1):
-                    there = rotated(self.unknowns.direction(state, i), sign * self.angle * axis)
-                    turns.append(rotation_vector(layers.lights.centres[i], there))
-            ways = [(one, flux, size) for one in turns] + [(turn, flux, size + 0.1)]
-            now, *ends, larger = layers.lights.cores_of(i, ways, layers.whole)
-            cores = np.stack([now, *self._differences(ends), (larger - now) / 0.1])
-            seen = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
-            found.append((i, turns, cores, seen))
-            unknowns += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
-            unknowns += [("flux", i, c) for c in range(3)]
-        profile = self._profile(point, [seen[0] for *_, seen in found])
-        for i, turns, cores, seen in found:
-            glow, *ends = (self._log_glow(state, i, one) for one in turns)
-            shone = None
-            if glow is not None:
-                shone = np.stack([sky * -np.expm1(-glow), *(sky * d for d in self._differences(ends))])
-            shone = self._with_lit_ground(point, cores[:3], shone)
-            if shone is not None:
-                seen[:3] += self.blocks.pictures(shone) * profile.reshape(-1, 3)
-        whole = []
+                    end = rotated(self.unknowns.direction(state, i), sign * self.angle * axis)
+                    turns.append(rotation_vector(layers.lights.centres[i], end))
+            placements = [(one, flux, size) for one in turns]
+            placements.append((turn, flux, size + SIZE_STEP))
+            core, *ends, larger = layers.lights.cores_of(i, placements, layers.whole)
+            cores = np.stack([core, *self._differences(ends), (larger - core) / SIZE_STEP])
+            pictures = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
+            lights.append((i, turns, cores, pictures))
+            names += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
+            names += [("flux", i, c) for c in range(3)]
+
+        # ---- Glows, and the ground that lights shine on, through the blocks
+        profile = self._profile(point, [pictures[0] for *_, pictures in lights])
+        for i, turns, cores, pictures in lights:
+            log_glow, *ends = (self._log_glow(state, i, one) for one in turns)
+            change = None
+            if log_glow is not None:
+                # d log(1 + s G) / d log s = s G / (1 + s G), which is 1 - 1 / (1 + s G)
+                change = np.stack([sky * -np.expm1(-log_glow), *(sky * d for d in self._differences(ends))])
+            change = self._with_lit_ground(point, cores[:3], change)
+            if change is not None:
+                pictures[:3] += self.blocks.pictures(change) * profile.reshape(-1, 3)
+
+        # ---- The saturation, through the blocks
+        of_sky = []
         if self.unknowns.saturates:
-            unknowns.append(("saturation", 0, 0))
-            whole.append(self._by_saturation(point, profile))
-        return self._apart([seen for *_, seen in found], whole), unknowns, profile
+            names.append(("saturation", 0, 0))
+            of_sky.append(self._by_saturation(point, profile))
+        return self._apart([pictures for *_, pictures in lights], of_sky), names, profile
 
     def _by_saturation(self, point, profile):
         """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
-        params, own = self.unknowns.params(point.state), self.layers.shape[0]
-        base, change = self.layers.by_saturation(params)
-        # Of what a gain brightens a part is luminance, which stays.
-        more = np.maximum(np.exp(self.layers.log_gain(params)) - 1, 0)
-        luminance = base[:own] @ np.array(LUMINANCE, np.float32)
-        grey = (1 - VEIL) * base[:own] + VEIL * luminance[..., None]
-        base[:own] += more * grey
-        change[:own] *= 1 + (1 - VEIL) * more
-        change *= np.divide(point.sky, base, out=np.zeros_like(base), where=base > 0)
+        change = self.layers.saturation_slope(self.unknowns.params(point.state))
         change = self._with_lit_ground(point, np.zeros_like(change[None]), change[None])
         return (self.blocks.pictures(change) * profile.reshape(-1, 3))[0]
 
     def _with_lit_ground(
-        self, point: Point, cores: np.ndarray, shone: np.ndarray | None
+        self, point: Point, cores: np.ndarray, change: np.ndarray | None
     ) -> np.ndarray | None:
         """Add to changes of the sky (k, rows, W, 3), None for none, those of the ground that it lights."""
-        falls, lit, up = self.layers.ground_light, self.layers.lit, self.layers.shape[0]
-        if falls is None:
-            return shone
-        whole = np.zeros_like(cores) if shone is None else shone
-        light = np.maximum(falls.irradiance(point.edited[self.rows][:up]), 1e-30)
+        ground = self.layers.ground_light
+        if ground is None:
+            return change
+        up = self.layers.shape[0]
+        share = self.layers.lit[up:, None, None]
+        change = np.zeros_like(cores) if change is None else change
+        light = np.maximum(ground.irradiance(point.edited[self.rows][:up]), 1e-30)
         for k, core in enumerate(cores):
-            more = falls.irradiance(whole[k, :up] + core[:up]) / light
-            whole[k, up:] += point.sky[up:] * np.float32(lit[up:, None, None] * more)
-        return whole
+            more = ground.irradiance(change[k, :up] + core[:up]) / light
+            change[k, up:] += point.sky[up:] * np.float32(share * more)
+        return change
 
     def _log_glow(self, state, i, turn):
         turns = state["turn"].copy()
         turns[i] = turn
         return self.layers.log_glow_of(i, turns, state["flux"])
 
-    def _apart(self, pictures, whole):
+    def _apart(self, of_lights, of_sky):
         """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
 
         By direction, size, and flux per channel; in memory channel by channel. Pictures (h * w, 3) of
         unknowns that are no light's come last.
         """
-        lights = 6 * len(pictures)
-        found = np.zeros((3, lights + len(whole), math.prod(self.shape)), np.float32)
-        for k, seen in enumerate(pictures):
+        first = 6 * len(of_lights)
+        columns = np.zeros((3, first + len(of_sky), math.prod(self.shape)), np.float32)
+        for k, pictures in enumerate(of_lights):
             for c in range(3):
-                found[c, 6 * k : 6 * k + 3] = seen[1:, :, c]
-                found[c, 6 * k + 3 + c] = seen[0, :, c]
-        for k, one in enumerate(whole, lights):
-            found[:, k] = one.reshape(-1, 3).T
-        return found.reshape(3, -1, *self.shape).transpose(1, 2, 3, 0)
+                columns[c, 6 * k : 6 * k + 3] = pictures[1:, :, c]
+                columns[c, 6 * k + 3 + c] = pictures[0, :, c]
+        for k, picture in enumerate(of_sky, first):
+            columns[:, k] = picture.reshape(-1, 3).T
+        return columns.reshape(3, -1, *self.shape).transpose(1, 2, 3, 0)
 
     def _tangents(self, state, i):
         """Two directions in which a light can move, (3,) each: axes of rotation."""

@@ -63,8 +63,8 @@ class Found:
     """What a search, and the steps from what it found, make of a map and a picture."""
 
     def __init__(self, transport, image, wanted, weight=None):
-        layers = Layers((0, HEIGHT))
-        encoded = layers.encode(image[:ROWS])
+        layers = Layers.of(image[:ROWS], (0, HEIGHT))
+        encoded = layers.start()
         likelihood = Likelihood(on_average_one(weight, wanted.shape[:2]))
         problem = Problem(layers, transport, image, wanted, likelihood, saturates=True)
         likeliest = search.search(problem, problem.state(encoded))

@@ -13,10 +13,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from envedit import api, config, inputs, pipeline, representations
+from envedit import api, config, inputs, pipeline
 from envedit.core import color, interrupts, latlong
 from envedit.core.errors import InputError
 from envedit.images import analytic_sky, images
+from envedit.representations import choice
 from envedit.representations.layers import gain
 from envedit.scene import scene
 from envedit.solve import (
@@ -458,14 +459,14 @@ def test_rows_that_fill_no_cell_of_the_block_transport_can_be_edited(rows, tmp_p
 
 @pytest.mark.parametrize(("rows", "place"), [("upper", (0, 8)), ("all", (0, 8)), ([2, 4], (2, 8))])
 def test_the_representation_is_told_which_rows_of_the_map_it_is(rows, place, tmp_path, rng, monkeypatch):
-    places, plain = [], representations.make
+    places, plain = [], choice.make
 
     def noted(*args):
         representation = plain(*args)
         places.append(representation._rows)
         return representation
 
-    monkeypatch.setattr(representations, "make", noted)
+    monkeypatch.setattr(choice, "make", noted)
     pipeline.run(
         settings_of(
             tmp_path, sunny(rng), input={"rows": rows}, representation={"kind": "siren"},

@@ -53,12 +53,11 @@ def rendered(transport, image):
 
 def problem_of(transport, image, picture, coverage, prior=None):
     """Return the problem of a picture painted over the rendering, and the state of the map as it is."""
-    layers = Layers((0, HEIGHT))
-    params = layers.encode(image[:ROWS])
+    layers = Layers.of(image[:ROWS], (0, HEIGHT))
     weight = pixel_weight(coverage, np.zeros(coverage.shape[:2], bool), 1.0, FOLLOWING)
     likelihood = Likelihood.of_paint(weight, coverage, rendered(transport, image), picture)
     problem = Problem(layers, transport, image, picture, likelihood, prior or of_paint(FREEDOM))
-    return problem, problem.state(params)
+    return problem, problem.state(layers.start())
 
 
 def painted(transport, image, other, share=1.0):

@@ -37,8 +37,8 @@ def gaussian(rng, freedom):
     coverage[:4] = 1
     weight = pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3)
     likelihood = replace(Likelihood.of_paint(weight, coverage, before, picture), paint_noise=SIGMA)
-    layers = Layers(cycles=3)
-    params = layers.encode(image)
+    layers = Layers.of(image, cycles=3)
+    params = layers.start()
     problem = Problem(layers, transport, image, picture, likelihood, of_paint(freedom))
     start = problem.state(params)
 

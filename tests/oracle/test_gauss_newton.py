@@ -53,8 +53,8 @@ def shown(transport, image):
 
 def problem_of(image, transport, target, likelihood=None, cycles=3, **options):
     """Return a problem and the parameters to start from."""
-    layers = Layers(cycles=cycles)
-    params = layers.encode(image)
+    layers = Layers.of(image, cycles=cycles)
+    params = layers.start()
     return Problem(layers, transport, image, target, likelihood, **options), params
 
 
@@ -559,8 +559,8 @@ def followed(problem, params, **options):
 def test_a_change_that_layers_can_make_is_found(rng):
     image = clouds(rng) + lamp()
     transport = DenseTransport.random(rng, (20, 24), GRID, even=0.5)
-    layers = Layers(cycles=3)
-    params = layers.encode(image)
+    layers = Layers.of(image, cycles=3)
+    params = layers.start()
     nodes = params["gain.0"].numpy() + 0.5 * rng.normal(0, 1, params["gain.0"].shape[:2])[..., None]
     turned = np.zeros((3, 3), np.float32)
     centre = layers.lights.centres[0]
@@ -648,8 +648,8 @@ def test_no_step_is_longer_than_its_limit(case):
 def test_no_step_takes_a_light_below_the_horizon(rng):
     """Of a map whose lower half keeps its values: pushed down, a light stays at the edge of the sky."""
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
-    layers = Layers((0, GRID[0]), cycles=3)
-    params = layers.encode(image[: GRID[0] // 2])
+    layers = Layers.of(image[: GRID[0] // 2], (0, GRID[0]), cycles=3)
+    params = layers.start()
     problem = Problem(layers, transport, image, shown(transport, image))
     start = state = problem.state(params)
     heights = [problem.direction(start, 0)[1]]
@@ -1054,8 +1054,8 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
 def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
     """The blur of a mirror, and what falls on ground: by the sky, and by a light's flux and place."""
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
-    layers = Layers((0, GRID[0]), cycles=3, horizon=horizon)
-    params = layers.encode(image)
+    layers = Layers.of(image, cycles=3, horizon=horizon)
+    params = layers.start()
     assert (layers.below.light is not None) == (horizon == "keep")
     target = shown(transport, image) * np.exp(rng.normal(0, 0.3, (*FILM, 3))).astype(np.float32)
     problem = Problem(layers, transport, image, target, saturates=True)
@@ -1124,8 +1124,8 @@ def colourful(rng):
 def saturating(rng, kept):
     """A problem whose target is the sky with its colours' saturation times ``kept``, and its start."""
     image, transport = colourful(rng), DenseTransport.random(rng, FILM, GRID)
-    layers = Layers(cycles=3)
-    params = layers.encode(image)
+    layers = Layers.of(image, cycles=3)
+    params = layers.start()
     grey = params | {"saturation": mi.TensorXf(np.full((1, 1), np.log(kept), np.float32))}
     target = shown(transport, layers.decode(grey).numpy())
     return Problem(layers, transport, image, target, saturates=True), params

@@ -364,8 +364,8 @@ def edited(m, folder):
     Where the turned map is the same map, not one bit changes in the loop.
     """
     height, width, _ = m.shape
-    made = Layers()
-    params = made.encode(m)
+    made = Layers.of(m)
+    params = made.start()
     traced = renderer(height, width)
     turned = latlong.rotate(m, 90.0)
     same = np.array_equal(turned, m)

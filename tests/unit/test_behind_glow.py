@@ -59,8 +59,8 @@ def test_the_old_place_of_a_sun_looks_like_the_elevation_and_an_unmoved_one_keep
     image[SUN] = 5e4
     mirror = np.degrees(np.arccos(np.clip(D @ (D[SUN] * [1, -1, 1]), -1, 1)))
     image[32:] = (plain * np.float32(1 + 4 * np.exp(-0.5 * (mirror / 6) ** 2))[..., None])[32:]
-    made = Layers(horizon="mirror")
-    params = made.encode(image)
+    made = Layers.of(image, horizon="mirror")
+    params = made.start()
     still = made.decode(params).numpy()
     outside = np.ones(SHAPE, bool)
     outside[:32] = ~(made.separation.core > 0).any(axis=2)
@@ -80,8 +80,8 @@ def test_a_low_orange_sun_that_leaves_a_grey_sky_leaves_no_fleck_below_the_horiz
     mirror = np.degrees(np.arccos(np.clip(D @ (at * [1, -1, 1]), -1, 1)))
     shine = 1 + 20 * np.float32(np.exp(-0.5 * (mirror / 3) ** 2))[..., None] * orange
     image[32:] = (plain * (1 + 8 * np.float32(np.exp(-mirror / 8))[..., None] * orange) * shine)[32:]
-    made = Layers(horizon="mirror")
-    params = made.encode(image)
+    made = Layers.of(image, horizon="mirror")
+    params = made.start()
     flux = params["flux"].numpy()
     flux[0] = DARK / SCALES["flux"]
     grey = tensor(np.full((1, 1), np.log(0.05), np.float32))
@@ -94,8 +94,8 @@ def test_a_low_orange_sun_that_leaves_a_grey_sky_leaves_no_fleck_below_the_horiz
 @pytest.fixture(scope="module")
 def analytic():
     """The analytic sky at 35 degrees, told apart."""
-    made = Layers(horizon="keep")
-    return made, made.encode(sunsky(128, 90.0, 35.0))
+    made = Layers.of(sunsky(128, 90.0, 35.0), horizon="keep")
+    return made, made.start()
 
 
 @pytest.mark.parametrize("elevation", [5, 20, 50, 65, 80])

@@ -1,6 +1,5 @@
 """Rows below the horizon: told apart by what they show, unchanged under the same sky, without an edge."""
 
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -96,14 +95,14 @@ def test_a_mirror_turns_with_its_sky():
 def test_the_width_is_that_under_which_the_original_mirrors_itself():
     low, sky = halves(mirror((64, 128)))
     sharp = np.ascontiguousarray(sky[::-1])
-    assert Below(sharp, sky, "mirror").widest == below_horizon.WIDEST[0]
-    for widest in below_horizon.WIDEST[1:3]:
-        blur = below_horizon._Blur(sky.shape[:2], 64, below_horizon.COARSE)
+    assert Below(sharp, sky, "mirror").widest == below_horizon.BLUR_MOST_DEGREES[0]
+    for widest in below_horizon.BLUR_MOST_DEGREES[1:3]:
+        blur = below_horizon._Blur(sky.shape[:2], 64, below_horizon.CHOICE_COLUMNS)
         blur.widen(widest)
         soft = blur(tensor(sky)).numpy().reshape(*blur.grid, 3)
         made = np.einsum("ri,ijx,cj->rcx", blur.down[::-1], soft, blur.across)
         assert Below(np.float32(made), sky, "mirror").widest == widest
-    assert Below(low, sky, "keep").widest in below_horizon.WIDEST
+    assert Below(low, sky, "keep").widest in below_horizon.BLUR_MOST_DEGREES
 
 
 @pytest.mark.parametrize("kind", below_horizon.KINDS)
@@ -152,8 +151,8 @@ def test_a_channel_that_is_black_in_the_sky_does_not_burst_below_it(kind, channe
 
 def moved(sun=(24, 20)):
     image = mirror((64, 128), sun)
-    made = Layers((0, 64), horizon="mirror")
-    params = made.encode(image)
+    made = Layers.of(image, horizon="mirror")
+    params = made.start()
     assert len(made.separation.lights) == 1 and made.below is not None
     turn = np.zeros((made.lights.count, 3))
     there = latlong.directions(64, 128)[sun[0] + 2, 90]
@@ -167,8 +166,8 @@ def test_layers_give_a_whole_map_back_and_have_no_edge_when_the_sun_moves():
     edited = made.decode(away).numpy()
     assert edited.shape == image.shape and np.isfinite(edited).all()
     assert np.abs(np.log(edited[40:] / image[40:])).max() > 0.1  # below the horizon it does follow
-    upper = Layers((0, 64))
-    upper_params = upper.encode(image[:32])
+    upper = Layers.of(image[:32], (0, 64))
+    upper_params = upper.start()
     alone = image.copy()
     turn = away["turn"].numpy()[: upper.lights.count]
     alone[:32] = upper.decode(upper_params | {"turn": tensor(turn)}).numpy()
@@ -209,12 +208,8 @@ def test_hats_of_rows_that_follow_are_those_of_the_rows_that_they_mirror():
 def test_only_a_whole_map_has_rows_that_follow():
     image = mirror()
     for rows, part in (((0, 32), image[:16]), ((4, 32), image[4:])):
-        made = Layers(rows, horizon="mirror")
-        made.encode(part)
-        assert made.below is None
-    with pytest.raises(ValueError, match="follow"):
-        made = Layers((0, 32), horizon="mirror")
-        made.decode(made.encode(image), (32, 128))
+        assert Layers.of(part, rows, horizon="mirror").below is None
+    assert Layers.of(image, (0, 32), horizon="mirror").below is not None
 
 
 def test_texels_whose_change_nobody_sees_keep_their_bits():

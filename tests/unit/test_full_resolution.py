@@ -57,10 +57,8 @@ def small(source, size=WORKING):
 
 def encoded(working, rows=ROWS, free=None):
     first, count = rows
-    made = Layers((first, len(working)))
-    params = {k: v.numpy().copy() for k, v in made.encode(working[first : first + count]).items()}
-    made.keep(free)
-    return made, params
+    made = Layers.of(working[first : first + count], (first, len(working))).keeping(free)
+    return made, {k: v.numpy().copy() for k, v in made.start().items()}
 
 
 def sent(made, params, v, light=0):
@@ -107,6 +105,22 @@ def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
     monkeypatch.setattr(texel_maps, "BAND_TEXELS", band)
     source, working, made, params = sunny
     assert carried(made, params, working, source)[0].tobytes() == source.tobytes()
+
+
+def test_saturation_and_gain_leave_kept_texels_their_bits():
+    source = sky(256, 512, sun=None)
+    working = small(source)
+    free = np.ones((ROWS[1], WORKING[1]), bool)
+    free[:, :64] = False
+    made, params = encoded(working, free=free)
+    params["saturation"] = np.full((1, 1), -1, np.float32)
+    params["gain.0"] += 0.5
+    result = carried(made, params, working, source)[0]
+    kept = np.repeat(free, 4, axis=1)[0] == 0
+    rows = active(source)
+    np.testing.assert_array_equal(result[rows][:, kept], source[rows][:, kept])
+    changed = np.abs(result - source)[rows][:, ~kept]
+    assert (changed > 1e-3).all(axis=2).mean() > 0.9
 
 
 @pytest.mark.slow
@@ -511,8 +525,8 @@ def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer, satur
     up = sky(height, width, sun=(20.0, 200.0), seed=1)[: height // 2]
     source = np.concatenate([up, np.minimum(up[::-1], 3)])
     working = latlong.resize(source, *WORKING)
-    made = Layers((0, WORKING[0]), horizon=kind)
-    params = made.encode(working)
+    made = Layers.of(working, horizon=kind)
+    params = made.start()
     turn = np.zeros((made.lights.count, 3))
     turn[0] = rotation_vector(made.lights.centres[0], toward(25.0, 90.0))
     params = params | {"turn": mi.TensorXf(np.float32(turn / made.scales["turn"]))}

@@ -206,7 +206,7 @@ def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):
     coarse, fine = gain.GridGain(6, 0.5), gain.GridGain(6, 0.5)
     size = gain.grid_size(12, 0.5)
     known = np.linspace(0, 1, size[0] * size[1]).reshape(size)
-    fine.refine([Octave(size, known, 0.5)])
+    fine = fine.refined([Octave(size, known, 0.5)])
     assert fine.sizes == [*coarse.sizes, size] and fine.init().keys() - coarse.init().keys() == {"gain.3"}
     assert not fine.init()["gain.3"].any()
     unit = fine.scales()["gain.3"]

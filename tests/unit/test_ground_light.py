@@ -99,8 +99,8 @@ def test_gradient_is_that_of_finite_differences(rng):
 
 def test_layers_darken_the_ground_with_their_light_and_have_no_edge_at_the_horizon():
     image = np.float32(analytic_sky.sunsky(128, 90.0, 35.0))
-    made = Layers(horizon="keep")
-    params = made.encode(image)
+    made = Layers.of(image, horizon="keep")
+    params = made.start()
     assert np.array_equal(made.decode(params).numpy()[32:], image[32:])  # unmoved: the original's bits
     flux = params["flux"].numpy().copy()
     flux[0] = -30.0  # out

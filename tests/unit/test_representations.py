@@ -89,6 +89,19 @@ def test_siren_is_one_function_at_any_resolution(coordinates, rows, shape, found
     assert representation.decode(params).shape == (8, 16, 3)
 
 
+@pytest.mark.parametrize("kind", ["layers", "pixels"])
+def test_an_image_is_encoded_as_the_configuration_asks_for(kind, rng):
+    image, settings = sky(rng), config.Config(representation=config.Representation(kind=kind))
+    representation, params = representations.encoded(image, settings)
+    assert representation.models_edit == (kind == "layers")
+    np.testing.assert_allclose(representation.decode(params).numpy(), image, rtol=1e-6)
+
+
+def test_layers_are_not_made_without_an_image():
+    with pytest.raises(ValueError, match="got kind 'layers'"):
+        representations.make(config.Config(representation=config.Representation(kind="layers")))
+
+
 def halved(image):
     height, width = image.shape[:2]
     return image.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))

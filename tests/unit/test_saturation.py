@@ -52,8 +52,8 @@ def test_black_stays_black():
 def test_a_sky_of_one_colour_stays_that_colour_and_photographed_ground_stays_as_it_is(horizon, rng):
     """What follows the sky's mirror loses its colours with it, ground does not."""
     image = np.float32(0.2 + rng.random((16, 32, 3)))
-    layers = Layers((0, 16), cycles=3, horizon=horizon)
-    params = layers.encode(image)
+    layers = Layers.of(image, cycles=3, horizon=horizon)
+    params = layers.start()
     assert layers.parts(params)[0].numpy().shape == image.shape
     grey = params | {"saturation": mi.TensorXf(np.full((1, 1), -9, np.float32))}
     made, up = layers.decode(grey).numpy(), 8

@@ -209,12 +209,11 @@ class Session:
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        layers = Layers(self.rows.place, horizon=horizon)
-        params = layers.encode(self.origin[self.rows.slice])
+        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon)
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
-        self.still = self.start = self.problem.state(params)
+        self.still = self.start = self.problem.state(layers.start())
         self.run = gauss_newton.Run(self.start, self.start)
         self.point = self.problem.evaluate(self.run.state, resolve=False)
         self._painted: tuple[list, strokes.Painted] | None = None

@@ -26,9 +26,11 @@ from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.separation import Light
 
-BLUR = 4.0
-"""Standard deviation of K, degrees: what is finer is texture, what is coarser the sky's brightness."""
-_LEAST = 1e-12
+BLUR_DEGREES = 4.0
+"""Standard deviation of K: what is finer is texture, what is coarser the sky's brightness. Measured: with 2
+and 8 degrees maps whose lights have moved are 0.05 dB better and 0.13 dB worse."""
+LEAST_VARIANCE = 1e-12
+"""Variance of log luminance that is added before a quotient of two: keeps it finite. Not measured."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,8 @@ def gone_of(ratio: mi.Color3f) -> mi.Float:
 
 
 def near_core(away: np.ndarray) -> np.ndarray:
-    """Return 1 within a core, falling to 0 over :data:`BLUR`, of degrees to it: bloom, and no cloud."""
-    return np.exp(-0.5 * np.square(away / BLUR))
+    """Return how near a core is, of degrees to it: 1 within, where texture is bloom and no cloud."""
+    return np.exp(-0.5 * np.square(away / BLUR_DEGREES))
 
 
 def behind_glow(
@@ -93,16 +95,16 @@ def behind_glow(
     faint = float(max(1e-6 * background.mean(), 1e-30))
     shape = background.shape[:2]
     logs = np.log(background + faint)
-    low = _blurred(logs, BLUR, rows)
+    low = _blurred(logs, BLUR_DEGREES, rows)
     texture = np.square((logs - low) @ LUMINANCE)[..., None]
-    around = np.maximum(_blurred(texture, 2 * BLUR, rows), 0)  # a cut spectrum rings
+    around = np.maximum(_blurred(texture, 2 * BLUR_DEGREES, rows), 0)  # a cut spectrum rings
     weight = np.maximum(glow.mean(axis=2, keepdims=True) ** -2.0, 1e-30)
 
     def at_elevation(values):
         mean = (values * weight).sum(axis=1) / weight.sum(axis=1)
-        return (_along_rows(shape[0], BLUR, rows[1]) @ mean)[:, None]
+        return (_along_rows(shape[0], BLUR_DEGREES, rows[1]) @ mean)[:, None]
 
-    contrast = np.sqrt(np.minimum((at_elevation(texture) + _LEAST) / (around + _LEAST), 1))
+    contrast = np.sqrt(np.minimum((at_elevation(texture) + LEAST_VARIANCE) / (around + LEAST_VARIANCE), 1))
     contrast *= 1 - near_core(away)[..., None]
     slope = np.broadcast_to(contrast - 1, background.shape)
     offset = at_elevation(low) - contrast * low

@@ -6,14 +6,16 @@ are the original's, times a smooth factor, the change of the sky above:
     E_low = E0_low * R^f * (a H / H_0)^(1 - f),
     log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
-S and S_0 are the sky, without cores of lights, after the edit and before, in every channel with some of its
-luminance (:data:`.VEIL`; a ratio to a channel that is black says nothing), m is the mirrored direction, K a
-Gaussian on the sphere that widens with the angle below the horizon, and b goes from 0 at the horizon to 1 at
-:data:`BLENDED` degrees: there is no edge. Cores are apart, as they are far too bright for a ratio; what a
-mirror shows of one goes with its glow (:meth:`Below.reveal`). f is 1 for a mirror; for ground it falls off
-with the angle (:data:`FADE`). Farther down ground follows H, the light that falls on it
-(``ground_light.py``), or keeps its brightness where its albedo would be none that there is. a is an unknown
-of the edit, 1 where the picture does not determine it: light from the side, or another ground.
+S and S_0 are the sky after the edit and before, without cores of lights, and with some of its luminance in
+every channel (:data:`.VEIL`), as a ratio to a black channel says nothing. m is the mirrored direction, K a
+Gaussian on the sphere that widens with the angle below the horizon. b goes from 0 at the horizon to 1 at
+:data:`BLEND_DEGREES`, so that there is no edge. Cores are left out, as they are far too bright for a ratio;
+the reflection of a core goes with its glow (:meth:`Below.reveal`).
+
+f is 1 for a mirror; for ground it falls off with the angle (:data:`FADE_DEGREES`). Farther down, ground
+follows its irradiance H (``ground_light.py``), or keeps its brightness where that would need an implausible
+albedo. a is an unknown of the edit, 1 where the picture does not determine it: light from the side, or
+another ground.
 """
 
 from __future__ import annotations
@@ -28,29 +30,40 @@ from envedit.core import latlong
 from envedit.core.arrays import settled, tensor
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.gain import VEIL
-from envedit.representations.layers.ground_light import GroundLight
+from envedit.representations.layers.ground_light import GroundLight, with_luminance
 
 Horizon = Literal["mirror", "keep", "free"]
 
 KINDS = "mirror", "keep"
-SMOOTH, BOX = 0.0125, 7.0
-"""Median of |log luminance less its mean over a square of so many degrees| below the horizon up to which it
-is no photograph: PureSky has 0.001 to 0.007, maps with ground 0.03 to 0.14 (128 to 1024 texels wide; smaller
-maps, where the square still has three texels, as much more as they are smaller)."""
-VARIES = 1 / 512
-"""Least range of log luminance around the horizon of what can mirror a sky."""
-NARROWEST, WIDENING = 1.0, 0.3
-"""Standard deviation of K: degrees at the horizon, and more for each degree below it."""
-WIDEST = 3.0, 6.0, 10.0, 15.0, 20.0
-"""What it grows to at most, degrees: of these, that under which the original mirrors its own sky best."""
-BLENDED = 5.0
-"""Degrees below the horizon over which the blur sets in."""
-FADE = 10.0
-"""Degrees below the horizon at which ground follows what it would mirror by 1/e."""
-UNLIT = 1e-3
-"""Least share of a texel's light that a glow counts as: what is divided by it stays finite."""
-COLUMNS, COARSE = 96, 48
-"""Columns of the grid on which K is applied, and on which its width is chosen."""
+MIRROR_MOST_DETAIL = 0.0125
+"""Most detail below the horizon of a mirror: median of |log luminance less its mean over a square of
+:data:`DETAIL_DEGREES`|. Above it is photographed ground. Measured: 0.001 to 0.007 on 13 PureSky maps, 0.03 to
+0.14 on four maps with ground, 128 to 1024 texels wide (``test_public_maps_are_told_apart``)."""
+DETAIL_DEGREES = 7.0
+"""Side of that square. In maps narrower than 128 texels, where it would have fewer than three texels, the
+limit is as much higher as they are narrower. Not measured beside other values."""
+MIRROR_LEAST_RANGE = 1 / 512
+"""Least range of log luminance around the horizon of a mirror; below it, nothing shows that it is one.
+Derived: no display shows less (:data:`.unseen.UNSEEN`)."""
+BLUR_DEGREES = 1.0
+"""Standard deviation of K at the horizon. Not measured beside other values."""
+BLUR_WIDENING = 0.3
+"""Degrees that are added to it for each degree below the horizon. Not measured beside other values."""
+BLUR_MOST_DEGREES = 3.0, 6.0, 10.0, 15.0, 20.0
+"""Candidates for the largest standard deviation of K: the one is taken under which the original mirrors its
+own sky best. Measured: the lower halves of 13 PureSky maps turned by 60 degrees, their upper halves given,
+come 15.9 dB nearer to the truth, and 14.2 dB with 10 degrees for all."""
+BLEND_DEGREES = 5.0
+"""Degrees below the horizon over which the blur sets in. Not measured beside other values."""
+FADE_DEGREES = 10.0
+"""Degrees below the horizon at which ground follows the mirrored sky by 1/e. Not measured beside other
+values."""
+LEAST_GONE = 1e-3
+"""Least share of a texel's light that is taken for a glow's: keeps a quotient finite. Not measured."""
+GRID_COLUMNS = 96
+"""Columns of the grid on which K is applied. Not measured beside other values."""
+CHOICE_COLUMNS = 48
+"""Columns of the grid on which the widths of K are compared. Not measured beside other values."""
 
 
 class Averaged(NamedTuple):
@@ -81,11 +94,14 @@ def kind_of(envmap: np.ndarray) -> str:
     # Neither the horizon, where the sky's own detail is near, nor the nadir, where columns meet.
     logs = logs[len(logs) // 8 : max(3 * len(logs) // 4, len(logs) // 8 + 1)]
     width = envmap.shape[1]
-    half = max(1, round(BOX / 360 * width / 2 - 0.5))
-    padded = np.pad(np.pad(logs, ((half, half), (0, 0)), mode="edge"), ((0, 0), (half, half)), mode="wrap")
+    half = max(1, round(DETAIL_DEGREES / 360 * width / 2 - 0.5))
+    padded = np.pad(logs, ((half, half), (0, 0)), mode="edge")
+    padded = np.pad(padded, ((0, 0), (half, half)), mode="wrap")
     mean = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1,) * 2).mean(axis=(2, 3))
-    smooth = np.median(np.abs(logs - mean)) <= SMOOTH * max(1.0, 128 / width)
-    return "mirror" if smooth and np.ptp(logs, axis=1).max() > VARIES else "keep"
+    detail = np.median(np.abs(logs - mean))
+    smooth = detail <= MIRROR_MOST_DETAIL * max(1.0, 128 / width)
+    varies = np.ptp(logs, axis=1).max() > MIRROR_LEAST_RANGE
+    return "mirror" if smooth and varies else "keep"
 
 
 class Below:
@@ -117,30 +133,41 @@ class Below:
     """
 
     def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str, above: np.ndarray | None = None):
-        (up, width, _), low = sky.shape, len(radiance)
+        up, width, _ = sky.shape
+        low = len(radiance)
         total = up + low
-        self.kind, self.shape, self.image = kind, radiance.shape[:2], radiance
+        self.kind = kind
+        self.shape = radiance.shape[:2]
+        self.image = radiance
         self.radiance = dr.opaque(mi.Color3f(np.ascontiguousarray(radiance.reshape(-1, 3).T, np.float32)))
         self._faint = float(max(1e-6 * sky.mean(), 1e-30))
+
+        # ---- How far each row follows the mirrored sky, sharp and blurred
         angle = np.degrees(np.pi * np.arange(up, total) / max(total - 1, 1)) - 90
-        self.fade = np.ones(low) if kind == "mirror" else np.exp(-angle / FADE)
-        self._blend = blend = np.clip(angle / BLENDED, 0, 1)
-        self._sharp, self._soft = (tensor((s * self.fade)[:, None]) for s in (1 - blend, blend))
+        self.fade = np.ones(low) if kind == "mirror" else np.exp(-angle / FADE_DEGREES)
+        self._blend = np.clip(angle / BLEND_DEGREES, 0, 1)
+        self._sharp = tensor(((1 - self._blend) * self.fade)[:, None])
+        self._soft = tensor((self._blend * self.fade)[:, None])
+
+        # ---- The mirrored sky: its texels, and its average over K
         self.mirrored = np.arange(low)[::-1]
         texel = self.mirrored[:, None] * (3 * width) + np.arange(3 * width)
-        self._behind = None
         self._mirrored = dr.opaque(mi.UInt32(texel.ravel().astype(np.uint32)))
-        self._blur = _Blur((up, width), total, COLUMNS)
+        self._blur = _Blur((up, width), total, GRID_COLUMNS)
         self._up = tensor(self._blur.down[self.mirrored])
         self._back = tensor(np.kron(self._blur.across.T, np.eye(3)))
-        self.widest = WIDEST[2] if kind == "keep" else self._best_width(radiance, sky, total)
+        self.widest = BLUR_MOST_DEGREES[2] if kind == "keep" else self._best_width(radiance, sky, total)
         self._blur.widen(self.widest)
         self._before = self.averaged(tensor(sky))
+        self._behind = None
+
+        # ---- Ground that follows its irradiance
         self.light: GroundLight | None = None
         if kind == "keep" and above is not None:
             light = GroundLight(above, radiance)
             self.light = light if light.plausible else None
-        self._lit, self._around = tensor(self.lit[:, None]), tensor(np.tile(np.eye(3), width))
+        self._lit = tensor(self.lit[:, None])
+        self._around = tensor(np.tile(np.eye(3), width))
 
     @property
     def said(self) -> str:
@@ -158,26 +185,27 @@ class Below:
 
     def _best_width(self, radiance, sky, total):
         """Choose the widest K by how well K S_0 explains the variation of each row around the horizon."""
-        blur = _Blur(sky.shape[:2], total, COARSE)
+        blur = _Blur(sky.shape[:2], total, CHOICE_COLUMNS)
         omega = latlong.solid_angles(total, sky.shape[1])[sky.shape[0] :]
 
         def varying(image):
             logs = np.log(image.astype(np.float64) @ LUMINANCE + self._faint)
             return logs - logs.mean(axis=1, keepdims=True)
 
-        shown, errors = varying(radiance), []
-        for widest in WIDEST:
+        original = varying(radiance)
+        errors = []
+        for widest in BLUR_MOST_DEGREES:
             blur.widen(widest)
             soft = blur(tensor(sky)).numpy().reshape(*blur.grid, 3)
             soft = np.einsum("ri,ijx,cj->rcx", blur.down[self.mirrored], soft, blur.across, optimize=True)
-            errors.append(omega @ np.square(varying(soft) - shown).mean(axis=1))
-        return WIDEST[int(np.argmin(errors))]
+            errors.append(omega @ np.square(varying(soft) - original).mean(axis=1))
+        return BLUR_MOST_DEGREES[int(np.argmin(errors))]
 
     def reveal(self, log_change: np.ndarray, gone: np.ndarray, near: np.ndarray) -> None:
-        """Say what changes, (rows, W, 3), where all of a texel's light was a glow's and is gone.
+        """Set what else changes where a texel's light was all a glow's and is gone.
 
-        From nothing at the horizon, which follows the sky's own change, to all of it at :data:`BLENDED`. The
-        mirror image of a core goes with its glow, all of it and at any elevation.
+        The change grows from nothing at the horizon, which follows the sky's own, to all of it at
+        :data:`BLEND_DEGREES`. The mirror image of a core goes with its glow, all of it and at any elevation.
 
         Parameters
         ----------
@@ -186,7 +214,7 @@ class Below:
         gone, near : ndarray (rows, W, 1)
             Share of the light that is gone where every glow is, and :func:`.near_core`.
         """
-        share = 1 - near + near / np.maximum(gone, UNLIT)
+        share = 1 - near + near / np.maximum(gone, LEAST_GONE)
         seen = 1 - (1 - self._blend[:, None, None]) * (1 - near)
         self._behind = tensor(log_change * share * seen)
 
@@ -209,11 +237,6 @@ class Below:
         change = change if ground is None else change + ground
         return dr.matmul(self._lit, dr.matmul(change, self._around))
 
-    def reshaped(self, log_factor: mi.TensorXf | float) -> mi.TensorXf:
-        """Return a log factor (rows, 3 W), or one number for all, as (rows, W, 3)."""
-        rows, width = self.shape
-        return dr.reshape(dr.zeros(mi.TensorXf, (rows, 3 * width)) + log_factor, (rows, width, 3))
-
     def log_factor(
         self,
         sky: mi.TensorXf | Averaged,
@@ -227,11 +250,11 @@ class Below:
         added (:meth:`log_lit`). With what is to be revealed, ``gone`` (sky_rows * W) is the share of a
         texel's light above the horizon that was a glow's and is gone.
         """
-        was = self._before if before is None else before
-        now, was = (one if isinstance(one, Averaged) else self.averaged(one) for one in (sky, was))
-        soft = dr.log((now.soft + self._faint) / (was.soft + self._faint))
+        before = self._before if before is None else before
+        old, new = (one if isinstance(one, Averaged) else self.averaged(one) for one in (before, sky))
+        soft = dr.log((new.soft + self._faint) / (old.soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
-        sharp = dr.log((now.sky.array + self._faint) / (was.sky.array + self._faint))
+        sharp = dr.log((new.sky.array + self._faint) / (old.sky.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
         factor = settled(dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3)), 0)
         if self._behind is None or gone is None:
@@ -257,17 +280,21 @@ class _Blur:
         up, width = shape
         columns = min(columns, width)
         rows = max(1, columns // 4)
-        place = 2 * np.arange(up) / max(total - 1, 1) * rows - 0.5
-        self.grid, self.down = (rows, columns), _tents(place, rows)
+        self.grid = rows, columns
+
+        # ---- From the sky to the grid: means by solid angle
+        self.down = _tents(2 * np.arange(up) / max(total - 1, 1) * rows - 0.5, rows)
         self.across = _tents((np.arange(width) + 0.5) / width * columns - 0.5, columns, periodic=True)
         weight = self.down * latlong.solid_angles(total, width)[:up, None]
         share = weight.sum(axis=0)[:, None] * self.across.sum(axis=0)
         self._down = tensor(weight.T)
         self._across = tensor(np.kron(self.across, np.eye(3)))
         self._share = tensor(1 / np.maximum(np.repeat(share, 3, axis=1), 1e-30))
-        at = (np.arange(columns)[:, None] + np.arange(columns)) % columns  # distance, column
-        place = np.arange(rows)[:, None, None, None] * columns + at[..., None]
-        self._shifted = dr.opaque(mi.UInt32((3 * place + np.arange(3)).ravel().astype(np.uint32)))
+
+        # ---- Every row of the grid, shifted by every number of columns
+        column = (np.arange(columns)[:, None] + np.arange(columns)) % columns  # distance, column
+        node = np.arange(rows)[:, None, None, None] * columns + column[..., None]
+        self._shifted = dr.opaque(mi.UInt32((3 * node + np.arange(3)).ravel().astype(np.uint32)))
 
     def widen(self, widest: float) -> None:
         """Make K for a greatest standard deviation, degrees; each of its rows sums to 1."""
@@ -276,7 +303,7 @@ class _Blur:
         # The same around the horizon: angles between nodes of two rows, by how many columns they are apart.
         d = latlong.on_sphere(theta[:, None], 2 * np.pi * np.arange(columns) / columns)
         angle = np.degrees(np.arccos(np.clip(np.einsum("ik,jck->ijc", d[:, 0], d), -1, 1)))
-        width = np.minimum(NARROWEST + WIDENING * (90 - np.degrees(theta)), widest)
+        width = np.minimum(BLUR_DEGREES + BLUR_WIDENING * (90 - np.degrees(theta)), widest)
         kernel = np.exp(-0.5 * (angle / width[:, None, None]) ** 2) * np.sin(theta)[:, None]
         kernel = (kernel / kernel.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
         self._kernel, self._adjoint = (
@@ -298,7 +325,8 @@ class _Around(dr.CustomOp):
     """
 
     def eval(self, coarse, kernel, adjoint, shifted):
-        self._adjoint, self._shifted = adjoint, shifted
+        self._adjoint = adjoint
+        self._shifted = shifted
         return self._product(coarse, kernel)
 
     def _product(self, coarse, kernel):
@@ -318,8 +346,8 @@ def _veiled(sky):
     By a matrix: ``dr.unravel`` of an array that is used afterwards too loses
     the derivative of that use (drjit 1.5.0).
     """
-    mixed = (1 - VEIL) * np.eye(3) + VEIL * np.asarray(LUMINANCE)[:, None]
-    return dr.reshape(dr.matmul(dr.reshape(sky, (-1, 3)), tensor(mixed)), sky.shape)
+    mixed = dr.matmul(dr.reshape(sky, (-1, 3)), tensor(with_luminance(VEIL)))
+    return dr.reshape(mixed, sky.shape)
 
 
 def _tents(place, count, periodic=False):

@@ -8,6 +8,7 @@ Finer ones are added where they are identifiable from the picture.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,16 +21,18 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 
 MOST = 12.0
-"""Largest log factor: e^12 is more than any sky needs, and leaves float32 room."""
+"""Largest log factor. Derived: e^12 is more than any sky needs, and leaves float32 room."""
 LEVELS = 3
-"""Coarse grids, which any picture may move."""
+"""Coarse grids, which any picture may move. Not measured."""
 CYCLES = 12
-"""Cycles around the horizon that are free with any picture; finer detail must be identifiable from it."""
-
+"""Cycles around the horizon that are free with any picture; finer detail must be identifiable from it.
+Measured beside networks of 5 to 16 cycles, not beside other grids (``docs/decisions/gain_of_the_sky.md``)."""
 DETAIL = 1.0
-"""A step of the nodes of finer grids, where they are well known."""
+"""Unit of the nodes of finer grids where they are well known, a logarithm. Not measured."""
 VEIL = 0.2
-"""Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up."""
+"""Share of luminance in what a gain above 1 adds: a channel that is black cannot be scaled up. Measured
+against none: a cyan and orange sky came out in patches of green (36.5 dB, with it 41.0 dB;
+``docs/decisions/gain_of_the_sky.md``)."""
 
 
 def brightened(base: mi.Color3f, factor: mi.Color3f) -> mi.Color3f:
@@ -112,11 +115,13 @@ class GridGain:
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
         self._units: list[Any] = [0.5**level for level in range(LEVELS)]
 
-    def refine(self, octaves: Sequence[Octave]) -> None:
-        """Add finer grids, :class:`Octave`; a step of a node counts as far as it is known."""
-        for octave in octaves:
-            self.sizes.append(octave.size)
-            self._units.append(DETAIL * np.repeat(octave.known[..., None], 3, axis=2).astype(np.float32))
+    def refined(self, octaves: Sequence[Octave]) -> GridGain:
+        """Return this gain with finer grids; a step of a node of theirs counts as far as it is known."""
+        finer = copy.copy(self)
+        finer.sizes = [*self.sizes, *(octave.size for octave in octaves)]
+        units = [DETAIL * np.repeat(octave.known[..., None], 3, axis=2) for octave in octaves]
+        finer._units = [*self._units, *(unit.astype(np.float32) for unit in units)]
+        return finer
 
     def init(self) -> dict:
         """Return its parameters: all zero."""
@@ -158,7 +163,7 @@ class GridGain:
 
     def prepare(self, shape: tuple[int, int], rows: object = None) -> list:
         """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
-        found = []
+        matrices = []
         for size in self.sizes:
             down, across = splines(size, shape)
             at_pole = np.zeros_like(down)
@@ -167,8 +172,8 @@ class GridGain:
             around[:, 0] = 1
             channels = np.eye(3)  # one apart from the other
             wide = [np.kron(m.T, channels) for m in (across, around)]
-            found.append([tensor(m) for m in (down, wide[0], at_pole, wide[1])])
-        return found
+            matrices.append([tensor(m) for m in (down, wide[0], at_pole, wide[1])])
+        return matrices
 
     def evaluate(self, params: dict, prepared: Sequence) -> mi.Color3f:
         """Return the log gain at every texel.

@@ -17,12 +17,13 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 
 ALBEDO = 0.02, 1.0
-"""Least and greatest albedo of ground that is lit by what is above. Four photographs with ground or floor
-have 0.06 to 0.16, the maps of two public scenes 0.1 and 0.3; ``analytic_sky.py`` lays a ground of 0.2 below
-its sky. Ground that shines itself has more."""
-MIXED = 0.01
-"""Share of its luminance in every channel of H: a ratio to a channel that is black says nothing."""
-_LEAST = 1e-30
+"""Least and greatest albedo of ground that is lit by what is above; outside it keeps its brightness. Measured
+(``test_maps_with_ground_have_an_albedo_that_there_is``): four photographs with ground or floor have 0.06 to
+0.16, the maps of two public scenes 0.1 and 0.3. Ground that shines itself has more than 1."""
+LUMINANCE_SHARE = 0.01
+"""Share of its luminance in every channel of H: a ratio to a black channel says nothing. Not measured."""
+LEAST_IRRADIANCE = 1e-30
+"""Irradiance below which there is none: keeps logarithms finite."""
 
 
 class GroundLight:
@@ -46,15 +47,17 @@ class GroundLight:
     """
 
     def __init__(self, above: np.ndarray, ground: np.ndarray):
-        (up, width, _), total = above.shape, len(above) + len(ground)
-        up_part = np.maximum(latlong.directions(total, width)[:up, :1, 1], 0)
-        self.cosine = latlong.lookup_solid_angles(total, width)[:up, None] * up_part
+        up, width, _ = above.shape
+        total = len(above) + len(ground)
+        cosine = np.maximum(latlong.directions(total, width)[:up, :1, 1], 0)
+        self.cosine = latlong.lookup_solid_angles(total, width)[:up, None] * cosine
         self.initial = self.irradiance(above)
         light = float(self.initial @ LUMINANCE)
-        self.albedo = np.pi * float(np.median(ground @ LUMINANCE)) / light if light > _LEAST else 0.0
+        radiance = float(np.median(ground @ LUMINANCE))
+        self.albedo = np.pi * radiance / light if light > LEAST_IRRADIANCE else 0.0
         # Products of matrices: their sums, and those of their adjoints, have one order.
-        mixed = (1 - MIXED) * np.eye(3) + MIXED * np.asarray(LUMINANCE)[:, None]
-        self._rows, self._columns = tensor(self.cosine.T), tensor(np.tile(mixed, (width, 1)))
+        self._rows = tensor(self.cosine.T)
+        self._columns = tensor(np.tile(with_luminance(LUMINANCE_SHARE), (width, 1)))
         self._size = up * width * 3
         self._before = self._log_light(tensor(above))
 
@@ -83,4 +86,9 @@ class GroundLight:
     def _log_light(self, above):
         flat = dr.reshape(above, (above.shape[0], 3 * above.shape[1]))
         light = dr.matmul(dr.matmul(self._rows, flat), self._columns)
-        return dr.log(dr.maximum(light, _LEAST))
+        return dr.log(dr.maximum(light, LEAST_IRRADIANCE))
+
+
+def with_luminance(share: float) -> np.ndarray:
+    """Return the matrix (3, 3) by which a row of channels is multiplied to mix its luminance into each."""
+    return (1 - share) * np.eye(3) + share * np.asarray(LUMINANCE)[:, None]

@@ -1,19 +1,20 @@
 """Layers: a representation of the edit instead of the map.
 
-    E = sat_k(E_0' * prod((1 + G_l) / (1 + G_l^0)) * exp(w r)) * exp(g) + sum(C_l)
+The formula is that of ``composition.py``, at the texels of a working map: lights that move
+(``separation.py``, ``lights.py``) over a background under a smooth gain (``gain.py``). Rows below the horizon
+follow those above (``below_horizon.py``), or are edited like them. Where exp(g) is above 1, what it adds is
+in part luminance (:func:`.brightened`). Unmoved lights, no gain and k = 1 give the original back, bit for bit
+outside the cores: the sky's own detail is kept.
 
-E_0' is the original without the cores of its lights, G_l and C_l are glow and core of light l
-(``separation.py``, ``lights.py``), with index 0 before they moved; w and r are what is seen where a glow has
-gone (``behind_glow.py``), k is the saturation of the sky's colours (``saturation.py``), g is its smooth gain
-(``gain.py``), and s_l, the factor of a light's flux, is in G_l. Rows below the horizon follow those above
-(``below_horizon.py``), or are edited like them. Where f = exp(g) is above 1, E f is read as
-E + (f - 1) ((1 - VEIL) E + VEIL lum(E)), :func:`.brightened`. Unmoved lights, no gain and k = 1 give the
-original back, bit for bit outside the cores: the sky's own detail is kept, and the map has any resolution.
-
-Longer than 400 lines: the terms of one formula, and what each is at other resolutions.
+Longer than 400 lines: one class, from the image to derivatives.
 """
 
 from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -24,238 +25,370 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.representations.layers import behind_glow
+from envedit.representations.layers.behind_glow import BehindGlow
 from envedit.representations.layers.below_horizon import Below, Horizon, sky_rows
-from envedit.representations.layers.gain import CYCLES, GridGain, Octave, brightened
+from envedit.representations.layers.composition import Fields, Glows, compose
+from envedit.representations.layers.gain import CYCLES, GridGain, Octave
 from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.lights import DARK, SPARE, Lights
-from envedit.representations.layers.saturation import by_saturation, saturated
+from envedit.representations.layers.saturation import saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
 SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5, "saturation": 1.0}
-"""What a unit of each parameter is, in radians and logarithms: one learning rate then suits all."""
+"""Unit of each parameter, in radians and logarithms: one learning rate then suits all. Not measured."""
 
 GROUND = 0.3
-"""What a unit of the log factor of lit ground is: by so much the colour of daylight changes. With 1, Adam,
+"""Unit of the log factor of ground, a logarithm: by so much the colour of daylight changes. With 1, Adam,
 which has no prior, made ground pink under a mirror (three edits of the analytic sky: maps 34.3, 27.1 and
 22.1 dB; with 0.3 36.5, 33.4 and 28.9)."""
 
+SATURATION_STEP = 0.05
+"""Step of the difference by the log saturation, towards grey. Not measured beside other steps. The tangent in
+its place (forward-mode derivative) differs by 0.2 to 0.7 % of the largest value; with it two of four small
+edits towards renderings ended 1.0 and 0.7 dB lower, one of them after 22 steps in place of 14."""
 
-class Layers:
-    """Lights that move, a background under a smooth gain.
 
-    Parameters may hold ``saturation`` (1, 1), the logarithm of k of ``saturation.py``; without it, k is 1.
-
-    Parameters
-    ----------
-    rows : (int, int)
-        First row of the images in their map, and the rows of that map.
-    cycles : int
-        Cycles of the gain around the horizon, before :meth:`refine`.
-    horizon : str
-        What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
-        ``below_horizon.py``, or "free": edited as those above.
-
-    aureoles : bool
-        Lights that are added have the glow of the map's strongest, as for :class:`.Lights`.
+@dataclass(frozen=True)
+class TexelFields:
+    """What parameters do to every texel of a working map, (rows, W, 3) float32 each.
 
     Attributes
     ----------
+    log_gain : ndarray
+        Log gain, also of texels that :meth:`Layers.keeping` excepts from it; of rows that follow, the log
+        factor that is beside :attr:`log_followed`.
+    log_followed : ndarray
+        Log factor, by what lights do, of rows that follow; 0 of others.
+    offset, slope : ndarray
+        Of :class:`.BehindGlow`; 0 of rows that follow, and without glows.
+    """
+
+    log_gain: np.ndarray
+    log_followed: np.ndarray
+    offset: np.ndarray
+    slope: np.ndarray
+
+
+class _Texels(NamedTuple):
+    """The texels above the horizon on the device; ``before``, ``offset`` and ``slope`` are of glows."""
+
+    directions: mi.Vector3f
+    base: mi.Color3f
+    before: mi.Color3f | None
+    offset: mi.Color3f | None
+    slope: mi.Color3f | None
+    free: mi.Float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Lights that move, a background under a smooth gain; made by :meth:`of`, and never changed.
+
+    Parameters may hold ``saturation`` (1, 1), the logarithm of k of ``saturation.py``; without it, k is 1.
+
+    Attributes
+    ----------
+    rows : (int, int)
+        First row of the image in its map, and the rows of that map.
+    whole : (int, int)
+        Rows and columns of the image.
     separation : Separation
-        What :meth:`encode` found in the image.
+        Lights and background of the rows above the horizon, or of all where none follow.
     lights : Lights
         Its lights and spare ones.
     gain : GridGain
         The gain's grids.
-    rows, shape : (int, int)
-        As given, and rows and columns that lights and gain act on: of the image, or of its sky where the
-        rows below the horizon follow.
-    whole : (int, int)
-        Rows and columns of the image.
-    below : Below or None
-        The rows that follow.
+    base : ndarray (rows, W, 3) float32
+        E_0', of the rows of the separation.
     behind : BehindGlow or None
         What is seen where a glow has gone; None without glows.
+    below : Below or None
+        The rows that follow.
     free : ndarray of bool (rows, W) or None
-        As given to :meth:`keep`.
-    scales : dict
-        What a unit of each parameter is.
+        Texels that gain and saturation act on; None: all.
     """
 
-    lr = 0.03
-    models_edit, fitted = True, None
-    Gain = GridGain
+    rows: tuple[int, int]
+    whole: tuple[int, int]
+    separation: Separation
+    lights: Lights
+    gain: GridGain
+    base: np.ndarray
+    behind: BehindGlow | None = None
+    below: Below | None = None
+    free: np.ndarray | None = None
 
-    def __init__(
-        self,
+    lr = 0.03
+    models_edit = True
+    fitted = None
+
+    # ---- making --------------------------------------------------------------------------------------------
+
+    @classmethod
+    def of(
+        cls,
+        image: np.ndarray,
         rows: tuple[int, int] | None = None,
         cycles: int = CYCLES,
         horizon: Horizon = "free",
         aureoles: bool = True,
-    ):
-        self.rows, self._cycles, self._horizon, self._aureoles = rows, cycles, horizon, aureoles
-        self.below: Below | None = None
-        self.separation: Separation | None = None
-        self.free: np.ndarray | None = None
+    ) -> Layers:
+        """Separate an image.
 
-    def encode(self, image: np.ndarray, seed: int = 0) -> dict:
-        """Separate the image; ``seed`` is not used.
+        Parameters
+        ----------
+        image : ndarray (rows, W, 3)
+            Linear radiance.
+        rows : (int, int), optional
+            First row of the image in its map, and the rows of that map; None: it is a whole map.
+        cycles : int
+            Cycles of the gain around the horizon, before :meth:`refined`.
+        horizon : str
+            What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
+            ``below_horizon.py``, or "free": edited as those above.
+        aureoles : bool
+            Lights that are added have the glow of the map's strongest, as for :class:`.Lights`.
 
         Raises
         ------
         InputError
             If a texel is not finite, negative, or brighter than :data:`.radiance.BRIGHTEST`.
         """
-        self.rows = self.rows or (0, image.shape[0])
-        require_radiance(image, "layers", self.rows[0], BRIGHTEST)
+        rows = rows or (0, len(image))
+        require_radiance(image, "layers", rows[0], BRIGHTEST)
         image = np.ascontiguousarray(image, np.float32)
-        self.whole, low = image.shape[:2], None
-        if self._horizon != "free" and self.rows == (0, len(image)):
-            up = sky_rows(len(image))
-            image, low = np.ascontiguousarray(image[:up]), image[up:]
-        self.separation = separate(image, self.rows, MOVABLE)
-        self.lights = Lights(self.separation.lights, self.rows, image.shape[1], self._aureoles)
-        self.shape = image.shape[:2]
-        core = self.separation.core
-        base = np.where((core > 0).any(axis=2, keepdims=True), image - core, image)
-        self.base = np.maximum(base, 0).astype(np.float32)
-        self.behind = None
-        if self.lights.glowing:
-            self._away = behind_glow.degrees_to_cores(self.separation.lights, self.shape, self.rows)
-            self.behind = behind_glow.behind_glow(
-                self.separation.background, self.separation.glow, self._away, self.rows
-            )
-        self.gain = self.Gain(self._cycles, self.shape[0] / self.rows[1], self.rows[0] == 0)
-        self._prepared: dict = {}
-        n = self.lights.count
-        flux = np.zeros((n, 3), np.float32)
-        flux[n - SPARE :] = DARK / SCALES["flux"]
-        given = {"turn": np.zeros((n, 3), np.float32), "flux": flux, "size": np.zeros((n, 1), np.float32)}
-        params = {name: tensor(value) for name, value in given.items()}
-        self.below = self._below(low, params) if low is not None and len(low) else None
-        if self.ground_light:
-            params["ground"] = tensor(np.zeros((1, 3), np.float32))
-        self.scales = self._units()
-        return params | {name: tensor(value) for name, value in self.gain.init().items()}
 
-    def _below(self, low, params):
+        # ---- Rows above the horizon, and rows below that follow them
+        above, low = image, image[:0]
+        if horizon != "free" and rows == (0, len(image)):
+            up = sky_rows(len(image))
+            above, low = image[:up], image[up:]
+
+        # ---- Lights, and the map without their cores
+        separation = separate(above, rows, MOVABLE)
+        lights = Lights(separation.lights, rows, image.shape[1], aureoles)
+        core = separation.core
+        base = np.where((core > 0).any(axis=2, keepdims=True), above - core, above)
+        base = np.maximum(base, 0).astype(np.float32)
+
+        # ---- What is seen where a glow has gone
+        behind, away = None, None
+        if lights.glowing:
+            away = behind_glow.degrees_to_cores(separation.lights, above.shape[:2], rows)
+            behind = behind_glow.behind_glow(separation.background, separation.glow, away, rows)
+
+        gain = GridGain(cycles, len(above) / rows[1], rows[0] == 0)
+        layers = cls(rows, image.shape[:2], separation, lights, gain, base, behind)
+        return replace(layers, below=layers._below(low, horizon, away)) if len(low) else layers
+
+    def _below(self, low, horizon, away):
         """Rows that follow, and what they show where the reflection of a glow has gone."""
-        above = self._unmoved(params) if self._horizon == "keep" else None
-        below = Below(low, self.base, self._horizon, above)
-        if self.behind is None or self._horizon != "mirror":
+        lit_by = self.base + self._core(self._real(self.start())).numpy()[: len(self.base)]
+        below = Below(low, self.base, horizon, lit_by if horizon == "keep" else None)
+        if self.behind is None or horizon != "mirror":
             return below
         background, glow = self.separation.background, self.separation.glow
         gone = 1 - 1 / (glow @ LUMINANCE)[..., None]
         dark = background * np.exp(gone * self.behind.log_change(background))
         unlit = low * np.exp(np.float64(below.log_factor(tensor(dark)).numpy()))
-        glow, gone, away = (one[below.mirrored] for one in (glow, gone, self._away))
+        glow, gone, away = (field[below.mirrored] for field in (glow, gone, away))
         behind = behind_glow.behind_glow(unlit, glow, away, (self.shape[0], self.rows[1]))
         below.reveal(behind.log_change(unlit), gone, behind_glow.near_core(away)[..., None])
         return below
 
-    def refine(self, params: dict, octaves: list[Octave]) -> dict:
-        """Give the gain finer grids and ``params``, of :meth:`encode`, what these start from: zero."""
-        self.gain.refine(octaves)
-        self.scales = {
-            name: unit if np.ndim(unit) == 0 else tensor(unit) for name, unit in self._units().items()
-        }
-        self._prepared = {}
-        new = {k: tensor(v) for k, v in self.gain.init().items() if k not in params}
-        return params | new
+    def refined(self, octaves: Sequence[Octave]) -> Layers:
+        """Return these layers with finer grids of the gain; :meth:`start` has zeros for them."""
+        return replace(self, gain=self.gain.refined(octaves))
 
-    def keep(self, free: np.ndarray | None) -> None:
-        """Say which texels (rows, W) may change other than by a light's moving; None: all."""
-        self.free = None if free is None else free[: self.shape[0]]
-        self._prepared = {}
+    def keeping(self, free: np.ndarray | None) -> Layers:
+        """Return these layers with other texels (rows, W) that gain and saturation act on; None: all."""
+        return replace(self, free=None if free is None else free[: self.shape[0]])
 
-    def decode(self, params: dict, shape: tuple[int, int] | None = None) -> mi.TensorXf:
-        """Compose the map at the resolution of the image, or at any other ``shape`` (rows, W).
+    # ---- parameters ----------------------------------------------------------------------------------------
 
-        Rows that follow have the resolution of the image. Without parameters of the gain it is 1.
-        """
-        sky, core = self.parts(params, shape)
-        return sky + core
+    def start(self) -> dict[str, mi.TensorXf]:
+        """Return the parameters of no edit, in units of :attr:`scales`: zeros, and spare lights dark."""
+        n = self.lights.count
+        flux = np.zeros((n, 3), np.float32)
+        flux[n - SPARE :] = DARK / SCALES["flux"]
+        start = {"turn": np.zeros((n, 3)), "flux": flux, "size": np.zeros((n, 1))}
+        if self.ground_light:
+            start["ground"] = np.zeros((1, 3))
+        return {name: tensor(value) for name, value in (start | self.gain.init()).items()}
 
-    def parts(self, params: dict, shape: tuple[int, int] | None = None) -> tuple[mi.TensorXf, mi.TensorXf]:
-        """Compose the map as :meth:`decode` does, its lights' cores apart: the sky, and cores."""
-        shape = shape or self.shape
-        if self.below is not None and shape != self.shape:
-            raise ValueError(f"rows below the horizon follow at {self.whole} texels only, asked for {shape}")
-        rows = self._at(shape)[0]
-        real = self._real(params)
-        lit, gone = self._lit(real, shape)
-        sky = self._under_gain(real, lit, shape)
-        if self.below is None:
-            return sky, self._core(real, shape, rows)
-        core = self._core(real, self.whole, rows)
-        by_lights, further = self._log_below(real, lit, gone, sky, core)
-        low = self._low(real, by_lights)
-        low = dr.ravel(brightened(low, dr.unravel(mi.Color3f, dr.exp(further).array)))
-        return mi.TensorXf(dr.concat((sky.array, low)), (*self.whole, 3)), core
+    @functools.cached_property
+    def scales(self) -> dict[str, Any]:
+        """Unit of each parameter, a number or a tensor of its shape."""
+        units = SCALES | self.gain.scales() | ({"ground": GROUND} if self.ground_light else {})
+        return {name: unit if np.ndim(unit) == 0 else tensor(unit) for name, unit in units.items()}
 
     def _real(self, params):
         """Return parameters as logarithms and radians."""
         return {name: value * self.scales[name] for name, value in params.items()}
 
-    def _units(self):
-        """Return what a unit of each parameter is; the factor of lit ground is a logarithm, as the gain."""
-        return SCALES | self.gain.scales() | ({"ground": GROUND} if self.ground_light else {})
+    # ---- composing -----------------------------------------------------------------------------------------
 
-    def _unmoved(self, params):
-        """Rows above the horizon as :meth:`decode` composes them where nothing has changed."""
-        real = {name: value * SCALES[name] for name, value in params.items()}
-        return self.base + self._core(real, self.shape, self.rows).numpy()
+    def decode(self, params: dict) -> mi.TensorXf:
+        """Compose the map, (rows, W, 3); without parameters of the gain that is 1."""
+        sky, core = self.parts(params)
+        return sky + core
 
-    def _core(self, real, shape, rows):
-        return self.lights.core(real["turn"], real["flux"], real["size"], shape, rows)
-
-    def _lit(self, real, shape):
-        """Return the sky under its lights, and which share of a texel's light was a glow's and is gone."""
-        _, d, base, before, _, _, behind = self._at(shape)
-        if not self.lights.glowing:
-            return base, None
-        ratio = self.lights.glow_ratio(real["turn"], real["flux"], d, before)
-        gone = behind_glow.gone_of(ratio)
-        return base * ratio * dr.exp(gone * behind), gone
-
-    def _under_gain(self, real, lit, shape):
-        """Return the sky with its saturation and its gain."""
-        *_, gain, free, _ = self._at(shape)
-        sky = _coloured(real, lit)
-        if "gain.0" in real:
-            sky = brightened(sky, dr.exp(self.gain.evaluate(real, gain)))
-        sky = sky if free is None else dr.select(free, sky, lit)
-        return mi.TensorXf(dr.ravel(sky), (*shape, 3))
-
-    def log_below(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Return log factors (rows, W, 3) of rows that follow: by lights, before saturation; and further."""
-        if self.below is None:
-            return (np.zeros((0, self.shape[1], 3), np.float32),) * 2
+    def parts(self, params: dict) -> tuple[mi.TensorXf, mi.TensorXf]:
+        """Compose the map as :meth:`decode` does, its lights' cores apart: the sky, and cores."""
         real = self._real(params)
-        lit, gone = self._lit(real, self.shape)
-        sky, core = self._under_gain(real, lit, self.shape), self._core(real, self.whole, self.rows)
-        by_lights, further = self._log_below(real, lit, gone, sky, core)
-        return np.broadcast_to(by_lights.numpy(), further.shape), further.numpy()
+        above, core = self._above(real), self._core(real)
+        sky = dr.ravel(above.sky)
+        if self.below is not None:
+            log_followed, log_gain = self._log_below(real, above, core)
+            low = self._low(_log_saturation(real), log_followed, log_gain)
+            sky = dr.concat((sky, dr.ravel(low.sky)))
+        return mi.TensorXf(sky, (*self.whole, 3)), core
 
-    def _log_below(self, real, lit, gone, sky, core):
-        """Log factors of the rows that follow: by what lights do, and by what else the sky does."""
-        before = None
-        by_lights = mi.TensorXf(np.zeros((1, 1, 1), np.float32))
-        if self.lights.glowing:
-            before = self.below.averaged(self._image(lit))
-            by_lights = self.below.log_factor(before, gone)
-        ground = self.below.log_lit(sky, core, real.get("ground"))
-        if "gain.0" not in real and "saturation" not in real:  # the sky is as lights have made it
-            return by_lights, self.below.reshaped(ground)
+    def _core(self, real):
+        return self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+
+    def _above(self, real, fields=None):
+        """Compose the rows above the horizon, by default with the fields of the parameters."""
+        return compose(self._texels.base, self._texels.directions, fields or self._fields(real))
+
+    def _fields(self, real):
+        """Return what parameters do to the rows above the horizon."""
+        glows = None
+        if self.behind is not None:
+            texels = self._texels
+            glows = Glows(
+                self.lights,
+                real["turn"],
+                real["flux"],
+                texels.before,
+                texels.offset,
+                texels.slope,
+                dr.opaque(mi.Float, self.behind.faint),
+            )
+        return Fields(
+            glows=glows,
+            log_saturation=_log_saturation(real),
+            log_gain=self.gain.evaluate(real, self._grids) if "gain.0" in real else None,
+            share=self._texels.free,
+        )
+
+    def _log_below(self, real, above, core):
+        """Log factors (rows, W, 3) of the rows that follow: by lights, or None; by what else the sky does."""
+        before, log_followed = None, None
+        if above.gone is not None:
+            before = self.below.averaged(self._image(above.relit))
+            log_followed = self.below.log_factor(before, above.gone)
+        # A mirror has the sky's saturation itself.
         if self.mirrored and "saturation" in real:
-            before = self._image(_coloured(real, lit))
-        return by_lights, self.below.log_factor(sky, None, ground, before)
+            before = self._image(saturated(above.relit, dr.exp(_log_saturation(real))))
+        sky = self._image(above.sky)
+        ground = self.below.log_lit(sky, core, real.get("ground"))
+        return log_followed, self.below.log_factor(sky, None, ground, before)
 
-    def _low(self, real, by_lights):
-        """Rows that follow, before the gain."""
-        low = self.below.radiance
-        if self.lights.glowing:
-            low = low * dr.unravel(mi.Color3f, dr.exp(by_lights).array)
-        return _coloured(real, low) if self.mirrored else low
+    def _low(self, log_saturation, log_followed, log_gain):
+        """Compose the rows that follow."""
+        fields = Fields(
+            log_followed=None if log_followed is None else dr.unravel(mi.Color3f, log_followed.array),
+            log_saturation=log_saturation if self.mirrored else None,
+            log_gain=dr.unravel(mi.Color3f, log_gain.array),
+        )
+        return compose(self.below.radiance, None, fields)
+
+    def _image(self, colours):
+        return mi.TensorXf(dr.ravel(colours), (*self.shape, 3))
+
+    @functools.cached_property
+    def _texels(self) -> _Texels:
+        (first, total), (height, width) = self.rows, self.shape
+        d = latlong.directions(total, width)[first : first + height].reshape(-1, 3)
+        directions = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+        before, offset, slope = None, None, None
+        if self.behind is not None:
+            before = dr.opaque(self.lights.glow_before(directions))
+            offset = _colours(self.behind.offset)
+            slope = _colours(self.behind.slope)
+        free = None if self.free is None else dr.opaque(mi.Float(np.float32(self.free.ravel())))
+        return _Texels(directions, _colours(self.base), before, offset, slope, free)
+
+    @functools.cached_property
+    def _grids(self):
+        return self.gain.prepare(self.shape, self.rows)
+
+    # ---- fields and derivatives ----------------------------------------------------------------------------
+
+    def log_gain(self, params: dict) -> np.ndarray:
+        """Return the log gain (rows, W, 3) of the rows above the horizon, also of kept texels."""
+        return self._image(self.gain.evaluate(self._real(params), self._grids)).numpy()
+
+    def texel_fields(self, params: dict) -> TexelFields:
+        """Return what parameters do to every texel, as images that hold at any resolution."""
+        nothing = np.zeros((*self.shape, 3), np.float32)
+        log_gain = self.log_gain(params) if "gain.0" in params else nothing
+        log_followed, offset, slope = nothing, nothing, nothing
+        if self.behind is not None:
+            offset, slope = self.behind.offset, self.behind.slope
+        if self.below is not None:
+            real = self._real(params)
+            below = np.zeros((*self.below.shape, 3), np.float32)
+            by_lights, further = self._log_below(real, self._above(real), self._core(real))
+            log_gain = np.concatenate([log_gain, further.numpy()])
+            log_followed = np.concatenate([nothing, below if by_lights is None else by_lights.numpy()])
+            offset, slope = (np.concatenate([field, below]) for field in (offset, slope))
+        return TexelFields(log_gain, log_followed, offset, slope)
+
+    def gain_slope(self, params: dict) -> np.ndarray:
+        """Return the derivative of the sky by the log gain of a texel, (rows, W, 3), above the horizon."""
+        real = self._real(params)
+        with dr.isolate_grad():
+            fields = self._fields(real)
+            log_gain = mi.Color3f(fields.log_gain)
+            dr.enable_grad(log_gain)
+            dr.set_grad(log_gain, 1)
+            sky = self._above(real, replace(fields, log_gain=log_gain)).sky
+            dr.forward_to(sky)
+            return self._image(dr.grad(sky)).numpy()
+
+    def saturation_slope(self, params: dict) -> np.ndarray:
+        """Return the derivative of the map without cores by the log saturation, (rows, W, 3): a difference.
+
+        Of the saturation itself, in all rows that have it: what rows below the horizon follow is held.
+        """
+        real = self._real(params)
+        fields = self._fields(real)
+        followed = self._log_below(real, self._above(real), None) if self.mirrored else None
+
+        def sky_at(log_saturation):
+            sky = dr.ravel(self._above(real, replace(fields, log_saturation=log_saturation)).sky)
+            if followed:
+                sky = dr.concat((sky, dr.ravel(self._low(log_saturation, *followed).sky)))
+            return sky.numpy().reshape(-1, self.whole[1], 3)
+
+        log_saturation = real["saturation"].array
+        here = sky_at(log_saturation)
+        slopes = np.zeros((*self.whole, 3), np.float32)
+        slopes[: len(here)] = (here - sky_at(log_saturation - SATURATION_STEP)) / np.float32(SATURATION_STEP)
+        return slopes
+
+    def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
+        """Return log(1 + s_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
+
+        ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.
+        """
+        if self.lights.glows[i] is None:
+            return None
+        factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._texels.directions)
+        log_glow = self._image(dr.log(factor)).numpy()
+        if self.below is None:
+            return log_glow
+        return np.concatenate([log_glow, log_glow[self.below.mirrored] * self.below.fade[:, None, None]])
+
+    # ---- rows ----------------------------------------------------------------------------------------------
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns that lights and gain act on: of the image, or of its sky where rows follow it."""
+        height, width, _ = self.base.shape
+        return height, width
 
     @property
     def active(self) -> slice:
@@ -296,12 +429,12 @@ class Layers:
         Of a map with a :attr:`ground_light`.
         """
         rows, columns = self.gain.sizes[level]
-        falls = self.ground_light
-        light = (self.base @ LUMINANCE * falls.cosine / float(falls.initial @ LUMINANCE)).ravel()
-        part = np.zeros(rows * columns)
-        for node, share in self.gain.hats(level, self.shape):
-            part += np.bincount(node, share * light, rows * columns)
-        return part
+        ground = self.ground_light
+        light = (self.base @ LUMINANCE * ground.cosine / float(ground.initial @ LUMINANCE)).ravel()
+        total = np.zeros(rows * columns)
+        for node, weight in self.gain.hats(level, self.shape):
+            total += np.bincount(node, weight * light, rows * columns)
+        return total
 
     def background(self) -> np.ndarray:
         """Return the image without its lights and their glow, (rows, W, 3)."""
@@ -313,95 +446,18 @@ class Layers:
 
     def hats(self, level: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """List what :meth:`.GridGain.hats` does, of all texels of the image, those that follow included."""
-        rows, taps = self.followed, []
-        for node, share in self.gain.hats(level, self.shape):
-            node, share = node.reshape(self.shape)[rows], share.reshape(self.shape)[rows]
-            taps.append((node.ravel(), (share * self.follows[:, None]).ravel()))
+        taps = []
+        for node, weight in self.gain.hats(level, self.shape):
+            node = node.reshape(self.shape)[self.followed]
+            weight = weight.reshape(self.shape)[self.followed] * self.follows[:, None]
+            taps.append((node.ravel(), weight.ravel()))
         return taps
 
-    def before_gain(self, params: dict) -> np.ndarray:
-        """Return what the gain multiplies, (rows, W, 3): the sky under its lights, with its saturation."""
-        real = self._real(params)
-        return self._image(_coloured(real, self._lit(real, self.shape)[0])).numpy()
 
-    def by_saturation(self, params: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Return the image before the gain, without cores, and its derivative by the log saturation."""
-        real = self._real(params)
-        lit, gone = self._lit(real, self.shape)
-        parts, image = [(slice(self.shape[0]), lit)], np.empty((*self.whole, 3), np.float32)
-        if self.below is not None:
-            unsaturated = {name: value for name, value in real.items() if name != "saturation"}
-            by_lights = self.below.log_factor(self._image(lit), gone)
-            low = self._low(unsaturated, by_lights)
-            image[self.shape[0] :] = dr.ravel(low).numpy().reshape(*self.below.shape, 3)
-            parts += [(slice(self.shape[0], None), low)] * self.mirrored
-        return by_saturation(image, parts, real["saturation"].array)
-
-    def log_gain(self, params: dict) -> np.ndarray:
-        """Return the logarithm of the gain (rows, W, 3) float32, at the resolution of the image.
-
-        Of all texels that the gain acts on itself, also of those that :meth:`keep` excepts from it.
-        """
-        real = self._real(params)
-        field = self.gain.evaluate(real, self.gain.prepare(self.shape, self.rows))
-        return self._image(field).numpy()
-
-    def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
-        """Return log(1 + s_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
-
-        ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.
-        """
-        if self.lights.glows[i] is None:
-            return None
-        factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._at(self.shape)[1])
-        found = self._image(dr.log(factor)).numpy()
-        if self.below is None:
-            return found
-        return np.concatenate([found, found[self.below.mirrored] * self.below.fade[:, None, None]])
-
-    def _image(self, colours):
-        return mi.TensorXf(dr.ravel(colours), (*self.shape, 3))
-
-    def _at(self, shape):
-        if shape not in self._prepared:
-            self._prepared[shape] = self._prepare(shape)
-        return self._prepared[shape]
-
-    def _prepare(self, shape):
-        first, total = self.rows
-        height, width = self.shape
-        finer = shape[0] / height
-        rows = (0, shape[0])
-        if (first, total) != (0, height):
-            rows = round(first * finer), round(total * finer)
-        d = latlong.directions(rows[1], shape[1])[rows[0] : rows[0] + shape[0]]
-        base, behind = self._finer(self.base, shape, d), None
-        if self.behind is not None:
-            glow = self._finer(self.separation.glow, shape, d)
-            smooth = [self._finer(field, shape, d) for field in (self.behind.offset, self.behind.slope)]
-            change = behind_glow.BehindGlow(smooth[0], smooth[1], self.behind.faint).log_change(base / glow)
-            behind = dr.opaque(mi.Color3f(np.ascontiguousarray(change.reshape(-1, 3).T, np.float32)))
-        d = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)))
-        before = dr.opaque(self.lights.glow_before(d)) if self.lights.glowing else mi.Color3f(1)
-        base = dr.opaque(mi.Color3f(np.ascontiguousarray(base.reshape(-1, 3).T)))
-        free = None
-        if self.free is not None:
-            row = np.arange(shape[0]) * height // shape[0]
-            column = np.arange(shape[1]) * width // shape[1]
-            free = dr.opaque(mi.Bool(self.free[row][:, column].ravel()))
-        return rows, d, base, before, self.gain.prepare(shape, rows), free, behind
-
-    def _finer(self, image, shape, d):
-        """Interpolate an image (rows, W, 3) at the directions of another resolution."""
-        if shape == self.shape:
-            return image
-        first, total = self.rows
-        whole = np.repeat(image[-1:], total, axis=0)
-        whole[first : first + len(image)] = image
-        whole[:first] = image[:1]
-        return latlong.lookup(whole, d).astype(np.float32)
+def _colours(image):
+    """Copy an image (rows, W, 3) to the device."""
+    return dr.opaque(mi.Color3f(np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)))
 
 
-def _coloured(real, radiance):
-    """Return radiance with the saturation of its colours, where that is a parameter."""
-    return saturated(radiance, dr.exp(real["saturation"].array)) if "saturation" in real else radiance
+def _log_saturation(real):
+    return real["saturation"].array if "saturation" in real else None

@@ -1,4 +1,4 @@
-"""Lights that move on the sphere: their texels carried along a rotation, differentiably.
+"""Lights that move on the sphere: their texels are rotated, differentiably.
 
 A light is a set of points, each a direction with a flux. A rotation, a size and a flux per channel place it;
 then every point is shared out among the texels around it. A point's share of a texel is the tent of
@@ -29,31 +29,43 @@ from envedit.core.types import ArrayLike
 from envedit.representations.layers.separation import GLOW_DEGREES, Light
 
 SPARE = 2
-"""Lights beside the map's own, dark until one is needed: lobes."""
+"""Lights beside the map's own, dark until one is needed: lobes. Not measured: each costs as much as a light
+of the map."""
 DARK = -30.0
-"""Logarithm of the flux of a light that is not there."""
+"""Log flux of a light that is not there: such a flux is taken for 0. Derived: e^-30 is 1e-13."""
 FAINTEST = 1e-3
-"""Least flux of a spare light in a channel over that in its strongest: factors can give it any colour."""
+"""Least flux of a spare light in a channel, as a share of its strongest channel: factors can give it any
+colour. Not measured."""
 LOBE_POINTS = 1024
+"""Points of a lobe. Not measured: more cost time, with fewer a large lobe shows its points."""
 SPACINGS = math.sqrt(LOBE_POINTS) / 8
-"""Spacings of its points in the radius of a lobe."""
-LOBE_DEGREES, LOBE_REACH = 0.5, 2.5
-"""Points and radius of a lobe of size 1, a sun a little blurred, and where it ends, in radii: farther out
-points would lie singly."""
+"""Distances between points in the radius of a lobe. Derived from the lobe's area in points, to a factor."""
+LOBE_DEGREES = 0.5
+"""Radius (standard deviation) of a lobe of size 1: a sun, a little blurred. Not measured."""
+LOBE_REACH = 2.5
+"""Radii at which a lobe ends: points farther out would lie singly. Not measured."""
 NARROWEST = 0.4
 """Radius in texels from which a lobe is round. With the tents of its points, of variance 1/6, it makes 0.57:
-where its centre lies between texels changes its second moments by less than 2 %. What is narrower, as a
-target may need, is interpolated as a single texel is."""
+where its centre lies between texels changes its second moments by less than 2 % (derived;
+``tests/oracle/test_lights.py`` measures it). A narrower one is interpolated as a single texel is."""
 LOG_SIZES = (-6.0, 3.0)
-"""Logarithms of sizes are cut to these: from a texel's fraction to twenty times the light."""
+"""Log sizes are cut to these: from a texel's fraction to twenty times the light. Not measured."""
 MOST_LOG_FLUX = 30.0
-"""Logarithms of fluxes are cut there: e^30 is 1e13."""
-_LEAST_SINE = 1e-8
-_SNAP = 2e-4  # texels; of wide maps as many as float32 rounds an azimuth by
-_SNAP_SHARE = 4e-7
-_OFF_POLE = 1e-4  # texels: as far from a pole the texels of its row are taken to lie, each with its azimuth
-_WIDEST = 2.0  # half-width of a tent in widths of the map: there it is even all around
-_BITS = 40
+"""Log fluxes are cut there: e^30 is 1e13, and products stay within float32. Derived."""
+LEAST_SINE = 1e-8
+"""Least sine of a polar angle, where a column is not defined: keeps quotients finite. Derived."""
+SNAP_TEXELS = 2e-4
+"""A place within this of a whole row or column is taken for it: 1e-5 of a sun is bright. Derived: float32
+rounds the azimuths of a map 512 texels wide by so much."""
+SNAP_SHARE = 4e-7
+"""The same as a share of a map's width, where that is more. Derived from float32's rounding."""
+OFF_POLE_TEXELS = 1e-4
+"""Texels of a pole's row are taken to lie so far from it, so that each has its azimuth. Not measured."""
+MOST_HALF_WIDTH = 2.0
+"""Most half-width of a tent, in widths of the map: there it is even all around. Derived."""
+SUM_BITS = 40
+"""Bits that the largest radiance has in the integer sums. Derived: of 63, 23 are left for how many points
+may fall into one texel."""
 
 
 class Lights:
@@ -86,39 +98,47 @@ class Lights:
 
     def __init__(self, lights: list[Light], rows: tuple[int, int], width: int, aureoles: bool = True):
         first, total = rows
-        self.own, self.count, self.width, self.total = len(lights), len(lights) + SPARE, width, total
+        self.own = len(lights)
+        self.count = len(lights) + SPARE
+        self.width = width
+        self.total = total
         self._rows = rows
+
+        # ---- Points of each light: directions, fluxes, and widths as the sine of a polar angle
+        directions, fluxes, sines = [], [], []
         omega = latlong.lookup_solid_angles(total, width)
-        directions, fluxes, which, sines = [], [], [], []
-        for i, light in enumerate(lights):
+        for light in lights:
             row, column = first + light.texels // width, light.texels % width
             directions.append(points(row, column, total, width))
             fluxes.append(light.radiance * omega[row][:, None])
-            which.append(np.full(len(row), i))
             sines.append(np.sin(np.pi * row / max(total - 1, 1)))
-        own = np.array([f.sum(axis=0) for f in fluxes]).reshape(-1, 3)
+        own = np.array([flux.sum(axis=0) for flux in fluxes]).reshape(-1, 3)
         spare = own.mean(axis=0) if len(own) else np.ones(3)
         spare = np.maximum(spare, FAINTEST * spare.max())
-        for i in range(SPARE):
+        for _ in range(SPARE):
             d, weight, spacing = lobe()
             directions.append(d)
             fluxes.append(weight[:, None] * spare)
-            which.append(np.full(len(d), len(lights) + i))
             sines.append(np.full(len(d), spacing / (2 * math.pi / width)))
+
+        # ---- Which light each point is of
+        counts = [len(d) for d in directions]
+        which = np.repeat(np.arange(self.count), counts)
+        self._points_of = list(zip(np.cumsum([0, *counts[:-1]]).tolist(), counts, strict=True))
+        # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
+        self._owner = tensor(which[:, None] == np.arange(self.count))
+        self._which = dr.opaque(mi.UInt32(which.astype(np.uint32)))
+        self._added = dr.opaque(mi.Bool(which >= self.own))
+
+        # ---- The same on the device
         self.centres = np.array([light.direction for light in lights] + [[0.0, 1.0, 0.0]] * SPARE)
         self.flux = np.concatenate([own, np.repeat(spare[None], SPARE, axis=0)])
         self._point = dr.opaque(mi.Vector3f(np.concatenate(directions).T.astype(np.float32)))
         self._flux = dr.opaque(mi.Color3f(np.concatenate(fluxes).T.astype(np.float32)))
-        self._which = dr.opaque(mi.UInt32(np.concatenate(which).astype(np.uint32)))
-        many = [len(w) for w in which]
-        self._points_of = list(zip(np.cumsum([0, *many[:-1]]).tolist(), many, strict=True))
-        # Products with it, and not gathers, whose adjoint adds in the order in which threads come.
-        owner = np.concatenate(which)[:, None] == np.arange(self.count)
-        self._owner = tensor(owner)
         self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
         self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
-        added = np.concatenate([np.full(n, i >= self.own) for i, n in enumerate(many)])
-        self._added = dr.opaque(mi.Bool(added))
+
+        # ---- Glows
         self.glows = [light.glow for light in lights]
         self.glows += [_glow_in_proportion(self.glows, own, spare) if aureoles else None] * SPARE
         self._glow = [
@@ -167,11 +187,11 @@ class Lights:
         size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, *LOG_SIZES))
         turn = dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array)
         flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
+        wide = _widths(self._sine * size, self._added)
         finer = shape[1] / self.width
-        spread = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
-        wide, grid = _widths(self._sine * size, self._added), (rows[1], shape[1])
-        places = placed(self._point, centre, turn, size, wide, finer, grid)
-        return shared_out(*places, flux, spread, shape, rows)
+        half_row = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
+        row, column, half = placed(self._point, centre, turn, size, wide, finer, (rows[1], shape[1]))
+        return shared_out(row, column, half, flux, half_row, shape, rows)
 
     def cores_of(
         self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], shape: tuple[int, int]
@@ -192,20 +212,28 @@ class Lights:
         ndarray (k, rows, W, 3)
             Linear radiance; not differentiable.
         """
+        # ---- Every point of the light once for each placement
         first, count = self._points_of[i]
-        lane = dr.arange(mi.UInt32, count * len(placements))
+        pages = len(placements)
+        lane = dr.arange(mi.UInt32, count * pages)
         page = lane // dr.opaque(mi.UInt32, count)
         point = lane - page * dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        turns, fluxes, sizes = (np.float32(one) for one in zip(*placements, strict=True))
-        turn, flux = (dr.gather(mi.Vector3f, tensor(values).array, page) for values in (turns, fluxes))
-        size = dr.exp(dr.clip(dr.gather(mi.Float, tensor(sizes).array, page), *LOG_SIZES))
-        position, sine = dr.gather(mi.Vector3f, self._point, point), dr.gather(mi.Float, self._sine, point)
+        position = dr.gather(mi.Vector3f, self._point, point)
         centre = dr.gather(mi.Vector3f, self._centre, dr.opaque(mi.UInt32, i))
-        wide = _widths(sine * size, dr.gather(mi.Bool, self._added, point))
-        places = placed(position, centre, turn, size, wide, 1.0, (self.total, shape[1]))
-        flux = dr.gather(mi.Color3f, self._flux, point) * _exp(mi.Color3f(flux))
-        found = shared_out(*places, flux, 1.0, shape, self._rows, mi.Int32(page), len(placements)).numpy()
-        return found.reshape(-1, *shape, 3)
+
+        # ---- Its turn, flux and size there
+        turns, log_fluxes, log_sizes = (tensor(values).array for values in zip(*placements, strict=True))
+        turn = dr.gather(mi.Vector3f, turns, page)
+        log_flux = mi.Color3f(dr.gather(mi.Vector3f, log_fluxes, page))
+        flux = dr.gather(mi.Color3f, self._flux, point) * _exp(log_flux)
+        size = dr.exp(dr.clip(dr.gather(mi.Float, log_sizes, page), *LOG_SIZES))
+        wide = dr.gather(mi.Float, self._sine, point) * size
+        wide = _widths(wide, dr.gather(mi.Bool, self._added, point))
+
+        # ---- One image for each placement
+        row, column, half = placed(position, centre, turn, size, wide, 1.0, (self.total, shape[1]))
+        cores = shared_out(row, column, half, flux, 1.0, shape, self._rows, mi.Int32(page), pages)
+        return cores.numpy().reshape(-1, *shape, 3)
 
     def glow(self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.
@@ -234,8 +262,9 @@ class Lights:
         if self._glow[i] is None:
             return mi.Color3f(1)
         index = dr.opaque(mi.UInt32, i)
-        centre = rotate(_vector(turn, index), dr.gather(mi.Vector3f, self._centre, index))
-        return 1 + interpolated_glow(self._glow[i], dr.dot(d, centre)) * _exp(_colour(log_flux, index))
+        centre = rotate(_row(mi.Vector3f, turn, index), dr.gather(mi.Vector3f, self._centre, index))
+        factor = _exp(_row(mi.Color3f, log_flux, index))
+        return 1 + interpolated_glow(self._glow[i], dr.dot(d, centre)) * factor
 
 
 def placed(
@@ -268,12 +297,12 @@ def placed(
     scaled = dr.normalize(point + (point - centre * along) * (size - 1))
     d = rotate(turn, scaled)
     # As in latlong.texel_position; the horizontal part is held off 0, where a column is not defined.
-    across = dr.sqrt(dr.maximum(d.x * d.x + d.z * d.z, _LEAST_SINE**2))
+    across = dr.sqrt(dr.maximum(d.x * d.x + d.z * d.z, LEAST_SINE**2))
     row = dr.atan2(across, d.y) * dr.opaque(mi.Float, (total - 1) / math.pi)
     column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, width / (2 * math.pi)) - 0.5
-    snap = max(_SNAP, _SNAP_SHARE * width)
+    snap = max(SNAP_TEXELS, SNAP_SHARE * width)
     row, column = _snapped(row, snap), _snapped(column, snap)
-    half = dr.clip(wide / across * finer, 1, _WIDEST * width)
+    half = dr.clip(wide / across * finer, 1, MOST_HALF_WIDTH * width)
     half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
     return row, column, half
 
@@ -315,7 +344,7 @@ def shared_out(
 
 def points(row: np.ndarray, column: np.ndarray, total: int, width: int) -> np.ndarray:
     """Return the directions (n, 3) of texels; those of the poles' rows each keep their azimuth."""
-    theta = np.pi * np.clip(row, _OFF_POLE, total - 1 - _OFF_POLE) / max(total - 1, 1)
+    theta = np.pi * np.clip(row, OFF_POLE_TEXELS, total - 1 - OFF_POLE_TEXELS) / max(total - 1, 1)
     phi = 2 * np.pi * (column + 0.5) / width
     return latlong.on_sphere(theta, phi)
 
@@ -353,12 +382,9 @@ def _glow_in_proportion(glows, fluxes, flux):
     return glows[i] * (flux / np.maximum(fluxes[i], FAINTEST * fluxes[i].max()))
 
 
-def _vector(tensor, i):
-    return mi.Vector3f(*(dr.gather(mi.Float, tensor.array, i * 3 + k) for k in range(3)))
-
-
-def _colour(tensor, i):
-    return mi.Color3f(*(dr.gather(mi.Float, tensor.array, i * 3 + k) for k in range(3)))
+def _row(kind, values, i):
+    """Return row ``i`` of a tensor (n, 3)."""
+    return kind(*(dr.gather(mi.Float, values.array, i * 3 + k) for k in range(3)))
 
 
 def _exp(x):
@@ -420,7 +446,7 @@ class _Share(dr.CustomOp):
         # Of the largest radiance that can come about, so many bits are kept.
         most = dr.max(dr.maximum(dr.maximum(flux.x, flux.y), flux.z)) * float(1 / omega.min())
         most = dr.minimum(most, dr.largest(mi.Float))  # infinite, it would put all lights out
-        scale = dr.select(most > 0, 2.0**_BITS / dr.maximum(most, 1e-25), 0)
+        scale = dr.select(most > 0, 2.0**SUM_BITS / dr.maximum(most, 1e-25), 0)
         sums = dr.zeros(mi.Int64, texels * 3)
         _scatter(sums, row, column, half, flux, scale, *self.geometry)
         dr.eval(sums)

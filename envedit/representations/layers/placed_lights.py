@@ -20,8 +20,9 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
 from envedit.representations.layers.unseen import unseen_kept
 
-NARROWEST = 0.6
-"""Least standard deviation of an added light in texels: one that is narrower would vanish between them."""
+ADDED_LEAST_TEXELS = 0.6
+"""Least standard deviation of an added light in texels: a narrower one would vanish between them. Not
+measured."""
 
 
 class PlacedLights:
@@ -45,8 +46,8 @@ class PlacedLights:
     def __init__(self, envmap: np.ndarray, horizon: str = "auto"):
         self.envmap = envmap
         kind: Any = below_horizon.kind_of(envmap) if horizon == "auto" else horizon
-        self.layers = Layers(horizon=kind)
-        self._still = self.layers.encode(envmap)
+        self.layers = Layers.of(envmap, horizon=kind)
+        self._still = self.layers.start()
         self.lights = self.layers.separation.lights
 
     def params(self, placed: Sequence[dict]) -> dict:
@@ -54,19 +55,20 @@ class PlacedLights:
 
         An entry of a light that the map does not have does nothing.
         """
-        found = {name: self._still[name].numpy().copy() for name in ("turn", "flux", "size")}
+        values = {name: self._still[name].numpy().copy() for name in ("turn", "flux", "size")}
+        scales = self.layers.scales
         for light in placed:
             i = light.get("light", 0) - 1
             if not 0 <= i < len(self.lights):
                 continue
             flux = np.maximum(np.float64(light["flux"]), 1e-30)
-            found["flux"][i] = np.maximum(np.log(flux), DARK) / self.layers.scales["flux"]
-            found["size"][i] = np.log(light["size"]) / self.layers.scales["size"]
+            values["flux"][i] = np.maximum(np.log(flux), DARK) / scales["flux"]
+            values["size"][i] = np.log(light["size"]) / scales["size"]
             if "azimuth" in light:
-                to = direction(light["azimuth"], light["elevation"])
-                turn = rotation_vector(self.layers.lights.centres[i], to)
-                found["turn"][i] = turn / self.layers.scales["turn"]
-        return self._still | {name: tensor(value) for name, value in found.items()}
+                end = direction(light["azimuth"], light["elevation"])
+                turn = rotation_vector(self.layers.lights.centres[i], end)
+                values["turn"][i] = turn / scales["turn"]
+        return self._still | {name: tensor(value) for name, value in values.items()}
 
     def place(self, placed: Sequence[dict]) -> np.ndarray:
         """Return the map with its lights placed, (H, W, 3) float32.
@@ -76,18 +78,18 @@ class PlacedLights:
         InputError
             A texel becomes brighter than :data:`.radiance.BRIGHTEST`.
         """
-        found = self.envmap
+        envmap = self.envmap
         if any("light" in light for light in placed):
             params = self.params(placed)
             lights = {name: value for name, value in params.items() if not name.startswith("gain.")}
-            found = unseen_kept(found, self.layers.decode(lights).numpy())
-        found = add(found, [light for light in placed if "light" not in light])
-        require_radiance(found, "input.lights", brightest=BRIGHTEST)
-        return found
+            envmap = unseen_kept(envmap, self.layers.decode(lights).numpy())
+        envmap = add(envmap, [light for light in placed if "light" not in light])
+        require_radiance(envmap, "input.lights", brightest=BRIGHTEST)
+        return envmap
 
 
 def missing(placed: Sequence[dict], count: int) -> list[int]:
-    """List the numbers of lights that are asked for and that a map of ``count`` lights does not have."""
+    """List the numbers of placed lights that a map of ``count`` lights does not have."""
     return sorted(light["light"] for light in placed if light.get("light", 0) > count)
 
 
@@ -100,19 +102,19 @@ def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
     if not added:
         return envmap
     height, width, _ = envmap.shape
-    found = envmap.astype(np.float64)
+    radiance = envmap.astype(np.float64)
     omega = latlong.lookup_solid_angles(height, width)[:, None]
     toward = latlong.directions(height, width)
     for light in added:
-        size = max(np.radians(light["size"]), NARROWEST * np.pi / max(height - 1, 1))
+        size = max(np.radians(light["size"]), ADDED_LEAST_TEXELS * np.pi / max(height - 1, 1))
         cosine = toward @ direction(light["azimuth"], light["elevation"])
         angle = np.arccos(np.clip(cosine, -1, 1))
         lobe = np.where(angle < 5 * size, np.exp(-0.5 * (angle / size) ** 2), 0.0)
         total = float((lobe * omega).sum())
         if total > 0:
-            found += (lobe / total)[..., None] * np.float64(light["flux"])
+            radiance += (lobe / total)[..., None] * np.float64(light["flux"])
     with np.errstate(over="ignore"):
-        return found.astype(np.float32)
+        return radiance.astype(np.float32)
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:

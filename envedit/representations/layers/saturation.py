@@ -12,14 +12,11 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from envedit.representations.layers.gain import VEIL
 
 LEAST = 1e-4
-"""Least b, where k is near 1."""
-FURTHER = 0.05
-"""Step of the finite difference by log k."""
+"""Least b, where k is near 1: keeps logarithms finite. Not measured."""
 
 
 def saturated(radiance: mi.Color3f, exponent: mi.Float) -> mi.Color3f:
@@ -32,20 +29,3 @@ def saturated(radiance: mi.Color3f, exponent: mi.Float) -> mi.Color3f:
     chroma = dr.exp(exponent * dr.log(chroma))
     made = chroma * (light / mi.luminance(chroma))
     return dr.replace_grad(dr.select(exponent == 1, radiance, made), made)  # to the bit
-
-
-def by_saturation(
-    image: np.ndarray, parts: list[tuple[slice, mi.Color3f]], log: mi.Float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image (rows, W, 3) with a log saturation, and the derivative by it, a finite difference.
-
-    ``parts`` are rows that have this saturation, and their radiance where it is 0; others stay as they are.
-    """
-    found, slope = image.copy(), np.zeros_like(image)
-    for rows, radiance in parts:
-        here, before = (
-            dr.ravel(saturated(radiance, dr.exp(k))).numpy().reshape(found[rows].shape)
-            for k in (log, log - FURTHER)
-        )
-        found[rows], slope[rows] = here, (here - before) / np.float32(FURTHER)
-    return found, slope

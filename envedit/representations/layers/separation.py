@@ -21,35 +21,47 @@ from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 
 CONTRAST = 4.0
-"""A light is this many times as bright as the median of its surroundings."""
+"""A light is this many times as bright as the median of its surroundings. Not measured."""
 SURROUNDINGS = 20.0
-"""Radius of the surroundings, degrees: more than that of a sun's aureole or a softbox."""
+"""Radius of the surroundings, degrees: more than that of a sun's aureole or a softbox. Not measured."""
 LEAST_SHARE = 0.005
-"""Share of the map's luminance, integrated over solid angle, below which something bright is no light."""
-AS_BRIGHT, MOST_CUT = 0.8, 0.1
-"""A bright region is no light by itself where more than :data:`MOST_CUT` of the texels around it are brighter
-than :data:`AS_BRIGHT` times its mean luminance: it is the edge of a window larger than the surroundings."""
-MOST_LIGHTS, MOVABLE = 8, 4
-"""Most lights that are separated, and of these, those with most flux, that an edit may move: each costs
-time, and what is weaker is part of the background and its gain."""
+"""Share of the map's luminance, integrated over solid angle, below which something bright is no light. Not
+measured beside other values."""
+AS_BRIGHT = 0.8
+"""Luminance over a part's mean from which a texel beside the part counts as bright as it. Not measured."""
+MOST_AS_BRIGHT = 0.1
+"""Most of the texels around a part that are as bright as it: with more it is no light but cut off from a
+larger area, as the edge of a window that is larger than the surroundings. Not measured."""
+MOST_LIGHTS = 8
+"""Most lights that are separated, those with most flux. Not measured."""
+MOVABLE = 4
+"""Most lights that an edit may move: each costs time; weaker ones are part of the background and its gain.
+Not measured."""
 DETECT_WIDTH = 512
-"""Lights are looked for in a copy of at most this width: what is smaller has no flux."""
+"""Most columns of the copy in which lights are looked for: what is smaller has no flux. Not measured."""
 RING_SHARE = (0.1, 0.5)
-"""Quantiles of luminance in a ring around a light that give its glow: clouds and the horizon are brighter."""
-FARTHEST = 90.0
-"""Largest radius of a glow, degrees."""
-SOFT = 1 / 12
-"""Standard deviation by which a glow is smoothed, over the angle: 5 degrees, a ring, at 60."""
-FLAT = 1.05
-"""A glow ends where its ring is at most this many times as bright as the darkest ring farther out."""
+"""Quantiles of luminance in a ring around a light that give its glow: clouds and the horizon are brighter.
+Not measured beside other values."""
+GLOW_MOST_DEGREES = 90.0
+"""Largest radius of a glow. Not measured."""
+GLOW_SMOOTHING = 1 / 12
+"""Standard deviation by which a glow is smoothed, over the angle: 5 degrees, a ring, at 60. Derived from
+``_RINGS``: kinks between rings are visible as arcs."""
+GLOW_END = 1.05
+"""A glow ends where its ring is at most this many times as bright as the darkest ring farther out. Not
+measured."""
 LEAST_EXPLAINED = 0.2
-"""A glow is used only if it explains this share of the variance of log luminance."""
+"""A glow is used only if it explains this share of the variance of log luminance. Not measured."""
 GLOW_DEGREES = np.arange(0.0, 121.0)
 """Angles at which a glow is tabulated; 0 from the last on."""
 _RINGS = np.concatenate(
     [[0, 1, 1.5], np.arange(2.0, 10), np.arange(10.0, 20, 2), np.arange(20.0, 121, 5)]
 )  # edges, degrees
-_MEDIAN_WIDTH = 64
+"""Edges of the rings in which a glow is measured, degrees: finer near the light. Not measured."""
+MEDIAN_COLUMNS = 64
+"""Columns of the grid on which the median of the surroundings is taken. Not measured."""
+RELAXATIONS = 30
+"""Steps of relaxation of a membrane at every level of its pyramid. Not measured."""
 
 
 @dataclass(frozen=True)
@@ -143,40 +155,42 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int =
     first, total = rows or (0, image.shape[0])
     height, width = image.shape[:2]
     small = _reduced(image, first, total)
-    found = _survey(small, most)
-    if found is None:
+    survey = _survey(small, most)
+    if survey is None:
         return Separation(image, np.ones_like(image), np.zeros_like(image), [])
 
-    # The same at the map's own resolution.
-    toward = latlong.directions(total, width)[first : first + height]
+    # ---- Glow, cores and background at the map's own resolution
+    directions = latlong.directions(total, width)[first : first + height]
     glow = np.ones_like(image)
-    for table, centre in zip(found.glows, found.centres, strict=True):
+    for table, centre in zip(survey.glows, survey.centres, strict=True):
         if table is not None:
-            glow *= 1 + glow_at(table, toward @ centre)
-    here = small.at(found.label, height, width)
-    lit = here >= 0
-    base = small.upsampled(found.below, height, width)
-    core = np.where(lit[..., None], np.maximum(image - base * glow, 0), 0)
-    background = np.where(lit[..., None], (image - core) / glow, image / glow)
+            glow *= 1 + glow_at(table, directions @ centre)
+    label = small.at(survey.label, height, width)
+    inside = (label >= 0)[..., None]
+    below = small.upsampled(survey.below, height, width)
+    core = np.where(inside, np.maximum(image - below * glow, 0), 0)
+    background = np.where(inside, (image - core) / glow, image / glow)
+
+    # ---- Lights; those that leave nothing at this resolution are dropped
     lights: list[Light] = []
-    kept, own = np.full(len(found.centres) + 1, -1), []
-    for i, centre in enumerate(found.centres):
-        texels = np.flatnonzero((here == i).ravel() & (core > 0).any(axis=2).ravel())
-        if len(texels):
-            kept[i] = len(lights)
-            own.append(i)
-            radiance = core.reshape(-1, 3)[texels]
-            lights.append(Light(centre, texels, radiance, found.glows[i], float(found.shares[i])))
-        else:
-            core.reshape(-1, 3)[(here == i).ravel()] = 0
-    found = replace(
-        found,
-        label=kept[found.label],  # the last, -1, for texels of none
-        centres=[found.centres[i] for i in own],
-        glows=[found.glows[i] for i in own],
-        shares=[found.shares[i] for i in own],
+    kept: list[int] = []
+    number = np.full(len(survey.centres) + 1, -1)  # the last for texels of no light
+    for i, centre in enumerate(survey.centres):
+        texels = np.flatnonzero((label == i).ravel() & (core > 0).any(axis=2).ravel())
+        if not len(texels):
+            continue
+        number[i] = len(lights)
+        kept.append(i)
+        radiance = core.reshape(-1, 3)[texels]
+        lights.append(Light(centre, texels, radiance, survey.glows[i], float(survey.shares[i])))
+    survey = replace(
+        survey,
+        label=number[survey.label],
+        centres=[survey.centres[i] for i in kept],
+        glows=[survey.glows[i] for i in kept],
+        shares=[survey.shares[i] for i in kept],
     )
-    return Separation(background, glow, core, lights, found)
+    return Separation(background, glow, core, lights, survey)
 
 
 def _survey(small: _Small, most: int) -> Survey | None:
@@ -259,7 +273,8 @@ def _reduced(image, first, total):
         start = min(round(first * h / total), h - 1)
         stop = max(round((first + height) * h / total), start + 1)
         whole = np.zeros((total, width, 4), np.float32)
-        whole[first : first + height, :, :3], whole[first : first + height, :, 3] = image, 1
+        whole[first : first + height, :, :3] = image
+        whole[first : first + height, :, 3] = 1
         whole = latlong.resize(whole, h, w).astype(np.float64)[start:stop]
         small = whole[..., :3] / np.maximum(whole[..., 3:], 1e-6)
     else:
@@ -277,18 +292,23 @@ def _find(small: _Small, most: int) -> tuple[np.ndarray, int, list[float]]:
     if not total > 0:
         return nothing
     base = _local_median(lum, *small.rows)
+
+    # ---- Connected parts that stand out, and their shares of the map's light
     parts = _components(lum > np.maximum(CONTRAST * base, 1e-12 * lum.max()))
     excess = np.maximum(lum - base, 0) * small.omega
-    names, inverse = np.unique(parts, return_inverse=True)
-    flux = np.bincount(inverse.ravel(), excess.ravel()) / total
-    order = [i for i in np.argsort(-flux, kind="stable") if names[i] >= 0 and flux[i] >= LEAST_SHARE]
-    order = [i for i in order if not _cut_off(parts == names[i], lum, small.omega)][:most]
+    numbers, inverse = np.unique(parts, return_inverse=True)
+    share = np.bincount(inverse.ravel(), excess.ravel()) / total
+
+    # ---- Those that are lights
+    strongest = np.argsort(-share, kind="stable")
+    lights = [i for i in strongest if numbers[i] >= 0 and share[i] >= LEAST_SHARE]
+    lights = [i for i in lights if not _cut_off(parts == numbers[i], lum, small.omega)][:most]
     label = nothing[0]
-    for i, part in enumerate(order):
+    for i, part in enumerate(lights):
         # One texel more to every side: a lens and a resampling spread light.
-        grown = _grown(parts == names[part])
-        label = np.where(grown & (label < 0), i, label)
-    return label, len(order), [flux[i] for i in order]
+        mask = _grown(parts == numbers[part])
+        label = np.where(mask & (label < 0), i, label)
+    return label, len(lights), [share[i] for i in lights]
 
 
 def _cut_off(part, lum, omega):
@@ -296,16 +316,17 @@ def _cut_off(part, lum, omega):
     weight = lum[part] * omega[part]
     mean = (lum[part] * weight).sum() / max(weight.sum(), 1e-300)
     around = _grown(part) & ~part
-    return bool((lum[around] > AS_BRIGHT * mean).sum() > MOST_CUT * around.sum())
+    return bool((lum[around] > AS_BRIGHT * mean).sum() > MOST_AS_BRIGHT * around.sum())
 
 
 def _local_median(lum, first, total):
     """Median luminance, by solid angle, of the disc around every texel, found on a coarse grid."""
     height, width = lum.shape
-    w = min(_MEDIAN_WIDTH, width)
+    w = min(MEDIAN_COLUMNS, width)
     h = max(w // 2, 3)
     whole = np.zeros((total, width, 2), np.float32)
-    whole[first : first + height, :, 0], whole[first : first + height, :, 1] = lum, 1
+    whole[first : first + height, :, 0] = lum
+    whole[first : first + height, :, 1] = 1
     coarse = latlong.resize(whole, h, w).astype(np.float64).reshape(-1, 2)
     known = coarse[:, 1] > 1e-6
     value = coarse[known, 0] / coarse[known, 1]
@@ -369,6 +390,7 @@ def _components(mask):
 
 def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarray) -> np.ndarray | None:
     """Measure the glow around a centre: a table as :attr:`Light.glow`; None where none is believed."""
+    # ---- The colour of the sky in rings around the centre
     angle = np.degrees(np.arccos(np.clip(small.directions @ centre, -1, 1)))
     lum = image @ LUMINANCE
     ring = np.digitize(angle, _RINGS) - 1
@@ -384,6 +406,8 @@ def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarra
         sizes.append(small.omega[inside].sum())
     middle, colour = np.array(middles), np.array(colours).reshape(-1, 3)
     bright = colour @ LUMINANCE
+
+    # ---- The widest glow that explains enough
     for last in range(_end(middle, bright), 2, -1):
         far = np.maximum(colour[last], 1e-3 * colour[last].max())
         if not far.min() > 0:
@@ -422,8 +446,8 @@ def _falling(values, weights):
 
 
 def _without_kinks(table):
-    """Smooth a table over the width of its rings, about :data:`SOFT` of the angle: kinks are seen as arcs."""
-    sd = np.maximum(SOFT * GLOW_DEGREES, 1e-3)
+    """Smooth a table over about the width of its rings (:data:`GLOW_SMOOTHING`)."""
+    sd = np.maximum(GLOW_SMOOTHING * GLOW_DEGREES, 1e-3)
     share = np.exp(-0.5 * np.square(np.subtract.outer(GLOW_DEGREES, GLOW_DEGREES) / sd[:, None]))
     soft = np.minimum.accumulate(share @ table / share.sum(axis=1, keepdims=True), axis=0)
     soft[-1] = 0
@@ -433,7 +457,7 @@ def _without_kinks(table):
 def _end(middle, bright):
     """Return the first ring from which on no ring is darker, or which is too far out."""
     for i, value in enumerate(bright):
-        if value <= FLAT * bright[i:].min() or middle[i] > FARTHEST:
+        if value <= GLOW_END * bright[i:].min() or middle[i] > GLOW_MOST_DEGREES:
             return i
     return len(bright) - 1
 
@@ -441,20 +465,21 @@ def _end(middle, bright):
 def glow_at(table: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """Interpolate a :attr:`Light.glow` at angles given by their cosines; returns (..., 3) of their type."""
     table = np.asarray(table, cosine.dtype)
-    found = np.zeros((cosine.size, 3), cosine.dtype)
+    glow = np.zeros((cosine.size, 3), cosine.dtype)
     reach = int(np.flatnonzero(table.any(axis=1)).max(initial=-1)) + 1  # most of a sphere is beyond it
     if reach == 0:
-        return found.reshape(*cosine.shape, 3)
+        return glow.reshape(*cosine.shape, 3)
     farthest = np.cos(np.radians(min(GLOW_DEGREES[-1], reach * GLOW_DEGREES[1])) + 1e-9)
     some = np.flatnonzero(cosine >= farthest)
     place = np.degrees(np.arccos(np.clip(cosine.ravel()[some], -1, 1))) / GLOW_DEGREES[1]  # evenly apart
     inside = place <= len(GLOW_DEGREES) - 1
     some, place = some[inside], place[inside]
     node = np.minimum(place.astype(np.int32), len(GLOW_DEGREES) - 2)
-    share, steps = place - node.astype(place.dtype), np.diff(table, axis=0)
+    share = place - node.astype(place.dtype)
+    steps = np.diff(table, axis=0)
     for c in range(3):
-        found[some, c] = table[node, c] + steps[node, c] * share
-    return found.reshape(*cosine.shape, 3)
+        glow[some, c] = table[node, c] + steps[node, c] * share
+    return glow.reshape(*cosine.shape, 3)
 
 
 def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -479,27 +504,29 @@ def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.where(mask[..., None], np.maximum(surface, 0), image)
 
 
-_RELAXATIONS = 30
-
-
 def _membrane(values, mask):
+    """Fill masked texels of values (rows, W, n), coarse to fine."""
     height, width = mask.shape
     if not mask.any():
         return values
     if min(height, width) <= 2:
         return np.where(mask[..., None], values[~mask].mean(axis=0) if (~mask).any() else 0, values)
+
+    # ---- Means of known texels, half as fine, filled likewise
     known = (~mask).astype(np.float64)[..., None]
-    rows, columns = height + height % 2, width + width % 2
+    rows = height + height % 2
+    columns = width + width % 2
     pad = ((0, rows - height), (0, columns - width), (0, 0))
     weight = np.pad(known, pad).reshape(rows // 2, 2, columns // 2, 2, 1).sum(axis=(1, 3))
     total = np.pad(values * known, pad).reshape(rows // 2, 2, columns // 2, 2, -1).sum(axis=(1, 3))
     coarse = _membrane(total / np.maximum(weight, 1), weight[..., 0] == 0)
     guess = coarse.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+
+    # ---- From there, relaxed towards the mean of the neighbours
     values = np.where(mask[..., None], guess, values)
     r, c = np.nonzero(mask)
     up, down = np.maximum(r - 1, 0), np.minimum(r + 1, height - 1)
     left, right = (c - 1) % width, (c + 1) % width
-    values = values.copy()
-    for _ in range(_RELAXATIONS):
+    for _ in range(RELAXATIONS):
         values[r, c] = (values[up, c] + values[down, c] + values[r, left] + values[r, right]) / 4
     return values

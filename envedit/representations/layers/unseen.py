@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 UNSEEN = 1 / 512
-"""Relative change of radiance below a display's resolution: a step of 8 bits is at least four times this."""
+"""Relative change of radiance below a display's resolution. Derived: a step of 8 bits is at least four times
+this."""
 _TINY = np.finfo(np.float32).tiny  # what is less, Dr.Jit takes as 0
 
 

@@ -1,0 +1,134 @@
+"""The formula of the layers, at texels of any resolution.
+
+    E = sat_k(E_0' * prod((1 + s_l G_l) / (1 + G_l^0)) * exp(w r)) * exp(g) + sum(C_l)
+
+E_0' is the original without the cores C_l of its lights. The first factor is how the glow of the lights has
+changed, exp(w r) what is seen where a glow has gone (``behind_glow.py``), k the saturation of the sky's
+colours (``saturation.py``) and g its smooth gain (``gain.py``). In rows below the horizon that follow those
+above, one factor stands for the first two (``below_horizon.py``).
+
+:class:`.Layers` composes the working map, :mod:`.full_resolution` the map of the input's file: they differ in
+where these fields come from, and in how the cores are rendered, which are added to what :func:`compose`
+returns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from envedit.representations.layers.behind_glow import gone_of
+from envedit.representations.layers.gain import brightened
+from envedit.representations.layers.lights import Lights
+from envedit.representations.layers.saturation import saturated
+
+
+@dataclass(frozen=True)
+class Glows:
+    """The glows of lights, and what they hide, at the texels of a map.
+
+    Attributes
+    ----------
+    lights : Lights
+        The lights of the map.
+    turn, log_flux : TensorXf (count, 3)
+        Where they are placed, as of :meth:`.Lights.core`.
+    before : Color3f
+        Product of 1 + G over the unmoved lights (:meth:`.Lights.glow_before`).
+    offset, slope : Color3f
+        Of :class:`.BehindGlow`.
+    faint : Float
+        Likewise.
+    """
+
+    lights: Lights
+    turn: mi.TensorXf
+    log_flux: mi.TensorXf
+    before: mi.Color3f
+    offset: mi.Color3f
+    slope: mi.Color3f
+    faint: mi.Float
+
+
+@dataclass(frozen=True)
+class Fields:
+    """What an edit does at the texels of a map; None: nothing.
+
+    Attributes
+    ----------
+    glows : Glows or None
+        How the glows of lights change.
+    log_followed : Color3f or None
+        Log factor, by what lights do, of rows that follow those above the horizon.
+    follows : Bool or None
+        Texels of such rows; None: all where there are no :attr:`glows`.
+    log_saturation : Float or None
+        Logarithm of k.
+    log_gain : Color3f or None
+        The gain g.
+    share : Float or None
+        Share of the saturation and of the gain that acts on a texel, 0 to 1; None: all.
+    """
+
+    glows: Glows | None = None
+    log_followed: mi.Color3f | None = None
+    follows: mi.Bool | None = None
+    log_saturation: mi.Float | None = None
+    log_gain: mi.Color3f | None = None
+    share: mi.Float | None = None
+
+
+class Composed(NamedTuple):
+    """A map without the cores of its lights: ``sky``, and ``relit`` before its saturation and its gain.
+
+    ``gone`` (Float, None without glows) is the share of a texel's radiance that was a glow's and is gone.
+    """
+
+    sky: mi.Color3f
+    relit: mi.Color3f
+    gone: mi.Float | None
+
+
+def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) -> Composed:
+    """Compose texels of a map, but for the cores of its lights, differentiably.
+
+    Where no field changes a texel, the sky is ``base``, bit for bit.
+
+    Parameters
+    ----------
+    base : Color3f (n,)
+        Linear radiance of the original without the cores of its lights.
+    directions : Vector3f (n,) or None
+        Unit vectors through the texels; None where there are no glows.
+    fields : Fields
+        What the edit does.
+    """
+    # ---- Lights: their glow, and what it had hidden
+    factor, gone = None, None
+    if fields.glows is not None:
+        glows = fields.glows
+        factor = glows.lights.glow_ratio(glows.turn, glows.log_flux, directions, glows.before)
+        gone = gone_of(factor)
+        hidden = glows.offset + glows.slope * dr.log(base / glows.before + glows.faint)
+        factor = factor * dr.exp(gone * hidden)
+    if fields.log_followed is not None:
+        followed = dr.exp(fields.log_followed)
+        factor = followed if factor is None else dr.select(fields.follows, followed, factor)
+    relit = base if factor is None else base * factor
+
+    # ---- Saturation
+    sky = relit
+    if fields.log_saturation is not None:
+        sky = saturated(sky, dr.exp(_shared(fields.log_saturation, fields.share)))
+
+    # ---- Gain
+    if fields.log_gain is not None:
+        sky = brightened(sky, dr.exp(_shared(fields.log_gain, fields.share)))
+    return Composed(sky, relit, gone)
+
+
+def _shared(log, share):
+    return log if share is None else log * share

@@ -409,7 +409,7 @@ class Session:
         self.tell_state()
 
     def _explain(self, explanations, chosen=0):
-        """Take explanations of the paint, of which one is shown, and tell the pages."""
+        """Take explanations of the paint, of which one is shown, and show them in the pages."""
         self.explanations, self.explanation = explanations, chosen
         listed = [
             {"name": one.name, "reached": self._asked.reached(one.point.rendering)} for one in explanations

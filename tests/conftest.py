@@ -21,6 +21,12 @@ def pytest_configure(config):
     mi.set_variant(os.environ.get("ENVEDIT_VARIANT", "llvm_ad_rgb"))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):
+    """Two processes for a folder; files and single tests stay in this one, where they are easy to debug."""
+    return 2 if any(os.path.isdir(argument) for argument in config.args) else 0
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder with puresky/, hdri/, meshes/ and weights/."""

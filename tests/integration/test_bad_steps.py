@@ -225,6 +225,7 @@ def recorded(monkeypatch):
 PIXELS = {"representation": {"kind": "pixels"}, "optimizer": {"iterations": 6}}
 
 
+@pytest.mark.slow
 def test_a_last_step_that_leads_to_no_map_is_taken_back(tmp_path, rng, recorded):
     settings = settings_of(tmp_path, sunny(rng), **PIXELS)
     whole = pipeline.run(settings)
@@ -281,6 +282,7 @@ def spoil_renderer(monkeypatch, steps):
     monkeypatch.setattr(LightTransport, "render", spoiled)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
 def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
@@ -293,6 +295,7 @@ def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypa
     assert np.isfinite(pixels(out / "edited.exr")).all()
 
 
+@pytest.mark.slow
 def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch, capsys, recorded):
     spoil_renderer(monkeypatch, range(5, 1000))
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
@@ -305,6 +308,7 @@ def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch,
     assert names(out) == {"edited.exr"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
 @pytest.mark.parametrize("iterations", [1, 30])
 def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(

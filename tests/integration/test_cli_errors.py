@@ -45,6 +45,7 @@ def fails(code, capsys, path, *arguments):
     return err
 
 
+@pytest.mark.slow
 def test_the_configuration_of_these_tests_runs(path, tmp_path):
     assert call(path, "--quiet") == 0 and names(tmp_path / "c_out") >= FILES
 
@@ -303,6 +304,7 @@ def test_a_damaged_checkpoint(path, capsys, tmp_path):
 # ---- the machine: 4 --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_machine_without_llvm(path, tmp_path):
     environment = os.environ | {
         "DRJIT_LIBLLVM_PATH": "/nonexistent",

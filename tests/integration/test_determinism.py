@@ -50,6 +50,7 @@ def configured(folder, rng, kind, renderer="transport"):
 CASES = [("transport", kind) for kind in KINDS] + [("path", "siren"), ("path", "layers")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("renderer", "kind"),
     [pytest.param(*one, marks=[] if one == ("transport", "pixels") else pytest.mark.slow) for one in CASES],

@@ -152,6 +152,7 @@ def test_half_is_cut_at_its_largest_and_says_so(value, cut, tmp_path, rng):
     assert bool(said) == cut and (not cut or "1 texels are brighter than 65504" in said[0])
 
 
+@pytest.mark.slow
 def test_a_run_writes_the_format_that_is_asked_for(tmp_path):
     parts = (users_scenes.PATH, users_scenes.SENSOR, BALL, light(2))
     path, kind = (

@@ -59,6 +59,7 @@ def carried_out(folder, picture, *arguments, **tables):
     return folder / "c_out"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", slow_but(["layers", "log-pixels"], "log-pixels"))
 def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     picture = source(rng)
@@ -72,6 +73,7 @@ def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     np.testing.assert_allclose(*flux, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_path, rng):
     (tmp_path / "a").mkdir()
     out = carried_out(tmp_path / "a", latlong.resize(source(rng), 8, 16))
@@ -81,6 +83,7 @@ def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_
     assert not (out / "edited_full.exr").exists()
 
 
+@pytest.mark.slow
 def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monkeypatch, capsys):
     def out_of_memory(*arguments):
         raise MemoryError
@@ -91,6 +94,7 @@ def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monk
     assert "not enough memory" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
     full = file_resolution.at_full_resolution
 

@@ -92,6 +92,7 @@ def found_for(problem, start):
 # ---- the sun moves -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("row", "column"), slow_but([(6, 40), (4, 8)], 6))
 def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
     """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
@@ -121,6 +122,7 @@ def test_the_new_shadow_alone_says_so_too(transport):
 # ---- a light is added --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     """A tenth of the picture, as a second sun would light it; the first sun's light is painted as it is.
 
@@ -153,6 +155,7 @@ def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_ligh
 # ---- lights stay -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     """Stripes as bright as noon, and as dark as night: no move promises anything."""
     image = sky(SUN)

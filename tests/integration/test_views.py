@@ -119,6 +119,7 @@ def test_lists_of_sensors_that_say_nothing(given):
 # ---- targets -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
 def test_what_is_painted_belongs_to_a_view_and_the_others_hold(two):
     """From files, one or several, and as strokes; masks likewise."""

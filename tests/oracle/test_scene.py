@@ -370,6 +370,7 @@ def test_the_committed_statue_is_the_scripts(statue, tmp_path):
     assert made[body + count :] == committed[body + count :]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away here")
 def test_a_texture_is_read_on_one_core(tmp_path):
     """Mitsuba's reader of EXR files waits for a second thread."""

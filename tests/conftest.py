@@ -27,6 +27,20 @@ def pytest_xdist_auto_num_workers(config):
     return 2 if any(os.path.isdir(argument) for argument in config.args) else 0
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Leave three cases of a parametrised test in the quick tier: the first, the last and one between."""
+    quick = {}
+    for item in items:
+        if item.get_closest_marker("slow") is None:
+            quick.setdefault((item.path, item.originalname), []).append(item)
+    for cases in quick.values():
+        kept = (cases[0], cases[len(cases) // 2], cases[-1])
+        for case in cases:
+            if case not in kept:
+                case.add_marker("slow")
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder with puresky/, hdri/, meshes/ and weights/."""

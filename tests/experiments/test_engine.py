@@ -82,6 +82,7 @@ def test_numbers_have_three_digits():
     assert [tables.times(v) for v in (1234.5, 14.06)] == ["1,234", "14.1"]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_of_what_there_is(tmp_path):
     size = {"table": "scaling", "pixels": 16, "texels": [8, 16], "spp": 16, "trace_s": 1.0, "apply_s": 0.1}
     size |= {"adjoint_s": 0.2, "bytes": 1e6}

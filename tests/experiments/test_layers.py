@@ -17,6 +17,7 @@ def sky():
     return np.concatenate([up, up[::-1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", old_sun.WAYS)
 def test_every_way_to_fill_the_old_place_of_a_sun_gives_a_finite_map(sky, way):
     made = Layers((0, len(sky)), horizon="mirror")

@@ -118,6 +118,7 @@ def mirror():
     return protocol.SPHERES["mirror"]
 
 
+@pytest.mark.slow
 def test_a_constant_map_gives_the_reflectance(mirror):
     for sphere in (mirror, protocol.SPHERES["matte silver"]):
         found = protocol.render(replace(sphere, samples=8), constant(0.5))
@@ -129,6 +130,7 @@ def test_a_constant_map_gives_the_reflectance(mirror):
     assert protocol.render(mirror, constant())[..., 3].sum() == pytest.approx(area, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "direction, side",
     [((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1))],
@@ -148,6 +150,7 @@ def test_directions_of_blender_are_where_its_camera_sees_them(direction, side, m
     assert (right, -down) == pytest.approx(np.multiply(side, math.sqrt(0.5)), abs=0.13)
 
 
+@pytest.mark.slow
 def test_a_map_is_read_off_its_mirror(mirror):
     height, width = port.HEIGHT, port.WIDTH
     expected = 1 + 0.5 * latlong.directions(height, width).astype(np.float32)

@@ -144,6 +144,7 @@ def test_the_paper_s_settings_are_its_own_and_ours_the_standard_preset(maps, bui
             assert loss.image_l1 == 1 and found.optimizer.lr == "auto"
 
 
+@pytest.mark.slow
 def test_a_table_of_one_map_has_all_of_them_where_asked(maps, build):
     (maps / f"{DEFAULT}_puresky_1k.hdr").write_text("default")
     assert {case.about["map"] for case, _ in build("table1")} == {DEFAULT}
@@ -521,6 +522,7 @@ def test_a_stock_network_learns_radiance_beyond_what_a_sigmoid_reaches(scaled):
     assert np.abs(low + span * z.reshape(crop.shape) - crop).mean() < 0.1
 
 
+@pytest.mark.slow
 def test_a_fit_leaves_its_numbers_and_pictures(maps, build, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     sets = ["fit.epochs=3", "input.width=16", "representation.hidden=8", "representation.depth=1"]

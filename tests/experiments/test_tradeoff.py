@@ -190,6 +190,7 @@ sys.exit(code)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "compiling, longest, calls, compiled",
     [(0, 60, 1, 0), (1, 60, 2, 0), (9, 60, 2, 1), (1, 0, 1, 1)],
@@ -246,6 +247,7 @@ def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(sun
     assert before["sun_degrees"] == pytest.approx(angle, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_map_without_a_sun_has_no_place_of_it(tmp_path):
     images.write_exr(tmp_path / "grey.exr", np.full((8, 16, 3), 999, np.float32))
     judge = tiny(config.from_dict(plan.base(str(tmp_path / "grey.exr"), "matte"), tmp_path), true_spp=2)

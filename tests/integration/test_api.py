@@ -133,6 +133,7 @@ def test_a_built_scene_is_edited_and_has_its_own_map_again(tmp_path):
     assert config.load(tmp_path / "out" / "config.toml").target.file.endswith("given_target_map.exr")
 
 
+@pytest.mark.slow
 def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
     own = np.random.default_rng(3).uniform(0.1, 2, (8, 16, 3)).astype(np.float32)
     built, parsed = envedit.load_scene(mi.load_dict(ball(own))), envedit.load_scene(ball(own), 12, 8)

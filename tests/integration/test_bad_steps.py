@@ -283,7 +283,7 @@ def spoil_renderer(monkeypatch, steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
     path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
@@ -309,7 +309,7 @@ def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 @pytest.mark.parametrize("iterations", [1, 30])
 def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
     kind, iterations, tmp_path, rng, capsys, recorded

@@ -44,7 +44,6 @@ from tests.oracles.runs import (
     small_world,
     world,
 )
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
@@ -187,9 +186,7 @@ def test_rows_that_are_not_active_come_back_bit_for_bit(done):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "rows, active", slow_but([("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])], "all")
-)
+@pytest.mark.parametrize("rows, active", [("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])])
 def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
     adam = {"kind": "adam", "iterations": 4}  # Gauss-Newton leaves a row be that changes nothing but noise
     path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows}, optimizer=adam)
@@ -264,7 +261,7 @@ def test_without_iterations_the_map_is_the_original_and_its_two_renderings_are_t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
-@pytest.mark.parametrize("renderer", slow_but(["transport", "path"], "transport"))
+@pytest.mark.parametrize("renderer", ["transport", "path"])
 def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path, rng):
     path = world(tmp_path, rng)
     settings = changed(representation__kind=kind, renderer__kind=renderer, optimizer__iterations=2)
@@ -300,8 +297,8 @@ def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", slow_but([0.0, 1e-30], 0.0))
-@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "layers"))
+@pytest.mark.parametrize("value", [0.0, 1e-30])
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
     path = world(tmp_path, rng, representation={"kind": kind})
     images.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
@@ -311,7 +308,7 @@ def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", slow_but([65504.0, 1e6, 1e30], 1e30))
+@pytest.mark.parametrize("value", [65504.0, 1e6, 1e30])
 def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
     path = world(tmp_path, rng)
     bright = sky(rng)
@@ -452,7 +449,7 @@ def test_presets_and_overrides_take_effect(tmp_path, rng, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", slow_but(["with space", "é ü", "😀", 'a"b', "back\\slash"], "😀"))
+@pytest.mark.parametrize("name", ["with space", "é ü", "😀", 'a"b', "back\\slash"])
 def test_out_may_have_any_name(name, tmp_path, rng):
     path = world(tmp_path / "in", rng)
     assert call(path, "--quiet", "--out", tmp_path / name, *changed(optimizer__iterations=0)) == 0

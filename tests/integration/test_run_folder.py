@@ -13,7 +13,6 @@ from envedit.core import latlong
 from envedit.export import file_resolution
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
-from tests.oracles.tiers import slow_but
 
 WIDTH = 64
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
@@ -60,7 +59,7 @@ def carried_out(folder, picture, *arguments, **tables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(["layers", "log-pixels"], "log-pixels"))
+@pytest.mark.parametrize("kind", ["layers", "log-pixels"])
 def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     picture = source(rng)
     out = carried_out(tmp_path, picture, representation={"kind": kind}, input={"width": 32})
@@ -109,6 +108,7 @@ def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, 
     assert "edited_full.exr is not written" in said and "map.exr" in said
 
 
+@pytest.mark.slow
 def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     out = carried_out(tmp_path, source(rng))
     channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()

@@ -14,7 +14,6 @@ from envedit.solve.map_problem import SIGMA, Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -93,7 +92,7 @@ def found_for(problem, start):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("row", "column"), slow_but([(6, 40), (4, 8)], 6))
+@pytest.mark.parametrize(("row", "column"), [(6, 40), (4, 8)])
 def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
     """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
     image, place = sky(SUN), (row, column)
@@ -142,6 +141,7 @@ def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     assert np.abs(off).max() < 2 * VISIBLE
 
 
+@pytest.mark.slow
 def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_lights_the_rest(transport):
     place, image = (8, 44), sky()
     problem, start = problem_of(transport, image, *painted(transport, image, sky(place), share=0.05))

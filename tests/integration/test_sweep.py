@@ -230,6 +230,7 @@ def test_a_driver_that_slept_goes_on(stub, monkeypatch):
     assert stub.counts("begin", 4) == stub.counts("end", 4) == [1] * 4
 
 
+@pytest.mark.slow
 def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
     stub.block("hold", 0)
     driver = stub.driver(4)
@@ -324,6 +325,7 @@ def test_what_a_checkpoint_that_is_no_use_is_told_by_is_what_envedit_says(tmp_pa
     assert process._USELESS[1] in str(said.value)
 
 
+@pytest.mark.slow
 def test_two_drivers_do_not_do_the_same_job(stub):
     stub.block("hold", 0)
     driver = stub.driver(3)
@@ -350,6 +352,7 @@ def test_a_failure_that_another_driver_met_is_not_repeated_by_the_one_that_waite
     assert stub.counts("begin", 1) == [1]
 
 
+@pytest.mark.slow
 def test_a_job_whose_lock_was_taken_away_is_ended(stub, monkeypatch):
     monkeypatch.setattr(locks, "BEAT", 0.3)
     one = stub.jobs(1)[0]
@@ -394,6 +397,7 @@ def test_a_command_that_does_not_exist_is_a_failure(stub):
 # ---- threads -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, pytest.param(3, marks=dask)])
 def test_cores_are_divided_among_the_jobs(stub, monkeypatch, workers):
     monkeypatch.setattr(drive, "cores", lambda: 11)
@@ -406,6 +410,7 @@ def test_cores_are_divided_among_the_jobs(stub, monkeypatch, workers):
     assert shown == {f"{11 // workers} {11 // workers}"}
 
 
+@pytest.mark.slow
 def test_the_default_is_a_job_for_every_four_cores_where_dask_is_there(stub, monkeypatch):
     for number, most in ((1, 1), (3, 1), (13, 3 if DASK else 1)):
         monkeypatch.setattr(drive, "cores", lambda number=number: number)
@@ -413,6 +418,7 @@ def test_the_default_is_a_job_for_every_four_cores_where_dask_is_there(stub, mon
         assert f"{most} at a time, {number // most} threads" in stub.run(jobs=seeds)[1]
 
 
+@pytest.mark.slow
 def test_drjit_takes_the_number_of_threads(stub):
     run = "from envedit.run import main; sys.exit(main())"
     assert run in COMMAND[2]
@@ -799,6 +805,7 @@ def cluster(stub):
         one.wait()
 
 
+@pytest.mark.slow
 @dask
 @linux
 def test_jobs_run_on_a_cluster_and_the_death_of_a_worker_costs_what_it_was_at(stub, cluster):
@@ -820,6 +827,7 @@ def test_jobs_run_on_a_cluster_and_the_death_of_a_worker_costs_what_it_was_at(st
     assert stub.run(5)[0] == ["skipped"] * 5
 
 
+@pytest.mark.slow
 @dask
 def test_the_death_of_the_scheduler_costs_what_was_in_flight(stub, cluster):
     address, scheduler, worker = cluster
@@ -839,6 +847,7 @@ def test_the_death_of_the_scheduler_costs_what_was_in_flight(stub, cluster):
     assert max(stub.counts("begin", 4)) <= 2
 
 
+@pytest.mark.slow
 @dask
 def test_the_death_of_the_driver_costs_a_cluster_nothing_that_runs(stub, cluster):
     address, _, worker = cluster
@@ -856,6 +865,7 @@ def test_the_death_of_the_driver_costs_a_cluster_nothing_that_runs(stub, cluster
     assert stub.counts("begin", 4) == stub.counts("end", 4) == [1] * 4
 
 
+@pytest.mark.slow
 @dask
 def test_a_cluster_reports_failures_and_an_address_where_nobody_is(stub, cluster):
     address, _, worker = cluster

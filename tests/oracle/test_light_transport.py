@@ -36,7 +36,6 @@ from tests.oracles.scenes import (
     sun,
 )
 from tests.oracles.statistics import LEVEL, disagreement
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -157,7 +156,8 @@ def test_exact_columns_of_the_whole_map_give_the_picture(name):
     assert disagreement(1.01 * ours, theirs) != ""  # negative control
 
 
-@pytest.mark.parametrize("depth", slow_but([2, 3], 2))
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [2, 3])
 def test_depth_means_what_it_means_to_mitsuba(depth):
     film = {"width": 24, "height": 24}
     # Low and level, so that the sky is in view; the light of the lamp is cut at the same depth.

@@ -627,6 +627,7 @@ def test_gradient_of_the_glow_is_the_finite_difference(rng):
         np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_gradient_of_the_glow_along_a_path_adds_up_to_the_change(rng):
     light, count = patch(rng, 4, 46, glow=TABLE), 250
     made, d = Lights([light], (0, H), W), device(latlong.directions(H, W))

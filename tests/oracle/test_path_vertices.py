@@ -48,7 +48,8 @@ SCENES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", slow_but(SCENES, "statue", "in the air"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_columns_are_those_traced_one_by_one(name):
     columns = columns_of(load(name))
     got, (slow, lost) = traced(columns), expected(columns)
@@ -197,7 +198,8 @@ def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
     assert traced(columns).tobytes() == traced(columns_of(air)).tobytes()
 
 
-@pytest.mark.parametrize("name", slow_but(["in the air", "pair"], "in the air"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["in the air", "pair"])
 def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
     monkeypatch.setattr(path_vertices, "LANES", 200 * COUNT)  # two blocks of 200 pixels and one of 176
     columns = columns_of(load(name))

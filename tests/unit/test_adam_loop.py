@@ -128,6 +128,7 @@ def test_pixels_without_weight_do_not_count(rng):
 # ---- the loop --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
 def test_edit_finds_the_map_behind_the_picture(kind, rng):
     """The picture decides the map: the true one is the only minimum, at 0."""

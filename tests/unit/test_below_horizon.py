@@ -1,6 +1,5 @@
 """Rows below the horizon: told apart by what they show, unchanged under the same sky, without an edge."""
 
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

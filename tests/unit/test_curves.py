@@ -55,6 +55,7 @@ def test_long_history_stays_small_and_keeps_its_spike():
     assert min(y for _, _, y in points) < points[0][2] - 200
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(

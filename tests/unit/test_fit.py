@@ -342,6 +342,7 @@ def test_light_changes_the_last_layer_alone(coordinates, rng):
     assert changed == ["2.weight", "2.bias"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "value"), [((16, 32), 0.0), ((16, 32), 0.25), ((1, 2), 7.0)])
 def test_flat_maps_can_be_fitted(shape, value):
     image = np.full((*shape, 3), value, np.float32)
@@ -489,6 +490,7 @@ def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
 # ---- schedules -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
 @pytest.mark.parametrize("stride", [1, 2])
 def test_no_new_kernel_after_every_grid_had_a_turn(stride, gamma, rng):

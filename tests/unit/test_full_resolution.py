@@ -122,6 +122,7 @@ def test_bands_do_not_show(sunny, rng, monkeypatch):
         np.testing.assert_allclose(carried(made, params, working, source)[0], whole, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_inactive_rows_keep_their_bits(rng):
     source = sky(256, 512)
     working, rows = small(source), (5, 25)
@@ -502,6 +503,7 @@ def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
 # ---- rows below the horizon that follow --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finer", [2, 4])
 @pytest.mark.parametrize("kind", ["mirror", "keep"])
 @pytest.mark.parametrize("saturation", [None, -0.7])

@@ -415,6 +415,7 @@ def gradients(made, params, weight, shape=None):
     return {name: dr.grad(value).numpy() for name, value in params.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["unmoved", "moved", "zenith", "nadir"])
 def test_gradient_is_finite(start, rng, sunny):
     made, params = sunny
@@ -450,6 +451,7 @@ def test_gradient_by_gain_and_flux_is_the_finite_difference(rng, sunny):
         )
 
 
+@pytest.mark.slow
 def test_kept_texels_pull_at_no_gain(rng, sunny):
     made, params = sunny
     weight, free = rng.normal(size=(*SHAPE, 3)), np.zeros(SHAPE, bool)

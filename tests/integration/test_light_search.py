@@ -214,18 +214,6 @@ def test_the_same_question_has_the_same_answer_to_the_bit(transport, moved):
 # ---- a light's place beside known pictures ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "values, place", [((0, 3, 0), 0), ((1, 2, 2), 0.5), ((2, 2, 1), -0.5), ((1, 4, 3), 0.25)]
-)
-def test_vertex_of_three_neighbours(values, place):
-    assert point_light._vertex(np.array(values, float), 1) == pytest.approx(place)
-
-
-def test_vertex_at_a_border_or_in_a_valley_is_the_point_itself():
-    values = np.array([3.0, 1.0, 2.0])
-    assert [point_light._vertex(values, i) for i in range(3)] == [0, 0, 0]
-
-
 @pytest.mark.slow
 def test_refinement_finds_a_light_from_three_texels_off(transport):
     """Without any background; the flux is told as a factor."""

@@ -449,9 +449,8 @@ def test_presets_and_overrides_take_effect(tmp_path, rng, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["with space", "é ü", "😀", 'a"b', "back\\slash"])
-def test_out_may_have_any_name(name, tmp_path, rng):
-    path = world(tmp_path / "in", rng)
+def test_out_may_have_any_name(tmp_path, rng):
+    path, name = world(tmp_path / "in", rng), 'é ü 😀 a"b back\\slash'
     assert call(path, "--quiet", "--out", tmp_path / name, *changed(optimizer__iterations=0)) == 0
     assert names(tmp_path) == {"in", name} and names(tmp_path / name) >= FILES
 
@@ -493,25 +492,17 @@ def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="links")
-def test_an_input_is_known_by_any_name(tmp_path, rng, capsys):
-    path, out = world(tmp_path, rng), tmp_path / "c_out"
-    assert call(path, "--quiet") == 0
-    (tmp_path / "link").symlink_to(out)
-    for name in (tmp_path / "link" / "edited.exr", tmp_path / "nowhere" / ".." / "c_out" / "edited.exr"):
-        assert call(path, "--quiet", *changed(input__envmap=str(name))) == 3
-        assert "--out" in capsys.readouterr().err and (out / "edited.exr").exists()
-
-
-@pytest.mark.slow
-def test_an_input_is_not_moved_away_with_earlier_results(tmp_path, rng, capsys):
+def test_an_input_is_not_moved_away_with_earlier_results_by_any_name(tmp_path, rng, capsys):
     path, out = world(tmp_path, rng), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     before = content(out)
-    capsys.readouterr()
-    assert call(path, "--quiet", *changed(input__envmap=str(out / "edited.exr"))) == 3
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1 and "edited.exr" in said and "--out" in said
-    assert content(out) == before
+    (tmp_path / "link").symlink_to(out)
+    for folder in (out, tmp_path / "link", tmp_path / "nowhere" / ".." / "c_out"):
+        capsys.readouterr()
+        assert call(path, "--quiet", *changed(input__envmap=str(folder / "edited.exr"))) == 3
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1 and "edited.exr" in said and "--out" in said
+        assert content(out) == before
 
 
 # ---- stopping and continuing -----------------------------------------------------------------------------

@@ -107,7 +107,6 @@ def test_an_interrupted_command_has_no_traceback(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 130 and capsys.readouterr().err == "envedit: interrupted\n"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["nonsense"], 2), ([], 2)])
 def test_python_m_envedit_is_the_command(arguments, code):
     done = subprocess.run([*PYTHON, *arguments], capture_output=True, text=True)

@@ -9,19 +9,12 @@ import pytest
 from envedit.core.color import inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.losses import metrics
-from tests.oracles.plain import IDENTICAL
+from tests.oracles.plain import IDENTICAL, waves
 
 PAIRS = [
     "mse", "psnr", "ssim", "compare",
     "log_psnr", "log_rmse", "sun_offset", "peak_ratio", "mean_luminance_ratio",
 ]  # fmt: skip
-
-
-def waves(height=40, width=56):
-    """Two images by formula, so that another program can make the same ones."""
-    r, c = np.mgrid[:height, :width]
-    y = np.stack([0.5 + 0.4 * np.sin(0.3 * r + 0.11 * c * k) * np.cos(0.07 * k * c) for k in (1, 2, 3)], -1)
-    return y + 0.1 * np.cos(1.7 * r + 2.3 * c)[..., None], y
 
 
 def sky(rng, height=32, width=64):

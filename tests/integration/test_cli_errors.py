@@ -57,26 +57,8 @@ def test_the_configuration_of_these_tests_runs(path, tmp_path):
     ("text", "says"),
     [
         ("[fit]\nepoch = 3", ["[fit]", "epoch", "did you mean epochs"]),
-        ("[inptu]\nwidth = 16", ["inptu", "did you mean input"]),
-        ("sede = 1", ["sede", "did you mean seed"]),
-        ("[input]\nmax_depth = 3", ["max_depth", "did you mean renderer.max_depth"]),
         ('[fit]\nepochs = "many"', ["fit.epochs", "'many'", "integer"]),
-        ("[fit]\nepochs = 2.5", ["fit.epochs", "2.5", "integer"]),
-        ("[output]\nreport = 1", ["output.report", "true or false"]),
-        ("[optimizer]\nlr = nan", ["optimizer.lr", "nan", "finite"]),
-        ("[optimizer]\nlr = -1", ["optimizer.lr", "-1", "above 0"]),
-        ("[input]\nwidth = 1", ["input.width", "got 1", "even"]),
-        ("[input]\nwidth = 17", ["input.width", "got 17", "even"]),
-        ("[input]\nwidth = 4", ["width", "4", "even"]),
         ("[input]\nwidth = 16\nrows = [3, 8]", ["input.rows", "[3, 8]"]),
-        ("input = 3", ["input", "[input]"]),
-        ('preset = "drafty"', ["preset", "drafty", "did you mean draft"]),
-        ('variant = "scalar_rgb"', ["variant", "scalar_rgb"]),
-        ('[representation]\nkind = "layer"', ["representation.kind", "'layer'", "did you mean layers"]),
-        ('[target]\nkind = "strokes"', ["target.strokes", "got none", "at least one"]),
-        ('[target]\nkind = "image"', ["target.file"]),
-        ('[target]\nfile = "a.exr"\nrotate_degrees = 3', ["target.file", "rotate_degrees"]),
-        ("[fit\nepochs = 3", ["not TOML", "line 1"]),
         ("[fit]\nepochs = 3\nepochs = 4", ["not TOML", "line 3"]),
     ],
 )
@@ -91,10 +73,7 @@ def test_a_configuration_that_cannot_be_understood(text, says, tmp_path, capsys)
     ("override", "says"),
     [
         ("fit.epoch=3", ["--set", "did you mean epochs"]),
-        ("fit.epochs=few", ["--set", "fit.epochs", "few"]),
         ("fit.epochs", ["--set", "table.key=value"]),
-        ("=3", ["--set", "table.key=value"]),
-        ("input.width=1", ["--set", "input.width"]),
     ],
 )
 def test_an_override_that_cannot_be_understood(override, says, path, capsys):

@@ -1,6 +1,5 @@
 """Metrics against closed forms and scikit-image's recorded numbers."""
 
-import json
 import math
 
 import numpy as np
@@ -48,16 +47,6 @@ def test_compare_states_its_tonemap():
     assert metrics.compare(a, b, tonemap="linear")["mse"] == pytest.approx(0.75**2)
     with pytest.raises(ConfigError, match="tonemap"):
         metrics.compare(a, b, tonemap="gama")
-
-
-@pytest.mark.parametrize("level", [0.0, 1e-30, 65504.0, 1e6, 3e38])
-@pytest.mark.parametrize("shape", [(1, 1, 3), (12, 24, 3)])
-def test_everything_is_finite_or_null(level, shape, rng):
-    a, b = np.full(shape, level, np.float32), rng.random(shape).astype(np.float32)
-    for x, y in ((a, b), (b, a), (a, a)):
-        numbers = [getattr(metrics, name)(x, y) for name in PAIRS[4:]]
-        json.dumps([metrics.compare(x, y), numbers, metrics.high_frequency_energy(x)], allow_nan=False)
-    assert metrics.compare(a, a) == IDENTICAL
 
 
 def test_log_psnr_is_normalised_by_the_reference(rng):

@@ -185,9 +185,6 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
     [
         (lambda: {"settings": 3}, ConfigError, ["settings: got 3, expected a Config, a dict of tables"]),
         (lambda: {"settings": {"scene": {"fil": "a"}}}, ConfigError, ["no key fil", "did you mean file?"]),
-        (lambda: {"settings": {"scene": {"width": "a"}}}, ConfigError, ["settings: scene.width: got 'a'"]),
-        (lambda: {"settings": {"scene": 3}}, ConfigError, ["scene: got 3, expected a table"]),
-        (lambda: {"settings": {3: {}}}, ConfigError, ["unknown table or key 3"]),
         (lambda: {"mask": np.ones((4, 4))}, ConfigError, ["mask: got one without a target"]),
         (lambda: {"target": np.ones(3), "target_map": np.ones(3)}, ConfigError, ["got both, expected one"]),
         (lambda: {"envmap": "sky.exr"}, InputError, ["envmap: got 'sky.exr', expected an array"]),
@@ -195,7 +192,6 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
         (lambda: {"envmap": np.ones((8, 16))}, InputError, ["shape (8, 16)", "expected (H, 2 H, 3)"]),
         (lambda: {"envmap": np.ones((8, 8, 3))}, InputError, ["envmap: a lat-long map is 2:1"]),
         (lambda: {"envmap": np.full((8, 16, 3), np.nan)}, InputError, ["envmap: 128 texels are NaN"]),
-        (lambda: {"envmap": np.full((8, 16, 3), 1e39)}, InputError, ["envmap: 128 texels are NaN or"]),
         (lambda: {"target_map": np.full((8, 16, 3), -np.inf)}, InputError, ["target_map: 128 texels are"]),
         (lambda: {"target": np.full((64, 64, 3), np.nan)}, InputError, ["target: pixel at row 0, column 0"]),
         (lambda: {"envmap": MASKED}, InputError, ["envmap: 3 values are masked", "fill them"]),

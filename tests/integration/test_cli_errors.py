@@ -184,8 +184,6 @@ def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
     ("parts", "says"),
     [
         ([SENSOR, BALL, LIGHT, SKY], ["2 environment emitters", "constant", "envmap"]),
-        ([BALL, LIGHT], ["no sensor"]),
-        ([SENSOR, BALL, LIGHT, '<shape type="spere"/>'], ["spere"]),
         ([SENSOR, BALL, LIGHT, "<shape"], []),
         ([SENSOR, BALL, LIGHT, '<shape type="ply"><string name="filename" value="none.ply"/></shape>'],
          ["none.ply"]),

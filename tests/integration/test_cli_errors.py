@@ -13,7 +13,6 @@ from envedit.images import images
 from tests.oracles import ROOT
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 from tests.oracles.runs import FILES, SKY, call, changed, names, pixels, small_world, world
-from tests.oracles.tiers import slow_but
 
 ENSURE = doctor.ensure
 
@@ -148,6 +147,7 @@ def test_a_map_that_is_no_image(data, path, capsys, tmp_path):
     assert "map.exr" in fails(3, capsys, path)
 
 
+@pytest.mark.slow
 def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
     images.write_png(tmp_path / "map.png", sky(rng) / 3)
     assert call(path, "--quiet", *changed(input__envmap="map.png")) == 0
@@ -164,7 +164,8 @@ def test_a_map_that_is_not_two_to_one_or_too_small(height, width, path, capsys, 
     assert "map.exr" in said and f"{width} x {height}" in said
 
 
-@pytest.mark.parametrize("value", slow_but([np.nan, np.inf, -np.inf], np.nan))
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
     picture = sky(rng) + 0.1
     picture[3, 7, 1] = picture[6, 2, 0] = value

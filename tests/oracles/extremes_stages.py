@@ -27,7 +27,7 @@ from tests.oracles.plain import IDENTICAL
 
 FILM = (8, 6)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-STEPS = 30
+STEPS = 60
 """Of the edit loop; it stops at the 20th that is not finite in a row."""
 
 

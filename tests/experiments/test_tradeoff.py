@@ -134,6 +134,7 @@ def test_all_runs_of_a_cell_are_made_in_turn(tmp_path, monkeypatch):
         assert left.optimizer.iterations == 7 and left.input.envmap == settings.input.envmap
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_ends_its_cell(tmp_path, capfd):
     (tmp_path / "job.toml").write_text("seed = 'x'")
     with pytest.raises(EnveditError, match="the run ended with exit code 2"):

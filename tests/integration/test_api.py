@@ -208,6 +208,7 @@ def test_what_cannot_be_used_is_refused_by_name(given, kind, parts):
     assert all(part in str(info.value) for part in parts), str(info.value)
 
 
+@pytest.mark.slow
 def test_codes_of_a_picture_as_radiance_are_warned_of():
     adjusted = TINY | {"target": {"kind": "none"}, "scene": {"width": 8}}
     codes = np.full((8, 16, 3), 200, np.uint8)

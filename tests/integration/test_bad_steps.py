@@ -25,7 +25,6 @@ from envedit.transport.light_transport import LightTransport
 from tests.oracles import users_scenes
 from tests.oracles.matrix_renderer import arrays, case, same
 from tests.oracles.runs import TINY, call, changed, measured, names, pixels, settings_of, sunny, world
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_cache")
 
@@ -100,7 +99,8 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 # ---- the loop --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", slow_but(BAD_VALUES, math.nan))
+@pytest.mark.slow
+@pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("stage", STAGES)
 def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):
     arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
@@ -120,6 +120,7 @@ def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypat
         assert math.isfinite(row["loss"]) == (slope or row["iteration"] not in (5, 6, 12))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stage, monkeypatch):
     arguments = spoiled(stage, range(5, 1000), math.nan, monkeypatch)

@@ -196,6 +196,7 @@ def test_a_scene_that_cannot_be_used(parts, says, path, capsys, tmp_path):
     assert "scene.xml" in said and all(words in said for words in says), said
 
 
+@pytest.mark.slow
 def test_a_scene_that_sees_no_light(path, capsys, tmp_path):
     inside = '<shape type="sphere"><float name="radius" value="50"/></shape>'
     write_scene(tmp_path, SENSOR, inside, LIGHT, name="scene.xml")
@@ -271,6 +272,7 @@ def test_an_export_overwrites_nothing(path, capsys, tmp_path):
     assert not (tmp_path / "nowhere.png").exists()
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint(path, capsys, tmp_path):
     (tmp_path / "c_out").mkdir()
     (tmp_path / "c_out" / "checkpoint.npz").write_bytes(b"PK\3\4" + b"\0" * 100)

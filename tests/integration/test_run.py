@@ -543,6 +543,7 @@ def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(t
     assert path.read_bytes() != written and (tmp_path / "earlier-1" / "config.toml").read_bytes() == written
 
 
+@pytest.mark.slow
 def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch):
     def press(self, crop, original, start):
         raise KeyboardInterrupt

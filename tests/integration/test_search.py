@@ -167,6 +167,7 @@ def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     assert found.others and tried >= len(found.others)
 
 
+@pytest.mark.slow
 def test_paint_that_is_there_already_leaves_lights(transport):
     """No move is promising: nothing else is descended to."""
     image = sky(SUN)

@@ -95,6 +95,7 @@ def every_pixel(s):
     return np.arange(s.width * s.height, dtype=np.uint32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", [0, 1, 3])
 def test_trace_yields_escapes_and_vertices_bounce_by_bounce(bounces):
     s = scene.load("matte", 8, 8)

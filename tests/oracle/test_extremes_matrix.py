@@ -116,6 +116,7 @@ def test_half_floats_cut_a_sun_and_it_is_told(value, stored, tmp_path):
     assert len(info["warnings"]) == 1 and "1 texels sit at 65504, the largest half" in info["warnings"][0]
 
 
+@pytest.mark.slow
 def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
     m = extremes.sky(8, 16)
     settings = settings_of(tmp_path, m)

@@ -7,6 +7,7 @@ import pytest
 from envedit.core.errors import NumericalError
 from envedit.scene import film, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -28,7 +29,7 @@ def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
 
 
 @pytest.mark.parametrize("part", ['<rfilter type="box"/>', WIDE, SIGNED], ids=["box", "wide", "signed"])
-@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+@pytest.mark.parametrize("sampler", slow_but(["independent", "multijitter"], "multijitter"))
 def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path, rng):
     loaded, _ = lit_by_a_sun(tmp_path, rng, part, sampler)
     integrator = mi.load_dict({"type": "path", "max_depth": 4})

@@ -402,6 +402,7 @@ def test_texels_that_deserve_it_get_columns(lamp_scene):
     assert (np.diff(radiance) <= 0).all()  # brightest first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [slice(0, HEIGHT), slice(3, 11)])
 def test_pictures_of_few_texels_are_those_of_the_whole_map(lamp_scene, rng, rows):
     t = build(lamp_scene, spp=32)

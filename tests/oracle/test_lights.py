@@ -172,6 +172,7 @@ def direction(azimuth, elevation):
     return np.array([c * math.sin(azimuth), math.sin(elevation), -c * math.cos(azimuth)])
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(angles, angles)
 @example((0.0, 0.0), (math.pi, 0.0))
@@ -389,6 +390,7 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
                 assert share[near].sum() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.03, 1.0, 6.0])  # the first: as narrow as it is round
 @pytest.mark.parametrize("width", [256, 1024])
 def test_spare_lights_are_round(width, degrees, rng):
@@ -446,6 +448,7 @@ def plain_loss(image, kind):
     return (image * weights()).sum() if kind == "linear" else (image**2).sum() * 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["linear", "squares"])
 @pytest.mark.parametrize("top", [3, 11])
 def test_gradient_is_the_finite_difference(kind, top, rng):

@@ -123,6 +123,7 @@ def test_a_column_does_not_depend_on_those_beside_it(air, monkeypatch):
     assert len(blocks._kept[COUNT, SEED]) == 9
 
 
+@pytest.mark.slow
 def test_columns_traced_again_replace_the_old_ones(air):
     columns = columns_of(air)
     first = traced(columns).copy()
@@ -171,6 +172,7 @@ def test_memory_of_kept_paths_is_what_is_stated(name):
     assert columns.kept_bytes == sum(b.bytes for b in blocks)
 
 
+@pytest.mark.slow
 def test_kept_paths_stay_within_their_memory(air, monkeypatch):
     monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)
     needed = columns_of(air)

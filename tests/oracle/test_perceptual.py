@@ -309,6 +309,7 @@ def test_features_match_the_authors_code(recorded, backbones, measure, kind, siz
 SMALL = {"vgg": (16, 19), "alex": (36, 33), "squeeze": (20, 17)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(13, 18), (1, 1), (2, 7)])
 def test_dists_matches_plain_numpy(dists, size):
     x, y, _ = drawn.images(*size)

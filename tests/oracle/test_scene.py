@@ -23,6 +23,7 @@ SCENES = ROOT / "scenes"
 # ---- rendering ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampler", ["independent", "multijitter"])
 def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(sampler, tmp_path, rng):
     image = sky(rng)

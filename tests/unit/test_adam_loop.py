@@ -318,6 +318,7 @@ def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng, every_ste
     assert whole.bad_steps == 2 and math.isclose(whole.slowdown, 0.5)  # halved twice, ten good steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["log-pixels", "siren"])
 def test_no_new_kernel_after_the_third_iteration(kind, rng):
     network = config.Representation(kind=kind, hidden=9, depth=1)

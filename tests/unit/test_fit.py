@@ -456,6 +456,7 @@ def test_grids_take_turns_at_random(rng, monkeypatch):
     assert any(turn != turns[0] for turn in turns[:4])
 
 
+@pytest.mark.slow
 def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
     betas, plain = [], optimizer.Adam.__init__
 

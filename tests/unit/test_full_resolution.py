@@ -194,6 +194,7 @@ def test_a_gain_lies_where_it_lay(rng):
     assert np.abs(result[inside] / shifted[inside] - 1).max() > 0.05  # negative control
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [(50, 90), (20, 1), (80, 300), (35, 230)])
 def test_a_moved_sun_keeps_its_flux_and_stays_sharp(sunny, where):
     source, working, made, params = sunny
@@ -252,6 +253,7 @@ def test_a_light_that_stays_is_scaled_in_place(sunny):
     np.testing.assert_allclose(flux(result), flux(edited), rtol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
 def test_a_light_that_was_added_is_carried(degrees, sunny):
     source, working, made, params = sunny
@@ -310,6 +312,7 @@ def test_an_added_light_brings_the_glow_of_the_maps_sun(sunny):
     np.testing.assert_array_equal(result, source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(64, 128), (48, 96), (101, 202), (300, 512)])
 def test_sources_of_any_size(sunny, shape):
     source, working, made, params = sunny

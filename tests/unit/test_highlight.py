@@ -7,6 +7,7 @@ from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles
 from envedit.scene import highlight, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
 
 GLOSSY = {
     "rough": '<bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf>',
@@ -36,7 +37,7 @@ def mirrored(x, y):
     return ray - 2 * (ray @ normal) * normal
 
 
-@pytest.mark.parametrize("kind", GLOSSY)
+@pytest.mark.parametrize("kind", slow_but(GLOSSY, *list(GLOSSY)[:1]))
 def test_it_is_the_direction_of_the_mirror(kind, tmp_path):
     lit = ball(tmp_path, GLOSSY[kind])
     for place in ((0.45, 0.4), (0.56, 0.45), (0.5, 0.55)):

@@ -182,6 +182,7 @@ def test_other_resolutions_keep_flux_and_irradiance(shape, sunny):
         assert irradiance(sun).max() < 0.9 * irradiance(got).max()  # negative control
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(128, 256), (32, 64), (77, 131)])
 def test_gain_and_background_are_those_of_the_working_resolution(shape, rng):
     made, params = encoded(sky(sun=None))
@@ -201,6 +202,7 @@ def test_resolution_that_is_named_is_the_same_as_none(sunny):
 # ---- rows ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "last"), [(0, 40), (10, 40), (12, 64)])
 def test_rows_of_a_map(first, last, sunny):
     image = sky()[first:last]
@@ -233,6 +235,7 @@ def test_rows_at_another_resolution(finer):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(80, 256), (20, 64), (160, 512)])
 def test_background_of_rows_is_where_it_was(shape):
     image, first, last = sky(sun=None), 8, 48
@@ -430,6 +433,7 @@ def test_gradient_is_finite(start, rng, sunny):
     assert grads["turn"][0].any() and grads["size"][0].any() and grads["flux"][0].all()
 
 
+@pytest.mark.slow
 def test_gradient_by_gain_and_flux_is_the_finite_difference(rng, sunny):
     """With nodes of either sign, so that both branches of the veil are seen."""
     made, params = sunny
@@ -467,6 +471,7 @@ def test_kept_texels_pull_at_no_gain(rng, sunny):
 # ---- stress ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(3, 6), (4, 6), (5, 6), (6, 6)])
 def test_smallest_maps(shape, rng):
     image = rng.random((*shape, 3), dtype=np.float32)
@@ -478,6 +483,7 @@ def test_smallest_maps(shape, rng):
             assert np.isfinite(made.decode(p, other).numpy()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [1e-28, 1e-12, 65504.0, 1e6])
 def test_any_exposure_is_finite(value, rng):
     for image in (sky(SMALL, (8, 47), level=value), grey(value)):

@@ -61,6 +61,7 @@ def test_preview_takes_any_size(tmp_path, shape):
     assert 214 <= width <= 800 and height <= 4 * 800
 
 
+@pytest.mark.slow
 def test_preview_shows_what_is_not_finite(tmp_path):
     image = grey(1.0, 64, 64)
     image[10, 20, 1], image[30, 40] = np.nan, -np.inf

@@ -84,6 +84,7 @@ def test_depth_follows_the_light_by_bounce():
             recording.choose_bounces(s, depth, light * (depth == 2))
 
 
+@pytest.mark.slow
 def test_depth_error_is_the_share_of_a_rendering_without_bound():
     """In the middle of a long white tube: paths of nine segments lack a part of the picture."""
     eye = mi.ScalarTransform4d().look_at([0, 0, 0], [1, 0, 0], [0, 1, 0])

@@ -48,6 +48,7 @@ PAINTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", PAINTED)
 def test_what_keeps_the_noise_of_the_rendering_is_painted(how, sphere):
     """All over it: there is no part that equals the rendering."""
@@ -65,6 +66,7 @@ def test_what_was_rendered_under_other_light_is_not(seed, sphere):
     assert tell(sphere, eight_bit(picture))[0]
 
 
+@pytest.mark.slow
 def test_without_noise_it_was_not_painted_on_the_rendering(sphere):
     """A denoised picture of another light, or one of many samples."""
     lit, envmap, _, _ = sphere

@@ -66,6 +66,7 @@ def test_the_area_covered_is_that_of_the_shape_at_any_resolution(shape, area, si
     assert covered(size, **shape).mean() == pytest.approx(area, rel=5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("softness", [0.01, 0.1])
 @pytest.mark.parametrize("shape", [shape for shape, _ in AREAS])
 def test_soft_shapes_cover_the_same_share_at_any_resolution(shape, softness):

@@ -79,6 +79,7 @@ def test_a_rendered_target_is_rendered_on_the_smaller_film():
     assert np.abs(found.picture - blocks).mean() < 0.1 * blocks.mean()
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_scene_is_made_smaller_and_less_noisy(tmp_path):
     """Its samples are those of its pixels, four times as many a pixel; a mask stays beside it."""
     lit = scene.load("sphere", 48)

@@ -206,6 +206,7 @@ def test_what_is_raised_after_a_step_ends_the_search(transport):
         search.search(problem, start, after_step=enough)
 
 
+@pytest.mark.slow
 def test_a_map_that_is_not_finite_has_no_explanation(transport):
     """The search returns it as it is; the steps refuse it."""
     image = sky(SUN)

@@ -39,7 +39,7 @@ def room(lamps):
 def test_only_the_lamp_that_has_changed_changes(lamps, moved, removed, added):
     settings = {
         "input": {"width": WIDTH},
-        "scene": {"file": "sphere", "width": 32, "parameters": {"roughness": 0.3}},
+        "scene": {"file": "sphere", "width": 48, "parameters": {"roughness": 0.3}},
         "target": {"spp": 128},
         "output": {"spp": 64},
         "renderer": {"spp": 128},

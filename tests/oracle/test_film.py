@@ -11,6 +11,7 @@ from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
+BOX = '<rfilter type="box"/>'
 WIDE = '<rfilter type="gaussian"/><boolean name="sample_border" value="true"/>'
 CROP = "".join(
     f'<integer name="crop_{key}" value="{value}"/>'
@@ -28,7 +29,9 @@ def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
     return loaded, sky
 
 
-@pytest.mark.parametrize("part", ['<rfilter type="box"/>', WIDE, SIGNED], ids=["box", "wide", "signed"])
+@pytest.mark.parametrize(
+    "part", slow_but(['<rfilter type="box"/>', WIDE, SIGNED], WIDE), ids=["box", "wide", "signed"]
+)
 @pytest.mark.parametrize("sampler", slow_but(["independent", "multijitter"], "multijitter"))
 def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path, rng):
     loaded, _ = lit_by_a_sun(tmp_path, rng, part, sampler)
@@ -42,7 +45,7 @@ def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ['<rfilter type="box"/>', WIDE], ids=["box", "wide"])
+@pytest.mark.parametrize("part", [BOX, WIDE], ids=["box", "wide"])
 def test_any_number_of_samples_gives_the_same_bits_on_any_number_of_threads(part, tmp_path, rng, threads):
     loaded, sky = lit_by_a_sun(tmp_path, rng, part, size=48)
     for spp in (1, 7, 64, 100, 144):

@@ -43,6 +43,7 @@ def test_nothing_but_non_finite_contributions_is_an_empty_record(monkeypatch):
     assert got.lost == 2 and got.weights.shape == (0, 3) and len(got.pixels) == len(got.texels) == 0
 
 
+@pytest.mark.slow
 def test_transport_says_how_many_were_left_out(monkeypatch):
     s = scene.load("matte", 8, 8)
     options = {"spp": 4, "max_depth": 2, "memory_gb": 0.1, "refresh": 1}

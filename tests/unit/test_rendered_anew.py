@@ -136,6 +136,7 @@ def test_samples_have_ends(rng):
     assert few == 1 and many == rendered_anew.MOST_SAMPLES
 
 
+@pytest.mark.slow
 def test_samples_of_a_rendering_are_nearly_those_it_was_made_with(sphere):
     """Where noise is uneven, up to twice as little of it is found, and four times the samples."""
     lit, envmap, on, _ = sphere

@@ -291,6 +291,7 @@ def test_junk_tables_raise_nothing_but_config_errors(table):
     only_config_errors(lambda: cfg.from_dict(table))
 
 
+@pytest.mark.slow
 @quick
 @given(st.sampled_from(list(schema.FIELDS)), st.data())
 def test_junk_values_raise_nothing_but_config_errors(table, data):

@@ -282,6 +282,7 @@ def test_a_file_of_a_target_map_that_is_no_panorama_is_a_picture(ball, pictured,
         target.make(asking(file=str(paint(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
 
 
+@pytest.mark.slow
 def test_a_painted_image_that_was_rendered_anew_is_solved_as_a_rendering(tmp_path, rng):
     """And one that was painted all over the rendering is not; a mask says that it was painted."""
     lit = scene.load("sphere", 48)

@@ -68,6 +68,7 @@ def test_views_are_scaled_each_by_itself(rng):
     assert np.array_equal(working_size.at_size(blocks, to, of), blocks.repeat(2, axis=0).repeat(2, axis=1))
 
 
+@pytest.mark.slow
 def test_a_rendered_target_is_rendered_on_the_smaller_film():
     asked = settings(target={"rotate_degrees": 90.0, "spp": 64})
     lit = scene.load("sphere", 24)

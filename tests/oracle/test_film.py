@@ -21,7 +21,7 @@ SIGNED = f'<rfilter type="lanczos"/>{CROP}'
 
 
 def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
-    sensor = SENSOR.replace('<rfilter type="box"/>', part)
+    sensor = SENSOR.replace(BOX, part)
     loaded = scene.load(write_scene(folder, sensor, BALL, LIGHT), size, sampler=sampler)
     sky = rng.random((16, 32, 3), dtype=np.float32)
     sky[3, 5] = 3000
@@ -29,9 +29,7 @@ def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
     return loaded, sky
 
 
-@pytest.mark.parametrize(
-    "part", slow_but(['<rfilter type="box"/>', WIDE, SIGNED], WIDE), ids=["box", "wide", "signed"]
-)
+@pytest.mark.parametrize("part", slow_but([BOX, WIDE, SIGNED], WIDE), ids=["box", "wide", "signed"])
 @pytest.mark.parametrize("sampler", slow_but(["independent", "multijitter"], "multijitter"))
 def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path, rng):
     loaded, _ = lit_by_a_sun(tmp_path, rng, part, sampler)
@@ -58,7 +56,7 @@ def test_any_number_of_samples_gives_the_same_bits_on_any_number_of_threads(part
 
 
 def test_a_sample_that_is_not_finite_is_not_dropped(tmp_path, rng):
-    loaded, sky = lit_by_a_sun(tmp_path, rng, '<rfilter type="box"/>')
+    loaded, sky = lit_by_a_sun(tmp_path, rng, BOX)
     loaded.params[_albedo(loaded)] = mi.Color3f(np.nan)
     loaded.params.update()
     with pytest.raises(NumericalError, match=r"pixels are not finite, the first at row \d+, column \d+"):

@@ -29,16 +29,14 @@ def pytest_xdist_auto_num_workers(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Leave three cases of a parametrised test in the quick tier: the first, the last and one between."""
+    """Leave two cases of a parametrised test in the quick tier: the first and the last."""
     quick = {}
     for item in items:
         if item.get_closest_marker("slow") is None:
             quick.setdefault((item.path, item.originalname), []).append(item)
     for cases in quick.values():
-        kept = (cases[0], cases[len(cases) // 2], cases[-1])
-        for case in cases:
-            if case not in kept:
-                case.add_marker("slow")
+        for case in cases[1:-1]:
+            case.add_marker("slow")
 
 
 @pytest.fixture(scope="session")

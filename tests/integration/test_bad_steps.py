@@ -134,6 +134,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
     assert same(arrays(adam.params), arrays(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("part", ["_m", "_v"])
 def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):

@@ -924,6 +924,7 @@ def test_the_maps_light_moves_where_no_step_leads(rng):
     assert degrees_off(problem, alone, 0, place) > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 0.9, 1.5])
 def test_no_light_is_added_or_moved_where_one_factor_makes_the_target(rng, factor):
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)

@@ -224,6 +224,7 @@ def test_automatic_depth_is_that_of_the_scene():
     assert build(plane, max_depth=5, spp=16).bounces == 4
 
 
+@pytest.mark.slow
 def test_texels_below_the_ground_have_no_influence(lit):
     # The plane ends 1.2 degrees below the horizon; the tent of row 9 begins 6 degrees below it.
     assert (lit.influence[9:] == 0).all() and (lit.influence[1:7] > 0).all()
@@ -369,6 +370,7 @@ def test_scale_of_the_map_is_the_scale_of_the_picture(scale):
     np.testing.assert_allclose(picture(t, scaled) / scale, picture(t, image), rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_black_map_needs_no_columns_and_shows_the_lamp(lamp_scene, lit):
     assert lit.resolve(black()) == 0
     lamp = picture(lit, black())
@@ -712,6 +714,7 @@ def test_too_little_memory_is_told_with_what_to_do(lamp_scene):
     assert t.spp < 256 and t.memory_bytes < 0.003e9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["auto", DEPTH])
 def test_closed_room_is_refused(depth):
     room = {"type": "sphere", "radius": 50.0, "flip_normals": True, "bsdf": WHITE}
@@ -719,6 +722,7 @@ def test_closed_room_is_refused(depth):
         build(scene.load(stage(room)), max_depth=depth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1, 0, -1])
 def test_depth_at_which_the_sky_lights_nothing_is_refused(depth):
     # The camera of the matte scene sees ground and ball only: a black picture would be the silent result.

@@ -279,6 +279,7 @@ GOALS = [(math.pi / 2, 0.0), (-math.pi / 2, 0.0), (1.5, 2.0), (-1.5, -2.0), (0.0
          (0.01, 0.1), (0.9, 0.0)]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("top", [1, 3, 11, 20])
 def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
     """Low to high and back, across the seam, over a pole, at a pole."""
@@ -606,6 +607,7 @@ def test_glow_is_the_product_over_the_lights(rng):
     np.testing.assert_array_equal(got[far], 1)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_glow_is_the_finite_difference(rng):
     own = [patch(rng, 4, 10, glow=TABLE), patch(rng, 15, 40, glow=0.5 * TABLE)]
     made, d, h = Lights(own, (0, H), W), unit(rng, 200), 1e-6

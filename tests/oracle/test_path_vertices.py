@@ -13,7 +13,6 @@ from envedit.transport.texel_sampling import Grid
 from tests.oracles import column_tracer
 from tests.oracles.kernels import compiled
 from tests.oracles.scenes import HEIGHT, METAL, WIDTH, ball, load, stage
-from tests.oracles.tiers import slow_but
 
 BOUNCES, COUNT, SEED = 3, 8, 3
 ROOM = 10**9
@@ -69,9 +68,8 @@ def test_paths_that_are_cut_short(bounces):
     assert got.any()
 
 
-@pytest.mark.parametrize(
-    "size, count", slow_but([((1, 1), 1), ((1, 1), 5), ((3, 1), 1), ((9, 1), 1)], (1, 1))
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("size, count", [((1, 1), 1), ((1, 1), 5), ((3, 1), 1), ((9, 1), 1)])
 def test_few_paths(size, count):
     """Arrays of one element are scalars to Dr.Jit: a single vertex or escape must not count twice."""
     film = {"width": size[0], "height": size[1]}
@@ -161,6 +159,7 @@ def size_of(value):
     return sum(size_of(part) for part in value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pair", "in the air"])
 def test_memory_of_kept_paths_is_what_is_stated(name):
     columns = columns_of(load(name))

@@ -190,6 +190,7 @@ def test_a_map_of_the_wrong_shape_is_refused(tmp_path, image):
         scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).set_envmap(image)
 
 
+@pytest.mark.slow
 def test_a_dict_scene_is_the_same_as_its_xml(tmp_path, rng):
     to_world = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 12, "filter": {"type": "box"}}

@@ -14,6 +14,7 @@ from envedit.images import images
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT, users_scenes
 from tests.oracles.builders import BALL, SENSOR, sky, write_scene
+from tests.oracles.tiers import slow_but
 from tests.oracles.users_scenes import CONSTANT, FLOOR, KINDS, LAMP, NO_FILM, PATH, PLUGINS, TURN, light
 
 pytestmark = pytest.mark.usefixtures("isolated")
@@ -40,7 +41,16 @@ def close(ours, theirs, noise=0.01):
 
 @pytest.mark.parametrize(
     "scale, inside, envmap",
-    [(None, "", "auto"), (0.5, TURN, "auto"), (3, "", "scene"), (800, TURN, "auto"), (800, "", "other.exr")],
+    slow_but(
+        [
+            (None, "", "auto"),
+            (0.5, TURN, "auto"),
+            (3, "", "scene"),
+            (800, TURN, "auto"),
+            (800, "", "other.exr"),
+        ],
+        0.5,
+    ),
 )
 def test_the_initial_rendering_is_mitsuba_s_of_the_users_file(scale, inside, envmap, tmp_path, rng):
     """With a lamp beside the map, whose balance with it is the file's, and through T as well."""

@@ -69,6 +69,7 @@ def test_without_a_folder_nothing_is_kept(rng):
 # ---- files that are no good ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_damage_to_a_single_byte_goes_unseen(tmp_path, rng):
     """Every byte of a small file is changed in turn: nothing, or the same arrays where it was padding."""
     cache, arrays = DiskCache(tmp_path), some(rng, 5)

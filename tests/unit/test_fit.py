@@ -261,6 +261,7 @@ def test_perturbation_is_none_after_a_gradient_that_is_not_finite(rng):
 # ---- the fit ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_small_fit_reaches_a_good_picture(rng):
     image = sky(rng)
     settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)

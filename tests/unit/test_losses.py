@@ -138,6 +138,7 @@ def test_tv_wraps_columns_and_not_rows():
     assert tv(double(np.swapaxes(x, 0, 1)))[0] * 20 == pytest.approx(4)  # the row below only
 
 
+@pytest.mark.slow
 def test_losses_compose_in_the_graph(rng):
     """A loss is a node like any other: scaled, added to the others, and reached through another operation."""
     x, y = rng.random((16, 16, 3)), rng.random((16, 16, 3))

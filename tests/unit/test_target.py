@@ -342,6 +342,7 @@ def test_a_target_without_weight_is_refused():
 # ---- pixels that see no surface ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     """Of a scene that hides what lights it: weights are shared out among pixels that see a surface."""
     ball = scene.load(write_scene(tmp_path, HIDDEN, SENSOR, BALL, LIGHT))

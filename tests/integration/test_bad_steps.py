@@ -192,6 +192,7 @@ class Steep:
         return dr.exp(params["log"])
 
 
+@pytest.mark.slow
 def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
     """Without going back the parameters would stay where the radiance is infinite, whatever the rate."""
     arguments, _ = case(np.random.default_rng(0), iterations=80)

@@ -158,6 +158,7 @@ def test_a_light_near_the_end_of_single_precision_is_not_put_out():
     assert one.measure() <= one.bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [np.nan, np.inf, -5.0])
 def test_no_error_is_told_of_a_map_that_is_no_radiance(value):
     with pytest.raises(InputError, match="light transport: 1 texels are .* row 5, column 9"):

@@ -932,6 +932,7 @@ def test_no_light_is_added_or_moved_where_one_factor_makes_the_target(rng, facto
     assert found.name == "lights left where they are" and lit == [0]
 
 
+@pytest.mark.slow
 def test_a_light_that_the_target_does_not_have_goes_out(rng):
     image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
     problem, found, lit = searched(image + lamp(), transport, shown(transport, image))

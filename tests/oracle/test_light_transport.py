@@ -379,6 +379,7 @@ def test_black_map_needs_no_columns_and_shows_the_lamp(lamp_scene, lit):
     np.testing.assert_array_equal(picture(t, np.zeros((6, 12, 3), np.float32)), 0)
 
 
+@pytest.mark.slow
 def test_non_finite_texel_is_not_hidden():
     t = build(load("matte"), 6, 12, spp=16)
     image = np.ones((6, 12, 3), np.float32)

@@ -60,6 +60,7 @@ def test_gradient_is_the_adjoint_of_light_transport(gradients, adjoints):
     assert disagreement(1.02 * gradients, adjoints, sizes=(1, 2, 0)) != ""
 
 
+@pytest.mark.slow
 def test_columns_at_the_seam_receive_what_their_halo_gathered(gradients, adjoints):
     # Without its copy in the halo a column at the seam would have lost a good part of its gradient.
     seam = [0, WIDTH - 1]

@@ -133,6 +133,7 @@ def test_columns_traced_again_replace_the_old_ones(air):
     assert traced(columns, count=2).tobytes() == few.tobytes() != first.tobytes()
 
 
+@pytest.mark.slow
 def test_retraced_and_restored_columns_have_the_same_bits(air):
     columns = columns_of(air)
     columns.trace(TEXELS[:3], COUNT, SEED)
@@ -214,6 +215,7 @@ def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
 # ---- what is not finite ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_contributions_that_are_not_finite_are_left_out_and_counted(air, monkeypatch):
     columns = columns_of(air)
     clean, real = traced(columns).copy(), path_vertices.connect
@@ -233,6 +235,7 @@ def test_contributions_that_are_not_finite_are_left_out_and_counted(air, monkeyp
     assert np.isfinite(got).all() and (got[:, pixel] <= clean[:, pixel]).all()
 
 
+@pytest.mark.slow
 def test_escapes_that_are_not_finite_are_left_out_and_counted(monkeypatch):
     s, real = load("in the air"), path_vertices.bsdf_weight
     columns = columns_of(s)

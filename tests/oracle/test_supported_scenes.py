@@ -14,7 +14,6 @@ from envedit.images import images
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT, users_scenes
 from tests.oracles.builders import BALL, SENSOR, sky, write_scene
-from tests.oracles.tiers import slow_but
 from tests.oracles.users_scenes import CONSTANT, FLOOR, KINDS, LAMP, NO_FILM, PATH, PLUGINS, TURN, light
 
 pytestmark = pytest.mark.usefixtures("isolated")
@@ -39,6 +38,7 @@ def close(ours, theirs, noise=0.01):
 # ---- the scene's own map and its scale -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scale, inside, envmap",
     slow_but(
@@ -239,6 +239,7 @@ def test_a_map_without_a_name_is_refused(tmp_path):
             map_of((PATH, SENSOR, BALL, f'<emitter type="envmap">{inside}</emitter>'), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_scene_without_an_environment_is_lit_by_a_map_beside_its_lamps(tmp_path, rng):
     parts = PATH, SENSOR, BALL, FLOOR, LAMP
     with pytest.raises(InputError, match=r"no environment emitter: add <emitter.*>, or .* --envmap FILE"):

@@ -517,6 +517,7 @@ def test_the_cache_can_be_refused(tmp_path, rng):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed"])
 def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     image = sky(rng)
@@ -627,6 +628,7 @@ def test_a_killed_fit_goes_on_to_the_same_weights(tmp_path, monkeypatch, gamma, 
     assert len(list(tmp_path.iterdir())) == 1 and fit.fit(image, NETWORK, settings, folder=tmp_path).cached
 
 
+@pytest.mark.slow
 def test_seconds_of_a_killed_fit_count(tmp_path, monkeypatch, rng):
     ticks = iter(range(0, 10**6, 100))
     monkeypatch.setattr(fit.time, "perf_counter", lambda: float(next(ticks)))

@@ -270,6 +270,7 @@ def test_a_light_that_was_added_is_carried(degrees, sunny):
     assert 0.3 < inside.max() < (0.95 if degrees < 2 else 0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.03, 0.5, 3.0])
 @pytest.mark.parametrize("width", [256, 1024])
 def test_a_light_that_was_added_is_a_round_gaussian(width, degrees):
@@ -294,6 +295,7 @@ def test_a_light_that_was_added_is_a_round_gaussian(width, degrees):
         np.testing.assert_allclose(result[..., 0], expected, atol=2e-4 * result.max())
 
 
+@pytest.mark.slow
 def test_an_added_light_brings_the_glow_of_the_maps_sun(sunny):
     """As bright as the sun, in its mirror image: the sky around it is as bright as the sun's, and no more."""
     source, working, made, params = sunny

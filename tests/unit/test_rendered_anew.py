@@ -56,6 +56,7 @@ def test_what_keeps_the_noise_of_the_rendering_is_painted(how, sphere):
     assert tell(sphere, eight_bit(PAINTED[how](sphere[2]))) == (False, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 5])
 def test_what_was_rendered_under_other_light_is_not(seed, sphere):
     """With another seed, and with the same, whose paths go elsewhere."""

@@ -97,6 +97,7 @@ def test_a_picture_of_the_scene_is_made_smaller_and_less_noisy(tmp_path):
     assert 2 * wanted.spp < found.spp < 8 * wanted.spp and found.noise.max() < 0.8 * wanted.noise.max()
 
 
+@pytest.mark.slow
 def test_paint_keeps_its_change_and_its_weight():
     asked = settings(target={"kind": "strokes", "strokes": [SQUARE], "spp": 64})
     lit = scene.load("sphere", 24)

@@ -41,16 +41,7 @@ def close(ours, theirs, noise=0.01):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "scale, inside, envmap",
-    slow_but(
-        [
-            (None, "", "auto"),
-            (0.5, TURN, "auto"),
-            (3, "", "scene"),
-            (800, TURN, "auto"),
-            (800, "", "other.exr"),
-        ],
-        0.5,
-    ),
+    [(None, "", "auto"), (0.5, TURN, "auto"), (3, "", "scene"), (800, TURN, "auto"), (800, "", "other.exr")],
 )
 def test_the_initial_rendering_is_mitsuba_s_of_the_users_file(scale, inside, envmap, tmp_path, rng):
     """With a lamp beside the map, whose balance with it is the file's, and through T as well."""

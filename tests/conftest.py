@@ -21,6 +21,24 @@ def pytest_configure(config):
     mi.set_variant(os.environ.get("ENVEDIT_VARIANT", "llvm_ad_rgb"))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):
+    """Two processes for a folder; files and single tests stay in this one, where they are easy to debug."""
+    return 2 if any(os.path.isdir(argument) for argument in config.args) else 0
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Leave two cases of a parametrised test in the quick tier: the first and the last."""
+    quick = {}
+    for item in items:
+        if item.get_closest_marker("slow") is None:
+            quick.setdefault((item.path, item.originalname), []).append(item)
+    for cases in quick.values():
+        for case in cases[1:-1]:
+            case.add_marker("slow")
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder with puresky/, hdri/, meshes/ and weights/."""

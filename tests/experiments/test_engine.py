@@ -76,6 +76,7 @@ def test_numbers_have_three_digits():
     assert [tables.seconds(v) for v in (None, 0.0123, 1200)] == ["-", "12.3 ms", "1200 s"]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_of_what_there_is(tmp_path):
     size = {"table": "scaling", "pixels": 16, "texels": [8, 16], "spp": 16, "again_s": 1.0, "apply_s": 0.1}
     size |= {"adjoint_s": 0.2, "read": 1e6}

@@ -18,6 +18,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
 # ---- the package -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize(
     ("what", "cases"),
@@ -79,6 +80,7 @@ def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
     assert declared / 2 < answer["peak"] < 8 * declared
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("field", ["dataWindow", "displayWindow", "both"])
 def test_an_image_two_billion_texels_wide_takes_no_memory(tmp_path, field):
@@ -135,6 +137,7 @@ def read(path, index):
 """
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize(
     ("kind", "outcome", "words"),
@@ -170,6 +173,7 @@ def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words):
         assert process.read(tmp_path / "good", 1, 0)["outcome"] == "refused"  # and the next one is read
 
 
+@pytest.mark.slow
 @linux
 def test_failing_cases_are_kept_and_counted(tmp_path, monkeypatch):
     (tmp_path / "bad.py").write_text(
@@ -187,6 +191,7 @@ def test_failing_cases_are_kept_and_counted(tmp_path, monkeypatch):
     assert "SIGABRT" in (kept / f"2-crashed-{name}.txt").read_text()
 
 
+@pytest.mark.slow
 @linux
 def test_a_whole_file_that_is_not_read_is_a_fault(tmp_path, monkeypatch):
     (tmp_path / "bad.py").write_text(

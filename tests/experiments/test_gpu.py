@@ -48,6 +48,7 @@ def test_a_step_that_fails_is_a_result():
     assert found.keys() == {"error"} and "none_ad_rgb" in found["error"]
 
 
+@pytest.mark.slow
 def test_a_step_ends_with_all_that_it_has_started_when_the_time_is_over(tmp_path, monkeypatch):
     program = tmp_path / "sleeping.sh"
     program.write_text(f"#!/bin/sh\nsleep 60 & echo $! >{tmp_path}/pid\nwait\n")

@@ -90,6 +90,7 @@ def calling(times=2, tables=None):
     return harness.calling("call", name, tables or {"seed": 5}, {"what": "x"}, times=times)
 
 
+@pytest.mark.slow
 def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
@@ -191,6 +192,7 @@ def data(tmp_path, monkeypatch):
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", command.modules())
 def test_every_experiment_makes_its_cases(name, data, tmp_path, capsys):
     asked = [*name.split(), "run", "--dry-run", "--out", str(tmp_path / "out")]

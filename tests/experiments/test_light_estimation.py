@@ -124,6 +124,7 @@ def mirror():
     return protocol.SPHERES["mirror"]
 
 
+@pytest.mark.slow
 def test_a_constant_map_gives_the_reflectance(mirror):
     for sphere in (mirror, protocol.SPHERES["matte silver"]):
         found = protocol.render(replace(sphere, samples=8), constant(0.5))
@@ -135,6 +136,7 @@ def test_a_constant_map_gives_the_reflectance(mirror):
     assert protocol.render(mirror, constant())[..., 3].sum() == pytest.approx(area, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "direction, side",
     [((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1))],
@@ -198,6 +200,7 @@ def _unit(v):
     return v / np.maximum(np.linalg.norm(v, axis=2, keepdims=True), 1e-9)
 
 
+@pytest.mark.slow
 def test_a_map_is_read_off_its_mirror(mirror):
     expected = 1 + 0.5 * latlong.directions(HEIGHT, WIDTH).astype(np.float32)
     found = read_off(protocol.render(mirror, expected))

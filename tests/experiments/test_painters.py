@@ -19,6 +19,7 @@ def picture(view):
     return view.scene.render(view.envmap, spp=64, seed=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", PAINTERS)
 def test_what_is_not_covered_is_not_painted(view, picture, edit):
     paint = PAINTERS[edit](view, picture)
@@ -32,6 +33,7 @@ def test_what_is_not_covered_is_not_painted(view, picture, edit):
     assert not np.allclose(paint.picture, picture, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_painted_shadow_is_that_of_the_map_turned_for_it(view, picture):
     paint = PAINTERS["shadow moved by 60 degrees"](view, picture)
     moved = np.roll(view.envmap, -round(60 / 360 * 64), axis=1)

@@ -136,6 +136,7 @@ def test_the_paper_s_settings_are_its_own_and_ours_the_standard_preset(maps, bui
             assert loss.image_l1 == 1 and found.optimizer.lr == "auto"
 
 
+@pytest.mark.slow
 def test_a_table_of_one_map_has_all_of_them_where_asked(maps, build):
     (maps / f"{DEFAULT}_puresky_1k.hdr").write_text("default")
     assert {case.about["map"] for case, _ in build("table1")} == {DEFAULT}

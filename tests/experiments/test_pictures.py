@@ -2,12 +2,14 @@
 
 import mitsuba as mi
 import numpy as np
+import pytest
 
 import envedit
 from envedit import config
 from experiments.pictures.experiment import write_png
 
 
+@pytest.mark.slow
 def test_the_png_of_plain_mitsuba_is_the_rendering_of_envedit(tmp_path):
     envmap = envedit.sunsky(64, azimuth=200, elevation=35)
     settings = config.from_dict({"scene": {"file": "sphere", "width": 32, "scale": 0.5}})

@@ -27,6 +27,7 @@ def test_every_scene_of_a_folder_is_a_case_and_other_files_are_none(tmp_path):
         experiment.cases(SimpleNamespace(folder=tmp_path / "nowhere"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts, lit_by, refused",
     [

@@ -51,6 +51,7 @@ def ball(texels, scale=2.0):
 # ---- the example of the documentation ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_example_runs(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -69,6 +70,7 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
     assert np.array_equal(images.read(tmp_path / "edit" / "edited.exr")[0], result.envmap)
 
 
+@pytest.mark.slow
 def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path, own_cache):
     sky = np.random.default_rng(5).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
     picture = np.random.default_rng(6).uniform(0, 1, (16, 16, 3))
@@ -87,6 +89,7 @@ def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path
     assert (result.metrics["timing"]["total_s"], result.warnings) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["image", "rendering"])
 def test_a_picture_is_paint_or_with_its_kind_a_rendering_of_the_scene(kind, tmp_path, own_cache):
     """What is saved says which, and runs to the same map."""
@@ -112,6 +115,7 @@ def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
 # ---- what an edit takes ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_built_scene_is_edited_and_has_its_own_map_again(tmp_path):
     own = np.full((8, 16, 3), 0.5, np.float32)
     own[2, 3] = 20
@@ -129,6 +133,7 @@ def test_a_built_scene_is_edited_and_has_its_own_map_again(tmp_path):
     assert config.load(tmp_path / "out" / "config.toml").target.file.endswith("given_target_map.exr")
 
 
+@pytest.mark.slow
 def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
     own = np.random.default_rng(3).uniform(0.1, 2, (8, 16, 3)).astype(np.float32)
     built, parsed = envedit.load_scene(mi.load_dict(ball(own))), envedit.load_scene(ball(own), 12, 8)
@@ -180,9 +185,6 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
     [
         (lambda: {"settings": 3}, ConfigError, ["settings: got 3, expected a Config, a dict of tables"]),
         (lambda: {"settings": {"scene": {"fil": "a"}}}, ConfigError, ["no key fil", "did you mean file?"]),
-        (lambda: {"settings": {"scene": {"width": "a"}}}, ConfigError, ["settings: scene.width: got 'a'"]),
-        (lambda: {"settings": {"scene": 3}}, ConfigError, ["scene: got 3, expected a table"]),
-        (lambda: {"settings": {3: {}}}, ConfigError, ["unknown table or key 3"]),
         (lambda: {"mask": np.ones((4, 4))}, ConfigError, ["mask: got one without a target"]),
         (lambda: {"target": np.ones(3), "target_map": np.ones(3)}, ConfigError, ["got both, expected one"]),
         (lambda: {"envmap": "sky.exr"}, InputError, ["envmap: got 'sky.exr', expected an array"]),
@@ -190,7 +192,6 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
         (lambda: {"envmap": np.ones((8, 16))}, InputError, ["shape (8, 16)", "expected (H, 2 H, 3)"]),
         (lambda: {"envmap": np.ones((8, 8, 3))}, InputError, ["envmap: a lat-long map is 2:1"]),
         (lambda: {"envmap": np.full((8, 16, 3), np.nan)}, InputError, ["envmap: 128 texels are NaN"]),
-        (lambda: {"envmap": np.full((8, 16, 3), 1e39)}, InputError, ["envmap: 128 texels are NaN or"]),
         (lambda: {"target_map": np.full((8, 16, 3), -np.inf)}, InputError, ["target_map: 128 texels are"]),
         (lambda: {"target": np.full((64, 64, 3), np.nan)}, InputError, ["target: pixel at row 0, column 0"]),
         (lambda: {"envmap": MASKED}, InputError, ["envmap: 3 values are masked", "fill them"]),
@@ -207,6 +208,7 @@ def test_what_cannot_be_used_is_refused_by_name(given, kind, parts):
     assert all(part in str(info.value) for part in parts), str(info.value)
 
 
+@pytest.mark.slow
 def test_codes_of_a_picture_as_radiance_are_warned_of():
     adjusted = TINY | {"target": {"kind": "none"}, "scene": {"width": 8}}
     codes = np.full((8, 16, 3), 200, np.uint8)
@@ -261,6 +263,7 @@ def test_other_functions_refuse_by_name_as_well(make, text):
     assert text in str(info.value)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_dicts():
     sky = envedit.sunsky(16)
     fitted = envedit.fit(sky, {"hidden": 8, "depth": 1}, {"epochs": 2, "cache": False})
@@ -292,6 +295,7 @@ def test_the_public_names_are_what_dir_shows_and_explain_themselves():
                     assert inspect.getdoc(found), (name, member)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("given", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
 def test_importing_envedit_limits_the_threads_of_numpy_but_not_against_the_user(given, threads):
     code = f"import os, envedit; assert os.environ['OPENBLAS_NUM_THREADS'] == '{threads}'"

@@ -25,7 +25,6 @@ from envedit.transport.light_transport import LightTransport
 from tests.oracles import users_scenes
 from tests.oracles.matrix_renderer import arrays, case, same
 from tests.oracles.runs import TINY, call, changed, measured, names, pixels, settings_of, sunny, world
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_cache")
 
@@ -100,7 +99,8 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 # ---- the loop --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", slow_but(BAD_VALUES, math.nan))
+@pytest.mark.slow
+@pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("stage", STAGES)
 def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):
     arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
@@ -120,6 +120,7 @@ def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypat
         assert math.isfinite(row["loss"]) == (slope or row["iteration"] not in (5, 6, 12))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stage, monkeypatch):
     arguments = spoiled(stage, range(5, 1000), math.nan, monkeypatch)
@@ -133,6 +134,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
     assert same(arrays(adam.params), arrays(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("part", ["_m", "_v"])
 def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):
@@ -190,6 +192,7 @@ class Steep:
         return dr.exp(params["log"])
 
 
+@pytest.mark.slow
 def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
     """Without going back the parameters would stay where the radiance is infinite, whatever the rate."""
     arguments, _ = case(np.random.default_rng(0), iterations=80)
@@ -225,6 +228,7 @@ def recorded(monkeypatch):
 PIXELS = {"representation": {"kind": "pixels"}, "optimizer": {"iterations": 6}}
 
 
+@pytest.mark.slow
 def test_a_last_step_that_leads_to_no_map_is_taken_back(tmp_path, rng, recorded):
     settings = settings_of(tmp_path, sunny(rng), **PIXELS)
     whole = pipeline.run(settings)
@@ -281,7 +285,8 @@ def spoil_renderer(monkeypatch, steps):
     monkeypatch.setattr(LightTransport, "render", spoiled)
 
 
-@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
     path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
@@ -293,6 +298,7 @@ def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypa
     assert np.isfinite(pixels(out / "edited.exr")).all()
 
 
+@pytest.mark.slow
 def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch, capsys, recorded):
     spoil_renderer(monkeypatch, range(5, 1000))
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
@@ -305,7 +311,8 @@ def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch,
     assert names(out) == {"edited.exr"}
 
 
-@pytest.mark.parametrize("kind", slow_but(["layers", "siren", "pixels", "log-pixels"], "pixels"))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 @pytest.mark.parametrize("iterations", [1, 30])
 def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
     kind, iterations, tmp_path, rng, capsys, recorded

@@ -124,6 +124,7 @@ def small(tmp_path, rng, monkeypatch):
     return path
 
 
+@pytest.mark.slow
 def test_calibration_measures_this_scene(small):
     settings = config.load(small)
     found = budget.calibrate(settings, small.parent)

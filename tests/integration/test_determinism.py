@@ -50,15 +50,13 @@ def configured(folder, rng, kind, renderer="transport"):
 CASES = [("transport", kind) for kind in KINDS] + [("path", "siren"), ("path", "layers")]
 
 
-@pytest.mark.parametrize(
-    ("renderer", "kind"),
-    [pytest.param(*one, marks=[] if one == ("transport", "pixels") else pytest.mark.slow) for one in CASES],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("renderer", "kind"), CASES)
 def test_the_same_files_on_any_number_of_threads(kind, renderer, tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, kind, renderer)
-    one, again, two = (carried_out(path, count) for count in (1, 1, 2))
+    one, two = (carried_out(path, count) for count in (1, 2))
     warm = carried_out(path, 2, cache=tmp_path / "cache-1")  # fit and recording come from disk
-    assert [differing(one, other) for other in (again, two, warm)] == [set()] * 3
+    assert differing(one, two) == set() == differing(one, warm)
     assert pixels(one / "edited.exr").tobytes() != pixels(tmp_path / "map.exr").tobytes()
 
 
@@ -68,8 +66,8 @@ def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_
     scene = tmp_path / "scene.xml"
     scene.write_text(scene.read_text().replace('type="box"', 'type="gaussian"'))
     odd = changed(target__spp=100, output__spp=144)
-    one, again, two = (carried_out(path, count, *odd) for count in (1, 2, 2))
-    assert differing(one, again) == set() == differing(one, two)
+    one, two = (carried_out(path, count, *odd) for count in (1, 2))
+    assert differing(one, two) == set()
 
 
 @pytest.mark.slow

@@ -79,6 +79,7 @@ def test_a_notebook_runs(name, says, tmp_path):
     assert all(re.search(line, printed) for line in says), printed
 
 
+@pytest.mark.slow
 def test_the_citation_names_the_version():
     cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)
     assert cited and cited[1] == envedit.__version__
@@ -130,6 +131,7 @@ def parse(command, monkeypatch, capsys):
         assert not {option for option in options if option not in said.out}, command
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.* found in sys.modules after import:RuntimeWarning")
 @pytest.mark.parametrize("page", sorted({page for page, _ in commands()}))
 def test_every_command_in_the_pages_is_understood(page, monkeypatch, capsys):
@@ -146,6 +148,7 @@ def test_every_command_in_the_pages_is_understood(page, monkeypatch, capsys):
         parse(command, monkeypatch, capsys)
 
 
+@pytest.mark.slow
 def test_commands_are_found_and_a_wrong_one_is_noticed(monkeypatch, capsys):
     found = [command for _, command in commands()]
     assert len(set(found)) > 40 and {c.split()[1] for c in found if c.startswith("envedit ")} >= set(COMMANDS)

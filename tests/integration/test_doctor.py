@@ -71,6 +71,7 @@ def test_a_variant_envedit_does_not_know():
     assert "does not run on variant 'scalar_rgb'" in doctor.check("scalar_rgb").lines[0]
 
 
+@pytest.mark.slow
 def test_the_command_prints_versions_and_returns_the_exit_code(monkeypatch):
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nonexistent/libLLVM.so")
     done = subprocess.run([sys.executable, "-m", "envedit.doctor"], cwd=ROOT, capture_output=True, text=True)

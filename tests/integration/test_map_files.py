@@ -49,6 +49,7 @@ def own(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_plain_mitsuba_renders_the_written_scene_as_the_run_judged_it(own):
     out = own / "c_out"
     file = OpenEXR.File(str(out / "render_edited.exr"), separate_channels=True).channels()
@@ -67,6 +68,7 @@ def test_plain_mitsuba_renders_the_written_scene_as_the_run_judged_it(own):
     assert after[4:].tobytes() == before[4:].tobytes()  # rows that are not active, in the file's units
 
 
+@pytest.mark.slow
 def test_sky_and_lights_add_up_to_the_map(own, rng):
     out = own / "c_out"
     parts = [pixels(out / f"edited_{name}.exr") for name in ("sky", "lights")]
@@ -152,6 +154,7 @@ def test_half_is_cut_at_its_largest_and_says_so(value, cut, tmp_path, rng):
     assert bool(said) == cut and (not cut or "1 texels are brighter than 65504" in said[0])
 
 
+@pytest.mark.slow
 def test_a_run_writes_the_format_that_is_asked_for(tmp_path):
     parts = (users_scenes.PATH, users_scenes.SENSOR, BALL, light(2))
     path, kind = (

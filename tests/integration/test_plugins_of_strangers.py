@@ -78,6 +78,7 @@ def provide(shared_object, folder):
         shutil.copy(shared_object, folder / "plugins" / f"{name}.so")
 
 
+@pytest.mark.slow
 def test_no_plugin_of_a_scenes_or_the_working_folder_runs(shared_object, mark, tmp_path):
     provide(shared_object, tmp_path)
     shutil.copy(ROOT / "scenes" / "statue.ply", tmp_path)  # read by another process first, with these folders

@@ -31,6 +31,7 @@ def small():
     return changed(**keys | {"scene__width": 16, "optimizer__iterations": 1})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [["--rotate", "90"], ["--target", "other.exr"], ["--paint", "paint.exr"]])
 def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
     if option[0] == "--paint":
@@ -56,6 +57,7 @@ def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
     assert pixels(here / "again" / "edited.exr").tobytes() == before.tobytes()
 
 
+@pytest.mark.slow
 def test_a_target_that_is_no_panorama_is_a_picture_of_the_scene(here, capsys):
     """Which the record of the run says; it is solved as a rendering, and nothing of it is paint."""
     export = "--export-initial", "wanted.exr", "--quiet"
@@ -95,6 +97,7 @@ def test_what_the_scene_names_is_not_moved_out_of_the_folder_of_results(named, h
     assert file.read_bytes() == before and [path.name for path in (here / "out").iterdir()] == [file.name]
 
 
+@pytest.mark.slow
 def test_a_scene_without_an_environment_is_edited_by_a_map_beside_its_lamps(here, capsys):
     write_scene(here, PATH, SENSOR, BALL, users_scenes.LAMP, name="lamps.xml")
     assert call("lamps.xml", "--envmap", "other.exr", "--rotate", "90", *small()) == 0
@@ -105,6 +108,7 @@ def test_a_scene_without_an_environment_is_edited_by_a_map_beside_its_lamps(here
     assert call("lamps_out/edited.xml", "--rotate", "90", "--out", "again", *small(), "--quiet") == 0
 
 
+@pytest.mark.slow
 def test_a_shipped_scene_by_its_name_and_another_map(here):
     assert call("matte", "--envmap", "other.exr", "--rotate", "90", *small(), "--quiet") == 0
     ran = config.load(here / "matte_out" / "config.toml")

@@ -13,7 +13,6 @@ from envedit.core import latlong
 from envedit.export import file_resolution
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
-from tests.oracles.tiers import slow_but
 
 WIDTH = 64
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
@@ -59,7 +58,8 @@ def carried_out(folder, picture, *arguments, **tables):
     return folder / "c_out"
 
 
-@pytest.mark.parametrize("kind", slow_but(["layers", "log-pixels"], "log-pixels"))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["layers", "log-pixels"])
 def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     picture = source(rng)
     out = carried_out(tmp_path, picture, representation={"kind": kind}, input={"width": 32})
@@ -72,6 +72,7 @@ def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     np.testing.assert_allclose(*flux, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_path, rng):
     (tmp_path / "a").mkdir()
     out = carried_out(tmp_path / "a", latlong.resize(source(rng), 8, 16))
@@ -81,6 +82,7 @@ def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_
     assert not (out / "edited_full.exr").exists()
 
 
+@pytest.mark.slow
 def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monkeypatch, capsys):
     def out_of_memory(*arguments):
         raise MemoryError
@@ -91,6 +93,7 @@ def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monk
     assert "not enough memory" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
     full = file_resolution.at_full_resolution
 
@@ -105,6 +108,7 @@ def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, 
     assert "edited_full.exr is not written" in said and "map.exr" in said
 
 
+@pytest.mark.slow
 def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     out = carried_out(tmp_path, source(rng))
     channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()

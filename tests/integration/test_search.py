@@ -14,7 +14,6 @@ from envedit.solve.map_problem import SIGMA, Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -91,7 +90,8 @@ def found_for(problem, start):
 # ---- the sun moves -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("row", "column"), slow_but([(6, 40), (4, 8)], 6))
+@pytest.mark.slow
+@pytest.mark.parametrize(("row", "column"), [(6, 40), (4, 8)])
 def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
     """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
     image, place = sky(SUN), (row, column)
@@ -120,6 +120,7 @@ def test_the_new_shadow_alone_says_so_too(transport):
 # ---- a light is added --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     """A tenth of the picture, as a second sun would light it; the first sun's light is painted as it is.
 
@@ -139,6 +140,7 @@ def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     assert np.abs(off).max() < 2 * VISIBLE
 
 
+@pytest.mark.slow
 def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_lights_the_rest(transport):
     place, image = (8, 44), sky()
     problem, start = problem_of(transport, image, *painted(transport, image, sky(place), share=0.05))
@@ -152,6 +154,7 @@ def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_ligh
 # ---- lights stay -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     """Stripes as bright as noon, and as dark as night: no move promises anything."""
     image = sky(SUN)
@@ -163,6 +166,7 @@ def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     assert found.others and tried >= len(found.others)
 
 
+@pytest.mark.slow
 def test_paint_that_is_there_already_leaves_lights(transport):
     """No move is promising: nothing else is descended to."""
     image = sky(SUN)
@@ -201,6 +205,7 @@ def test_what_is_raised_after_a_step_ends_the_search(transport):
         search.search(problem, start, after_step=enough)
 
 
+@pytest.mark.slow
 def test_a_map_that_is_not_finite_has_no_explanation(transport):
     """The search returns it as it is; the steps refuse it."""
     image = sky(SUN)

@@ -3,9 +3,12 @@
 import ast
 import re
 
+import pytest
+
 from tests.oracles import ROOT
 
 
+@pytest.mark.slow
 def test_every_finding_has_a_test_that_exists():
     rows = [row for row in (ROOT / "SECURITY.md").read_text().splitlines() if row.startswith("| ")][1:]
     assert rows

@@ -22,6 +22,7 @@ def shell(folder, arguments, redirected="", **environment):
     return done.returncode, done.stdout.decode("utf-8", "replace"), done.stderr.decode("utf-8", "replace")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 @pytest.mark.parametrize("redirected", [*REDIRECTED, "| true"])
 def test_a_command_does_its_work_when_nobody_can_read_along(tmp_path, redirected):
@@ -34,6 +35,7 @@ def test_a_command_does_its_work_when_nobody_can_read_along(tmp_path, redirected
         assert code == 2 and "Traceback" not in out + err
 
 
+@pytest.mark.slow
 def test_letters_that_a_terminal_cannot_show_are_escaped(tmp_path):
     code, out, err = shell(
         tmp_path, "init sphere --out größe.toml", PYTHONIOENCODING="ascii", LC_ALL="C.UTF-8"
@@ -49,6 +51,7 @@ def test_a_pipe_as_configuration_is_refused(tmp_path, capsys):
     assert "edit.toml': cannot be read: is no regular file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_with_closed_streams_leaves_whole_results(tmp_path, rng):
     path = world(tmp_path, rng, optimizer={"iterations": 2})
     for out, redirected in (("open", ""), ("closed", ">&- 2>&- <&-")):

@@ -218,6 +218,7 @@ def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub, held):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
     stub.block("hold", 0)
     driver = stub.driver(4)

@@ -101,7 +101,8 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(CHANGES, "seed"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHANGES)
 def test_another_recording_is_not_taken_for_this_one(name, lit, tmp_path):
     build(tmp_path, lit)
     other = build(tmp_path, lit, **CHANGES[name])
@@ -154,6 +155,7 @@ def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp
     assert 0 < asked.depth_error <= recording.DEPTH_TOLERANCE < build(tmp_path, lit, max_depth=2).depth_error
 
 
+@pytest.mark.slow
 def test_a_filter_with_negative_lobes_is_kept_too(tmp_path):
     sensor = SENSOR.replace('<rfilter type="box"/>', '<rfilter type="lanczos"/>')
     lit = scene.load(write_scene(tmp_path, sensor, BALL, GROUND, LIGHT))
@@ -162,12 +164,14 @@ def test_a_filter_with_negative_lobes_is_kept_too(tmp_path):
     assert build(tmp_path, lit, 32, 64, spp=4).cached
 
 
+@pytest.mark.slow
 def test_a_later_version_records_anew(lit, tmp_path, monkeypatch):
     build(tmp_path, lit)
     monkeypatch.setattr(light_transport, "_RECORDING", light_transport._RECORDING + 1)
     assert not build(tmp_path, lit).cached
 
 
+@pytest.mark.slow
 def test_damaged_files_are_traced_again(lit, tmp_path, rng):
     first = build(tmp_path, lit)
     state = rng.bit_generator.state
@@ -180,6 +184,7 @@ def test_damaged_files_are_traced_again(lit, tmp_path, rng):
     assert build(tmp_path, lit).cached
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -215,6 +220,7 @@ def test_recordings_of_a_refresh_are_not_kept(lit, tmp_path, rng):
     assert sorted(path.name for path in (tmp_path / "cache").iterdir()) == kept
 
 
+@pytest.mark.slow
 def test_without_a_folder_nothing_is_kept(lit, tmp_path):
     before = set(tmp_path.rglob("*"))
     for _ in range(2):
@@ -222,6 +228,7 @@ def test_without_a_folder_nothing_is_kept(lit, tmp_path):
     assert set(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "odd",
     [

@@ -34,6 +34,7 @@ def test_sun_stands_where_it_is_told(width, azimuth, elevation):
     assert min(away, width - away) <= 1
 
 
+@pytest.mark.slow
 def test_sky_is_the_plugin_s():
     found = analytic_sky.sunsky(512, 60, 35, turbidity=4, sun_scale=0)
     d = latlong.directions(256, 512)[2:124:7, ::11]

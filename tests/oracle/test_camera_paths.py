@@ -8,7 +8,6 @@ import pytest
 from envedit.core import latlong
 from envedit.scene import camera_paths, scene
 from tests.oracles.statistics import disagreement, normal_square, student
-from tests.oracles.tiers import slow_but
 
 # ---- statistics (also used by the tests of the renderers) --------------------------------------------------
 #
@@ -95,6 +94,7 @@ def every_pixel(s):
     return np.arange(s.width * s.height, dtype=np.uint32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", [0, 1, 3])
 def test_trace_yields_escapes_and_vertices_bounce_by_bounce(bounces):
     s = scene.load("matte", 8, 8)
@@ -179,7 +179,8 @@ FILMS = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(FILMS, "box"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILMS)
 def test_pixels_see_the_sky_through_the_filter_of_the_film(rng, name):
     # The sky fills the picture and changes from pixel to pixel: a texel is 2.8 degrees wide, a pixel 2.5.
     s = stage(ball(WHITE), film=FILMS[name], target=(0, 4, 0))

@@ -7,9 +7,11 @@ import pytest
 from envedit.core.errors import NumericalError
 from envedit.scene import film, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
+BOX = '<rfilter type="box"/>'
 WIDE = '<rfilter type="gaussian"/><boolean name="sample_border" value="true"/>'
 CROP = "".join(
     f'<integer name="crop_{key}" value="{value}"/>'
@@ -19,7 +21,7 @@ SIGNED = f'<rfilter type="lanczos"/>{CROP}'
 
 
 def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
-    sensor = SENSOR.replace('<rfilter type="box"/>', part)
+    sensor = SENSOR.replace(BOX, part)
     loaded = scene.load(write_scene(folder, sensor, BALL, LIGHT), size, sampler=sampler)
     sky = rng.random((16, 32, 3), dtype=np.float32)
     sky[3, 5] = 3000
@@ -27,8 +29,8 @@ def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
     return loaded, sky
 
 
-@pytest.mark.parametrize("part", ['<rfilter type="box"/>', WIDE, SIGNED], ids=["box", "wide", "signed"])
-@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+@pytest.mark.parametrize("part", slow_but([BOX, WIDE, SIGNED], WIDE), ids=["box", "wide", "signed"])
+@pytest.mark.parametrize("sampler", slow_but(["independent", "multijitter"], "multijitter"))
 def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path, rng):
     loaded, _ = lit_by_a_sun(tmp_path, rng, part, sampler)
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
@@ -41,7 +43,7 @@ def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ['<rfilter type="box"/>', WIDE], ids=["box", "wide"])
+@pytest.mark.parametrize("part", [BOX, WIDE], ids=["box", "wide"])
 def test_any_number_of_samples_gives_the_same_bits_on_any_number_of_threads(part, tmp_path, rng, threads):
     loaded, sky = lit_by_a_sun(tmp_path, rng, part, size=48)
     for spp in (1, 7, 64, 100, 144):
@@ -54,7 +56,7 @@ def test_any_number_of_samples_gives_the_same_bits_on_any_number_of_threads(part
 
 
 def test_a_sample_that_is_not_finite_is_not_dropped(tmp_path, rng):
-    loaded, sky = lit_by_a_sun(tmp_path, rng, '<rfilter type="box"/>')
+    loaded, sky = lit_by_a_sun(tmp_path, rng, BOX)
     loaded.params[_albedo(loaded)] = mi.Color3f(np.nan)
     loaded.params.update()
     with pytest.raises(NumericalError, match=r"pixels are not finite, the first at row \d+, column \d+"):

@@ -27,7 +27,6 @@ from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.matrix_renderer import same, without_times
 from tests.oracles.plain import plain_display
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -132,6 +131,7 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
     assert_gradient(problem, start, state, sigma)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
 def test_gradient_of_paint_with_the_mean_of_the_rest_is_that_of_finite_differences(painted, sigma):
     """Of the misfit, beside which the prior is large here: paint, the pattern of the rest, and its mean."""
@@ -175,6 +175,7 @@ def assert_gradient(problem, start, state, sigma, of_prior=True, normal=None):
         assert np.abs(slope).max() > 0
 
 
+@pytest.mark.slow
 def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
     problem, _, start, state = case
     sigma, n = 0.1, problem.nodes
@@ -205,6 +206,7 @@ def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
     assert (np.diag(plain_precision(problem, names))[: 3 * n] > 0.1 * np.diag(expected)[: 3 * n]).any()
 
 
+@pytest.mark.slow
 def test_the_mean_of_the_rest_is_three_more_residuals_of_the_hessian(painted):
     """Of rank three: J' J of finite differences of q, which is without a sigma."""
     problem, _, start, state = painted
@@ -234,6 +236,7 @@ def test_the_mean_of_the_rest_is_three_more_residuals_of_the_hessian(painted):
     np.testing.assert_allclose(with_mean.mean_of_rest.residual, mean)
 
 
+@pytest.mark.slow
 def test_texture_within_a_block_is_in_the_derivatives(rng):
     """Blocks of four pixels that see the same sky, with albedos of their own: as exact as single pixels."""
     height, width = film = (8, 64)
@@ -414,6 +417,7 @@ def test_penalty_of_a_light(case):
 # ---- a problem of known solution ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     """A grey sky so dark that display values are linear, and asked to change by a thousandth."""
     monkeypatch.setattr(
@@ -515,6 +519,7 @@ def test_deviation_shrinks_with_what_is_known(rng):
     assert target.any()
 
 
+@pytest.mark.slow
 def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
     image, transport = clouds(rng), DenseTransport.random(rng, (24, 24), GRID, even=0.8)
     problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
@@ -556,6 +561,7 @@ def followed(problem, params, **options):
     return solution, last
 
 
+@pytest.mark.slow
 def test_a_change_that_layers_can_make_is_found(rng):
     image = clouds(rng) + lamp()
     transport = DenseTransport.random(rng, (20, 24), GRID, even=0.5)
@@ -645,6 +651,7 @@ def test_no_step_is_longer_than_its_limit(case):
     np.testing.assert_array_equal(found["flux"][1:], state["flux"][1:])
 
 
+@pytest.mark.slow
 def test_no_step_takes_a_light_below_the_horizon(rng):
     """Of a map whose lower half keeps its values: pushed down, a light stays at the edge of the sky."""
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
@@ -735,7 +742,8 @@ class Enough(Exception):
     pass
 
 
-@pytest.mark.parametrize("stop", slow_but([1, 3, "last"], 3, "last"))
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [1, 3, "last"])
 def test_run_goes_on_from_its_arrays_to_the_same_bits(case, stop):
     problem, params, *_ = case
     whole = solve(problem, params, sigma=0.05)
@@ -785,7 +793,8 @@ def test_black_map_stays_black(rng):
     np.testing.assert_allclose(solution.posterior.deviation, prior_deviation(problem), rtol=1e-4)
 
 
-@pytest.mark.parametrize("factor", slow_but([0.25, 4.0], 4.0))
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.25, 4.0])
 def test_a_single_light_takes_its_flux(rng, factor):
     image = lamp()
     problem, _, last = extreme(rng, image, lambda t: factor * shown(t, image))
@@ -793,7 +802,8 @@ def test_a_single_light_takes_its_flux(rng, factor):
     assert problem.shining(last.state) == [0]
 
 
-@pytest.mark.parametrize("value", slow_but([0.0, 65504.0, 1e6, 1e30], 65504.0, 1e6))
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [0.0, 65504.0, 1e6, 1e30])
 def test_targets_of_any_radiance(rng, value):
     image = clouds(rng) + lamp()
     problem, solution, last = extreme(rng, image, lambda t: np.full((*FILM, 3), value, np.float32))
@@ -801,6 +811,7 @@ def test_targets_of_any_radiance(rng, value):
     assert solution.history and (last.rendering.mean() > before) == (value > before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [1e6, 1e30])
 def test_maps_of_any_radiance(rng, value):
     image = clouds(rng) + lamp(radiance=value)
@@ -890,6 +901,7 @@ def degrees_off(problem, state, k, place):
     return np.degrees(np.arccos(problem.direction(state, k) @ latlong.directions(*GRID)[place]))
 
 
+@pytest.mark.slow
 def test_a_light_is_added_where_the_target_has_one(rng):
     image, transport, place = clouds(rng), DenseTransport.random(rng, FILM, GRID), (9, 30)
     problem, found, lit = searched(image, transport, shown(transport, image + lamp(place, 300.0)))
@@ -900,6 +912,7 @@ def test_a_light_is_added_where_the_target_has_one(rng):
     assert [row["iteration"] for row in found.run.history] == list(range(len(found.run.history)))
 
 
+@pytest.mark.slow
 def test_the_maps_light_moves_where_no_step_leads(rng):
     """Or goes out there for one that is added; steps alone do not get there."""
     image, transport, place = clouds(rng), DenseTransport.random(rng, FILM, GRID, even=0.8), (9, 34)
@@ -913,6 +926,7 @@ def test_the_maps_light_moves_where_no_step_leads(rng):
     assert degrees_off(problem, alone, 0, place) > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 0.9, 1.5])
 def test_no_light_is_added_or_moved_where_one_factor_makes_the_target(rng, factor):
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
@@ -920,6 +934,7 @@ def test_no_light_is_added_or_moved_where_one_factor_makes_the_target(rng, facto
     assert found.name == "lights left where they are" and lit == [0]
 
 
+@pytest.mark.slow
 def test_a_light_that_the_target_does_not_have_goes_out(rng):
     image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
     problem, found, lit = searched(image + lamp(), transport, shown(transport, image))
@@ -927,6 +942,7 @@ def test_a_light_that_the_target_does_not_have_goes_out(rng):
     assert lit == [] or flux < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("errors", "stays"), [((1.0, 1.0), True), ((1.0, 0.97), True), ((1.0, 0.9), False)])
 def test_a_near_start_stays_unless_path_tracing_says_that_the_solution_is_closer(rng, errors, stays):
     image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
@@ -1020,6 +1036,7 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
 # ---- glow and rows that follow ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("added", [False, True])
 def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
     """Where every texel is a cell; a picture that sees no core."""
@@ -1050,6 +1067,7 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
         assert np.abs(pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", ["mirror", "keep"])
 def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
     """The blur of a mirror, and what falls on ground: by the sky, and by a light's flux and place."""
@@ -1086,6 +1104,7 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
         np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=close, err_msg=kind)
 
 
+@pytest.mark.slow
 def test_gradient_by_the_sky_is_exact_where_a_block_is_not(rng):
     """Pixels of a block that each see another sky: the gradient goes through T, not through their mean."""
     film, sigma = (8, 64), 0.2

@@ -36,7 +36,6 @@ from tests.oracles.scenes import (
     sun,
 )
 from tests.oracles.statistics import LEVEL, disagreement
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -49,7 +48,7 @@ SUNS = {
     "the seam, last column": (5, WIDTH - 1),
     "the pole": (0, 5),
 }
-EVERY_SUN = ("sphere", "mirror", "matte", "turned and cropped", "in the air")
+EVERY_SUN = ("sphere", "turned and cropped", "in the air")
 SUNS_BELOW = {"below the horizon": (HEIGHT // 2, 22), "the lower pole": (HEIGHT - 1, 5)}
 MAPS = {
     "sunny sky": "puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr",
@@ -105,7 +104,7 @@ def test_pictures_are_those_of_mitsuba(recorded):
         theirs = references(s, refined(image), spp=128)
         compare(f"sun at {what}", image, theirs, sees=1.1 if what == "the horizon" else 1.03)
         assert_transpose(transports[0], image, some)
-        if name == "matte" and what == "the seam, first column":  # negative control: one texel further
+        if name == "sphere" and what == "the seam, first column":  # negative control: one texel further
             moved = np.roll(image, 1, axis=1)
             assert all(t.resolve(moved) >= 1 for t in transports)
             assert disagreement(np.stack([picture(t, moved) for t in transports]), theirs) != ""
@@ -157,7 +156,8 @@ def test_exact_columns_of_the_whole_map_give_the_picture(name):
     assert disagreement(1.01 * ours, theirs) != ""  # negative control
 
 
-@pytest.mark.parametrize("depth", slow_but([2, 3], 2))
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [2, 3])
 def test_depth_means_what_it_means_to_mitsuba(depth):
     film = {"width": 24, "height": 24}
     # Low and level, so that the sky is in view; the light of the lamp is cut at the same depth.
@@ -224,6 +224,7 @@ def test_automatic_depth_is_that_of_the_scene():
     assert build(plane, max_depth=5, spp=16).bounces == 4
 
 
+@pytest.mark.slow
 def test_texels_below_the_ground_have_no_influence(lit):
     # The plane ends 1.2 degrees below the horizon; the tent of row 9 begins 6 degrees below it.
     assert (lit.influence[9:] == 0).all() and (lit.influence[1:7] > 0).all()
@@ -369,6 +370,7 @@ def test_scale_of_the_map_is_the_scale_of_the_picture(scale):
     np.testing.assert_allclose(picture(t, scaled) / scale, picture(t, image), rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_black_map_needs_no_columns_and_shows_the_lamp(lamp_scene, lit):
     assert lit.resolve(black()) == 0
     lamp = picture(lit, black())
@@ -377,6 +379,7 @@ def test_black_map_needs_no_columns_and_shows_the_lamp(lamp_scene, lit):
     np.testing.assert_array_equal(picture(t, np.zeros((6, 12, 3), np.float32)), 0)
 
 
+@pytest.mark.slow
 def test_non_finite_texel_is_not_hidden():
     t = build(load("matte"), 6, 12, spp=16)
     image = np.ones((6, 12, 3), np.float32)
@@ -402,6 +405,7 @@ def test_texels_that_deserve_it_get_columns(lamp_scene):
     assert (np.diff(radiance) <= 0).all()  # brightest first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [slice(0, HEIGHT), slice(3, 11)])
 def test_pictures_of_few_texels_are_those_of_the_whole_map(lamp_scene, rng, rows):
     t = build(lamp_scene, spp=32)
@@ -711,6 +715,7 @@ def test_too_little_memory_is_told_with_what_to_do(lamp_scene):
     assert t.spp < 256 and t.memory_bytes < 0.003e9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["auto", DEPTH])
 def test_closed_room_is_refused(depth):
     room = {"type": "sphere", "radius": 50.0, "flip_normals": True, "bsdf": WHITE}
@@ -718,6 +723,7 @@ def test_closed_room_is_refused(depth):
         build(scene.load(stage(room)), max_depth=depth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1, 0, -1])
 def test_depth_at_which_the_sky_lights_nothing_is_refused(depth):
     # The camera of the matte scene sees ground and ball only: a black picture would be the silent result.

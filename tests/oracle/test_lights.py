@@ -172,6 +172,7 @@ def direction(azimuth, elevation):
     return np.array([c * math.sin(azimuth), math.sin(elevation), -c * math.cos(azimuth)])
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(angles, angles)
 @example((0.0, 0.0), (math.pi, 0.0))
@@ -278,6 +279,7 @@ GOALS = [(math.pi / 2, 0.0), (-math.pi / 2, 0.0), (1.5, 2.0), (-1.5, -2.0), (0.0
          (0.01, 0.1), (0.9, 0.0)]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("top", [1, 3, 11, 20])
 def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
     """Low to high and back, across the seam, over a pole, at a pole."""
@@ -389,6 +391,7 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
                 assert share[near].sum() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.03, 1.0, 6.0])  # the first: as narrow as it is round
 @pytest.mark.parametrize("width", [256, 1024])
 def test_spare_lights_are_round(width, degrees, rng):
@@ -446,6 +449,7 @@ def plain_loss(image, kind):
     return (image * weights()).sum() if kind == "linear" else (image**2).sum() * 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["linear", "squares"])
 @pytest.mark.parametrize("top", [3, 11])
 def test_gradient_is_the_finite_difference(kind, top, rng):
@@ -603,6 +607,7 @@ def test_glow_is_the_product_over_the_lights(rng):
     np.testing.assert_array_equal(got[far], 1)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_glow_is_the_finite_difference(rng):
     own = [patch(rng, 4, 10, glow=TABLE), patch(rng, 15, 40, glow=0.5 * TABLE)]
     made, d, h = Lights(own, (0, H), W), unit(rng, 200), 1e-6
@@ -627,6 +632,7 @@ def test_gradient_of_the_glow_is_the_finite_difference(rng):
         np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_gradient_of_the_glow_along_a_path_adds_up_to_the_change(rng):
     light, count = patch(rng, 4, 46, glow=TABLE), 250
     made, d = Lights([light], (0, H), W), device(latlong.directions(H, W))

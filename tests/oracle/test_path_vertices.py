@@ -13,7 +13,6 @@ from envedit.transport.texel_sampling import Grid
 from tests.oracles import column_tracer
 from tests.oracles.kernels import compiled
 from tests.oracles.scenes import HEIGHT, METAL, WIDTH, ball, load, stage
-from tests.oracles.tiers import slow_but
 
 BOUNCES, COUNT, SEED = 3, 8, 3
 ROOM = 10**9
@@ -48,7 +47,8 @@ SCENES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", slow_but(SCENES, "statue", "in the air"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_columns_are_those_traced_one_by_one(name):
     columns = columns_of(load(name))
     got, (slow, lost) = traced(columns), expected(columns)
@@ -68,9 +68,8 @@ def test_paths_that_are_cut_short(bounces):
     assert got.any()
 
 
-@pytest.mark.parametrize(
-    "size, count", slow_but([((1, 1), 1), ((1, 1), 5), ((3, 1), 1), ((9, 1), 1)], (1, 1))
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("size, count", [((1, 1), 1), ((1, 1), 5), ((3, 1), 1), ((9, 1), 1)])
 def test_few_paths(size, count):
     """Arrays of one element are scalars to Dr.Jit: a single vertex or escape must not count twice."""
     film = {"width": size[0], "height": size[1]}
@@ -122,6 +121,7 @@ def test_a_column_does_not_depend_on_those_beside_it(air, monkeypatch):
     assert len(blocks._kept[COUNT, SEED]) == 9
 
 
+@pytest.mark.slow
 def test_columns_traced_again_replace_the_old_ones(air):
     columns = columns_of(air)
     first = traced(columns).copy()
@@ -133,6 +133,7 @@ def test_columns_traced_again_replace_the_old_ones(air):
     assert traced(columns, count=2).tobytes() == few.tobytes() != first.tobytes()
 
 
+@pytest.mark.slow
 def test_retraced_and_restored_columns_have_the_same_bits(air):
     columns = columns_of(air)
     columns.trace(TEXELS[:3], COUNT, SEED)
@@ -159,6 +160,7 @@ def size_of(value):
     return sum(size_of(part) for part in value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pair", "in the air"])
 def test_memory_of_kept_paths_is_what_is_stated(name):
     columns = columns_of(load(name))
@@ -170,6 +172,7 @@ def test_memory_of_kept_paths_is_what_is_stated(name):
     assert columns.kept_bytes == sum(b.bytes for b in blocks)
 
 
+@pytest.mark.slow
 def test_kept_paths_stay_within_their_memory(air, monkeypatch):
     monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)
     needed = columns_of(air)
@@ -197,7 +200,8 @@ def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
     assert traced(columns).tobytes() == traced(columns_of(air)).tobytes()
 
 
-@pytest.mark.parametrize("name", slow_but(["in the air", "pair"], "in the air"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["in the air", "pair"])
 def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
     monkeypatch.setattr(path_vertices, "LANES", 200 * COUNT)  # two blocks of 200 pixels and one of 176
     columns = columns_of(load(name))
@@ -211,6 +215,7 @@ def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
 # ---- what is not finite ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_contributions_that_are_not_finite_are_left_out_and_counted(air, monkeypatch):
     columns = columns_of(air)
     clean, real = traced(columns).copy(), path_vertices.connect
@@ -230,6 +235,7 @@ def test_contributions_that_are_not_finite_are_left_out_and_counted(air, monkeyp
     assert np.isfinite(got).all() and (got[:, pixel] <= clean[:, pixel]).all()
 
 
+@pytest.mark.slow
 def test_escapes_that_are_not_finite_are_left_out_and_counted(monkeypatch):
     s, real = load("in the air"), path_vertices.bsdf_weight
     columns = columns_of(s)

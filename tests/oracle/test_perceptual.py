@@ -233,6 +233,7 @@ def test_max_pooling_gives_the_gradient_to_the_first_largest():
     assert back[1, 3] == 2 and back[2, 2] == 8
 
 
+@pytest.mark.slow
 def test_least_sizes(backbones):
     """torchvision says 32, 63 and 17, which counts the last pooling of VGG16 and AlexNet."""
     least = {kind: backbones[kind].least_size() for kind in KINDS}
@@ -309,6 +310,7 @@ def test_features_match_the_authors_code(recorded, backbones, measure, kind, siz
 SMALL = {"vgg": (16, 19), "alex": (36, 33), "squeeze": (20, 17)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(13, 18), (1, 1), (2, 7)])
 def test_dists_matches_plain_numpy(dists, size):
     x, y, _ = drawn.images(*size)
@@ -363,6 +365,7 @@ def test_gradient_against_differences_and_both_modes(dists, lpips, name):
     assert dr.forward_to(value)[0] == pytest.approx(np.sum(slope * directions[0]), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_measures_keep_the_digits_of_near_images(dists, lpips):
     """1 minus a sum near 1, as the formula is written, would leave nothing of a distance of 1e-9."""
     x, y, _ = drawn.images(33, 40)

@@ -16,7 +16,6 @@ from envedit.images import images
 from envedit.scene import film, scene
 from tests.oracles import ROOT
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
-from tests.oracles.tiers import slow_but
 
 SCENES = ROOT / "scenes"
 
@@ -24,6 +23,7 @@ SCENES = ROOT / "scenes"
 # ---- rendering ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampler", ["independent", "multijitter"])
 def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(sampler, tmp_path, rng):
     image = sky(rng)
@@ -47,6 +47,7 @@ def test_render_is_the_one_of_mitsuba_with_the_same_bitmap_orientation_and_seed(
     np.testing.assert_allclose(ours[0, 0], seen, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_russian_roulette_begins_where_the_scene_says(tmp_path, rng):
     image = sky(rng)
     for kind in ("path", "volpath"):
@@ -60,6 +61,7 @@ def test_russian_roulette_begins_where_the_scene_says(tmp_path, rng):
             assert np.array_equal(ours, theirs) == (depth == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [0, -1])
 def test_light_in_the_row_of_a_pole_alone_is_seen(row, tmp_path):
     """As in the sum with another map, as rendering is linear."""
@@ -89,6 +91,7 @@ def test_resolution_may_change_between_renderings(tmp_path, rng):
     assert np.array_equal(other, fresh) and not np.array_equal(other, first)
 
 
+@pytest.mark.slow
 def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
     lamp = '<emitter type="point"><point name="position" x="2" y="3" z="4"/></emitter>'
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT, lamp))
@@ -141,12 +144,14 @@ def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
     assert taken == 16 and unknown is None and np.array_equal(picture, loaded.render(even, spp=16, seed=4))
 
 
+@pytest.mark.slow
 def test_noise_that_does_not_fall_ends_at_the_most_samples(tmp_path, monkeypatch):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     monkeypatch.setattr(scene, "QUIET_DECIBELS", 200.0)
     assert loaded.sampled(np.ones((8, 16, 3)), "auto")[1] == 768
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e6])
 def test_extreme_maps_render_in_proportion(tmp_path, value):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
@@ -185,6 +190,7 @@ def test_a_map_of_the_wrong_shape_is_refused(tmp_path, image):
         scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).set_envmap(image)
 
 
+@pytest.mark.slow
 def test_a_dict_scene_is_the_same_as_its_xml(tmp_path, rng):
     to_world = mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 12, "filter": {"type": "box"}}
@@ -313,7 +319,8 @@ def test_names_are_found_in_included_files(tmp_path):
 # ---- shipped scenes and the statue -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", slow_but(shipped.scenes(), "mesh"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped.scenes())
 def test_shipped_scenes_render(name, rng):
     parameters = {"mesh": "statue.ply"} if name == "mesh" else None
     loaded = scene.load(name, parameters=parameters)
@@ -370,6 +377,7 @@ def test_the_committed_statue_is_the_scripts(statue, tmp_path):
     assert made[body + count :] == committed[body + count :]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away here")
 def test_a_texture_is_read_on_one_core(tmp_path):
     """Mitsuba's reader of EXR files waits for a second thread."""

@@ -62,6 +62,7 @@ def test_ssim_class_agrees_with_the_function_and_can_be_reused(rng):
         assert ssim(single(image))[0] == a  # without gradients asked for
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [False, True])
 def test_ssim_of_pictures_below_each_other_is_that_of_each(weighted, rng):
     """Value and gradient; each counts by its pixels, or by its weight."""

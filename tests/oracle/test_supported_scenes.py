@@ -38,6 +38,7 @@ def close(ours, theirs, noise=0.01):
 # ---- the scene's own map and its scale -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scale, inside, envmap",
     [(None, "", "auto"), (0.5, TURN, "auto"), (3, "", "scene"), (800, TURN, "auto"), (800, "", "other.exr")],
@@ -99,6 +100,7 @@ def test_public_scenes_are_as_bright_as_in_mitsuba(scene, own, other, data, tmp_
 # ---- kinds of scenes -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", {kind.parts: kind for kind in KINDS}.values(), ids=lambda kind: kind.name)
 def test_a_kind_of_scene_is_rendered_as_by_mitsuba_or_refused(kind, tmp_path):
     said = users_scenes.happened(kind)
@@ -126,6 +128,7 @@ def test_a_kind_of_scene_is_rendered_as_by_mitsuba_or_refused(kind, tmp_path):
         close(transport.apply(mi.TensorXf(radiance)).numpy(), expected, 0.02)
 
 
+@pytest.mark.slow
 def test_plugins_that_are_replaced_or_refused(tmp_path):
     def said(*parts):
         return users_scenes.happened(users_scenes.Kind("", parts))
@@ -197,6 +200,7 @@ def map_of(parts, folder, **keys):
     return lit, inputs.read_map(settings.input, lit, 256).radiance, inputs.notes(settings.input, lit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts", [(SENSOR, BALL, CONSTANT), (Z_UP, BALL, GROUND, SUN)], ids=["constant", "sunsky"]
 )
@@ -226,6 +230,7 @@ def test_a_map_without_a_name_is_refused(tmp_path):
             map_of((PATH, SENSOR, BALL, f'<emitter type="envmap">{inside}</emitter>'), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_scene_without_an_environment_is_lit_by_a_map_beside_its_lamps(tmp_path, rng):
     parts = PATH, SENSOR, BALL, FLOOR, LAMP
     with pytest.raises(InputError, match=r"no environment emitter: add <emitter.*>, or .* --envmap FILE"):
@@ -242,6 +247,7 @@ def test_a_scene_without_an_environment_is_lit_by_a_map_beside_its_lamps(tmp_pat
     close(plain(again)[..., :3], both)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "origin, up, asked, zenith",
     [
@@ -261,12 +267,14 @@ def test_the_zenith_of_a_light_without_one_is_the_sensor_s_up(origin, up, asked,
     assert np.linalg.det(lit.to_world) == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_a_light_with_an_orientation_keeps_it(tmp_path):
     lit, _, notes = map_of((PATH, Z_UP, BALL, SUN), tmp_path, up="y")
     np.testing.assert_allclose(lit.to_world @ [0, 1, 0], [0, 0, 1], atol=1e-12)
     assert "scene.up has no effect: the scene's sunsky has an orientation of its own" in notes
 
 
+@pytest.mark.slow
 def test_the_scale_of_the_scene_can_be_dropped(tmp_path, rng):
     images.write_exr(tmp_path / "own.exr", sky(rng) + 0.1)
     scaled, other, _ = map_of((PATH, SENSOR, BALL, light(800)), tmp_path)
@@ -281,6 +289,7 @@ def test_the_scale_of_the_scene_can_be_dropped(tmp_path, rng):
 # ---- films ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_cropped_film_is_enlarged_with_its_crop(tmp_path):
     def cropped(size, part):
         film = f'<integer name="width" value="{size[0]}"/><integer name="height" value="{size[1]}"/>'
@@ -330,6 +339,7 @@ def test_every_plugin_of_this_mitsuba_is_in_the_table():
     assert {name for plugins in PLUGINS.values() for name in plugins} == users_scenes.installed()
 
 
+@pytest.mark.slow
 def test_the_page_is_the_one_that_is_written():
     """``python -m tests.oracles.users_scenes > docs/scenes.md`` writes it anew."""
     assert (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8") == users_scenes.page()

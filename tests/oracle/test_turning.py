@@ -76,6 +76,7 @@ def test_a_turn_explains_nothing_where_there_is_no_residual_or_none_that_is_fini
     assert turning.Turn(90.0, error=still, still=still).left == np.inf
 
 
+@pytest.mark.slow
 def test_what_noise_hides_in_pixels_is_seen_in_blocks(rng, tmp_path):
     image = sky(rng)
     lit = scene.load("sphere", 32, 32)
@@ -97,6 +98,7 @@ def test_a_turn_that_explains_nothing_is_not_looked_for(traced, rng):
     assert found_of(traced, image, picture, thorough=False) == found_of(traced, image, picture)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e30])
 def test_any_radiance(value, traced, rng):
     image = sky(rng)

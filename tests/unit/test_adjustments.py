@@ -118,6 +118,7 @@ def test_what_cannot_be_is_refused(text):
         config.loads(text)
 
 
+@pytest.mark.slow
 def test_a_run_without_a_target(tmp_path, isolated, capsys):
     """The map of the scene at the file's size, a stop brighter; nothing is traced."""
     users_scenes.write(

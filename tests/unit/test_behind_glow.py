@@ -53,6 +53,7 @@ def test_extremes_stay_finite(level, shape):
     assert np.isfinite(background * np.exp(found.log_change(background))).all()
 
 
+@pytest.mark.slow
 def test_the_old_place_of_a_sun_looks_like_the_elevation_and_an_unmoved_one_keeps_its_bits():
     plain = sky(sun=None)
     image = plain * np.float32(1 + 30 * np.exp(-AWAY / 10))[..., None]
@@ -70,6 +71,7 @@ def test_the_old_place_of_a_sun_looks_like_the_elevation_and_an_unmoved_one_keep
         assert np.abs(np.log(edited / plain)[near]).max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_low_orange_sun_that_leaves_a_grey_sky_leaves_no_fleck_below_the_horizon():
     """Its reflection goes with its glow, and its colour before the sky's saturation is lowered."""
     low, orange = (29, 20), np.float32([1.0, 0.4, 0.1])
@@ -98,6 +100,7 @@ def analytic():
     return made, made.start()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elevation", [5, 20, 50, 65, 80])
 def test_a_sun_that_rises_or_sets_is_in_its_place_and_tears_nothing(elevation, analytic):
     """The truth is the analytic sky with its sun there; flux and gain, which differ, are the solver's."""

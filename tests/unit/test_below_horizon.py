@@ -175,6 +175,7 @@ def test_layers_give_a_whole_map_back_and_have_no_edge_when_the_sun_moves():
     assert seams[0] < 2 and seams[1] > 2 * seams[0]
 
 
+@pytest.mark.slow
 def test_gradient_of_a_whole_map_is_that_of_finite_differences(rng):
     """By a gain: rows below the horizon follow it through the sky above, which has a gradient of its own."""
     _, made, params, _ = moved()

@@ -43,6 +43,7 @@ def test_nothing_to_draw_is_an_empty_string(row):
     assert curves.curves_svg([row]) == "" == curves.curves_svg([])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(

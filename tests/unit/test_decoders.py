@@ -336,6 +336,7 @@ def test_damaged_files_are_refused_quietly(tmp_path, rng, capfd):
     assert capfd.readouterr() == ("", "")  # no library has spoken over us
 
 
+@pytest.mark.slow
 def test_reading_survives_random_damage(tmp_path, rng):
     """Flip bytes: each file either reads or is refused, in a process that must end well."""
     exr(tmp_path / "a.exr", **planes(rng, np.float16, (8, 16)))

@@ -65,16 +65,6 @@ def test_normalisation_is_equation_1(rng):
     assert values.min() == 0 and abs(values.max() - 1) < 1e-12
 
 
-@pytest.mark.parametrize("peak", [1.0, 65504.0, 1e6, 1e38])
-def test_normalisation_round_trip(peak):
-    image = np.array([0, 1e-30, 1e-4, 0.5, 1, peak / 7, peak] * 3, np.float32).reshape(1, 7, 3)
-    normalisation = fit.Normalisation.of(image)
-    decoded = normalisation.decode(mi.TensorXf(normalisation.encode(image).astype(np.float32))).numpy()
-    assert np.isfinite(decoded).all()
-    # x rounds at 6e-8 in [0, 1], and the exponent by as much of the 93 that its range can be.
-    np.testing.assert_allclose(decoded, image, rtol=2e-5, atol=1e-7)
-
-
 @pytest.mark.parametrize("value", [0.0, 1e-30, 0.3, 65504.0, 1e38])
 def test_constant_map_lies_in_the_middle_of_a_range_of_one(value):
     image = np.full((2, 4, 3), value, np.float32)
@@ -271,6 +261,7 @@ def test_perturbation_is_none_after_a_gradient_that_is_not_finite(rng):
 # ---- the fit ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_small_fit_reaches_a_good_picture(rng):
     image = sky(rng)
     settings = config.Fit(epochs=150, lr=5e-3, awp_gamma=0.0)
@@ -342,6 +333,7 @@ def test_light_changes_the_last_layer_alone(coordinates, rng):
     assert changed == ["2.weight", "2.bias"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "value"), [((16, 32), 0.0), ((16, 32), 0.25), ((1, 2), 7.0)])
 def test_flat_maps_can_be_fitted(shape, value):
     image = np.full((*shape, 3), value, np.float32)
@@ -349,14 +341,6 @@ def test_flat_maps_can_be_fitted(shape, value):
     assert all(np.isfinite(w).all() for w in fitted.params.values())
     got = picture(fitted, NETWORK, shape)
     np.testing.assert_allclose(got, image, atol=0.05 * (value + fit.EPSILON))
-
-
-@pytest.mark.parametrize("peak", [65504.0, 1e6, 3e38])
-def test_fit_of_extreme_peaks_stays_finite(peak, rng):
-    image = sky(rng)
-    image[3, 5] = peak
-    fitted = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.01))
-    assert all(np.isfinite(w).all() for w in fitted.params.values())
 
 
 def test_no_epochs_leaves_the_initial_weights(rng):
@@ -473,6 +457,7 @@ def test_grids_take_turns_at_random(rng, monkeypatch):
     assert any(turn != turns[0] for turn in turns[:4])
 
 
+@pytest.mark.slow
 def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
     betas, plain = [], optimizer.Adam.__init__
 
@@ -489,6 +474,7 @@ def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
 # ---- schedules -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
 @pytest.mark.parametrize("stride", [1, 2])
 def test_no_new_kernel_after_every_grid_had_a_turn(stride, gamma, rng):
@@ -531,6 +517,7 @@ def test_the_cache_can_be_refused(tmp_path, rng):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed"])
 def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
     image = sky(rng)
@@ -641,6 +628,7 @@ def test_a_killed_fit_goes_on_to_the_same_weights(tmp_path, monkeypatch, gamma, 
     assert len(list(tmp_path.iterdir())) == 1 and fit.fit(image, NETWORK, settings, folder=tmp_path).cached
 
 
+@pytest.mark.slow
 def test_seconds_of_a_killed_fit_count(tmp_path, monkeypatch, rng):
     ticks = iter(range(0, 10**6, 100))
     monkeypatch.setattr(fit.time, "perf_counter", lambda: float(next(ticks)))

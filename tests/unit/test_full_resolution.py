@@ -136,6 +136,7 @@ def test_bands_do_not_show(sunny, rng, monkeypatch):
         np.testing.assert_allclose(carried(made, params, working, source)[0], whole, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_inactive_rows_keep_their_bits(rng):
     source = sky(256, 512)
     working, rows = small(source), (5, 25)
@@ -207,6 +208,7 @@ def test_a_gain_lies_where_it_lay(rng):
     assert np.abs(result[inside] / shifted[inside] - 1).max() > 0.05  # negative control
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [(50, 90), (20, 1), (80, 300), (35, 230)])
 def test_a_moved_sun_keeps_its_flux_and_stays_sharp(sunny, where):
     source, working, made, params = sunny
@@ -265,6 +267,7 @@ def test_a_light_that_stays_is_scaled_in_place(sunny):
     np.testing.assert_allclose(flux(result), flux(edited), rtol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
 def test_a_light_that_was_added_is_carried(degrees, sunny):
     source, working, made, params = sunny
@@ -281,6 +284,7 @@ def test_a_light_that_was_added_is_carried(degrees, sunny):
     assert 0.3 < inside.max() < (0.95 if degrees < 2 else 0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.03, 0.5, 3.0])
 @pytest.mark.parametrize("width", [256, 1024])
 def test_a_light_that_was_added_is_a_round_gaussian(width, degrees):
@@ -305,6 +309,7 @@ def test_a_light_that_was_added_is_a_round_gaussian(width, degrees):
         np.testing.assert_allclose(result[..., 0], expected, atol=2e-4 * result.max())
 
 
+@pytest.mark.slow
 def test_an_added_light_brings_the_glow_of_the_maps_sun(sunny):
     """As bright as the sun, in its mirror image: the sky around it is as bright as the sun's, and no more."""
     source, working, made, params = sunny
@@ -323,6 +328,7 @@ def test_an_added_light_brings_the_glow_of_the_maps_sun(sunny):
     np.testing.assert_array_equal(result, source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(64, 128), (48, 96), (101, 202), (300, 512)])
 def test_sources_of_any_size(sunny, shape):
     source, working, made, params = sunny
@@ -516,6 +522,7 @@ def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
 # ---- rows below the horizon that follow --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finer", [2, 4])
 @pytest.mark.parametrize("kind", ["mirror", "keep"])
 @pytest.mark.parametrize("saturation", [None, -0.7])

@@ -54,6 +54,7 @@ def told(first, second=None, weight=None, value=0.5):
     return gain_bandwidth.octaves(first, second or first, BACKGROUND, ROWS, picture, weight, 4)
 
 
+@pytest.mark.slow
 def test_a_mirror_tells_every_octave_down_to_the_texel():
     found = told(mirror())
     assert [octave.cycles for octave in found] == [4, 8, 16, 32]

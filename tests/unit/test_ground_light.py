@@ -27,6 +27,7 @@ def whole(above):
     return tensor(np.zeros_like(above))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elevation", [5, 20, 50, 65, 80])
 def test_the_analytic_ground_goes_by_its_irradiance(elevation):
     """``analytic_sky`` lays a ground of one albedo under every sky, from an irradiance of its own making."""

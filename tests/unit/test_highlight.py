@@ -7,6 +7,7 @@ from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles
 from envedit.scene import highlight, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.tiers import slow_but
 
 GLOSSY = {
     "rough": '<bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf>',
@@ -36,7 +37,7 @@ def mirrored(x, y):
     return ray - 2 * (ray @ normal) * normal
 
 
-@pytest.mark.parametrize("kind", GLOSSY)
+@pytest.mark.parametrize("kind", slow_but(GLOSSY, *list(GLOSSY)[:1]))
 def test_it_is_the_direction_of_the_mirror(kind, tmp_path):
     lit = ball(tmp_path, GLOSSY[kind])
     for place in ((0.45, 0.4), (0.56, 0.45), (0.5, 0.55)):
@@ -44,6 +45,7 @@ def test_it_is_the_direction_of_the_mirror(kind, tmp_path):
         assert np.degrees(np.arccos(min(off, 1.0))) < (0.1 if kind in ("coated", "glass") else 6.0)
 
 
+@pytest.mark.slow
 def test_a_light_that_is_put_there_is_seen_there(tmp_path):
     lit, (x, y) = ball(tmp_path, GLOSSY["rough"]), (0.42, 0.45)
     azimuth, elevation = angles(highlight.direction(lit, 0, x, y))
@@ -54,6 +56,7 @@ def test_a_light_that_is_put_there_is_seen_there(tmp_path):
     assert np.abs(places.mean(axis=0) - [y * 48, x * 64]).max() < 2
 
 
+@pytest.mark.slow
 def test_where_no_light_can_do_it_the_reason_is_told(tmp_path):
     for name in "abc":
         (tmp_path / name).mkdir()

@@ -242,6 +242,7 @@ def test_map_statistics_of_a_real_map(data):
     assert float(cells[1]) == pytest.approx(light.max(), rel=1e-3) and cells[2] == f"{row}, {column}"
 
 
+@pytest.mark.slow
 def test_only_what_writes_results_imports_the_report():
     """The rest does without the page; which packages may import which, import-linter says."""
     package = ROOT / "envedit"

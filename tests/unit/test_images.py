@@ -60,6 +60,7 @@ def test_what_cannot_be_read_is_no_panorama(tmp_path):
         with pytest.raises(InputError, match=name):
             images.is_panorama(tmp_path / name)
 
+
 def test_load_envmap(tmp_path, rng):
     p = planes(rng, size=(8, 16))
     p["G"][3, 4] = -2
@@ -81,11 +82,13 @@ def test_load_envmap(tmp_path, rng):
         images.load_envmap(path, width=8)
     found, info = images.load_envmap(path, width=8, repair=True)
     assert np.isfinite(found).all() and (found >= 0).all() and info["repaired"] == 2
-    assert "1 texels are infinite, the first at row 5, column 2: taken for the brightest light, 65504" in (
-        info["warnings"]
+    assert (
+        "1 texels are infinite, the first at row 5, column 2: taken for the brightest light, 65504"
+        in (info["warnings"])
     )
-    assert "1 texels are NaN or -Inf, the first at row 5, column 6: replaced from their neighbours" in (
-        info["warnings"]
+    assert (
+        "1 texels are NaN or -Inf, the first at row 5, column 6: replaced from their neighbours"
+        in (info["warnings"])
     )
     np.testing.assert_allclose(images.load_envmap(path, repair=True)[0][5, 2, 0], 65504)
 

@@ -78,6 +78,7 @@ def test_solid_angles_count_nearest_directions(rng):
     assert np.abs(z).max() < 4.0  # six rows, p = 4e-4 in all
 
 
+@pytest.mark.slow
 def test_lookup_solid_angles_integrate_the_interpolation():
     v, u = (np.arange(2000) + 0.5) / 2000, (np.arange(400) + 0.5) / 400
     theta, phi = np.meshgrid(np.pi * v, 2 * np.pi * u, indexing="ij")
@@ -103,6 +104,7 @@ def test_shrinking_keeps_the_energy(rng, size):
     assert image.min() <= small.min() and small.max() <= image.max()
 
 
+@pytest.mark.slow
 def test_shrinking_is_an_area_average(rng):
     # Brute force: average the nearest source texel over dense directions inside one new texel.
     image = rng.random((9, 18, 3))

@@ -165,6 +165,7 @@ def test_same_image_has_the_same_parameters_and_bits():
 # ---- rows ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "last"), [(0, 40), (10, 40), (12, 64)])
 def test_rows_of_a_map(first, last, sunny):
     image = sky()[first:last]
@@ -350,6 +351,7 @@ def gradients(made, params, weight):
     return {name: dr.grad(value).numpy() for name, value in params.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["unmoved", "moved", "zenith", "nadir"])
 def test_gradient_is_finite(start, rng, sunny):
     made, params = sunny
@@ -364,6 +366,7 @@ def test_gradient_is_finite(start, rng, sunny):
     assert grads["turn"][0].any() and grads["size"][0].any() and grads["flux"][0].all()
 
 
+@pytest.mark.slow
 def test_gradient_by_gain_and_flux_is_the_finite_difference(rng, sunny):
     """With nodes of either sign, so that both branches of the veil are seen."""
     made, params = sunny
@@ -385,6 +388,7 @@ def test_gradient_by_gain_and_flux_is_the_finite_difference(rng, sunny):
         )
 
 
+@pytest.mark.slow
 def test_kept_texels_pull_at_no_gain(rng, sunny):
     made, params = sunny
     weight, free = rng.normal(size=(*SHAPE, 3)), np.zeros(SHAPE, bool)
@@ -398,6 +402,7 @@ def test_kept_texels_pull_at_no_gain(rng, sunny):
 # ---- stress ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(3, 6), (4, 6), (5, 6), (6, 6)])
 def test_smallest_maps(shape, rng):
     image = rng.random((*shape, 3), dtype=np.float32)
@@ -408,6 +413,7 @@ def test_smallest_maps(shape, rng):
         assert np.isfinite(made.decode(p).numpy()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [1e-28, 1e-12, 65504.0, 1e6])
 def test_any_exposure_is_finite(value, rng):
     for image in (sky(SMALL, (8, 47), level=value), grey(value)):

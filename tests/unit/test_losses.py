@@ -131,18 +131,6 @@ def test_luminance_needs_rgb():
         luminance(x, x)
 
 
-@pytest.mark.parametrize("sun", [(0, 0), (100, 200), (511, 511)])
-def test_a_sun_does_not_swallow_the_sky(sun):
-    """Float32 sums in blocks lose 5e-5 here; with the sun in both images the difference is all sky."""
-    sky = np.full((512, 512, 3), 0.1, np.float32)
-    sky[sun] = 1e6
-    value = LOSSES["l1"](single(sky))[0]
-    np.testing.assert_allclose(value, sky.astype(np.float64).sum(), rtol=1e-7)
-    brighter = sky + np.float32(1e-3) * (sky < 1)
-    expected = np.sum((brighter.astype(np.float64) - sky) * REC709)
-    np.testing.assert_allclose(luminance(single(brighter), single(sky))[0], expected, rtol=1e-6)
-
-
 def test_tv_wraps_columns_and_not_rows():
     x = np.zeros((4, 5, 1))
     x[:, 0] = 1
@@ -150,6 +138,7 @@ def test_tv_wraps_columns_and_not_rows():
     assert tv(double(np.swapaxes(x, 0, 1)))[0] * 20 == pytest.approx(4)  # the row below only
 
 
+@pytest.mark.slow
 def test_losses_compose_in_the_graph(rng):
     """A loss is a node like any other: scaled, added to the others, and reached through another operation."""
     x, y = rng.random((16, 16, 3)), rng.random((16, 16, 3))

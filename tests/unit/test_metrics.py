@@ -1,6 +1,5 @@
 """Metrics against closed forms and scikit-image's recorded numbers."""
 
-import json
 import math
 
 import numpy as np
@@ -9,19 +8,12 @@ import pytest
 from envedit.core.color import inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.losses import metrics
-from tests.oracles.plain import IDENTICAL
+from tests.oracles.plain import IDENTICAL, waves
 
 PAIRS = [
     "mse", "psnr", "ssim", "compare",
     "log_psnr", "log_rmse", "sun_offset", "peak_ratio", "mean_luminance_ratio",
 ]  # fmt: skip
-
-
-def waves(height=40, width=56):
-    """Two images by formula, so that another program can make the same ones."""
-    r, c = np.mgrid[:height, :width]
-    y = np.stack([0.5 + 0.4 * np.sin(0.3 * r + 0.11 * c * k) * np.cos(0.07 * k * c) for k in (1, 2, 3)], -1)
-    return y + 0.1 * np.cos(1.7 * r + 2.3 * c)[..., None], y
 
 
 def sky(rng, height=32, width=64):
@@ -55,16 +47,6 @@ def test_compare_states_its_tonemap():
     assert metrics.compare(a, b, tonemap="linear")["mse"] == pytest.approx(0.75**2)
     with pytest.raises(ConfigError, match="tonemap"):
         metrics.compare(a, b, tonemap="gama")
-
-
-@pytest.mark.parametrize("level", [0.0, 1e-30, 65504.0, 1e6, 3e38])
-@pytest.mark.parametrize("shape", [(1, 1, 3), (12, 24, 3)])
-def test_everything_is_finite_or_null(level, shape, rng):
-    a, b = np.full(shape, level, np.float32), rng.random(shape).astype(np.float32)
-    for x, y in ((a, b), (b, a), (a, a)):
-        numbers = [getattr(metrics, name)(x, y) for name in PAIRS[4:]]
-        json.dumps([metrics.compare(x, y), numbers, metrics.high_frequency_energy(x)], allow_nan=False)
-    assert metrics.compare(a, a) == IDENTICAL
 
 
 def test_log_psnr_is_normalised_by_the_reference(rng):

@@ -23,14 +23,7 @@ def test_film_size(tmp_path, asked, size):
     assert loaded.render(np.ones((3, 6, 3)), spp=1).shape == (size[1], size[0], 3)
 
 
-def test_a_cropped_film_keeps_its_crop(tmp_path):
-    crop = "".join(f'<integer name="crop_{k}" value="{v}"/>' for k, v in
-                   {"width": 4, "height": 3, "offset_x": 1, "offset_y": 2}.items())  # fmt: skip
-    path = write_scene(tmp_path, SENSOR.replace("<rfilter", crop + "<rfilter"), BALL, LIGHT)
-    assert scene.load(path).render(np.ones((3, 6, 3)), spp=1).shape == (3, 4, 3)
-    assert scene.load(path, width=8).render(np.ones((3, 6, 3)), spp=1).shape == (6, 8, 3)
-
-
+@pytest.mark.slow
 def test_names_of_plugins_in_capitals_are_those_of_mitsuba_3(tmp_path, rng):
     plane = '<shape type="rectangle"><bsdf type="diffuse"/></shape>'
     image = sky(rng)
@@ -92,6 +85,7 @@ def test_the_emitters_key_is_free_of_clashes(tmp_path):
     assert loaded.envmap_key == "envmap1.data" and loaded.envmap_key in loaded.params
 
 
+@pytest.mark.slow
 def test_zero_roughness_is_the_mirror(rng):
     image = sky(rng)
     smooth = scene.load("sphere", width=16, parameters={"roughness": 0}).render(image, spp=16)

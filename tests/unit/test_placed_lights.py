@@ -95,6 +95,7 @@ def test_keys_that_cannot_be_are_named():
     assert config.loads(config.to_toml(settings)).input.lights == settings.input.lights
 
 
+@pytest.mark.slow
 def test_the_full_map_has_the_same_lights(tmp_path):
     """The map's own resolution against the working one, without a target."""
     wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance

@@ -11,6 +11,8 @@ import pytest
 
 from tests.oracles import ROOT
 
+pytestmark = pytest.mark.slow
+
 IDIOMS = {
     r"\bcame\b[^.;]*\bwanted\b|: came\b": "got X, expected Y",
     r"\bwanted (?:a|an|one|none|the|text|table|whole)\b": "expected",

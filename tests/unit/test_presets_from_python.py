@@ -40,31 +40,6 @@ def test_a_preset_names_the_kind_where_none_is_given(preset, target):
     assert made.representation.kind == ("siren" if preset == "paper" else "layers")
 
 
-@pytest.mark.parametrize(
-    ("preset", "kind", "iterations", "ssim"),
-    [
-        ("draft", "layers", 100, 0.1),
-        ("draft", "siren", 150, 1.0),
-        ("standard", "layers", 100, 0.1),
-        ("standard", "siren", "auto", 1.0),
-        ("standard", "log-pixels", 600, 1.0),
-        ("paper", "siren", 400, (1.0, 1e4)),
-    ],
-)
-def test_the_numbers_of_preset_and_representation(preset, kind, iterations, ssim):
-    made = Config(preset=preset, representation=Representation(kind))
-    assert (made.optimizer.iterations, made.loss.ssim) == (iterations, ssim)
-
-
-@pytest.mark.parametrize("target", ["image", "strokes"])
-def test_the_numbers_of_a_painted_target(target):
-    changes = {preset: Config(preset=preset, target=Target(**TARGETS[target])).loss for preset in PRESETS}
-    assert {preset: loss.change for preset, loss in changes.items()} == {
-        "draft": 0.01, "standard": 0.01, "paper": 0.0,
-    }  # fmt: skip
-    assert changes["paper"].luminance == (1e-5, 1e-9)
-
-
 @pytest.mark.parametrize("preset", PRESETS)
 def test_what_is_given_goes_before_the_preset(preset):
     made = Config(

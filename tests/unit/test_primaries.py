@@ -118,6 +118,7 @@ def test_chromaticities_that_are_no_primaries_are_refused(space, tmp_path, rng):
         images.read(exr(tmp_path / "a.exr", {"chromaticities": space}, **planes(rng)))
 
 
+@pytest.mark.slow
 @on_cpu
 def test_acescg_goes_out_if_it_came_in(tmp_path, isolated, capsys, monkeypatch):
     """An edit of an ACEScg map is written in ACEScg; texels that are not edited keep their bits."""

@@ -43,6 +43,7 @@ def test_nothing_but_non_finite_contributions_is_an_empty_record(monkeypatch):
     assert got.lost == 2 and got.weights.shape == (0, 3) and len(got.pixels) == len(got.texels) == 0
 
 
+@pytest.mark.slow
 def test_transport_says_how_many_were_left_out(monkeypatch):
     s = scene.load("matte", 8, 8)
     options = {"spp": 4, "max_depth": 2, "memory_gb": 0.1, "refresh": 1}
@@ -84,6 +85,7 @@ def test_depth_follows_the_light_by_bounce():
             recording.choose_bounces(s, depth, light * (depth == 2))
 
 
+@pytest.mark.slow
 def test_depth_error_is_the_share_of_a_rendering_without_bound():
     """In the middle of a long white tube: paths of nine segments lack a part of the picture."""
     eye = mi.ScalarTransform4d().look_at([0, 0, 0], [1, 0, 0], [0, 1, 0])

@@ -48,6 +48,7 @@ PAINTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", PAINTED)
 def test_what_keeps_the_noise_of_the_rendering_is_painted(how, sphere):
     """All over it: there is no part that equals the rendering."""
@@ -55,6 +56,7 @@ def test_what_keeps_the_noise_of_the_rendering_is_painted(how, sphere):
     assert tell(sphere, eight_bit(PAINTED[how](sphere[2]))) == (False, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 5])
 def test_what_was_rendered_under_other_light_is_not(seed, sphere):
     """With another seed, and with the same, whose paths go elsewhere."""
@@ -65,6 +67,7 @@ def test_what_was_rendered_under_other_light_is_not(seed, sphere):
     assert tell(sphere, eight_bit(picture))[0]
 
 
+@pytest.mark.slow
 def test_without_noise_it_was_not_painted_on_the_rendering(sphere):
     """A denoised picture of another light, or one of many samples."""
     lit, envmap, _, _ = sphere
@@ -134,6 +137,7 @@ def test_samples_have_ends(rng):
     assert few == 1 and many == rendered_anew.MOST_SAMPLES
 
 
+@pytest.mark.slow
 def test_samples_of_a_rendering_are_nearly_those_it_was_made_with(sphere):
     """Where noise is uneven, up to twice as little of it is found, and four times the samples."""
     lit, envmap, on, _ = sphere

@@ -29,6 +29,7 @@ def test_deeply_nested_elements_are_refused(tmp_path, depth):
     refused(write_scene(tmp_path, SENSOR, LIGHT, nested(depth)), r"line \d+: more than 20 elements inside")
 
 
+@pytest.mark.slow
 def test_a_long_chain_of_references_is_refused_and_a_short_one_is_not(tmp_path):
     def chain(length):
         parts = [f'<bsdf type="twosided" id="b{i}"><ref id="b{i + 1}"/></bsdf>' for i in range(length)]

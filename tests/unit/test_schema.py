@@ -241,6 +241,7 @@ tables = given_keys(
 )
 
 
+@pytest.mark.slow
 @quick
 @given(tables)
 @example({"scene": {"parameters": {"most": 3.4028234663852886e38}}})
@@ -283,12 +284,14 @@ def only_config_errors(call):
         assert cfg.loads(cfg.to_toml(config)) == config
 
 
+@pytest.mark.slow
 @quick
 @given(st.dictionaries(keys, st.dictionaries(keys, anything, max_size=3) | anything, max_size=4) | anything)
 def test_junk_tables_raise_nothing_but_config_errors(table):
     only_config_errors(lambda: cfg.from_dict(table))
 
 
+@pytest.mark.slow
 @quick
 @given(st.sampled_from(list(schema.FIELDS)), st.data())
 def test_junk_values_raise_nothing_but_config_errors(table, data):

@@ -460,6 +460,7 @@ def test_a_sunny_sky_has_its_sun_and_no_ghost_of_it(name, data):
     assert (m @ LUMINANCE)[away < 10].max() > 1000 * surroundings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OVERCAST)
 def test_an_overcast_sky_has_no_light(name, data):
     assert checked(real(data, name)).lights == []

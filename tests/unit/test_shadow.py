@@ -45,6 +45,7 @@ def test_the_occluder_is_found_and_the_light_follows_the_pointer(lit):
     assert toward @ (point - there) / np.linalg.norm(point - there) > np.cos(np.radians(0.2))
 
 
+@pytest.mark.slow
 def test_a_light_that_is_put_there_casts_its_shadow_there(lit):
     sun = direction(60.0, 40.0)
     point = shadow.occluder(lit, 0, *on_picture(-sun / sun[1]), sun)

@@ -66,6 +66,7 @@ def test_the_area_covered_is_that_of_the_shape_at_any_resolution(shape, area, si
     assert covered(size, **shape).mean() == pytest.approx(area, rel=5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("softness", [0.01, 0.1])
 @pytest.mark.parametrize("shape", [shape for shape, _ in AREAS])
 def test_soft_shapes_cover_the_same_share_at_any_resolution(shape, softness):
@@ -409,16 +410,9 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
     "stroke, says",
     [
         ("amount = 1", "target.strokes[1].type: got none, expected one of shadow, light, erase-shadow"),
-        ("type = 'shade'", "target.strokes[1].type: got 'shade', expected one of"),
         ("type = 'shade'", "did you mean shadow?"),
-        ("type = 3", "target.strokes[1].type: got 3"),
         (f"type = 'shadow', {DOT}, widht = 1", "type shadow, has no key 'widht'; did you mean width?"),
-        (
-            f"type = 'shadow', {DOT}, kelvin = 1",
-            "target.strokes[1], type shadow, has no key 'kelvin'; known:",
-        ),
         ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
-        ("type = 'erase-shadow', softness = 1", "got no shape"),
         (f"type = 'light', {DOT}, ellipse = [0, 0, 1, 1]", "got points and ellipse, expected one shape"),
         ("type = 'light', points = [[0, 0]]", "target.strokes[1].width: got none, expected the width"),
         (
@@ -426,24 +420,11 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
             "target.strokes[1].width: got 0, expected a number above",
         ),
         (
-            "type = 'light', points = [[0, 0]], width = inf",
-            "target.strokes[1].width: got inf, expected a finite",
-        ),
-        (
             "type = 'blur', radius = 1, width = 1",
             "target.strokes[1].width: got 1, expected none without points",
         ),
         ("type = 'light', width = 1, points = []", "target.strokes[1].points: got [], expected [[x, y]"),
-        ("type = 'light', width = 1, points = 3", "target.strokes[1].points: got 3"),
         ("type = 'light', width = 1, points = [[0, 0], [1]]", "target.strokes[1].points[1]: got [1]"),
-        (
-            "type = 'light', width = 1, points = [[0, nan]]",
-            "target.strokes[1].points[0]: got [0, nan], expected a",
-        ),
-        (
-            "type = 'light', polygon = [[0, 0], [1, 1]]",
-            "target.strokes[1].polygon: got [[0, 0], [1, 1]], expected",
-        ),
         ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
         ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
         ("type = 'light', ellipse = [0, 0, 1, 0]", "ellipse: got [0, 0, 1, 0], expected a number above 0"),
@@ -451,28 +432,18 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
             "type = 'light', rectangle = [1, 0, 0, 1]",
             "rectangle: got [1, 0, 0, 1], expected [x0, y0, x1, y1] with",
         ),
-        ("type = 'light', rectangle = [0, 0, 1, 'a']", "rectangle: got [0, 0, 1, 'a'], expected a number"),
         (f"type = 'light', {DOT}, color = [1, -1, 1]", "target.strokes[1].color: got [1, -1, 1], expected"),
-        (f"type = 'light', {DOT}, color = [1, 1]", "expected a list of 3 numbers"),
         (f"type = 'light', {DOT}, color = '#ffd9a'", "[r, g, b], or a colour such as"),
         (
             f"type = 'light', {DOT}, amount = -1",
             "target.strokes[1].amount: got -1, expected a number of at least 0",
         ),
-        (f"type = 'shadow', {DOT}, amount = 1.5", "target.strokes[1].amount: got 1.5, expected"),
         (f"type = 'shadow', {DOT}, opacity = 2", "target.strokes[1].opacity: got 2, expected"),
-        (f"type = 'shadow', {DOT}, softness = -1", "target.strokes[1].softness: got -1, expected"),
-        (f"type = 'shadow', {DOT}, softness = true", "target.strokes[1].softness: got true, expected"),
         (
             f"type = 'shadow', {DOT}, units = 'pixel'",
             "units: got 'pixel', expected one of fraction, pixels; did",
         ),
         ("type = 'temperature'", "target.strokes[1].kelvin: got none, expected a number"),
-        (
-            "type = 'temperature', kelvin = 1000",
-            "target.strokes[1].kelvin: got 1000, expected a number of at least",
-        ),
-        ("type = 'blur'", "target.strokes[1].radius: got none"),
         ("type = 'blur', radius = 0", "target.strokes[1].radius: got 0, expected a number above 0"),
     ],
 )

@@ -282,6 +282,7 @@ def test_a_file_of_a_target_map_that_is_no_panorama_is_a_picture(ball, pictured,
         target.make(asking(file=str(paint(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
 
 
+@pytest.mark.slow
 def test_a_painted_image_that_was_rendered_anew_is_solved_as_a_rendering(tmp_path, rng):
     """And one that was painted all over the rendering is not; a mask says that it was painted."""
     lit = scene.load("sphere", 48)
@@ -341,6 +342,7 @@ def test_a_target_without_weight_is_refused():
 # ---- pixels that see no surface ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     """Of a scene that hides what lights it: weights are shared out among pixels that see a surface."""
     ball = scene.load(write_scene(tmp_path, HIDDEN, SENSOR, BALL, LIGHT))

@@ -78,6 +78,7 @@ plain = st.recursive(
 )
 
 
+@pytest.mark.slow
 @quick
 @given(st.dictionaries(words, plain, max_size=3))
 def test_nested_values_are_written_and_come_back(table):

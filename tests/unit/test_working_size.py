@@ -68,6 +68,7 @@ def test_views_are_scaled_each_by_itself(rng):
     assert np.array_equal(working_size.at_size(blocks, to, of), blocks.repeat(2, axis=0).repeat(2, axis=1))
 
 
+@pytest.mark.slow
 def test_a_rendered_target_is_rendered_on_the_smaller_film():
     asked = settings(target={"rotate_degrees": 90.0, "spp": 64})
     lit = scene.load("sphere", 24)
@@ -79,6 +80,7 @@ def test_a_rendered_target_is_rendered_on_the_smaller_film():
     assert np.abs(found.picture - blocks).mean() < 0.1 * blocks.mean()
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_scene_is_made_smaller_and_less_noisy(tmp_path):
     """Its samples are those of its pixels, four times as many a pixel; a mask stays beside it."""
     lit = scene.load("sphere", 48)
@@ -95,6 +97,7 @@ def test_a_picture_of_the_scene_is_made_smaller_and_less_noisy(tmp_path):
     assert 2 * wanted.spp < found.spp < 8 * wanted.spp and found.noise.max() < 0.8 * wanted.noise.max()
 
 
+@pytest.mark.slow
 def test_paint_keeps_its_change_and_its_weight():
     asked = settings(target={"kind": "strokes", "strokes": [SQUARE], "spp": 64})
     lit = scene.load("sphere", 24)

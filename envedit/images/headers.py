@@ -52,7 +52,8 @@ def check_declared(name: str, width: int, height: int) -> None:
 
 def damaged(name: str, reason: object) -> InputError:
     """Return the error for a file that starts well and cannot be decoded."""
-    reason = shown(" ".join(str(reason).split()), 160) or "no reason given"
+    without_name = str(reason).replace(str(name), "the file")  # which a cut would leave in part
+    reason = shown(" ".join(without_name.split()), 160) or "no reason given"
     return InputError(f"{name}: damaged or truncated ({reason}); export or download it again")
 
 

@@ -27,6 +27,7 @@ def browser():
     if CHROMIUM is None:
         pytest.skip("no chromium on this machine")
     gl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    sync_api.expect.set_options(timeout=120_000)  # a busy machine answers late
     with sync_api.sync_playwright() as playwright:
         found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *gl])
         yield found
@@ -69,6 +70,7 @@ class Page:
 
     def __init__(self, browser, url):
         self.page = browser.new_page(viewport={"width": 1280, "height": 720})
+        self.page.set_default_timeout(120_000)
         self.faults, self.asked = [], []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("console", lambda m: self.faults.append(m.text) if m.type == "error" else None)
@@ -78,11 +80,11 @@ class Page:
 
     def settled(self, rendered=True):
         """Wait for the solution of the last edit and the rendering that follows it."""
-        self.page.wait_for_function(SOLVED, timeout=120_000)
-        sync_api.expect(self.status).to_have_attribute("data-state", "done", timeout=120_000)
+        self.page.wait_for_function(SOLVED)
+        sync_api.expect(self.status).to_have_attribute("data-state", "done")
         if rendered:
             done = re.compile(r"path traced with (64|128|256)")  # by a busy machine not each is seen
-            sync_api.expect(self.status).to_contain_text(done, timeout=120_000)
+            sync_api.expect(self.status).to_contain_text(done)
 
     def at(self, name, x, y):
         box = self.page.locator(name).bounding_box()
@@ -164,13 +166,13 @@ def test_another_explanation_is_chosen(browser, tmp_path):
         sync_api.expect(holder).to_be_hidden()
         page.page.get_by_test_id("tool-erase-shadow").click()
         page.drag(*(page.at("#overlay", 0.52 + 0.04 * k, 0.3) for k in range(5)))
-        sync_api.expect(page.page.get_by_test_id("explanation-1")).to_contain_text("%", timeout=120_000)
+        sync_api.expect(page.page.get_by_test_id("explanation-1")).to_contain_text("%")
         page.settled(False)
         page.shot("explanations")
         before = page.picture("map")
         page.page.get_by_test_id("explanation-1").click()
         sync_api.expect(page.page.get_by_test_id("explanation-1")).to_have_attribute("aria-pressed", "true")
-        sync_api.expect(page.status).to_have_attribute("data-state", "done", timeout=120_000)
+        sync_api.expect(page.status).to_have_attribute("data-state", "done")
         assert page.picture("map") != before
         page.page.get_by_test_id("undo").click()
         sync_api.expect(holder).to_be_hidden(timeout=120_000)
@@ -206,7 +208,7 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         # ---- A stroke, with the sky and the rest as chosen
         page.page.get_by_test_id("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.6 + 0.1 * k, 0.8) for k in range(4)))
-        sync_api.expect(page.status).to_contain_text("% of the paint reached", timeout=120_000)
+        sync_api.expect(page.status).to_contain_text("% of the paint reached")
         page.page.get_by_test_id("freedom").fill("0.6")
         page.page.get_by_test_id("rest").select_option("keep")
         until(lambda: "freedom = 0.6" in kept.read_text() and 'rest = "keep"' in kept.read_text())

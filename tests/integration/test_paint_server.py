@@ -114,7 +114,8 @@ def test_bad_messages_are_told_and_huge_ones_end_the_connection(server):
             page.send("x" * (2 << 20))
             while True:
                 page.recv(timeout=60)
-        assert closed.value.rcvd.code == 1009
+        # Without a code where the server hangs up while the message is still being sent.
+        assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
     assert server.worker.is_alive()
 
 

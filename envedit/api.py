@@ -110,8 +110,13 @@ def edit(
                 stack.enter_context(built_scene.kept(scene))
             loaded = _loaded(scene, chosen.scene, base)
             chosen = _of_scene(chosen, loaded)
-        in_order = (arrays.get(name) for name in ("envmap", "target_map", "target", "mask"))
-        memory = inputs.Given(loaded, *in_order)
+        memory = inputs.Given(
+            scene=loaded,
+            envmap=arrays.get("envmap"),
+            target_map=arrays.get("target_map"),
+            picture=arrays.get("target"),
+            mask=arrays.get("mask"),
+        )
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
     if any(warnings):
         result.warnings[:0] = filter(None, warnings)

@@ -182,8 +182,14 @@ class _Edit:
             self.small = working_size.smaller(settings, self.scene)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")
-            arrays = self.memory.picture, self.memory.mask, self.memory.target_map
-            self.target = make_target(settings, self.scene, self.original, *arrays)
+            self.target = make_target(
+                settings,
+                self.scene,
+                self.original,
+                picture=self.memory.picture,
+                mask=self.memory.mask,
+                other=self.memory.target_map,
+            )
             self.warnings += self.target.warnings
 
     @property
@@ -405,16 +411,19 @@ class _Edit:
         initial, target, edited = (self.renders[name][rows] for name in ("initial", "target", "edited"))
         seen = None if self.scene.alpha is None else self.scene.alpha[rows] > 0
         tonemap = self.settings.output.tonemap
-        how = (tonemap, self.lpips, seen, views)
+
+        def compare(picture, other):
+            return metrics.compare(picture, other, tonemap, self.lpips, seen, views)
+
         measures = {
-            "render": metrics.compare(edited, target, *how),
-            "initial": metrics.compare(initial, target, *how),
+            "render": compare(edited, target),
+            "initial": compare(initial, target),
             "ceiling": None,
             "painted": None,
         }
         if self.ceiling:
             again, picture = self.ceiling
-            measures["ceiling"] = metrics.compare(again[rows], picture[rows], *how)
+            measures["ceiling"] = compare(again[rows], picture[rows])
         if self.target.coverage is not None:
             noise = None if self.noise is None else self.noise[rows]
             coverage = self.target.coverage[rows]

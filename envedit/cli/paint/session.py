@@ -106,6 +106,8 @@ class Session:
         self._saving = self.solving = False
         self.newer = lambda: not self._saving and newer()
         self.reach: feasibility.Reach | None = None  # of what is painted, once it is known
+        self.explanations: list[search.Explanation] = []  # of the paint; one of them is shown
+        self.explanation = 0
         self._kept = project.document  # as painted.toml has it
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
@@ -245,7 +247,8 @@ class Session:
     def _paint(self):
         """Paint the strokes and aim the solution at them."""
         chosen, self.reach, self.searched, self.advised = self._chosen, None, False, False
-        self._explain([])
+        if self.explanations:
+            self._explain([])
         self.hold = first_hold(chosen)
         painted = self._after(list(self.document.strokes), chosen.target.display_tonemap)
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)

@@ -38,14 +38,12 @@ SCALES = {"turn": 0.1, "flux": 1.0, "size": 0.5, "saturation": 1.0}
 """Unit of each parameter, in radians and logarithms: one learning rate then suits all. Not measured."""
 
 GROUND = 0.3
-"""Unit of the log factor of ground, a logarithm: by so much the colour of daylight changes. With 1, Adam,
-which has no prior, made ground pink under a mirror (three edits of the analytic sky: maps 34.3, 27.1 and
-22.1 dB; with 0.3 36.5, 33.4 and 28.9)."""
+"""Unit of the log factor of ground, a logarithm: by so much the colour of daylight changes. With a larger one
+Adam, which has no prior, colours ground under a mirror (``docs/decisions/gain_of_the_sky.md``)."""
 
 SATURATION_STEP = 0.05
-"""Step of the difference by the log saturation, towards grey. Not measured beside other steps. The tangent in
-its place (forward-mode derivative) differs by 0.2 to 0.7 % of the largest value; with it two of four small
-edits towards renderings ended 1.0 and 0.7 dB lower, one of them after 22 steps in place of 14."""
+"""Step of the difference by the log saturation, towards grey. Not measured beside other steps; why it is no
+tangent: ``docs/decisions/slope_of_the_saturation.md``."""
 
 
 @dataclass(frozen=True)
@@ -355,12 +353,15 @@ class Layers:
         """
         real = self._real(params)
         fields = self._fields(real)
-        followed = self._log_below(real, self._above(real), None) if self.mirrored else None
+        log_followed, log_gain = None, None
+        if self.mirrored:
+            log_followed, log_gain = self._log_below(real, self._above(real), None)
 
         def sky_at(log_saturation):
             sky = dr.ravel(self._above(real, replace(fields, log_saturation=log_saturation)).sky)
-            if followed:
-                sky = dr.concat((sky, dr.ravel(self._low(log_saturation, *followed).sky)))
+            if self.mirrored:
+                low = self._low(log_saturation, log_followed, log_gain)
+                sky = dr.concat((sky, dr.ravel(low.sky)))
             return sky.numpy().reshape(-1, self.whole[1], 3)
 
         log_saturation = real["saturation"].array

@@ -85,6 +85,7 @@ function show(frame) {
 let explanations = []; // their displays
 function explain(message) {
   $("explanations").hidden = !message.explanations.length;
+  if (!message.explanations.length) frames.explanation = [];
   explanations = message.explanations.map(() => new Display(document.createElement("canvas"), "radiance", true));
   $("explanations").replaceChildren(...message.explanations.map(({ name, reached }, i) => {
     const button = document.createElement("button");

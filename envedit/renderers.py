@@ -7,7 +7,7 @@ from typing import Protocol
 import mitsuba as mi
 
 from envedit import config
-from envedit.core import array_cache
+from envedit.core import array_cache, extensions
 from envedit.core.errors import ConfigError
 from envedit.core.types import Progress
 from envedit.scene import scene
@@ -56,6 +56,9 @@ def make(
     chosen = settings.renderer
     if chosen.kind == "path":
         return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
+    if chosen.kind != "transport":
+        renderer: Renderer = extensions.load(extensions.RENDERERS, chosen.kind)(settings, lit, shape)
+        return renderer
     return trace(settings, lit, shape, progress)
 
 

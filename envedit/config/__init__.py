@@ -1,5 +1,6 @@
 """Configuration: TOML to frozen dataclasses, with presets, checks and errors that name the key."""
 
+from envedit.config.input_schema import TARGET_KINDS
 from envedit.config.reading import from_dict, load, loads, parse_override, preset_names
 from envedit.config.schema import (
     Config,
@@ -19,6 +20,7 @@ from envedit.config.toml import quote, to_toml
 from envedit.config.unused import unused
 
 __all__ = [
+    "TARGET_KINDS",
     "Config",
     "Fit",
     "Input",

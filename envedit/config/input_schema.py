@@ -9,12 +9,15 @@ from envedit.config.light_schema import LightList
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.tables import EDITED, LAYERS, Table, key
 from envedit.config.validators import Boolean, Choice, Integer, Number, OneOrMore, OrAuto, String, show
+from envedit.core import extensions
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 from envedit.core.primaries import SPACES
 
 TURN_DEGREES = 60.0
 """Turn of the target's map where neither a map nor a turn is given."""
+TARGET_KINDS = ("envmap", "rendering", "image", "strokes", "none")
+"""Kinds of target that are built in."""
 _PAINTED = {"target.kind": ("image", "strokes")}
 _PICTURES = "rendering", "image"
 _SUNSKY = {"input.envmap": ("sunsky", "auto")}
@@ -116,7 +119,7 @@ class Target(Table):
 
     kind: str = key(
         "envmap",
-        Choice("envmap", "rendering", "image", "strokes", "none"),
+        Choice(*TARGET_KINDS, group=extensions.TARGETS),
         "given by: another map, a picture of the scene under other light, a painted image, or strokes; "
         '"none": only [lights], exposure, white balance',
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from envedit.config.key_validators import Ramp, Weight
 from envedit.config.tables import ADAM_STEPS, EDITED, LAYERS, SIREN, TRANSPORT, Table, key
 from envedit.config.validators import Boolean, Choice, Integer, Number, OrAuto, String
+from envedit.core import extensions
 from envedit.core.errors import ConfigError
 
 _DISTS = {"loss.dists": ()}
@@ -18,7 +19,7 @@ class Representation(Table):
 
     kind: str = key(
         "layers",
-        Choice("layers", "siren", "pixels", "log-pixels"),
+        Choice("layers", "siren", "pixels", "log-pixels", group=extensions.REPRESENTATIONS),
         "layers (lights and a smooth gain), siren (the paper's), pixels (radiance) or log-pixels",
     )
     cycles: int | str = key(
@@ -191,7 +192,10 @@ class Renderer(Table):
     """How the rendering is computed while editing."""
 
     kind: str = key(
-        "transport", Choice("transport", "path"), "stored transport, or a path tracer", when=EDITED
+        "transport",
+        Choice("transport", "path", group=extensions.RENDERERS),
+        "stored transport, or a path tracer",
+        when=EDITED,
     )
     spp: int | str = key(
         "auto",

@@ -19,6 +19,7 @@ from numbers import Integral, Real
 from os import PathLike, fspath
 from typing import Any
 
+from envedit.core import extensions
 from envedit.core.errors import ConfigError
 
 Schema = dict[str, Any]
@@ -108,22 +109,28 @@ class Boolean(Check):
 
 @dataclass(frozen=True, init=False)
 class Choice(Check):
-    """One of some names."""
+    """One of some names, or of those that installed packages add to a group of entry points."""
 
     names: tuple[str, ...]
+    group: str
     kind = "string"
 
-    def __init__(self, *names: str) -> None:
+    def __init__(self, *names: str, group: str = "") -> None:
         object.__setattr__(self, "names", names)
+        object.__setattr__(self, "group", group)
+
+    @property
+    def _added(self) -> tuple[str, ...]:
+        return extensions.names(self.group) if self.group else ()
 
     def _take(self, value: Any) -> str:
-        if isinstance(value, str) and value in self.names:
+        if isinstance(value, str) and (value in self.names or value in self._added):
             return value
         close = difflib.get_close_matches(value[:60], self.names, 1) if isinstance(value, str) else ()
         raise WantedError(f"{self}{f'; did you mean {close[0]}?' if close else ''}")
 
     def __str__(self) -> str:
-        return f"one of {', '.join(self.names)}"
+        return f"one of {', '.join([*self.names, *self._added])}"
 
     @property
     def range(self) -> str:
@@ -131,7 +138,7 @@ class Choice(Check):
         return ", ".join(f'"{name}"' for name in self.names)
 
     def _schema(self) -> Schema:
-        return {"enum": list(self.names)}
+        return {"enum": [*self.names, *self._added]}
 
 
 # ---- numbers -----------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from envedit import config
+from envedit.core import extensions
 from envedit.core.types import Params
 from envedit.representations.base import Encoder, Representation
 from envedit.representations.layers.gain import CYCLES
@@ -29,8 +30,8 @@ def make(
 
     Raises
     ------
-    ValueError
-        Of any other kind.
+    ConfigError
+        As of :func:`.extensions.load`, of a kind that another package adds.
     """
     kind = settings.representation.kind
     if kind == "pixels":
@@ -38,7 +39,8 @@ def make(
     if kind == "log-pixels":
         return LogPixels()
     if kind != "siren":
-        raise ValueError(f"make: got kind {kind!r}, expected siren, pixels or log-pixels")
+        encoder: Encoder = extensions.load(extensions.REPRESENTATIONS, kind)(settings, rows)
+        return encoder
     recipe = settings.fit if settings.fit.polish == "always" else fit.unpolished(settings.fit)
     return Siren(settings.representation, recipe, folder, progress, rows)
 

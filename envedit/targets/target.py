@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core import latlong
+from envedit.core import extensions, latlong
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import BRIGHTEST, require_radiance
@@ -134,7 +134,7 @@ def make(
         If a file cannot be read, a picture does not fit the film, or the other map is brighter than
         :data:`.radiance.BRIGHTEST`. A picture that is so bright is cut there, with a warning.
     ConfigError
-        If a view is not the scene's, or is given twice.
+        If a view is not the scene's, or is given twice; as of :func:`.extensions.load`.
     """
     chosen, alpha = settings.target, scene.alpha
     hidden = None if alpha is None else alpha == 0
@@ -145,6 +145,9 @@ def make(
         return _seen(made, hidden, settings.output.tonemap)
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
+    if chosen.kind not in config.TARGET_KINDS and picture is None:
+        picture = extensions.load(extensions.TARGETS, chosen.kind)(settings, scene, envmap)
+        chosen = replace(chosen, kind="rendering")
     if chosen.kind == "rendering":
         if picture is None and not chosen.file:  # an array may take its place
             raise ConfigError(

@@ -98,7 +98,7 @@ def test_an_image_is_encoded_as_the_configuration_asks_for(kind, rng):
 
 
 def test_layers_are_not_made_without_an_image():
-    with pytest.raises(ValueError, match="got kind 'layers'"):
+    with pytest.raises(ValueError, match="kind 'layers' of envedit.representations"):
         representations.make(config.Config(representation=config.Representation(kind="layers")))
 
 

@@ -1,7 +1,6 @@
 """One run from configuration to result: load, solve, adjust, render, measure.
 
 Nothing here prints or writes but the checkpoint; ``cli`` and ``report`` do, with what this returns.
-Longer than 400 lines: the stages of a run stand in the order in which they are made.
 """
 
 from __future__ import annotations

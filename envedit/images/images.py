@@ -3,8 +3,6 @@
 An image is a float32 array ``(H, W, 3)`` of linear radiance with Rec.709 primaries. Problems that a user can
 mend raise ``InputError`` with the file's name; what is merely odd goes to ``info["warnings"]``, a list of
 sentences.
-
-Longer than 400 lines: reading takes files and arrays, with the same checks.
 """
 
 from __future__ import annotations
@@ -176,61 +174,86 @@ def load_envmap(
     """
     if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
         raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
+    # ---- Read
     if isinstance(path, np.ndarray):
         image, info = _of_array(path, name, space)
     else:
         image, info = _decode(path, stored=False, space=space)
     if convert:
         image = marks.in_rec709(image, info)
-    name, warnings = info["path"], info["warnings"]
+
+    # ---- Check and mend
+    _check_shape(image, info)
+    info["health"] = radiance.health(image)
+    info["repaired"] = 0
+    info["clipped"] = info["health"].negative
+    if info["health"].nan or info["health"].inf:
+        image = _repaired(image, info, repair)
+    image = np.maximum(image, 0)  # also turns -0.0 into 0
+    info["warnings"] += _oddities(info["health"], image)
+
+    # ---- Bring to the width asked for
+    columns = info["size"][0]
+    if width is not None and width > columns:
+        info["warnings"].append(f"enlarged from {columns} to {width} texels across: no detail is added")
+    across = width or columns
+    if image.shape[1] != across:
+        image = latlong.resize(image, across // 2, across)
+    return image, info
+
+
+def _check_shape(image, info):
+    """Refuse what is no lat-long map; of one that a texel's rounding made odd, correct ``info["size"]``."""
+    name = info["path"]
     rows, columns = image.shape[:2]
     if abs(columns - 2 * rows) > 1:
         raise InputError(f"{name}: a lat-long map is 2:1, this is {columns} x {rows}{_remedy(image, info)}")
     if rows < latlong.MIN_HEIGHT:
         raise InputError(f"{name}: {columns} x {rows} texels are too few for a map; use at least 6 x 3")
     if columns != 2 * rows:
-        warnings.append(f"{columns} x {rows} texels are not 2:1: resampled to {2 * rows} x {rows}")
-        columns = 2 * rows
-        info["size"] = columns, rows
-    found = info["health"] = radiance.health(image)
-    info["repaired"], info["clipped"] = 0, found.negative
-    if found.nan or found.inf:
-        bad = radiance.any_channel(~np.isfinite(image))
-        info["repaired"] = int(bad.sum())
-        if not repair:
-            where = f"{info['repaired']} texels are NaN or infinite, the first at {place_of(bad)}"
-            raise InputError(f"{name}: {where}; repair the map, or ask for repair")
-        try:
-            image, overflowed, replaced = radiance.repair(image)
-        except InputError as e:
-            raise InputError(f"{name}: {e}") from None
-        if overflowed.any():
-            where = f"{overflowed.sum()} texels are infinite, the first at {place_of(overflowed)}"
-            warnings.append(f"{where}: taken for the brightest light, {image[overflowed].max():g}")
-        if replaced.any():
-            where = f"{replaced.sum()} texels are NaN or -Inf, the first at {place_of(replaced)}"
-            warnings.append(f"{where}: replaced from their neighbours")
-    if found.first_negative:
-        row, column = found.first_negative
+        info["warnings"].append(f"{columns} x {rows} texels are not 2:1: resampled to {2 * rows} x {rows}")
+        info["size"] = 2 * rows, rows
+
+
+def _repaired(image, info, repair):
+    """Mend texels that are not finite, or refuse them."""
+    name = info["path"]
+    bad = radiance.any_channel(~np.isfinite(image))
+    info["repaired"] = int(bad.sum())
+    if not repair:
+        where = f"{info['repaired']} texels are NaN or infinite, the first at {place_of(bad)}"
+        raise InputError(f"{name}: {where}; repair the map, or ask for repair")
+    try:
+        image, overflowed, replaced = radiance.repair(image)
+    except InputError as e:
+        raise InputError(f"{name}: {e}") from None
+    if overflowed.any():
+        where = f"{overflowed.sum()} texels are infinite, the first at {place_of(overflowed)}"
+        info["warnings"].append(f"{where}: taken for the brightest light, {image[overflowed].max():g}")
+    if replaced.any():
+        where = f"{replaced.sum()} texels are NaN or -Inf, the first at {place_of(replaced)}"
+        info["warnings"].append(f"{where}: replaced from their neighbours")
+    return image
+
+
+def _oddities(health, image):
+    """List what is odd in a map: warnings."""
+    warnings = []
+    if health.first_negative:
+        row, column = health.first_negative
         where = f"the first at row {row}, column {column}"
         warnings.append(
-            f"{found.negative} texels are negative (down to {found.minimum:.3g}), {where}: set to 0"
+            f"{health.negative} texels are negative (down to {health.minimum:.3g}), {where}: set to 0"
         )
-    image = np.maximum(image, 0)  # also turns -0.0 into 0
-    if found.first_saturated:
-        row, column = found.first_saturated
+    if health.first_saturated:
+        row, column = health.first_saturated
         warnings.append(
-            f"{found.saturated} texels sit at 65504, the largest half, the first at row {row}, "
+            f"{health.saturated} texels sit at 65504, the largest half, the first at row {row}, "
             f"column {column}: the light was cut when the file was saved"
         )
     if not image.any():
         warnings.append("the map is black: it lights nothing")
-    if width is not None and width > columns:
-        warnings.append(f"enlarged from {columns} to {width} texels across: no detail is added")
-    across = width or columns
-    if image.shape[1] != across:
-        image = latlong.resize(image, across // 2, across)
-    return image, info
+    return warnings
 
 
 _SHAPES = {

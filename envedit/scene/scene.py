@@ -16,8 +16,6 @@ Maps are radiance as it reaches the scene: a ``scale`` of the environment emitte
 is built (:mod:`envedit.inputs` applies it to what a file holds). With scene and camera fixed a rendering is
 I = T E + I_0: linear in the map E, plus a constant I_0 where the scene has lamps besides its environment,
 which stay as they are.
-
-Longer than 400 lines: what is changed in a scene before it is built belongs to how it is rendered.
 """
 
 from __future__ import annotations

@@ -14,8 +14,6 @@ Two tiers, both unbiased for paths up to the path depth:
 
 T E = T_coarse (E outside the columns) + T_exact (E inside them). What it costs follows the light, not the
 grid.
-
-Longer than 400 lines: one class; both tiers, their memory and their checkpoint are one state.
 """
 
 from __future__ import annotations

@@ -8,8 +8,6 @@ While strokes change, the present solution goes on: Gauss-Newton steps from wher
 target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit
 that is saved is the pipeline's, which paints on Mitsuba's rendering, goes on from the solution here, and
 judges its result.
-
-Longer than 400 lines: one class; edits, idle work and frames act on the same solution.
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ The formula is that of ``composition.py``, at the texels of a working map: light
 follow those above (``below_horizon.py``), or are edited like them. Where exp(g) is above 1, what it adds is
 in part luminance (:func:`.brightened`). Unmoved lights, no gain and k = 1 give the original back, bit for bit
 outside the cores: the sky's own detail is kept.
-
-Longer than 400 lines: one class, from the image to derivatives.
 """
 
 from __future__ import annotations

@@ -9,14 +9,13 @@ all of it: no blur; turned about the vertical, a light is interpolated as any tu
 
 The shares are piecewise linear in the place, so their derivatives are exact everywhere but on the lines
 through texel centres, where they jump. Sums run in integers: the order in which threads add does not matter.
-
-Longer than 400 lines: the shares of a point and their derivatives by hand are read side by side.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -426,6 +425,18 @@ def interpolated_glow(table: mi.Float, cosine: mi.Float) -> mi.Color3f:
     return dr.select(angle < last, low + (high - low) * part, 0)
 
 
+class _Grid(NamedTuple):
+    """Texels that points are shared out among; a point falls on one of several pages of them."""
+
+    per_omega: mi.Float
+    half_row: mi.Float
+    width: mi.Int32
+    first: mi.Int32
+    height: mi.Int32
+    total: mi.Int32
+    page: mi.Int32
+
+
 class _Share(dr.CustomOp):
     """Share points out among texels; see the module's docstring."""
 
@@ -433,14 +444,14 @@ class _Share(dr.CustomOp):
         first, total = rows
         self.args = row, column, half, flux
         omega = latlong.lookup_solid_angles(total, shape[1]).astype(np.float32)
-        self.geometry = (
-            dr.opaque(mi.Float(1 / omega)),
-            dr.opaque(mi.Float, half_row),
-            dr.opaque(mi.Int32, shape[1]),
-            dr.opaque(mi.Int32, first),
-            dr.opaque(mi.Int32, shape[0]),
-            dr.opaque(mi.Int32, total),
-            page,
+        self.grid = _Grid(
+            per_omega=dr.opaque(mi.Float(1 / omega)),
+            half_row=dr.opaque(mi.Float, half_row),
+            width=dr.opaque(mi.Int32, shape[1]),
+            first=dr.opaque(mi.Int32, first),
+            height=dr.opaque(mi.Int32, shape[0]),
+            total=dr.opaque(mi.Int32, total),
+            page=page,
         )
         texels = pages * shape[0] * shape[1]
         # Of the largest radiance that can come about, so many bits are kept.
@@ -448,7 +459,7 @@ class _Share(dr.CustomOp):
         most = dr.minimum(most, dr.largest(mi.Float))  # infinite, it would put all lights out
         scale = dr.select(most > 0, 2.0**SUM_BITS / dr.maximum(most, 1e-25), 0)
         sums = dr.zeros(mi.Int64, texels * 3)
-        _scatter(sums, row, column, half, flux, scale, *self.geometry)
+        _scatter(sums, row, column, half, flux, scale, self.grid)
         dr.eval(sums)
         lit = mi.Float(mi.Float64(sums) * dr.select(scale > 0, 1 / mi.Float64(scale), 0))
         # Summed in double precision: many bright points are no infinity.
@@ -456,7 +467,7 @@ class _Share(dr.CustomOp):
         return mi.TensorXf(dr.select(bad, dr.nan, lit), (*((pages,) if pages > 1 else ()), *shape, 3))
 
     def backward(self):
-        row, column, half, flux = _pull(self.grad_out().array, *self.args, *self.geometry)
+        row, column, half, flux = _pull(self.grad_out().array, *self.args, self.grid)
         self.set_grad_in("row", row)
         self.set_grad_in("column", column)
         self.set_grad_in("half", half)
@@ -491,7 +502,8 @@ def _total(place, half, low, high):
 
 
 @dr.syntax
-def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, first, height, total, page):
+def _scatter(sums, row, column, half, flux, scale, grid):
+    per_omega, half_row, width, first, height, total, page = grid
     rows, _, _ = _total(row, half_row, mi.Int32(0), total - 1)
     columns, _, _ = _total(column, half, mi.Int32(-1 << 20), mi.Int32(1 << 20))
     r = dr.maximum(mi.Int32(dr.ceil(row - half_row)), first)
@@ -512,7 +524,8 @@ def _scatter(sums, row, column, half, flux, scale, per_omega, half_row, width, f
 
 
 @dr.syntax
-def _pull(grad, row, column, half, flux, per_omega, half_row, width, first, height, total, page):
+def _pull(grad, row, column, half, flux, grid):
+    per_omega, half_row, width, first, height, total, page = grid
     rows, rows_slope, _ = _total(row, half_row, mi.Int32(0), total - 1)
     columns, columns_slope, columns_widening = _total(column, half, mi.Int32(-1 << 20), mi.Int32(1 << 20))
     all_, d_row, d_column, d_half = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)

@@ -7,8 +7,6 @@ changes. What is left is the background B, the map as it would be without its li
 
 All steps are in angles and shares of the light, not in texels or radiance: they mean the same for a map of
 any resolution and exposure.
-
-Longer than 400 lines: one algorithm, whose thresholds are set against each other.
 """
 
 from __future__ import annotations

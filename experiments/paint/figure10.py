@@ -11,6 +11,7 @@ Playwright's.
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -37,6 +38,7 @@ DRAWN = (
     " return Number(of.frame) > 0 && ['done', 'rendering', 'solving'].includes(of.state); }"
 )
 FEASIBLE, RENDERED = f"{STATUS}('% feasible')", f"{STATUS}('with 256 samples')"
+DIFFERS = re.compile(r"differs from the one shown before by (\S+) of a display value")
 SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
 TITLES = {
     "move_shadow": "Moving the shadow",
@@ -146,6 +148,8 @@ def paint(page, stroke):
     if shape == "ellipse":
         x, y, rx, ry = stroke["ellipse"][:4]
         corners = [(x - rx, y - ry), (x + rx, y + ry)]
+    elif "rectangle" in stroke:
+        corners = [stroke["rectangle"][:2], stroke["rectangle"][2:]]
     else:
         corners = stroke.get("points", [(0, 0), (1, 1)])
     page.mouse.move(*at(corners[0]))
@@ -171,7 +175,10 @@ def edit(settings, folder, strokes) -> dict:
         page.get_by_test_id("save").click()
         page.wait_for_function(SAVED, timeout=600_000)
         saved = time.perf_counter()
+        message = page.get_by_test_id("message").inner_text()
     found = json.loads((work / "edit_out/metrics.json").read_text())["painted"]
+    differs = DIFFERS.search(message)
+    found["differs"] = float(differs[1]) if differs else None
     found["strokes"] = tomllib.loads((work / "edit_out/painted.toml").read_text())["target"]["strokes"]
     return found | {"painted_s": painted - began, "solved_s": solved - painted, "saved_s": saved - solved}
 
@@ -224,6 +231,7 @@ EXPERIMENT = Experiment(
         "painted change reached": "{towards:.0%}",
         "feasible": "{reachable:.0%}",
         "mean change elsewhere": "{elsewhere:.3f}",
+        "saved from shown": "{differs:.4f}",
     },
     panels=panels,
     sheet=lambda case: "page" if case.name == "page" else "figure10",

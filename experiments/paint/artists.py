@@ -1,0 +1,59 @@
+"""Twelve edits that lighting artists make, each painted in the page: ``artists.toml`` has their strokes."""
+
+import tomllib
+from pathlib import Path
+
+from envedit.core.color import tonemap
+from experiments import puresky
+from experiments.harness import Experiment, calling
+from experiments.paint import figure10
+from experiments.summary import Summary, values
+
+
+def cases(given):
+    edits = tomllib.loads((Path(__file__).parent / "artists.toml").read_text())
+    made = []
+    for name, edit in edits.items():
+        tables = {"input": {"envmap": puresky.file(edit["map"])}, "scene": {"file": edit["scene"]}}
+        about = {"edit": name.replace("_", " "), "scene": edit["scene"], "map": edit["map"]}
+        function = "experiments.paint.figure10:edit"
+        made.append(calling(name, function, tables, about, strokes=edit["strokes"]))
+    return made
+
+
+def panels(done):
+    """Return rendering before, painted and saved, and the map before and after."""
+    saved = type(done)(done.case, done.folder / "work/edit_out")
+    shown = [saved.picture(f"render_{name}") for name in ("initial", "target", "edited")]
+    return [tonemap(one, "gamma") for one in (*shown, *saved.maps[:2])]
+
+
+EXPERIMENT = Experiment(
+    "paint.artists",
+    "Twelve edits that lighting artists make, each painted in the page.",
+    cases,
+    lambda done: values(done.metrics),
+    {
+        "edit": "{edit}",
+        "scene": "{scene}",
+        "map": "{map}",
+        "solving, s": "{solved_s:.0f}",
+        "saving, s": "{saved_s:.0f}",
+        "painted change reached": "{towards:.0%}",
+        "feasible": "{reachable:.0%}",
+        "mean change elsewhere": "{elsewhere:.3f}",
+        "saved from shown": "{differs:.4f}",
+    },
+    summary=Summary(
+        {},
+        {
+            "solving, s, median": "{solved_s.median:.0f}",
+            "at most": "{solved_s.max:.0f}",
+            "painted change reached": "{towards.mean:.0%}",
+            "saved from shown, at most": "{differs.max:.4f}",
+        },
+    ),
+    panels=panels,
+    sheet=lambda case: "artists",
+    alone=True,
+)

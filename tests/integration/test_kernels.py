@@ -29,7 +29,7 @@ ADAM = ["optimizer.kind=adam", "representation.turn=false"]  # a turned map woul
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind, light_moves", [("layers", False), ("siren", True), ("pixels", True), ("log-pixels", False)]
+    "kind, light_moves", [("layers", False), ("siren", True), ("pixels", True)]
 )
 def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monkeypatch):
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
@@ -88,7 +88,7 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_over_400_iterations(monkeypatch):
+def test_memory_does_not_grow_over_200_iterations(monkeypatch):
     settings = config.loads(
         "",
         overrides=[
@@ -97,7 +97,7 @@ def test_memory_does_not_grow_over_400_iterations(monkeypatch):
             "representation.hidden=16",
             "representation.turn=false",
             "target.spp=256",
-            "optimizer.iterations=400",
+            "optimizer.iterations=200",
         ],
     )
     live, compare = {}, adam_loop.Objective.__call__
@@ -109,5 +109,5 @@ def test_memory_does_not_grow_over_400_iterations(monkeypatch):
 
     monkeypatch.setattr(adam_loop.Objective, "__call__", watched)
     pipeline.run(settings)
-    # A leak of one 64 x 32 map a step would be 30 MB over these 300 steps; the history takes 0.2 MB.
-    assert len(live) == 400 and live[399] - live[99] < 10e6
+    # A leak of one 64 x 32 map a step would be 12 MB over these 120 steps; the history takes 0.1 MB.
+    assert len(live) == 200 and live[199] - live[79] < 4e6

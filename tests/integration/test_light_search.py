@@ -15,7 +15,7 @@ from envedit.transport.light_transport import LightTransport
 pytestmark = pytest.mark.usefixtures("own_core")
 
 HEIGHT, WIDTH, ROWS = 32, 64, 16
-PIXELS = 64
+PIXELS = 40
 SUN, ELSEWHERE = (6, 20), (6, 52)
 TEXEL = 360 / WIDTH
 NEAR = 2 * TEXEL

@@ -42,8 +42,8 @@ def air():
 # ---- against columns traced one by one ---------------------------------------------------------------------
 
 SCENES = [
-    "statue", "sphere", "mirror", "pair", "glass", "sphere, alpha 0.02", "plastic and principled",
-    "in the air", "turned and cropped", "mitchell filter", "red wall and a lamp",
+    "statue", "mirror", "pair", "glass", "plastic and principled", "turned and cropped",
+    "red wall and a lamp",
 ]  # fmt: skip
 
 
@@ -69,7 +69,7 @@ def test_paths_that_are_cut_short(bounces):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size, count", [((1, 1), 1), ((1, 1), 5), ((3, 1), 1), ((9, 1), 1)])
+@pytest.mark.parametrize("size, count", [((1, 1), 1), ((3, 1), 1)])
 def test_few_paths(size, count):
     """Arrays of one element are scalars to Dr.Jit: a single vertex or escape must not count twice."""
     film = {"width": size[0], "height": size[1]}

@@ -10,8 +10,8 @@ from envedit import config
 from envedit.core import array_cache, extensions
 from envedit.core.errors import ConfigError
 from envedit.core.types import Progress
-from envedit.scene import scene
 from envedit.scene.path_tracer import PathTracer
+from envedit.scene.scene import Scene
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 
@@ -38,7 +38,7 @@ class Renderer(Protocol):
 
 
 def make(
-    settings: config.Config, lit: scene.Scene, shape: tuple[int, int], progress: Progress | None = None
+    settings: config.Config, scene: Scene, shape: tuple[int, int], progress: Progress | None = None
 ) -> Renderer:
     """Build the renderer of a configuration for maps of the given (H, W).
 
@@ -46,7 +46,7 @@ def make(
     ----------
     settings : config.Config
         Whose renderer.
-    lit : scene.Scene
+    scene : Scene
         The scene.
     shape : (int, int)
         Rows and columns of the maps.
@@ -55,14 +55,14 @@ def make(
     """
     chosen = settings.renderer
     if chosen.kind == "path":
-        return PathTracer(lit, chosen.spp, chosen.max_depth, settings.seed)
+        return PathTracer(scene, chosen.spp, chosen.max_depth, settings.seed)
     if chosen.kind != "transport":
-        renderer: Renderer = extensions.load(extensions.RENDERERS, chosen.kind)(settings, lit, shape)
+        renderer: Renderer = extensions.load(extensions.RENDERERS, chosen.kind)(settings, scene, shape)
         return renderer
-    return trace(settings, lit, shape, progress)
+    return trace(settings, scene, shape, progress)
 
 
-def check(settings: config.Config, lit: scene.Scene, shape: tuple[int, int]) -> None:
+def check(settings: config.Config, scene: Scene, shape: tuple[int, int]) -> None:
     """Refuse, before anything is rendered, what :func:`make` will refuse.
 
     Raises
@@ -73,22 +73,22 @@ def check(settings: config.Config, lit: scene.Scene, shape: tuple[int, int]) -> 
         T does not fit into memory.
     """
     chosen = settings.renderer
-    if chosen.kind == "path" and len(lit.views) > 1:
+    if chosen.kind == "path" and len(scene.views) > 1:
         raise ConfigError(
-            f'renderer.kind: got "path" with {len(lit.views)} views, which only "transport" renders: '
+            f'renderer.kind: got "path" with {len(scene.views)} views, which only "transport" renders: '
             "set it, or [scene] sensors to one of them"
         )
     if chosen.kind == "transport":
-        recording.choose_samples(lit, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
+        recording.choose_samples(scene, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
 
 
 def trace(
-    settings: config.Config, lit: scene.Scene, shape: tuple[int, int], progress: Progress | None = None
+    settings: config.Config, scene: Scene, shape: tuple[int, int], progress: Progress | None = None
 ) -> LightTransport:
     """Trace the light transport of a configuration, or take it from disk; arguments as :func:`make`."""
     chosen = settings.renderer
     return LightTransport.build(
-        lit,
+        scene,
         *shape,
         spp=chosen.spp,
         max_depth=chosen.max_depth,

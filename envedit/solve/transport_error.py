@@ -27,7 +27,7 @@ STEPS = 6
 
 
 def corrected(
-    target: Target, lit: Scene, envmap: np.ndarray, seen: np.ndarray, seed: int, keep: bool = True
+    target: Target, scene: Scene, envmap: np.ndarray, seen: np.ndarray, seed: int, keep: bool = True
 ) -> Target:
     """Return a target whose aim is the picture as T would show it near a map.
 
@@ -35,7 +35,7 @@ def corrected(
     ----------
     target : Target
         The target; its picture stays.
-    lit : Scene
+    scene : Scene
         The scene.
     envmap : ndarray (H, W, 3)
         E^.
@@ -46,5 +46,5 @@ def corrected(
     keep : bool
         Keep I on disk: a run that is killed and resumed has the same.
     """
-    shown, _, _ = rendered(lit, envmap, SPP, Seeds.of(seed).solution_check, keep)
+    shown, _, _ = rendered(scene, envmap, SPP, Seeds.of(seed).solution_check, keep)
     return target.seen_as(seen, shown)

@@ -34,10 +34,10 @@ _MOST_BYTES = 1 << 16  # of a neighbour that is read
 _PREFIX = "envedit."  # of a fact in the picture's metadata
 
 
-def initial(lit: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
+def initial(scene: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
     """Render the picture to paint on, (h, w, 3): the scene under the map as it is, at [target] spp."""
     picture, _, _ = rendered(
-        lit, envmap, settings.target.spp, Seeds.of(settings.seed).exported, settings.renderer.cache
+        scene, envmap, settings.target.spp, Seeds.of(settings.seed).exported, settings.renderer.cache
     )
     return picture
 

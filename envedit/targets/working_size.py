@@ -38,31 +38,31 @@ def most_pixels(settings: config.Config) -> int | None:
     return PIXELS if smooth and settings.newton else None
 
 
-def smaller(settings: config.Config, lit: Scene) -> Scene:
+def smaller(settings: config.Config, scene: Scene) -> Scene:
     """Return the scene on a film of at most so many pixels as are asked for, all views together.
 
     It is the scene itself where its film is hardly larger, or somebody has built it.
     """
-    most, pixels = most_pixels(settings), lit.width * lit.height
+    most, pixels = most_pixels(settings), scene.width * scene.height
     if most is None or pixels <= MUCH * most:
-        return lit
-    found = scaled(lit, (most / pixels) ** 0.5)
-    return found if found is not None and found.width * found.height < pixels else lit
+        return scene
+    found = scaled(scene, (most / pixels) ** 0.5)
+    return found if found is not None and found.width * found.height < pixels else scene
 
 
-def scaled(lit: Scene, factor: float) -> Scene | None:
+def scaled(scene: Scene, factor: float) -> Scene | None:
     """Return the scene on a film that is ``factor`` times as wide and high; None if it is built already."""
-    if lit.again is None:
+    if scene.again is None:
         return None
-    heights = {rows.stop - rows.start for rows in lit.rows}
+    heights = {rows.stop - rows.start for rows in scene.rows}
     height = max(1, round(factor * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
-    return lit.again(max(4, round(factor * lit.width)), height)
+    return scene.again(max(4, round(factor * scene.width)), height)
 
 
 def worked_on(
-    settings: config.Config, lit: Scene, small: Scene, envmap: np.ndarray, target: Target
+    settings: config.Config, scene: Scene, small: Scene, envmap: np.ndarray, target: Target
 ) -> Target:
-    """Return the target (of ``lit``) as the picture of a smaller scene.
+    """Return the target (of ``scene``) as the picture of a smaller scene.
 
     It is rendered anew, so that the film's filter is the same as in what it is compared with. What was
     painted is the change of each pixel, averaged over its area and added to the smaller initial rendering.
@@ -71,7 +71,7 @@ def worked_on(
     ----------
     settings : config.Config
         Of the run.
-    lit, small : Scene
+    scene, small : Scene
         The scene, and it on a smaller film.
     envmap : ndarray (H, W, 3)
         The map that is edited.
@@ -83,19 +83,19 @@ def worked_on(
     if target.coverage is None or target.initial is None or target.weight is None:
         weight = None
         if target.envmap is None:  # a picture of the scene
-            picture = at_size(target.picture, lit, small)
+            picture = at_size(target.picture, scene, small)
             noise = rendered_anew.noise(picture, small.rows)
             spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)
         else:
             picture, spp, noise = with_noise(settings, small, target.envmap)
         if target.weight is not None:
-            weight = np.where(hidden[..., None], 0, at_size(target.weight, lit, small)).astype("f4")
+            weight = np.where(hidden[..., None], 0, at_size(target.weight, scene, small)).astype("f4")
         return replace(target, picture=picture, noise=noise, spp=spp, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
-    change = at_size(target.picture - target.initial, lit, small)
+    change = at_size(target.picture - target.initial, scene, small)
     picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))
-    coverage = np.where(hidden[..., None], 0, at_size(target.coverage, lit, small))
-    uncounted = at_size((target.weight == 0).astype(np.float32), lit, small)[..., 0] > 0.5
+    coverage = np.where(hidden[..., None], 0, at_size(target.coverage, scene, small))
+    uncounted = at_size((target.weight == 0).astype(np.float32), scene, small)[..., 0] > 0.5
     weight = pixel_weight(coverage, uncounted | hidden, chosen.paint, first_hold(settings))
     return replace(target, picture=picture, initial=initial, coverage=coverage, weight=weight)
 

@@ -7,8 +7,11 @@ its docstring. Constants are the numbers of ``solve`` and ``preparation``.
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib
+import inspect
 import math
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,27 +87,49 @@ def scaled(value: float, factor: float) -> float:
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
-def measured(
-    settings: config.Config, folder: Path, module: str = "", constant: str = "", factor: float = 1.0
-):
-    """Make the edits with one constant changed wherever it has been imported; return their numbers."""
-    if constant:
-        before = getattr(importlib.import_module(module), constant)
-        importlib.import_module("envedit.pipeline")
-        for other in [m for key, m in sys.modules.items() if key.startswith("envedit.")]:
-            if other.__name__ == module or (
-                hasattr(other, constant)
-                and getattr(other, constant) is before
-                and not hasattr(other, "__path__")
-            ):
-                setattr(other, constant, scaled(before, factor))
+def measured(settings: config.Config, folder: Path, module: str = "") -> dict:
+    """Make the edits with each constant of a module halved and doubled; without a module, as they are."""
+    if not module:
+        return {"rows": [{"constant": None, "change": "", "edits": _edits()}]}
+    rows = []
+    for one in constants():
+        for change, factor in FACTORS.items() if one.module == module else ():
+            with _changed(one, scaled(one.value, factor)):
+                rows.append({"constant": one.label, "change": change, "edits": _edits()})
+    return {"rows": rows}
+
+
+@contextlib.contextmanager
+def _changed(constant: Constant, value: float):
+    """Change a constant wherever it has been imported."""
+    importlib.import_module("envedit.pipeline")
+    places = [
+        other
+        for key, other in sys.modules.items()
+        if key.startswith("envedit.") and not hasattr(other, "__path__")
+        if key == constant.module or _imports(other, constant)
+    ]
+    for other in places:
+        setattr(other, constant.name, value)
+    try:
+        yield
+    finally:
+        for other in places:
+            setattr(other, constant.name, constant.value)
+
+
+def _imports(module, constant):
+    """Whether a module has a constant from another one."""
+    source = inspect.getsource(module)
+    text = rf"from {re.escape(constant.module)} import [^)]*?\b{constant.name}\b"
+    return hasattr(module, constant.name) and re.search(text, source) is not None
+
+
+def _edits():
     numbers = {}
     for edit, tables in EDITS.items():
-        chosen = config.from_dict(
-            presets.overlaid(presets.overlaid(BASE, {"renderer": {"cache": False}}), tables)
-        )
         try:
-            metrics = pipeline.run(chosen).metrics
+            metrics = pipeline.run(config.from_dict(presets.overlaid(BASE, tables))).metrics
         except Exception as error:  # a constant may make an edit impossible
             numbers[edit] = {"failed": f"{type(error).__name__}: {error}"}
             continue
@@ -114,33 +139,21 @@ def measured(
             "map": metrics["envmap"]["psnr"] if metrics["envmap"] else None,
             "paint": None if painted is None else 100 * painted["towards"],
         }
-    return {"edits": numbers}
+    return numbers
 
 
 def cases(given) -> list[Case]:
-    """Return the edits as they are, and with each constant halved and doubled."""
+    """Return the edits as they are, and those of each module."""
     function = "experiments.constants.experiment:measured"
-    found = [calling("as they are", function, BASE, {"constant": None, "change": ""})]
-    for one in constants():
-        for change, factor in FACTORS.items():
-            about = {"constant": one, "change": change}
-            found.append(
-                calling(
-                    f"{one.label} {change}",
-                    function,
-                    BASE,
-                    about,
-                    module=one.module,
-                    constant=one.name,
-                    factor=factor,
-                )
-            )
-    return found
+    modules = dict.fromkeys(one.module for one in constants())
+    changed = [calling(module, function, BASE, {}, module=module) for module in modules]
+    return [calling("as they are", function, BASE, {}), *changed]
 
 
 def combine(rows: list[dict]) -> list[dict]:
     """Return a row a constant: by how much numbers differ from those of the edits as they are."""
     base = next(row["edits"] for row in rows if row["constant"] is None)
+    by_label = {one.label: one for one in constants()}
     combined: dict[str, dict] = {}
     for row in rows:
         if row["constant"] is None:
@@ -153,8 +166,9 @@ def combine(rows: list[dict]) -> list[dict]:
                     changes[kind] = max(changes[kind], change, key=abs)
             if "failed" in numbers:
                 changes = dict.fromkeys(changes, math.nan)
-        label = row["constant"].label
-        combined.setdefault(label, {"constant": row["constant"]})[row["change"]] = changes
+        label = row["constant"]
+        if label in by_label:
+            combined.setdefault(label, {"constant": by_label[label]})[row["change"]] = changes
     return list(combined.values())
 
 
@@ -172,6 +186,7 @@ EXPERIMENT = Experiment(
     "constants",
     __doc__.splitlines()[0],
     cases=cases,
+    measure=lambda done: done.metrics["rows"],
     combine=combine,
     columns={
         "constant": lambda row: f"`{row['constant'].label}`",

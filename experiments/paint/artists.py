@@ -6,7 +6,6 @@ from pathlib import Path
 from envedit.core.color import tonemap
 from experiments import puresky
 from experiments.harness import Experiment, calling
-from experiments.paint import figure10
 from experiments.summary import Summary, values
 
 

@@ -99,7 +99,7 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
             heard(page, "status", lambda m: m.get("number") == count and m["state"] == "done")
             under = session.coverage
             changes = session.target - session.base, under * (session.target - session.point.rendering)
-            return [change[rows] for change in changes for rows in session.lit.rows]
+            return [change[rows] for change in changes for rows in session.scene.rows]
 
         front, behind, _, _ = painted({**shadow, "view": 1})
         assert not front.any() and behind[10:18, 11:21].mean() < -0.02 and not behind[0].any()

@@ -63,7 +63,7 @@ class Picking:
 
     Parameters
     ----------
-    lit : Scene
+    scene : Scene
         What is seen.
     placed : PlacedLights
         The map as it was given.
@@ -73,8 +73,8 @@ class Picking:
         Of the map, which may change.
     """
 
-    def __init__(self, lit: Scene, placed: PlacedLights, transport: LightTransport, rows: Rows):
-        self.lit, self.placed, self.transport, self.rows = lit, placed, transport, rows
+    def __init__(self, scene: Scene, placed: PlacedLights, transport: LightTransport, rows: Rows):
+        self.scene, self.placed, self.transport, self.rows = scene, placed, transport, rows
 
     def answer(self, asked: Pick, document: Document, shown: Sequence[Placed]) -> dict[str, Any]:
         """Return ``light``, and where it must stand, or ``text``: why nowhere.
@@ -83,7 +83,7 @@ class Picking:
         flux of those whose shadow it is in; ``point`` is what casts it. ``shown`` are the document's lights
         where the rendering that is shown has them.
         """
-        view = min(asked.view, len(self.lit.rows) - 1)
+        view = min(asked.view, len(self.scene.rows) - 1)
         if asked.light >= 0:
             found: dict[str, Any] = {"light": asked.light}
             try:
@@ -100,10 +100,10 @@ class Picking:
 
     def _direction(self, asked, view):
         if asked.of == "highlight":
-            return highlight.direction(self.lit, view, asked.x, asked.y)
+            return highlight.direction(self.scene, view, asked.x, asked.y)
         if not asked.point:
             raise shadow.NoShadowError("no shadow was picked")
-        return shadow.direction(self.lit, view, asked.x, asked.y, np.array(asked.point))
+        return shadow.direction(self.scene, view, asked.x, asked.y, np.array(asked.point))
 
     def _shadowed(self, asked, view, listed):
         """Return the light of most flux whose shadow lies at a place, and what casts it."""
@@ -112,7 +112,7 @@ class Picking:
             if not listed[i].flux.any():
                 continue
             try:
-                point = shadow.occluder(self.lit, view, asked.x, asked.y, listed[i].direction)
+                point = shadow.occluder(self.scene, view, asked.x, asked.y, listed[i].direction)
                 return {"light": i, "point": point.tolist()}
             except shadow.NoShadowError as reason:
                 text = f"light {i + 1}: {reason}" if text == "the map has no light" else text
@@ -120,8 +120,8 @@ class Picking:
 
     def _seen(self, view, x, y):
         """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
-        patch = np.zeros((self.lit.height, self.lit.width, 3), np.float32)
-        seen = patch[self.lit.rows[view]]
+        patch = np.zeros((self.scene.height, self.scene.width, 3), np.float32)
+        seen = patch[self.scene.rows[view]]
         height, width = seen.shape[:2]
         row, column = min(int(y * height), height - 1), min(int(x * width), width - 1)
         seen[max(row - PATCH, 0) : row + PATCH + 1, max(column - PATCH, 0) : column + PATCH + 1] = 1

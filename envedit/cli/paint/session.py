@@ -118,24 +118,24 @@ class Session:
         }
         settings = project.settings
         self._stage("loading the scene")
-        self.lit = self._worked_on(inputs.load_scene(settings.scene, project.base))
+        self.scene = self._worked_on(inputs.load_scene(settings.scene, project.base))
         self._stage("reading the map")
-        self.given = inputs.read_map(settings.input, self.lit, settings.input.width)
+        self.given = inputs.read_map(settings.input, self.scene, settings.input.width)
         self.notes = self.given.warnings
         self.map = self.given.radiance
         height = len(self.map)
         self.rows = inputs.active_rows(settings.input.rows, height)
-        renderers.check(settings, self.lit, self.map.shape[:2])
+        renderers.check(settings, self.scene, self.map.shape[:2])
         self._stage("tracing light transport")
-        self.transport = renderers.trace(settings, self.lit, self.map.shape[:2], self._progress)
+        self.transport = renderers.trace(settings, self.scene, self.map.shape[:2], self._progress)
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
-        self.picking = picking.Picking(self.lit, self.placed, self.transport, self.rows)
+        self.picking = picking.Picking(self.scene, self.placed, self.transport, self.rows)
         self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
         self._quick = self.transport
         if self.transport.spp > QUICK_SPP:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
-            self._quick = renderers.trace(fewer, self.lit, self.map.shape[:2], self._progress)
+            self._quick = renderers.trace(fewer, self.scene, self.map.shape[:2], self._progress)
         self._sharp: Scene | None = None
         self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
@@ -149,7 +149,7 @@ class Session:
         kept = []
         for i, stroke in enumerate(document.strokes):
             try:
-                self.lit.view(stroke.get("view", 0), f"target.strokes[{i}].view")
+                self.scene.view(stroke.get("view", 0), f"target.strokes[{i}].view")
             except ConfigError as error:
                 self.notes = [*self.notes, f"{error}: the stroke is left out"]
             else:
@@ -296,8 +296,8 @@ class Session:
     @property
     def _hidden(self):
         """Pixels that see no surface, where the scene hides what lights it: they do not count."""
-        shape = self.lit.height, self.lit.width
-        return np.zeros(shape, bool) if self.lit.alpha is None else self.lit.alpha == 0
+        shape = self.scene.height, self.scene.width
+        return np.zeros(shape, bool) if self.scene.alpha is None else self.scene.alpha == 0
 
     def _after(self, painted, tonemap):
         """Paint strokes; all but the last as they were painted before, where they are the same."""
@@ -312,9 +312,9 @@ class Session:
     def _on_views(self, before, painted, tonemap):
         """Paint strokes, each on its view, over what was painted before."""
         picture, coverage = before.picture.copy(), before.coverage.copy()
-        views = [self.lit.view(one.get("view", 0), "target.strokes.view") for one in painted]
+        views = [self.scene.view(one.get("view", 0), "target.strokes.view") for one in painted]
         for view in sorted(set(views)):
-            rows = self.lit.rows[view]
+            rows = self.scene.rows[view]
             own = [one for one, on in zip(painted, views, strict=True) if on == view]
             made = strokes.paint(picture[rows], own, tonemap)
             picture[rows], coverage[rows] = made.picture, 1 - (1 - coverage[rows]) * (1 - made.coverage)
@@ -461,13 +461,13 @@ class Session:
     def _pass(self, i, shown):
         """Return one pass of Mitsuba's rendering of a map, at the size that is shown when idle."""
         if self._sharp is None:
-            self._sharp = working_size.scaled(self.lit, SHARPER) or self.lit
+            self._sharp = working_size.scaled(self.scene, SHARPER) or self.scene
         return self._sharp.render(shown, PASS, Seeds.of(self.project.settings.seed).pass_of_page(i))
 
-    def _worked_on(self, lit):
+    def _worked_on(self, scene):
         """Return the scene at the size that an edit is solved at; as it is, if strokes are in its pixels."""
         in_pixels = any(one.get("units") == "pixels" for one in self.project.document.strokes)
-        return lit if in_pixels else working_size.smaller(self.project.settings, lit)
+        return scene if in_pixels else working_size.smaller(self.project.settings, scene)
 
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
@@ -511,7 +511,7 @@ class Session:
     def _tell_unreachable(self):
         """Show what of the paint is not feasible, once that is known."""
         if self.reach is not None:
-            self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.lit.rows)
+            self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.scene.rows)
 
     # ---- what is shown -------------------------------------------------------------------------------------
 
@@ -534,17 +534,17 @@ class Session:
             rendering = by.apply(tensor(shown)).numpy()
         if rendering is not self._shown:  # a stroke that is being drawn has changed nothing yet
             self._shown = rendering
-            self.tell.frame("render", source, rendering, self.lit.rows)
+            self.tell.frame("render", source, rendering, self.scene.rows)
             self.tell.frame("map", source, shown)
         if not self._dragged:
             both = self.target, self.point.rendering
             target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
-            self.tell.frame("difference", source, target - solution, self.lit.rows)
+            self.tell.frame("difference", source, target - solution, self.scene.rows)
 
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
         self.resting, self._shown = False, None
-        self.tell.frame("before", "transport", self.before, self.lit.rows)
+        self.tell.frame("before", "transport", self.before, self.scene.rows)
         self._tell_unreachable()
         self._explain(self.explanations, self.explanation)
         self._show("transport")

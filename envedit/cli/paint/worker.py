@@ -142,18 +142,18 @@ class Worker(threading.Thread):
         self.session = session
         self._painting += 1
         project.note(opened)
-        scene = run.scene_name(self.session.lit.path)
+        scene = run.scene_name(self.session.scene.path)
         self.tell.say(
             {
                 "type": "opened",
                 "painting": self._painting,
                 "title": f"{scene}, {Path(opened.settings.input.envmap).name}",
                 "folder": opened.folder.name,
-                "views": [view.name for view in self.session.lit.views],
+                "views": [view.name for view in self.session.scene.views],
                 "again": opened.again,
                 "document": self.session.document.plain(),
-                "width": self.session.lit.width,
-                "height": self.session.lit.height,
+                "width": self.session.scene.width,
+                "height": self.session.scene.height,
                 "notes": self.session.notes,
                 "exposure": self.session.exposure,
                 "hold": opened.settings.target.hold,

@@ -170,6 +170,7 @@ COUNTS = {
     "light_estimation": 6,
     "natural": 680,
     "natural.skies": 1,
+    "paint.artists": 12,
     "paint.figure10": 7,
     "painted_edits": 18,
     "painted_edits.artists": 296,

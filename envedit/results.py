@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core.errors import MachineError
-from envedit.export import file_resolution
+from envedit.core import latlong
+from envedit.core.errors import ConfigError, MachineError
+from envedit.export import adjustments, file_resolution
 from envedit.losses import metrics
 from envedit.report import preview
 from envedit.report.variants import Variant
@@ -168,6 +169,43 @@ class Result:
                 else:
                     axis.set(xlabel="azimuth, degrees", ylabel="elevation, degrees")
         return figure
+
+    def samples(self, count: int, seed: int = 0) -> np.ndarray:
+        """Draw maps that explain the target as well as this one, for what the picture leaves open.
+
+        From the posterior in Laplace's approximation, a Gaussian of the solver's unknowns about the edited
+        map: where the picture determines the sky draws agree, elsewhere they differ as the prior lets them.
+
+        Parameters
+        ----------
+        count : int
+            How many.
+        seed : int
+            Of the draws.
+
+        Returns
+        -------
+        ndarray (count, H, W, 3) float32
+            In the units of :attr:`envmap`.
+
+        Raises
+        ------
+        ConfigError
+            The edit was not solved by Gauss-Newton steps, or these leave open what the posterior is.
+        """
+        if self.found is None or self.posterior is None or self.posterior.sample is None:
+            raise ConfigError('Result.samples: needs an edit by layers with optimizer.kind = "gauss-newton"')
+        settings = self._settings
+        before = latlong.rotate(self.maps["initial"], self.found.turn_degrees)
+        rows = inputs.active_rows(settings.input.rows, len(before)).slice
+        rng = np.random.default_rng(seed)
+        drawn = []
+        for _ in range(count):
+            envmap = before.copy()
+            envmap[rows] = self.found.representation.decode(self.posterior.sample(rng)).numpy()
+            adjusted, _ = adjustments.adjust(envmap, settings.lights, settings.output, self.given.scale)
+            drawn.append(self.given.as_stored(adjusted, self.found.turn_degrees))
+        return np.stack(drawn) if drawn else np.zeros((0, *self.envmap.shape), np.float32)
 
     def save(self, folder: str | PathLike[str]) -> list[str]:
         """Write what a run leaves: maps, renderings, metrics, report, and the configuration to run again.

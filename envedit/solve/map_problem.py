@@ -16,13 +16,16 @@ The residual is exact, through T; so is the gradient by gain and saturation. Oth
 
 from __future__ import annotations
 
+import contextlib
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
 
 from envedit.core.arrays import tensor
-from envedit.core.rotations import rotated, rotation_between, rotation_vector
+from envedit.core.rotations import rotation_between
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.solve.block_jacobian import BlockJacobian
@@ -30,19 +33,13 @@ from envedit.solve.derivatives import Derivatives
 from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.normal_equations import Blocks, MeanOfRest, Normal, solved
 from envedit.solve.prior import AXES, Prior
-from envedit.solve.unknowns import Point, Unknowns, in_numpy
+from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
 LARGEST_STEP = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
 """Largest step of an unknown: beyond it the linear model does not hold."""
-OWN_LOG_SIZES, LOBE_LOG_SIZES = (-3.0, 1.5), (-3.0, 2.1)
-"""Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
-larger lobe would be seen."""
-LOG_SATURATIONS = (-3.0, 0.0)
-"""Logarithms of the sky's saturation that are looked for, from 5 % to the original's own: more would amplify
-what its colours have of noise."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +50,14 @@ class Posterior:
     ----------
     deviation, prior : ndarray (H, W)
         Standard deviation of the log luminance gain with and without the picture; 0 outside the active rows.
+    sample : callable or None
+        Draws parameters of the layers with a generator of numbers: in Laplace's approximation, as likely as
+        picture and prior make them. None where the normal equations cannot be solved.
     """
 
     deviation: np.ndarray
     prior: np.ndarray
+    sample: Callable[[np.random.Generator], dict] | None = None
 
     @property
     def identified(self) -> np.ndarray:
@@ -315,32 +316,7 @@ class Problem(Unknowns):
             return None
         if not np.isfinite(step).all():
             return None
-        n, found = self.nodes, {name: value.copy() for name, value in state.items()}
-        found["gain"] += np.clip(step[: 3 * n], -LARGEST_STEP["gain"], LARGEST_STEP["gain"]).reshape(3, n).T
-        turns: dict[int, np.ndarray] = {}
-        for value, (name, i, axis) in zip(step[3 * n :], normal.unknowns, strict=True):
-            if name == "turn":
-                turns[i] = turns.get(i, 0.0) + value * axis
-            else:
-                found[name][i, axis] += np.clip(value, -LARGEST_STEP[name], LARGEST_STEP[name])
-        own = self.layers.lights.own
-        found["saturation"] = np.clip(found["saturation"], *LOG_SATURATIONS)
-        found["size"][:own] = np.clip(found["size"][:own], *OWN_LOG_SIZES)
-        found["size"][own:] = np.clip(found["size"][own:], *LOBE_LOG_SIZES)
-        for i, turn in turns.items():
-            turn = turn * min(1.0, LARGEST_STEP["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
-            there = self._in_sky(rotated(self.direction(state, i), turn), self.direction(state, i))
-            found["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
-        return found
-
-    def _in_sky(self, there, here):
-        """Return a direction, raised to the horizon where a light would leave the sky by it."""
-        edge = np.cos(np.pi * (self.rows.start + self.layers.shape[0]) / len(self.envmap))
-        lowest = min(edge, here[1])
-        if there[1] >= lowest:
-            return there
-        along = there[[0, 2]] * np.sqrt(max(0.0, 1 - lowest**2)) / max(np.hypot(there[0], there[2]), 1e-12)
-        return np.array([along[0], lowest, along[1]])
+        return self.moved(state, step, normal.unknowns, LARGEST_STEP)
 
     def _within(self, step, now, damped, normal):
         """Return a step, solved anew for all else where it takes the saturation out of its bounds."""
@@ -354,19 +330,29 @@ class Problem(Unknowns):
         step[k] = to
         return step
 
-    def posterior(self, normal: Normal) -> Posterior:
-        """Return what the normal equations at the solution say of the log luminance gain."""
+    def posterior(self, state: dict, normal: Normal) -> Posterior:
+        """Return what the normal equations at a solution say of it."""
         n = self.nodes
         prior = np.linalg.inv(3 * self._precisions[0])
         mean = np.zeros((len(normal.hessian), n))
         for c in range(3):
             mean[c * n + np.arange(n), np.arange(n)] = 1 / 3
-        try:
-            half = np.linalg.solve(np.linalg.cholesky(normal.hessian), mean)
-            covariance = half.T @ half if np.isfinite(half).all() else prior
-        except np.linalg.LinAlgError:  # nothing can be said beyond the prior
-            covariance = prior
+        sample = None
+        covariance = prior  # where nothing can be said beyond it
+        with contextlib.suppress(np.linalg.LinAlgError):
+            lower = np.linalg.cholesky(normal.hessian)
+            half = np.linalg.solve(lower, mean)
+            if np.isfinite(half).all():
+                covariance = half.T @ half
+                unknowns = Unknowns(self.layers, self.saturates)  # not this problem, which keeps T in memory
+                sample = functools.partial(_sample, unknowns, state, lower, normal.unknowns)
         spread = [self.blocks.spread(one) for one in (covariance, prior)]
         whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
         whole[:, self.rows] = spread
-        return Posterior(*whole)
+        return Posterior(deviation=whole[0], prior=whole[1], sample=sample)
+
+
+def _sample(unknowns, state, lower, names, rng):
+    """Return parameters at a step of covariance (L L')^-1 from a state."""
+    step = np.linalg.solve(lower.T, rng.standard_normal(len(lower)))
+    return unknowns.params(unknowns.moved(state, step, names))

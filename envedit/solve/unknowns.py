@@ -12,9 +12,16 @@ from typing import Any
 import numpy as np
 
 from envedit.core.arrays import tensor
-from envedit.core.rotations import rotated
+from envedit.core.rotations import rotated, rotation_vector
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
+
+OWN_LOG_SIZES, LOBE_LOG_SIZES = (-3.0, 1.5), (-3.0, 2.1)
+"""Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
+larger lobe would be seen."""
+LOG_SATURATIONS = (-3.0, 0.0)
+"""Logarithms of the sky's saturation that are looked for, from 5 % to the original's own: more would amplify
+what its colours have of noise."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,55 @@ class Unknowns:
         if not state["saturation"].any():
             params.pop("saturation", None)
         return params
+
+    def moved(
+        self, state: dict, step: np.ndarray, names: list, largest: dict[str, float] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return the state after a step.
+
+        Parameters
+        ----------
+        state : dict
+            Before.
+        step : ndarray (3 nodes + len(names),)
+            The gain's nodes channel by channel, then what is named.
+        names : list of (str, int, int or ndarray (3,))
+            Which unknown, of which light, and which channel or axis of its turn.
+        largest : dict, optional
+            Largest step of each; None: any.
+        """
+        bound = {"gain": np.inf, "turn": np.inf, "flux": np.inf, "size": np.inf, "saturation": np.inf}
+        bound |= largest or {}
+        n = self.nodes
+        changed = {name: value.copy() for name, value in state.items()}
+        changed["gain"] += np.clip(step[: 3 * n], -bound["gain"], bound["gain"]).reshape(3, n).T
+
+        # ---- Lights, and the saturation
+        turns: dict[int, np.ndarray] = {}
+        for value, (name, i, axis) in zip(step[3 * n :], names, strict=True):
+            if name == "turn":
+                turns[i] = turns.get(i, 0.0) + value * axis
+            else:
+                changed[name][i, axis] += np.clip(value, -bound[name], bound[name])
+        own = self.layers.lights.own
+        changed["saturation"] = np.clip(changed["saturation"], *LOG_SATURATIONS)
+        changed["size"][:own] = np.clip(changed["size"][:own], *OWN_LOG_SIZES)
+        changed["size"][own:] = np.clip(changed["size"][own:], *LOBE_LOG_SIZES)
+        for i, turn in turns.items():
+            turn = turn * min(1.0, bound["turn"] / max(float(np.linalg.norm(turn)), 1e-12))
+            there = self._in_sky(rotated(self.direction(state, i), turn), self.direction(state, i))
+            changed["turn"][i] = rotation_vector(self.layers.lights.centres[i], there)
+        return changed
+
+    def _in_sky(self, there, here):
+        """Return a direction, raised to the horizon where a light would leave the sky by it."""
+        first, total = self.layers.rows
+        edge = np.cos(np.pi * (first + self.layers.shape[0]) / total)
+        lowest = min(edge, here[1])
+        if there[1] >= lowest:
+            return there
+        along = there[[0, 2]] * np.sqrt(max(0.0, 1 - lowest**2)) / max(np.hypot(there[0], there[2]), 1e-12)
+        return np.array([along[0], lowest, along[1]])
 
     def added(self, state: dict) -> list[int]:
         """List the added lights that shine: spare ones whose flux is not 0."""

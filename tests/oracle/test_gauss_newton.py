@@ -507,7 +507,7 @@ def test_deviation_shrinks_with_what_is_known(rng):
             problem, params = problem_of(image, seen, shown(seen, image))
             start = problem.state(params)
             normal = problem.normal(problem.evaluate(start), start, sigma)
-            found[name, sigma] = problem.posterior(normal).deviation
+            found[name, sigma] = problem.posterior(start, normal).deviation
             assert (found[name, sigma] <= prior_deviation(problem) * (1 + 1e-4)).all(), (name, sigma)
     for name in ("half", "all", "twice"):
         for more, less in ((map_problem.SIGMA, 0.02), (0.02, 0.2)):
@@ -525,7 +525,7 @@ def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
     problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
     start = problem.state(params)
     normal = problem.normal(problem.evaluate(start), start, map_problem.SIGMA)
-    deviation = problem.posterior(normal).deviation
+    deviation = problem.posterior(start, normal).deviation
     assert np.isfinite(deviation).all() and (deviation > 0).all()
     assert (deviation <= prior_deviation(problem) * (1 + 1e-4)).all()
 
@@ -1226,3 +1226,19 @@ def test_problems_of_one_job_share_their_blocks_and_nothing_else(rng):
     one, other = (p.normal(p.evaluate(state), state, 0.01) for p in (again, alone))
     assert one.gradient.any() and one.gradient.tobytes() == other.gradient.tobytes()
     assert one.hessian.tobytes() == other.hessian.tobytes()
+
+
+@pytest.mark.slow
+def test_draws_vary_as_much_as_is_open(rng):
+    """Their standard deviation is the posterior's, to the noise of 200; a seed has one draw."""
+    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
+    problem, params = problem_of(image, transport, shown(transport, image))
+    start = problem.state(params)
+    posterior = problem.posterior(start, problem.normal(problem.evaluate(start), start, 0.02))
+    draws = [problem.layers.log_gain(posterior.sample(rng)).mean(axis=2) for _ in range(200)]
+    rows = problem.rows
+    measured, stated = np.std(draws, axis=0), posterior.deviation[rows]
+    np.testing.assert_allclose(measured.mean(), stated.mean(), rtol=0.1)
+    assert np.corrcoef(measured.ravel(), stated.ravel())[0, 1] > 0.9
+    first, again = (posterior.sample(np.random.default_rng(5)) for _ in range(2))
+    assert all(np.array_equal(first[name].numpy(), again[name].numpy()) for name in first)

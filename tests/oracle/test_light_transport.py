@@ -63,7 +63,11 @@ def test_every_shipped_scene_is_compared():
     assert {value[0] for value in SCENES.values() if isinstance(value, tuple)} == set(shipped.scenes())
 
 
-@pytest.fixture(scope="module", params=[name for name in SCENES if name not in ("matte", "pair")])
+SEEN_BY_OTHERS = ("matte", "pair", "mitchell filter")
+"""Scenes of other tests."""
+
+
+@pytest.fixture(scope="module", params=[name for name in SCENES if name not in SEEN_BY_OTHERS])
 def recorded(request):
     """Return a scene's name, the scene, and independent transports of it."""
     s = load(request.param)

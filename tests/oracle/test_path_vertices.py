@@ -42,7 +42,7 @@ def air():
 # ---- against columns traced one by one ---------------------------------------------------------------------
 
 SCENES = [
-    "statue", "mirror", "pair", "glass", "plastic and principled", "turned and cropped",
+    "statue", "mirror", "pair", "glass", "mitchell filter", "turned and cropped",
     "red wall and a lamp",
 ]  # fmt: skip
 

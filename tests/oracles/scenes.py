@@ -74,7 +74,6 @@ SCENES = {  # a shipped one by name and parameters, or a dict
     "pair": ("pair", {}),
     "mesh": ("mesh", {"mesh": "statue.ply", "up": "z", "turn": 30}),
     "glass": stage(ball({"type": "dielectric"})),
-    "sphere, alpha 0.02": ("sphere", {"roughness": 0.02}),
     "sphere, alpha 1": ("sphere", {"roughness": 1.0}),
     "plastic and principled": stage(ball({"type": "plastic"}, -0.9, 0.8), ball(PRINCIPLED, 0.9, 0.8)),
     "red wall and a lamp": stage(ball(WHITE), WALL, LAMP),

@@ -103,6 +103,7 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     decoded = _decoded(name, len(parts))[index]
     left, top, width, height = windows[index]
     try:
+        info["half"] = all(decoded.channels[c].pixels.dtype == np.float16 for c in names)
         planes = [np.array(decoded.channels[c].pixels, np.float32) for c in names]
     except MemoryError:
         raise

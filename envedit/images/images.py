@@ -61,7 +61,8 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
     info : dict
         ``path`` (str), ``format`` ("exr", "hdr", "png" or "jpeg"), ``size`` (width, height), ``hdr`` (False
         for 8- and 16-bit pictures, which have ``bits``), ``metadata`` (dict of str, int and float),
-        ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str).
+        ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str). Of OpenEXR
+        also ``half``: whether its values are.
 
     Raises
     ------
@@ -339,7 +340,9 @@ def write_exr(
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
 
 
-def write_hdr(path: FilePath, image: ArrayLike) -> None:
+def write_hdr(
+    path: FilePath, image: ArrayLike, chromaticities: primaries.Chromaticities | None = None
+) -> None:
     """Write an image as a Radiance file (:func:`.rgbe.encode`), whole or not at all.
 
     Parameters
@@ -348,6 +351,8 @@ def write_hdr(path: FilePath, image: ArrayLike) -> None:
         The file; an existing one is replaced.
     image : array (H, W, 3)
         Linear radiance, finite and not negative.
+    chromaticities : tuple, optional
+        Of the image's colours, which few programs read from such a file; None: Rec. 709.
 
     Raises
     ------
@@ -355,7 +360,7 @@ def write_hdr(path: FilePath, image: ArrayLike) -> None:
         As :func:`write_exr`.
     """
     name = os.fsdecode(path)
-    write_atomically(name, rgbe.encode(np.maximum(_checked(name, image), 0)))
+    write_atomically(name, rgbe.encode(_checked(name, image), chromaticities))
 
 
 def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:

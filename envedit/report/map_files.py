@@ -10,9 +10,9 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
-from envedit.core.radiance import HALF_MAX
 from envedit.export import light_list
 from envedit.images import images, layered_exr
+from envedit.maps import map_file
 from envedit.report import manifest
 from envedit.scene import scene
 
@@ -54,15 +54,9 @@ def write_map(
         else:
             layered_exr.write(name, {"edited": envmap}, chromaticities=space)  # on all cores
         return []
-    images.write_exr(name, np.minimum(envmap, HALF_MAX), source, half=True, chromaticities=space)
-    over = (envmap > HALF_MAX).any(axis=2)
-    if not over.any():
-        return []
-    lost = 100 * float(np.maximum(envmap - HALF_MAX, 0).sum(dtype=np.float64) / envmap.sum(dtype=np.float64))
-    return [
-        f"{name}: {over.sum()} texels are brighter than {HALF_MAX:g}, the largest half, and are cut there: "
-        f"{lost:.2g} % of the sum of all texels is lost; set output.half = false"
-    ]
+    cut, warnings = map_file.cut_to_half(envmap, name, "set output.half = false")
+    images.write_exr(name, cut, source, half=True, chromaticities=space)
+    return warnings
 
 
 def write_lights(folder: Path, result: results.Result) -> None:

@@ -10,7 +10,6 @@ Longer than 400 lines: reading takes files and arrays, with the same checks.
 from __future__ import annotations
 
 import os
-import sys
 import zlib
 
 import numpy as np
@@ -436,10 +435,7 @@ def _write_whole(name, suffix, write):
 
 
 def _version():
-    """Return the package's version, or "unknown" when it runs uninstalled."""
-    import importlib.metadata
+    """Return the package's version."""
+    import envedit
 
-    try:
-        return importlib.metadata.version("envedit")
-    except importlib.metadata.PackageNotFoundError:
-        return getattr(sys.modules.get("envedit"), "__version__", "unknown")
+    return envedit.__version__

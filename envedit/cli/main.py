@@ -13,6 +13,8 @@ COMMANDS = {
     "run": "carry out the edit that a configuration describes",
     "paint": "paint on the rendering in the browser, while the map follows",
     "fit": "fit a SIREN to a map, without an edit",
+    "apply": "give maps the light of an edit: its look",
+    "convert": "turn a map as another program expects it",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

@@ -102,7 +102,7 @@ def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
         solid = float(weight.sum())
         x, y, z = light.direction
         elevation = math.atan2(y, math.hypot(x, z))
-        half, most = _radii(light, (height, width))
+        half, most = radii(light, (height, width))
         lights.append(
             {
                 "azimuth": math.degrees(math.atan2(x, -z)) % 360,
@@ -119,7 +119,7 @@ def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
     return sorted(lights, key=lambda light: -sum(light["flux"]))
 
 
-def _radii(light: Light, shape: tuple[int, int]) -> list[float]:
+def radii(light: Light, shape: tuple[int, int]) -> list[float]:
     """Return the angles from a light's direction within which half and 97 % of its flux lie, degrees.
 
     A texel counts as the tent that Mitsuba interpolates by, sampled at up to 8 x 8 points.
@@ -137,8 +137,8 @@ def _radii(light: Light, shape: tuple[int, int]) -> list[float]:
     chord = np.linalg.norm(toward - light.direction, axis=-1).ravel()
     order = np.argsort(chord)
     share = np.cumsum(flux[order]) / flux.sum()
-    radii = np.interp([0.5, 0.97], share, chord[order])
-    return np.degrees(2 * np.arcsin(np.clip(radii / 2, 0, 1))).tolist()
+    chords = np.interp([0.5, 0.97], share, chord[order])
+    return np.degrees(2 * np.arcsin(np.clip(chords / 2, 0, 1))).tolist()
 
 
 def kept(

@@ -12,7 +12,7 @@ from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
 from envedit.export import light_list
 from envedit.images import images, layered_exr
-from envedit.maps import map_file
+from envedit.maps import looks, map_file, usd_scene
 from envedit.report import manifest
 from envedit.scene import scene
 
@@ -60,28 +60,36 @@ def write_map(
 
 
 def write_lights(folder: Path, result: results.Result) -> None:
-    """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
+    """Write ``edited_sky.exr``, ``edited_lights.exr``, ``lights.json`` and ``look.toml``."""
     source = {"source": result.given.source}
     space = result.given.chromaticities
     sky, lights = light_list.split(result.envmap, result.given.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
     manifest.write_json(folder / "lights.json", result.lights)
+    degrees = result.found.turn_degrees if result.found else 0.0
+    looks.write(folder / "look.toml", looks.of_edit(result.maps["initial"], result.maps["edited"], degrees))
 
 
-def write_scene(settings: config.Config, folder: Path, base: Path | None = None) -> list[str]:
-    """Write ``edited.xml``: the scene lit by the edited map, which lies beside it.
+def write_scene(
+    settings: config.Config, folder: Path, result: results.Result, base: Path | None = None
+) -> list[str]:
+    """Write ``edited.xml``, the scene lit by the edited map, which lies beside it, and ``edited.usda``.
 
     Returns
     -------
     list of str
         A warning, if it cannot be written.
     """
+    edited = f"edited.{settings.output.format}"
+    lights = result.lights["after"]
+    stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale)
+    atomic_files.write_atomically(folder / "edited.usda", stage.encode())
     chosen = settings.scene
     try:
         text = scene.relit(
             chosen.file,
-            f"edited.{settings.output.format}",
+            edited,
             dict(chosen.parameters),
             base,
             chosen.up,

@@ -1,4 +1,4 @@
-"""Looks applied to maps: their lights placed, their sky graded, at the resolution of the file.
+"""Looks of edits, and looks applied to maps: lights placed, the sky graded, at the resolution of the file.
 
 A map's own lights move and change as an edit moves them, with their glow; one that the map does not have is
 added, round and with a soft glow. What is found on a small working map is carried to the file by
@@ -111,9 +111,7 @@ def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | Non
         first = _working(envmap, width)
 
     # ---- The edit of the working map
-    layers = looks.layers_of(first)
-    if "key" in look.lights:
-        layers = looks.layers_of(first, _aureole(layers, look.lights["key"]))
+    layers = _layers(first, look)
     begun = no_change(layers) if start is None else change_of(layers, start)
     params = parameters(layers, blended(begun, change_of(layers, look), amount))
 
@@ -126,10 +124,44 @@ def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | Non
     return full_resolution.carry(layers, params, first, first, envmap, Rows.of(len(first)))
 
 
+def of_edit(initial: np.ndarray, edited: np.ndarray, turn: float = 0.0) -> Look:
+    """Measure the look of an edit.
+
+    The lights are those of the edited map; the sky's change is that from the map before with these lights.
+
+    Parameters
+    ----------
+    initial, edited : ndarray (H, W, 3) float32
+        The map before and after, linear radiance.
+    turn : float
+        Degrees by which the whole map was turned before it was edited.
+    """
+    after = looks.layers_of(edited)
+    irradiance = looks.sky_irradiance(after, after.base)
+    look = Look(turn=turn, lights=looks.lights_of(after))
+    before = _layers(latlong.rotate(initial, turn), look)
+    relit = replace(no_change(before), lights=_lights(before, look, irradiance))
+    sky, core = (part.numpy() for part in before.parts(parameters(before, relit)))
+    rows = min(before.shape[0], after.shape[0])
+    lit = core[:rows].any(axis=2) | after.separation.core[:rows].any(axis=2)
+    total = before.rows[1]
+    weight = np.where(lit, 0.0, latlong.solid_angles(total, sky.shape[1])[:rows, None])
+    gain, saturation, white_balance = looks.sky_change(sky[:rows], after.base[:rows], weight, total)
+    return replace(look, gain=gain, saturation=saturation, white_balance=white_balance)
+
+
 def _working(envmap, width):
     if width == envmap.shape[1]:
         return envmap
     return latlong.resize(envmap, round(envmap.shape[0] * width / envmap.shape[1]), width)
+
+
+def _layers(envmap, look):
+    """Separate a map; lights that a look adds to it have a soft glow."""
+    layers = looks.layers_of(envmap)
+    if "key" not in look.lights:
+        return layers
+    return looks.layers_of(envmap, _aureole(layers, look.lights["key"]))
 
 
 def _aureole(layers, key):
@@ -178,39 +210,36 @@ def change_of(layers: Layers, look: Look) -> Change:
 
     Without a key light in the look the map's lights are put out.
     """
-    nothing = no_change(layers)
-    black = {i: replace(light, flux=np.zeros(3)) for i, light in nothing.lights.items()}
-    stay = nothing.lights if look.lights else black
     graded = replace(
-        nothing,
-        lights=stay,
+        no_change(layers),
         gain=look.gain,
         log_saturation=math.log(max(look.saturation, 1e-3)),
         white_balance=np.asarray(look.white_balance),
     )
-    relative = {role: 2.0**light.flux * np.asarray(light.tint) for role, light in look.lights.items()}
     irradiance = 0.0
-    change = graded
-    for _ in range(_ROUNDS):
+    change = replace(graded, lights=_lights(layers, look, irradiance))
+    for _ in range(_ROUNDS if look.lights else 0):
         sky = layers.parts(parameters(layers, change))[0].numpy()
         fresh = looks.sky_irradiance(layers, sky)
-        if abs(fresh - irradiance) <= _ENOUGH * fresh or not look.lights:
+        if abs(fresh - irradiance) <= _ENOUGH * fresh:
             break
         irradiance = fresh
-        change = replace(graded, lights=stay | _placed(layers, look, relative, irradiance))
+        change = replace(graded, lights=_lights(layers, look, irradiance))
     return change
 
 
-def _placed(layers, look, relative, irradiance):
+def _lights(layers, look, irradiance):
     """Place the lights of a look in a map whose sky has an irradiance."""
+    placed = no_change(layers).lights
+    if not look.lights:
+        return {i: replace(light, flux=np.zeros(3)) for i, light in placed.items()}
     own = layers.lights
     roles = looks.roles(layers)
     spare = iter(range(own.own, own.count))
     width = layers.whole[1]
-    placed = {}
     for role, light in look.lights.items():
         toward = look.toward(role)
-        flux = irradiance * relative[role]
+        flux = irradiance * 2.0**light.flux * np.asarray(light.tint)
         if role in roles:
             # ---- The map's own light, as far as its glow allows
             i = roles[role]

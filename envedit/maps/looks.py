@@ -4,7 +4,7 @@ A look has lights by role, and what was done to the sky. The key light is the on
 the strongest one behind, more than :data:`RIM_DEGREES` of azimuth from the key; the fill is the strongest of
 the others. Fluxes are in stops over the irradiance of the horizontal plane by the sky, the map without its
 lights: a look means the same for a map of any exposure. The sky's change is a smooth gain, a saturation and a
-white balance, of the background of :mod:`.separation`: where a light has gone is no part of it.
+white balance, of what lights do not do to it.
 """
 
 from __future__ import annotations
@@ -38,11 +38,8 @@ FAINTEST = 1e-3
 """Radiance over the sky's mean that is added before logarithms: black ground has no gain. Not measured."""
 MOST_STOPS = 16.0
 """Most stops that a gain, a white balance or a flux may have. Derived: e^12 of the gain is 17 stops."""
-MOST_GLOW = 1.25
-"""Glow of the lights, before or after, up to which a texel counts for the sky's change: where a strong glow
-goes, colours change for no other reason. Not measured."""
-LEAST_CLEAR = 0.1
-"""Least share of the sky with so little glow; with less, all of it counts. Not measured."""
+MOST_COEFFICIENT = 100.0
+"""Largest coefficient of a gain. Derived: of an even gain of MOST_STOPS it is 57."""
 _CHANNEL = 1e-2  # least channel over its luminance in logarithms
 _VARIES = 1e-4  # least variance of log chroma from which its slope is known
 
@@ -174,21 +171,6 @@ def radius(layers: Layers, i: int) -> float:
     return max(most, smallest(layers.whole[1]))
 
 
-def of_edit(initial: np.ndarray, edited: np.ndarray, turn: float = 0.0) -> Look:
-    """Measure the look of an edit.
-
-    Parameters
-    ----------
-    initial, edited : ndarray (H, W, 3) float32
-        The map before and after, linear radiance.
-    turn : float
-        Degrees by which the whole map was turned before it was edited.
-    """
-    before, after = layers_of(latlong.rotate(initial, turn)), layers_of(edited)
-    gain, saturation, white_balance = _sky_change(before, after)
-    return Look(turn, gain, saturation, white_balance, lights_of(after))
-
-
 def lights_of(layers: Layers) -> dict[str, RoleLight]:
     """Describe the lights of a map by their roles."""
     sky = sky_irradiance(layers, layers.base)
@@ -209,32 +191,43 @@ def lights_of(layers: Layers) -> dict[str, RoleLight]:
             azimuth,
             elevation,
             float(np.clip(np.log2(light / sky), -MOST_STOPS, MOST_STOPS)),
-            size if size > smallest(layers.whole[1]) else 0.0,
+            min(size, 90.0) if size > smallest(layers.whole[1]) else 0.0,
             tuple((flux / light).tolist()),
         )
     return described
 
 
-def _sky_change(before, after):
-    """Measure gain (9,), saturation and white balance (3,) between two maps without their lights."""
-    rows = min(before.shape[0], after.shape[0])
-    total, columns = before.rows[1], before.shape[1]
-    weight = np.repeat(latlong.solid_angles(total, columns)[:rows], columns)
-    glow = np.maximum(*(layers.separation.glow[:rows] @ LUMINANCE for layers in (before, after))).ravel()
-    clear = weight * (glow < MOST_GLOW)
-    weight = clear if clear.sum() > LEAST_CLEAR * weight.sum() else weight
-    weight /= weight.sum()
-    skies = [layers.separation.background[:rows].reshape(-1, 3) for layers in (before, after)]
+def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total: int) -> tuple:
+    """Measure the gain, the saturation and the white balance between two skies.
+
+    Parameters
+    ----------
+    before, after : ndarray (rows, W, 3)
+        Linear radiance of the first rows of a map, without its lights.
+    weight : ndarray (rows, W)
+        How much each texel counts.
+    total : int
+        Rows of the map.
+
+    Returns
+    -------
+    gain, saturation, white_balance
+        As of :class:`Look`.
+    """
+    rows, columns = weight.shape
+    weight = (weight / max(weight.sum(), 1e-300)).ravel()
+    skies = [np.float64(sky).reshape(-1, 3) for sky in (before, after)]
     light = [sky @ LUMINANCE for sky in skies]
-    means = [float(weight @ one) for one in light]
-    if not min(means) > 0:
+    mean = float(weight @ light[0])
+    if not (mean > 0 and weight @ light[1] > 0):
         return np.zeros(9), 1.0, (0.0, 0.0, 0.0)
 
     # ---- Gain: weighted least squares of the change of log luminance
-    change = np.log2((light[1] + FAINTEST * means[0]) / (light[0] + FAINTEST * means[0]))
+    change = np.log2((light[1] + FAINTEST * mean) / (light[0] + FAINTEST * mean))
     basis = harmonics(latlong.directions(total, columns)[:rows].reshape(-1, 3))
     normal = (basis * weight[:, None]).T @ basis + RIDGE / (4 * np.pi) * np.eye(9)
-    gain = np.linalg.solve(normal, basis.T @ (weight * np.clip(change, -MOST_STOPS, MOST_STOPS)))
+    moment = basis.T @ (weight * np.clip(change, -MOST_STOPS, MOST_STOPS))
+    gain = np.clip(np.linalg.solve(normal, moment), -MOST_COEFFICIENT, MOST_COEFFICIENT)
 
     # ---- Saturation and white balance: log chroma after = balance + saturation * log chroma before
     chroma = [
@@ -259,7 +252,7 @@ _NUMBERS = {
     "turn": (1, -360.0, 360.0),
     "saturation": (1, 0.0, 4.0),
     "white_balance": (3, -MOST_STOPS, MOST_STOPS),
-    "gain": (9, -100.0, 100.0),
+    "gain": (9, -MOST_COEFFICIENT, MOST_COEFFICIENT),
 }
 _LIGHT = {
     "azimuth": (1, -360.0, 360.0),

@@ -99,7 +99,7 @@ def _brightness(intensity, colour):
 
 def _placed(rotation):
     """Write a rotation whose columns are where the axes go; USD has vectors as rows: its transpose."""
-    rows = [", ".join(quote(float(value)) for value in column) for column in rotation.T]
+    rows = [", ".join(quote(float(value) + 0.0) for value in column) for column in rotation.T]
     matrix = ", ".join(f"({row}, 0)" for row in rows)
     return (
         f"matrix4d xformOp:transform = ( {matrix}, (0, 0, 0, 1) )",

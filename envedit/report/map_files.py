@@ -12,7 +12,7 @@ from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
 from envedit.export import light_list
 from envedit.images import images, layered_exr
-from envedit.maps import looks, map_file, usd_scene
+from envedit.maps import look_transfer, looks, map_file, usd_scene
 from envedit.report import manifest
 from envedit.scene import scene
 
@@ -68,7 +68,8 @@ def write_lights(folder: Path, result: results.Result) -> None:
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
     manifest.write_json(folder / "lights.json", result.lights)
     degrees = result.found.turn_degrees if result.found else 0.0
-    looks.write(folder / "look.toml", looks.of_edit(result.maps["initial"], result.maps["edited"], degrees))
+    look = look_transfer.of_edit(result.maps["initial"], result.maps["edited"], degrees)
+    looks.write(folder / "look.toml", look)
 
 
 def write_scene(

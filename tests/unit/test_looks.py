@@ -60,7 +60,7 @@ def test_a_map_has_the_key_light_that_the_look_says(sun):
 
 def test_the_look_of_an_edit_is_what_it_did():
     before = sky(True)
-    look = looks.of_edit(before, look_transfer.apply(before, EVENING))
+    look = look_transfer.of_edit(before, look_transfer.apply(before, EVENING))
     key, expected = look.lights["key"], EVENING.lights["key"]
     assert (key.azimuth, key.elevation) == pytest.approx((220, 24), abs=1)
     assert key.flux == pytest.approx(expected.flux, abs=0.1) and key.radius == 0
@@ -73,7 +73,7 @@ def test_the_look_of_an_edit_is_what_it_did():
 
 def test_no_edit_is_a_look_that_changes_nothing():
     before = sky(True)
-    look = looks.of_edit(before, before)
+    look = look_transfer.of_edit(before, before)
     assert not look.gain.any() and look.saturation == 1 and look.turn == 0
     np.testing.assert_allclose(look_transfer.apply(before, look), before, rtol=1e-3)
     assert look_transfer.apply(before, EVENING, amount=0) is before
@@ -81,7 +81,7 @@ def test_no_edit_is_a_look_that_changes_nothing():
 
 def test_a_turned_sky_is_turned_until_its_key_light_stands_there():
     before = sky(True)
-    look = looks.of_edit(before, latlong.rotate(before, 45), 45)
+    look = look_transfer.of_edit(before, latlong.rotate(before, 45), 45)
     assert look.turn == 45 and look.lights["key"].azimuth == pytest.approx(55, abs=2)
     other = latlong.rotate(before, 90)
     made = look_transfer.apply(other, look)

@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, paint, fit, init, sweep, doctor, schema, cache, weights."""
+"""The command ``envedit``: its commands, and how they are called."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ COMMANDS = {
     "run": "carry out the edit that a configuration describes",
     "paint": "paint on the rendering in the browser, while the map follows",
     "fit": "fit a SIREN to a map, without an edit",
+    "lights": "list the lights of a map; write its sky and its lights apart",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

@@ -37,6 +37,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _lights(arguments: argparse.Namespace, console: Console) -> None:
+    from envedit.export import file_lights
     from envedit.images import images
     from envedit.maps import map_lights
     from envedit.report import manifest, output_folder
@@ -44,8 +45,8 @@ def _lights(arguments: argparse.Namespace, console: Console) -> None:
     # ---- The lights, in Rec. 709 and in the colours of the file
     input_map = map_command.read(arguments.map, arguments, console)
     shape = input_map.stored.shape[:2]
-    separated = map_lights.lights_of(input_map.radiance).lights
-    listed = map_lights.listed(separated, shape, map_lights.without(input_map.radiance, separated))
+    separated = file_lights.lights_of(input_map.radiance).lights
+    listed = map_lights.listed(separated, shape, file_lights.without(input_map.radiance, separated))
     texels = [input_map.stored.reshape(-1, 3)[light.texels][None] for light in separated]
     cores = [
         replace(input_map, stored=stored).as_stored(light.radiance[None].astype(np.float32))[0]

@@ -14,6 +14,7 @@ COMMANDS = {
     "paint": "paint on the rendering in the browser, while the map follows",
     "fit": "fit a SIREN to a map, without an edit",
     "lights": "list the lights of a map; write its sky and its lights apart",
+    "adjust": "exposure, colour, rotation, blur of a map; a second map as backplate",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

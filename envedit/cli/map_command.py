@@ -15,6 +15,7 @@ The action says what it does by ``console.say`` and puts what programs read into
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -62,6 +63,21 @@ def make_parser(
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     return parser
+
+
+def number(low: float, high: float) -> Callable[[str], float]:
+    """Return the type of an option that is a number from ``low`` to ``high``."""
+
+    def read_number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # a NaN is in no range
+            raise argparse.ArgumentTypeError(f"got {text}, expected a number from {low:g} to {high:g}")
+        return value
+
+    return read_number
 
 
 def run(arguments: argparse.Namespace, action: Callable[[Console], None]) -> int:

@@ -1,22 +1,16 @@
-"""The lights of a map at the resolution of its file, and the irradiance of a map.
-
-Lights are looked for on the small copy of :mod:`.separation` and taken out of the file's texels in bands.
-"""
+"""The lights of a map as a list, the map as sky and lights, and the irradiance of a map."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.export import light_list
-from envedit.representations.layers.separation import Light, Survey, separate, survey_of
+from envedit.representations.layers.separation import Light
 
-ROWS = 128
-"""Rows that are worked on at a time: a band of a map 8192 texels wide is 25 MB in double precision."""
 IRRADIANCE_WIDTH = 512
 """Most columns of the copy that irradiance is integrated over. Within a texel of it, 0.7 degrees, the cosine
 changes by less than 1.3 %, and the mean over the texel by 1e-5. Derived."""
@@ -24,60 +18,6 @@ AXES = {
     "+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1),
 }  # fmt: skip
 """Normals of the surfaces that irradiance is compared on, in the frame of the map: +y is up."""
-
-
-@dataclass(frozen=True)
-class MapLights:
-    """The lights of a map.
-
-    Attributes
-    ----------
-    lights : list of separation.Light
-        Those with most flux first; texels and radiance at the resolution of the map.
-    survey : separation.Survey, optional
-        Of the small copy; its lights are in the same order. None: there are none.
-    """
-
-    lights: list[Light]
-    survey: Survey | None
-
-
-def lights_of(radiance: np.ndarray) -> MapLights:
-    """Separate the lights of a map (H, W, 3), linear radiance in Rec. 709, from its sky."""
-    survey = survey_of(radiance)
-    if survey is None:
-        return MapLights([], None)
-    height, width = radiance.shape[:2]
-
-    # ---- Texels of each light, of the bands that hold any
-    rows = np.flatnonzero((survey.label >= 0).any(axis=1)) * ((height - 1) / (survey.rows[1] - 1))
-    margin = height / survey.rows[1] + 1
-    parts: list[list[Light]] = [[] for _ in survey.centres]
-    for first in range(0, height, ROWS):
-        if not ((rows > first - margin) & (rows < first + ROWS + margin)).any():
-            continue
-        band = separate(radiance[first : first + ROWS], (first, height), survey=survey)
-        for light in band.lights:
-            index = next(i for i, centre in enumerate(survey.centres) if centre is light.direction)
-            parts[index].append(replace(light, texels=light.texels + first * width))
-
-    # ---- Those that leave anything at this resolution
-    kept = [i for i, part in enumerate(parts) if part]
-    lights = [
-        replace(
-            parts[i][0],
-            texels=np.concatenate([light.texels for light in parts[i]]),
-            radiance=np.concatenate([light.radiance for light in parts[i]]),
-        )
-        for i in kept
-    ]
-    survey = replace(
-        survey,
-        centres=[survey.centres[i] for i in kept],
-        glows=[survey.glows[i] for i in kept],
-        shares=[survey.shares[i] for i in kept],
-    )
-    return MapLights(lights, survey)
 
 
 def listed(lights: list[Light], shape: tuple[int, int], sky: np.ndarray) -> list[dict]:
@@ -161,12 +101,3 @@ def split(stored: np.ndarray, cores: list[np.ndarray], lights: list[Light]) -> t
         stored.reshape(-1, 3)[light.texels] = sky
         alone.reshape(-1, 3)[light.texels] = lamp
     return stored, alone
-
-
-def without(radiance: np.ndarray, lights: list[Light]) -> np.ndarray:
-    """Return a map without its lights: radiance (H, W, 3) float32, not negative."""
-    sky = radiance.copy()
-    for light in lights:
-        flat = sky.reshape(-1, 3)
-        flat[light.texels] = np.maximum(flat[light.texels] - light.radiance, 0)
-    return sky

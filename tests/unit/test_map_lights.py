@@ -8,9 +8,10 @@ import pytest
 
 from envedit.cli import lights
 from envedit.core import latlong, primaries
-from envedit.export import light_list
+from envedit.export import file_lights, light_list
 from envedit.images import images
 from envedit.maps import map_lights
+from envedit.representations.layers.separation import separate
 
 HEIGHT, WIDTH = 48, 96
 AT = 12, 30
@@ -66,8 +67,8 @@ def test_the_list_has_direction_flux_and_stops(rng, tmp_path, capsys):
 
 def test_bands_of_a_large_map_hold_the_lights_of_the_whole(rng):
     envmap = latlong.resize(sunny(rng), 300, 600)
-    apart = map_lights.lights_of(envmap).lights
-    whole = map_lights.separate(envmap).lights
+    apart = file_lights.lights_of(envmap).lights
+    whole = separate(envmap).lights
     assert [len(one.texels) for one in apart] == [len(one.texels) for one in whole]
     for one, other in zip(apart, whole, strict=True):
         assert np.array_equal(one.texels, other.texels)

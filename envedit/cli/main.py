@@ -16,6 +16,7 @@ COMMANDS = {
     "lights": "list the lights of a map; write its sky and its lights apart",
     "adjust": "exposure, colour, rotation, blur of a map; a second map as backplate",
     "blend": "a map between two maps: lights move, skies blend",
+    "sky": "an analytic sky as a file, of a sun's position or of a place and a time",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

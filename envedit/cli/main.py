@@ -17,6 +17,7 @@ COMMANDS = {
     "adjust": "exposure, colour, rotation, blur of a map; a second map as backplate",
     "blend": "a map between two maps: lights move, skies blend",
     "sky": "an analytic sky as a file, of a sun's position or of a place and a time",
+    "compare": "how far two maps are apart, as pictures and as light",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

@@ -93,4 +93,4 @@ def _place(light: dict) -> str:
 
 
 def _stops(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.2f}"
+    return "-" if value is None else f"{round(value, 2) + 0.0:+.2f}"  # no minus of what rounds to 0

@@ -71,9 +71,9 @@ def lights_of(radiance: np.ndarray) -> FileLights:
 
 def take_out(radiance: np.ndarray, lights: list[Light]) -> None:
     """Take lights out of a map (H, W, 3) float32 in place; what is left is not negative."""
-    flat = radiance.reshape(-1, 3)
     for light in lights:
-        flat[light.texels] = np.maximum(flat[light.texels] - light.radiance, 0)
+        texels = np.divmod(light.texels, radiance.shape[1])  # of a map in any memory layout
+        radiance[texels] = np.maximum(radiance[texels] - light.radiance, 0)
 
 
 def without(radiance: np.ndarray, lights: list[Light]) -> np.ndarray:

@@ -96,8 +96,6 @@ def split(stored: np.ndarray, cores: list[np.ndarray], lights: list[Light]) -> t
     """
     alone = np.zeros_like(stored)
     for core, light in zip(cores, lights, strict=True):
-        texels = stored.reshape(-1, 3)[light.texels]
-        sky, lamp = light_list.split(texels, core)
-        stored.reshape(-1, 3)[light.texels] = sky
-        alone.reshape(-1, 3)[light.texels] = lamp
+        texels = np.divmod(light.texels, stored.shape[1])  # of a map in any memory layout
+        stored[texels], alone[texels] = light_list.split(stored[texels], core)
     return stored, alone

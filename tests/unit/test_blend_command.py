@@ -15,7 +15,8 @@ HEIGHT, WIDTH = 64, 128
 
 
 def sky(at, peak, level):
-    envmap = np.full((HEIGHT, WIDTH, 3), level, np.float32)
+    """Return a map in the memory layout of one that was read from a Radiance file."""
+    envmap = np.full((HEIGHT, 3, WIDTH), level, np.float32).transpose(0, 2, 1)
     if at:
         envmap[at] = np.float32([1, 0.8, 0.6]) * peak
     return envmap
@@ -29,7 +30,7 @@ def lights_of(envmap):
 def test_one_sun_moves_on_a_great_circle_and_its_flux_changes_geometrically(amount):
     first, second = sky((12, 30), 20000, 0.2), sky((25, 70), 3000, 0.8)
     ends = [lights_of(one)[0] for one in (first, second)]
-    mixed, listed = blended.blend(first.copy(), second.copy(), amount)
+    mixed, listed = blended.blend(first, second, amount)
     (light,) = lights_of(mixed)
     flux = np.array(ends[0]["flux"]) ** (1 - amount) * np.array(ends[1]["flux"]) ** amount
     np.testing.assert_allclose(light["flux"], flux, rtol=5e-3)
@@ -45,7 +46,7 @@ def test_one_sun_moves_on_a_great_circle_and_its_flux_changes_geometrically(amou
 def test_a_light_without_a_partner_fades_where_it_is():
     first, second = sky((12, 30), 20000, 0.2), sky(None, 0, 0.2)
     (before,) = lights_of(first)
-    mixed, _ = blended.blend(first.copy(), second, 0.75)
+    mixed, _ = blended.blend(first, second, 0.75)
     (after,) = lights_of(mixed)
     np.testing.assert_allclose(after["flux"], 0.25 * np.array(before["flux"]), rtol=5e-3)
     np.testing.assert_allclose(after["direction"], before["direction"], atol=0.02)

@@ -23,9 +23,9 @@ def sunny(rng, peak=5000.0):
     return envmap
 
 
-def written(envmap, tmp_path, **how):
-    images.write_exr(tmp_path / "sky.exr", envmap, **how)
-    assert lights.main([str(tmp_path / "sky.exr"), "--out", str(tmp_path / "out"), "--json"]) == 0
+def written(envmap, tmp_path, name="sky.exr", **how):
+    (images.write_hdr if name.endswith("hdr") else images.write_exr)(tmp_path / name, envmap, **how)
+    assert lights.main([str(tmp_path / name), "--out", str(tmp_path / "out"), "--json"]) == 0
     parts = [
         images.load_envmap(tmp_path / "out" / f"{name}.exr", convert=False) for name in ("sky", "lights")
     ]
@@ -33,10 +33,12 @@ def written(envmap, tmp_path, **how):
     return sky, alone, info
 
 
-@pytest.mark.parametrize("how", [{}, {"half": True}, {"chromaticities": primaries.ACES_AP1}])
+@pytest.mark.parametrize(
+    "how", [{"name": "sky.hdr"}, {}, {"half": True}, {"chromaticities": primaries.ACES_AP1}]
+)
 def test_sky_and_lights_sum_to_the_map_bit_for_bit(how, rng, tmp_path, capsys):
     sky, alone, info = written(sunny(rng), tmp_path, **how)
-    stored, _ = images.load_envmap(tmp_path / "sky.exr", convert=False)
+    stored, _ = images.load_envmap(tmp_path / how.get("name", "sky.exr"), convert=False)
     assert alone[AT].min() > 100 and sky[AT].max() < 2
     assert np.array_equal(sky + alone, stored)
     assert (info["chromaticities"] is None) == ("chromaticities" not in how)

@@ -169,6 +169,7 @@ COUNTS = {
     "layers": 96,
     "light_estimation": 6,
     "looks": 12,
+    "maps_alone": 26,
     "natural": 680,
     "natural.skies": 1,
     "paint.figure10": 7,

@@ -19,7 +19,7 @@ def stage_of(folder, to_world, scale=1.0):
     envmap = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
     envmap[7, 50] = [900, 600, 300]
     envmap[12, 9] = [30, 90, 200]
-    lights = light_list.listed(separate(envmap), to_world)
+    lights = light_list.listed(separate(envmap).lights, (HEIGHT, WIDTH), to_world)
     (folder / "edited.usda").write_text(
         usd_scene.text("edited.exr", "edited_sky.exr", lights, to_world, scale)
     )

@@ -14,7 +14,7 @@ import os
 # loops: beside other work a factorisation of 700 unknowns took 1.1 s with two threads and 6 ms with one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 _PUBLIC = {
     "Config": "envedit.config",
     "ConfigError": "envedit.core.errors",

@@ -78,6 +78,8 @@ class InputMap:
         The whole map, where it came as an array and not from a file.
     unmoved : ndarray (H, W, 3), optional
         The :attr:`radiance` as the file has it, where lights were placed or the map was turned by hand.
+    half : bool
+        Whether the file is OpenEXR in half.
     """
 
     source: str
@@ -89,6 +91,7 @@ class InputMap:
     placed: PlacedLights | None = None
     array: np.ndarray | None = None
     unmoved: np.ndarray | None = None
+    half: bool = False
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -124,7 +127,7 @@ class InputMap:
         """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
-        return _read(self.source if self.array is None else self.array, None, settings, self.scale)
+        return read_file(self.source if self.array is None else self.array, None, settings, self.scale)
 
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
@@ -220,7 +223,7 @@ def read_map(
     """
     scale = 1.0 if scene is None else scene.own.scale
     if array is not None:
-        return _by_hand(settings, _read(array, width, settings, scale))
+        return _by_hand(settings, read_file(array, width, settings, scale))
     source = source_of(settings, scene)
     if source == SUNSKY:
         width = width or settings.width
@@ -228,9 +231,9 @@ def read_map(
         input_map = InputMap(source, sky, scale, (width, width // 2), [])
     elif source == SCENE and scene is not None and scene.own.light is not None:
         light = scene.own.light.map(width or settings.width, scene.to_world)
-        input_map = replace(_read(light, width, settings, scale), source=SCENE)
+        input_map = replace(read_file(light, width, settings, scale), source=SCENE)
     else:
-        input_map = _read(source, width, settings, scale)
+        input_map = read_file(source, width, settings, scale)
     return _by_hand(settings, input_map)
 
 
@@ -254,15 +257,34 @@ def _by_hand(settings, input_map):
     return replace(input_map, stored=turned, warnings=warnings, placed=placed, unmoved=input_map.radiance)
 
 
-def _read(source, width, settings, scale):
-    """Read a map from its file, or take it from an array (H, 2 H, 3)."""
+def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:
+    """Read a map from its file, or take it from an array (H, 2 H, 3).
+
+    Parameters
+    ----------
+    source : str or ndarray
+        The file or the array.
+    width : int, optional
+        Texels across; None: as many as the file has.
+    settings : config.Input
+        ``repair`` and ``colour_space`` count.
+    scale : float
+        What the scene multiplies it by.
+
+    Raises
+    ------
+    InputError
+        As of :func:`.images.load_envmap`.
+    """
     stored, info = images.load_envmap(
         source, width, settings.repair, convert=False, name="envmap", space=settings.colour_space
     )
     array = source if isinstance(source, np.ndarray) else None
-    name = source if array is None else images.ARRAY
+    name = images.ARRAY if isinstance(source, np.ndarray) else source
     warnings = [*info["warnings"]]
-    input_map = InputMap(name, stored, scale, info["size"], warnings, info["chromaticities"], array=array)
+    space = info["chromaticities"]
+    half = info.get("half", False)
+    input_map = InputMap(name, stored, scale, info["size"], warnings, space, array=array, half=half)
     if input_map.outside > 0:
         space = primaries.name_of(input_map.chromaticities)
         warnings.append(

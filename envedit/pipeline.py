@@ -517,6 +517,7 @@ class _Edit:
             views=self.scene.views,
             lights=self.lights,
             core=self.core,
+            to_world=self.scene.to_world,
             influence=self.transport.influence if self.transport else None,
             frozen=self.frozen,
             scene=self.scene.path,

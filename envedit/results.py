@@ -52,6 +52,8 @@ class Result:
         Lights ``before`` and ``after``, of :func:`.light_list.matched`.
     core : ndarray (H, W, 3) float32
         The lights alone in the edited map, radiance that reaches the scene.
+    to_world : ndarray (3, 3), optional
+        Rotation from the map's frame to the scene's; None: none.
     influence : ndarray (H, W), optional
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
@@ -88,6 +90,7 @@ class Result:
     views: tuple[View, ...]
     lights: dict[str, list[dict]]
     core: np.ndarray
+    to_world: np.ndarray | None = None
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
     scene: Path | None = None

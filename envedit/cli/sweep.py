@@ -22,7 +22,7 @@ def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
         "configurations NAME.toml. The folder of a job is DIR/HASH; DIR/sweep.tsv lists names and folders.",
         epilog="examples:\n  envedit sweep jobs.toml --out runs/sweep --workers 2\n"
         "  envedit sweep jobs.toml --out /shared/runs --scheduler tcp://HOST:8786\n\n"
-        "A scheduler and its workers are Dask's (pip install 'envedit[cluster]'):\n"
+        "A scheduler and its workers are Dask's (pip install 'envedit-hdr[cluster]'):\n"
         "  dask scheduler                              # prints its address, tcp://HOST:8786\n"
         "  dask worker tcp://HOST:8786 --nthreads 1    # on each node; a thread is a job at a time",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -70,7 +70,7 @@ class Output(Table):
     half: bool = key(
         False, Boolean(), "OpenEXR with 16 bits a channel; what is above 65504 is cut, with a warning"
     )
-    scene: bool = key(True, Boolean(), "write edited.xml, the scene lit by the edited map")
+    scene: bool = key(True, Boolean(), "write edited.xml and edited.usda, which the edited map lights")
 
     def _check_together(self) -> None:
         if self.half and self.format != "exr":

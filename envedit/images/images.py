@@ -8,7 +8,6 @@ sentences.
 from __future__ import annotations
 
 import os
-import sys
 import zlib
 
 import numpy as np
@@ -59,7 +58,8 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
     info : dict
         ``path`` (str), ``format`` ("exr", "hdr", "png" or "jpeg"), ``size`` (width, height), ``hdr`` (False
         for 8- and 16-bit pictures, which have ``bits``), ``metadata`` (dict of str, int and float),
-        ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str).
+        ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str). Of OpenEXR
+        also ``half``: whether its values are.
 
     Raises
     ------
@@ -362,7 +362,9 @@ def write_exr(
     _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
 
 
-def write_hdr(path: FilePath, image: ArrayLike) -> None:
+def write_hdr(
+    path: FilePath, image: ArrayLike, chromaticities: primaries.Chromaticities | None = None
+) -> None:
     """Write an image as a Radiance file (:func:`.rgbe.encode`), whole or not at all.
 
     Parameters
@@ -371,6 +373,8 @@ def write_hdr(path: FilePath, image: ArrayLike) -> None:
         The file; an existing one is replaced.
     image : array (H, W, 3)
         Linear radiance, finite and not negative.
+    chromaticities : tuple, optional
+        Of the image's colours, which few programs read from such a file; None: Rec. 709.
 
     Raises
     ------
@@ -378,7 +382,7 @@ def write_hdr(path: FilePath, image: ArrayLike) -> None:
         As :func:`write_exr`.
     """
     name = os.fsdecode(path)
-    write_atomically(name, rgbe.encode(np.maximum(_checked(name, image), 0)))
+    write_atomically(name, rgbe.encode(_checked(name, image), chromaticities))
 
 
 def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:
@@ -449,15 +453,12 @@ def _checked(name, image):
 
 def _write_whole(name, suffix, write):
     """Call ``write(temporary name)`` and rename the result to ``name``."""
-    with replacing(name, suffix) as temporary, quiet_libraries():
+    with replacing(name, suffix) as temporary, quiet_libraries(), exr.on_cores():
         write(str(temporary))
 
 
 def _version():
-    """Return the package's version, or "unknown" when it runs uninstalled."""
-    import importlib.metadata
+    """Return the package's version."""
+    import envedit
 
-    try:
-        return importlib.metadata.version("envedit")
-    except importlib.metadata.PackageNotFoundError:
-        return getattr(sys.modules.get("envedit"), "__version__", "unknown")
+    return envedit.__version__

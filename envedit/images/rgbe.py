@@ -128,31 +128,43 @@ def _radiance_pixels(name, data, height, width):
 # Writing
 
 
-def encode(image: np.ndarray) -> bytes:
-    """Encode (H, W, 3) linear radiance, finite and not negative, as a Radiance file.
+def encode(image: np.ndarray, chromaticities: tuple[float, ...] | None = None) -> bytes:
+    """Encode (H, W, 3) linear radiance, finite, as a Radiance file; negative values are 0.
 
     A texel's channels share the exponent of the largest and have 8 bits each, rounded to the nearest: an
-    error of at most 1/256 of the largest channel. What is below 2^-128 is 0.
+    error of at most 1/256 of the largest channel. What is below 2^-128 is 0. Chromaticities, if there are
+    any, become the line ``PRIMARIES``.
     """
     height, width, _ = image.shape
-    values = np.minimum(image.astype(np.float64), _LARGEST)
+    space = "" if chromaticities is None else f"PRIMARIES={' '.join(f'{v:g}' for v in chromaticities)}\n"
+    head = f"#?RADIANCE\n{space}FORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
+    start, rows = bytes((2, 2, width >> 8 & 255, width & 255)), [head]
+    for first in range(0, height, _ROWS):
+        texels = _texels(image[first : first + _ROWS])
+        if not 8 <= width < 32768:  # too short or long for scanlines by channel
+            rows.append(texels.tobytes())
+            continue
+        for row in texels:
+            rows.append(start)
+            for channel in row.T:
+                plain = channel.tobytes()  # in runs of up to 128 that do not repeat
+                parts = (plain[i : i + 128] for i in range(0, width, 128))
+                rows += [bytes((len(part),)) + part for part in parts]
+    return b"".join(rows)
+
+
+def _texels(image):
+    """Return mantissas and exponent (rows, W, 4) uint8 of radiance (rows, W, 3)."""
+    values = np.clip(image.astype(np.float64), 0, _LARGEST)
     exponent = np.frexp(values.max(axis=2))[1]
     exponent += np.rint(np.ldexp(values.max(axis=2), 8 - exponent)) > 255
     codes = np.rint(np.ldexp(values, (8 - exponent)[..., None]))
     shown = (values.max(axis=2) > 0) & (exponent > -128)
-    texels = np.zeros((height, width, 4), np.uint8)
+    texels = np.zeros((*image.shape[:2], 4), np.uint8)
     texels[..., :3] = np.where(shown[..., None], codes, 0)
     texels[..., 3] = np.where(shown, exponent + 128, 0)
-    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
-    if not 8 <= width < 32768:  # too short or long for scanlines by channel
-        return head + texels.tobytes()
-    start, rows = bytes((2, 2, width >> 8, width & 255)), [head]
-    for row in texels:
-        rows.append(start)
-        for channel in row.T:
-            plain = channel.tobytes()  # in runs of up to 128 that do not repeat
-            rows += [bytes((len(part),)) + part for i in range(0, width, 128) if (part := plain[i : i + 128])]
-    return b"".join(rows)
+    return texels
 
 
+_ROWS = 256  # that are encoded at a time
 _LARGEST = 2.0**127 * (255 / 256)

@@ -10,9 +10,9 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
-from envedit.core.radiance import HALF_MAX
 from envedit.export import light_list
 from envedit.images import images, layered_exr
+from envedit.maps import look_transfer, looks, map_file, usd_scene
 from envedit.report import manifest
 from envedit.scene import scene
 
@@ -54,40 +54,43 @@ def write_map(
         else:
             layered_exr.write(name, {"edited": envmap}, chromaticities=space)  # on all cores
         return []
-    images.write_exr(name, np.minimum(envmap, HALF_MAX), source, half=True, chromaticities=space)
-    over = (envmap > HALF_MAX).any(axis=2)
-    if not over.any():
-        return []
-    lost = 100 * float(np.maximum(envmap - HALF_MAX, 0).sum(dtype=np.float64) / envmap.sum(dtype=np.float64))
-    return [
-        f"{name}: {over.sum()} texels are brighter than {HALF_MAX:g}, the largest half, and are cut there: "
-        f"{lost:.2g} % of the sum of all texels is lost; set output.half = false"
-    ]
+    cut, warnings = map_file.cut_to_half(envmap, name, "set output.half = false")
+    images.write_exr(name, cut, source, half=True, chromaticities=space)
+    return warnings
 
 
 def write_lights(folder: Path, result: results.Result) -> None:
-    """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
+    """Write ``edited_sky.exr``, ``edited_lights.exr``, ``lights.json`` and ``look.toml``."""
     source = {"source": result.given.source}
     space = result.given.chromaticities
     sky, lights = light_list.split(result.envmap, result.given.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
     manifest.write_json(folder / "lights.json", result.lights)
+    degrees = result.found.turn_degrees if result.found else 0.0
+    look = look_transfer.of_edit(result.maps["initial"], result.maps["edited"], degrees)
+    looks.write(folder / "look.toml", look)
 
 
-def write_scene(settings: config.Config, folder: Path, base: Path | None = None) -> list[str]:
-    """Write ``edited.xml``: the scene lit by the edited map, which lies beside it.
+def write_scene(
+    settings: config.Config, folder: Path, result: results.Result, base: Path | None = None
+) -> list[str]:
+    """Write ``edited.xml``, the scene lit by the edited map, which lies beside it, and ``edited.usda``.
 
     Returns
     -------
     list of str
         A warning, if it cannot be written.
     """
+    edited = f"edited.{settings.output.format}"
+    lights = result.lights["after"]
+    stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale)
+    atomic_files.write_atomically(folder / "edited.usda", stage.encode())
     chosen = settings.scene
     try:
         text = scene.relit(
             chosen.file,
-            f"edited.{settings.output.format}",
+            edited,
             dict(chosen.parameters),
             base,
             chosen.up,

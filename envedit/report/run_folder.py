@@ -53,7 +53,7 @@ def write(
     _write_full_resolution(settings, folder, result)
     map_files.write_lights(folder, result)
     if settings.output.scene:
-        result.warnings += map_files.write_scene(settings, folder, base)
+        result.warnings += map_files.write_scene(settings, folder, result, base)
     maps_written = time.perf_counter()
 
     # ---- What explains the run later

@@ -168,6 +168,8 @@ COUNTS = {
     "interiors": 5,
     "layers": 96,
     "light_estimation": 6,
+    "looks": 12,
+    "maps_alone": 26,
     "natural": 680,
     "natural.skies": 1,
     "paint.artists": 12,

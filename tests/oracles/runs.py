@@ -18,7 +18,7 @@ from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
 FILES = {
     "edited.exr", "render_initial.exr", "render_target.exr", "render_edited.exr", "preview.png",
     "report.html", "history.csv", "config.toml", "manifest.json", "metrics.json", "edited_layers.exr",
-    "edited_sky.exr", "edited_lights.exr", "lights.json", "edited.xml",
+    "edited_sky.exr", "edited_lights.exr", "lights.json", "edited.xml", "edited.usda", "look.toml",
 }  # fmt: skip
 INFLUENCE = {"influence.exr", "influence.png"}
 TINY = {

@@ -64,6 +64,8 @@ def degrees_to_cores(lights: list[Light], shape: tuple[int, int], rows: tuple[in
     omega = latlong.lookup_solid_angles(total, width)
     glowing = [light for light in lights if light.glow is not None]
     radii = [np.sqrt(omega[first + one.texels // width].sum() / np.pi) for one in glowing]
+    if not glowing:
+        return np.full(shape, 180.0)
     angles = np.arccos(np.clip(toward @ np.transpose([one.direction for one in glowing]), -1, 1))
     return np.degrees(np.maximum(angles - radii, 0).min(axis=2))
 

@@ -127,7 +127,7 @@ class Layers:
         rows: tuple[int, int] | None = None,
         cycles: int = CYCLES,
         horizon: Horizon = "free",
-        aureoles: bool = True,
+        aureoles: bool | np.ndarray = True,
     ) -> Layers:
         """Separate an image.
 
@@ -142,8 +142,9 @@ class Layers:
         horizon : str
             What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
             ``below_horizon.py``, or "free": edited as those above.
-        aureoles : bool
-            Lights that are added have the glow of the map's strongest, as for :class:`.Lights`.
+        aureoles : bool or ndarray
+            Lights that are added have the glow of the map's strongest, or that of a table, as for
+            :class:`.Lights`.
 
         Raises
         ------

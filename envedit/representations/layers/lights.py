@@ -78,8 +78,9 @@ class Lights:
         First row of the image that the lights' texels refer to in its map, and the rows of that map.
     width : int
         Its columns.
-    aureoles : bool
-        Spare lights have a glow; without it what surrounds a light that is added is left to the gain.
+    aureoles : bool or ndarray (len(GLOW_DEGREES), 3)
+        Spare lights have a glow; without it what surrounds a light that is added is left to the gain. A table
+        is the glow that they have.
 
     Attributes
     ----------
@@ -92,10 +93,12 @@ class Lights:
         :data:`FAINTEST` of it in every channel, or 1.
     glows : list of ndarray (len(GLOW_DEGREES), 3) or None
         As of :class:`.separation.Light`, of lights of :attr:`flux`. Spare ones have that of the strongest
-        light with a glow, in proportion to flux; None where none has.
+        light with a glow, in proportion to flux, None where none has; or the table of ``aureoles``.
     """
 
-    def __init__(self, lights: list[Light], rows: tuple[int, int], width: int, aureoles: bool = True):
+    def __init__(
+        self, lights: list[Light], rows: tuple[int, int], width: int, aureoles: bool | np.ndarray = True
+    ):
         first, total = rows
         self.own = len(lights)
         self.count = len(lights) + SPARE
@@ -139,7 +142,10 @@ class Lights:
 
         # ---- Glows
         self.glows = [light.glow for light in lights]
-        self.glows += [_glow_in_proportion(self.glows, own, spare) if aureoles else None] * SPARE
+        added = aureoles if isinstance(aureoles, np.ndarray) else None
+        if aureoles is True:
+            added = _glow_in_proportion(self.glows, own, spare)
+        self.glows += [added] * SPARE
         self._glow = [
             None if glow is None else dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
             for glow in self.glows

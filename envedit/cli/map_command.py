@@ -1,0 +1,135 @@
+"""What the commands on a map alone share: options, the object of ``--json``, exit codes.
+
+.. code-block:: python
+
+   @steady
+   def main(argv: list[str] | None = None) -> int:
+       parser = map_command.make_parser("adjust", "Adjust a map.", ["envedit adjust sky.hdr --exposure 1"])
+       parser.add_argument("map", ...)
+       arguments = parser.parse_args(argv)
+       return map_command.run(arguments, lambda console: _adjust(arguments, console))
+
+The action says what it does by ``console.say`` and puts what programs read into ``console.facts``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from envedit.cli.console import Console
+from envedit.core.errors import EnveditError, unwrapped
+
+if TYPE_CHECKING:
+    from envedit.inputs import InputMap
+
+MAP_HELP = "an OpenEXR or Radiance HDR file, lat-long, 2:1"
+
+
+def make_parser(
+    command: str,
+    description: str,
+    examples: Sequence[str],
+    out: str = "FILE",
+    default: str | None = None,
+    repair: bool = True,
+) -> argparse.ArgumentParser:
+    """Make a parser with the options that all commands on a map have.
+
+    Parameters
+    ----------
+    command : str
+        Its name, such as "adjust".
+    description : str
+        What it does.
+    examples : sequence of str
+        Command lines.
+    out : str
+        "FILE" or "DIR": what ``--out`` names.
+    default : str, optional
+        What it names without the option, for the help.
+    repair : bool
+        Whether there is the option of :func:`.map_file.read`.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"envedit {command}",
+        description=description,
+        epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    where = f" (default: {default}, in the working folder)" if default else ""
+    parser.add_argument("--out", metavar=out, help=f"where the result goes{where}")
+    if out == "FILE":
+        parser.add_argument(
+            "--overwrite", action="store_true", help="replace the file of --out, unless it is an input"
+        )
+    if repair:
+        about = "replace texels that are not finite instead of refusing them"
+        parser.add_argument("--repair", action="store_true", help=about)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    return parser
+
+
+def number(low: float, high: float) -> Callable[[str], float]:
+    """Return the type of an option that is a number from ``low`` to ``high``."""
+
+    def read_number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # a NaN is in no range
+            raise argparse.ArgumentTypeError(f"got {text}, expected a number from {low:g} to {high:g}")
+        return value
+
+    return read_number
+
+
+def run(arguments: argparse.Namespace, action: Callable[[Console], None]) -> int:
+    """Carry out a command; errors are reported, with ``--json`` in the object as well.
+
+    Returns
+    -------
+    int
+        0, the exit code of the error, or 130 after Ctrl-C.
+    """
+    console = Console(one_object=arguments.json)
+    code = 0
+    try:
+        with unwrapped():
+            action(console)
+    except EnveditError as error:
+        console.error(str(error))
+        code = error.exit_code
+    except MemoryError:
+        console.error("not enough memory for this map; make it smaller")
+        code = 4
+    except KeyboardInterrupt:
+        console.error("interrupted; no file was left half written")
+        code = 130
+    console.close(code)
+    return code
+
+
+def read(path: str, arguments: argparse.Namespace, console: Console) -> InputMap:
+    """Read a map as of :func:`.map_file.read`, and report its warnings."""
+    from envedit.maps import map_file
+
+    input_map = map_file.read(path, arguments.repair)
+    for warning in input_map.warnings:
+        console.warn(f"{path}: {warning}")
+    return input_map
+
+
+def select_variant() -> None:
+    """Select the variant of Mitsuba for PNG files, the analytic sky and metrics; MachineError without one."""
+    import mitsuba as mi
+
+    from envedit import config
+    from envedit.cli import doctor
+
+    variant = config.Config().variant
+    doctor.ensure(variant)
+    mi.set_variant(variant)

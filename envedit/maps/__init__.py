@@ -1,0 +1,1 @@
+"""Maps without a scene: what is done with the file of a map alone."""

@@ -1,0 +1,345 @@
+"""Looks: what an edit did to the light of a map, apart from the map (``look.toml``).
+
+A look has lights by role, and what was done to the sky. The key light is the one with most flux; the rim is
+the strongest one behind, more than :data:`RIM_DEGREES` of azimuth from the key; the fill is the strongest of
+the others. Fluxes are in stops over the irradiance of the horizontal plane by the sky, the map without its
+lights: a look means the same for a map of any exposure. The sky's change is a smooth gain, a saturation and a
+white balance, of what lights do not do to it.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from envedit.config.toml import quote
+from envedit.core import atomic_files, latlong
+from envedit.core.color import LUMINANCE
+from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import FilePath
+from envedit.export import light_list
+from envedit.representations.layers import below_horizon
+from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.placed_lights import angles, direction
+
+ROLES = ("key", "fill", "rim")
+RIM_DEGREES = 120.0
+"""Azimuth from the key light beyond which a light is a rim. Not measured."""
+LEAST_SHARE = 1 / 8
+"""Least flux of fill and rim over the key's: edges of clouds are below it. Not measured."""
+RIDGE = 1e-3
+"""Weight of the squared coefficients beside the mean squared misfit: keeps a gain that the sky does not
+determine at 0. Derived: it takes less than 1 % from a coefficient of an even gain."""
+FAINTEST = 1e-3
+"""Radiance over the sky's mean that is added before logarithms: black ground has no gain. Not measured."""
+MOST_STOPS = 16.0
+"""Most stops that a gain, a white balance or a flux may have. Derived: e^12 of the gain is 17 stops."""
+MOST_COEFFICIENT = 100.0
+"""Largest coefficient of a gain. Derived: of an even gain of MOST_STOPS it is 57."""
+_CHANNEL = 1e-2  # least channel over its luminance in logarithms
+_VARIES = 1e-4  # least variance of log chroma from which its slope is known
+
+
+@dataclass(frozen=True)
+class RoleLight:
+    """A light of a look.
+
+    Attributes
+    ----------
+    azimuth, elevation : float
+        Degrees in the map; of fill and rim, over the key's.
+    flux : float
+        Stops over the sky's irradiance.
+    radius : float
+        Degrees within which 97 % of its flux lie; 0: at most :func:`.smallest`, as a sun.
+    tint : (float, float, float)
+        Its colour, of luminance 1.
+    """
+
+    azimuth: float
+    elevation: float
+    flux: float
+    radius: float
+    tint: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What an edit did to the light.
+
+    Attributes
+    ----------
+    turn : float
+        Degrees by which the whole map was turned (:func:`.latlong.rotate`); 0: it stood.
+    gain : ndarray (9,)
+        Coefficients of :func:`harmonics`: stops of the sky's luminance.
+    saturation : float
+        Exponent of the sky's chroma, as of :mod:`.saturation`.
+    white_balance : (float, float, float)
+        Stops of the sky's red, green and blue beside those of its luminance.
+    lights : dict of str to RoleLight
+        By role; without a key light there is none.
+    """
+
+    turn: float = 0.0
+    gain: np.ndarray = field(default_factory=lambda: np.zeros(9))
+    saturation: float = 1.0
+    white_balance: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lights: dict[str, RoleLight] = field(default_factory=dict)
+
+    def toward(self, role: str) -> np.ndarray:
+        """Return the direction (3,) of a light in the map."""
+        light, key = self.lights[role], self.lights["key"]
+        if role == "key":
+            return direction(light.azimuth, light.elevation)
+        elevation = min(max(key.elevation + light.elevation, -90.0), 90.0)
+        return direction(key.azimuth + light.azimuth, elevation)
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Measuring
+
+
+def harmonics(d: np.ndarray) -> np.ndarray:
+    """Evaluate the real spherical harmonics up to order 2 at directions.
+
+    Y_0, then y, z, x, then xz, xy, yz, 3 y^2 - 1 and x^2 - z^2, orthonormal on the sphere. Below the horizon
+    they have their value at the mirrored direction: ground goes with the sky above it.
+
+    Parameters
+    ----------
+    d : ndarray (..., 3)
+        Unit vectors, +y up.
+
+    Returns
+    -------
+    ndarray (..., 9)
+    """
+    x, y, z = d[..., 0], np.abs(d[..., 1]), d[..., 2]
+    first = 0.5 * math.sqrt(3 / math.pi)
+    second = 0.5 * math.sqrt(15 / math.pi)
+    bands = [np.full_like(x, 0.5 / math.sqrt(math.pi)), first * y, first * z, first * x]
+    bands += [second * x * z, second * x * y, second * y * z]
+    bands += [0.25 * math.sqrt(5 / math.pi) * (3 * y**2 - 1), 0.5 * second * (x**2 - z**2)]
+    return np.stack(bands, axis=-1)
+
+
+def layers_of(envmap: np.ndarray, aureole: np.ndarray | None = None) -> Layers:
+    """Separate a map (H, W, 3) as looks are measured and applied; ``aureole`` is the glow of added lights."""
+    kind: Any = below_horizon.kind_of(envmap)
+    return Layers.of(envmap, horizon=kind, aureoles=False if aureole is None else aureole)
+
+
+def sky_irradiance(layers: Layers, sky: np.ndarray) -> float:
+    """Return the luminance of the irradiance of the horizontal plane by a sky (rows, W, 3) without lights."""
+    rows, columns = layers.shape
+    total = layers.rows[1]
+    cosine = np.maximum(np.cos(np.pi * np.arange(rows) / (total - 1)), 0)
+    weight = latlong.lookup_solid_angles(total, columns)[:rows] * cosine
+    return float(weight @ (sky[:rows].astype(np.float64) @ LUMINANCE).sum(axis=1))
+
+
+def smallest(width: int) -> float:
+    """Return the radius in degrees up to which a light of a map so wide may be a sun: two texels."""
+    return 2 * 360 / width
+
+
+def roles(layers: Layers) -> dict[str, int]:
+    """Return the index of the light of each role in a map."""
+    own = layers.lights.own
+    flux = layers.lights.flux[:own] @ LUMINANCE
+    if not own or not flux.max() > 0:
+        return {}
+    key = int(np.argmax(flux))
+    found = {"key": key}
+    for i in np.argsort(-flux, kind="stable"):
+        if i == key or flux[i] < LEAST_SHARE * flux[key]:
+            continue
+        apart = angles(layers.lights.centres[i])[0] - angles(layers.lights.centres[key])[0]
+        behind = abs((apart + 180) % 360 - 180) > RIM_DEGREES
+        found.setdefault("rim" if behind else "fill", int(i))
+    return found
+
+
+def radius(layers: Layers, i: int) -> float:
+    """Return the radius in degrees of a light of the map, at least :func:`smallest`."""
+    most = light_list.radii(layers.separation.lights[i], (layers.rows[1], layers.whole[1]))[1]
+    return max(most, smallest(layers.whole[1]))
+
+
+def lights_of(layers: Layers) -> dict[str, RoleLight]:
+    """Describe the lights of a map by their roles."""
+    sky = sky_irradiance(layers, layers.base)
+    described: dict[str, RoleLight] = {}
+    indices = roles(layers) if sky > 0 else {}
+    key_azimuth, key_elevation = 0.0, 0.0
+    for role, i in indices.items():
+        azimuth, elevation = angles(layers.lights.centres[i])
+        if role == "key":
+            key_azimuth, key_elevation = azimuth, elevation
+        else:
+            azimuth = (azimuth - key_azimuth + 180) % 360 - 180
+            elevation = elevation - key_elevation
+        flux = layers.lights.flux[i]
+        light = float(flux @ LUMINANCE)
+        size = radius(layers, i)
+        described[role] = RoleLight(
+            azimuth,
+            elevation,
+            float(np.clip(np.log2(light / sky), -MOST_STOPS, MOST_STOPS)),
+            min(size, 90.0) if size > smallest(layers.whole[1]) else 0.0,
+            tuple((flux / light).tolist()),
+        )
+    return described
+
+
+def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total: int) -> tuple:
+    """Measure the gain, the saturation and the white balance between two skies.
+
+    Parameters
+    ----------
+    before, after : ndarray (rows, W, 3)
+        Linear radiance of the first rows of a map, without its lights.
+    weight : ndarray (rows, W)
+        How much each texel counts.
+    total : int
+        Rows of the map.
+
+    Returns
+    -------
+    gain, saturation, white_balance
+        As of :class:`Look`.
+    """
+    rows, columns = weight.shape
+    weight = (weight / max(weight.sum(), 1e-300)).ravel()
+    skies = [np.float64(sky).reshape(-1, 3) for sky in (before, after)]
+    light = [sky @ LUMINANCE for sky in skies]
+    mean = float(weight @ light[0])
+    if not (mean > 0 and weight @ light[1] > 0):
+        return np.zeros(9), 1.0, (0.0, 0.0, 0.0)
+
+    # ---- Gain: weighted least squares of the change of log luminance
+    change = np.log2((light[1] + FAINTEST * mean) / (light[0] + FAINTEST * mean))
+    basis = harmonics(latlong.directions(total, columns)[:rows].reshape(-1, 3))
+    normal = (basis * weight[:, None]).T @ basis + RIDGE / (4 * np.pi) * np.eye(9)
+    moment = basis.T @ (weight * np.clip(change, -MOST_STOPS, MOST_STOPS))
+    gain = np.clip(np.linalg.solve(normal, moment), -MOST_COEFFICIENT, MOST_COEFFICIENT)
+
+    # ---- Saturation and white balance: log chroma after = balance + saturation * log chroma before
+    chroma = [
+        np.log2(np.maximum(sky / np.maximum(one, 1e-30)[:, None], _CHANNEL))
+        for sky, one in zip(skies, light, strict=True)
+    ]
+    mean_before, mean_after = (weight @ one for one in chroma)
+    apart = chroma[0] - mean_before
+    variance = float(weight @ np.square(apart).sum(axis=1))
+    saturation = 1.0
+    if variance > _VARIES:
+        covariance = float(weight @ (apart * (chroma[1] - mean_after)).sum(axis=1))
+        saturation = min(max(covariance / variance, 0.0), 4.0)
+    balance = np.clip(mean_after - saturation * mean_before, -MOST_STOPS, MOST_STOPS)
+    return gain, saturation, tuple(balance.tolist())
+
+
+# ------------------------------------------------------------------------------------------------------------
+# Files
+
+_NUMBERS = {
+    "turn": (1, -360.0, 360.0),
+    "saturation": (1, 0.0, 4.0),
+    "white_balance": (3, -MOST_STOPS, MOST_STOPS),
+    "gain": (9, -MOST_COEFFICIENT, MOST_COEFFICIENT),
+}
+_LIGHT = {
+    "azimuth": (1, -360.0, 360.0),
+    "elevation": (1, -180.0, 180.0),
+    "flux": (1, -MOST_STOPS, MOST_STOPS),
+    "radius": (1, 0.0, 90.0),
+    "tint": (3, 0.0, 1000.0),
+}
+"""Of each key: how many numbers it has, their least and their largest."""
+
+
+def to_toml(look: Look) -> str:
+    """Write a look as TOML."""
+    lines = [
+        "# What an edit did to the light. To do it to other maps: envedit apply look.toml MAP ...",
+        f"turn = {_short(look.turn)}  # degrees by which the sky was turned",
+        f"saturation = {_short(look.saturation)}",
+        f"white_balance = {_short(look.white_balance)}  # stops of red, green, blue",
+        f"gain = {_short(look.gain)}  # stops, spherical harmonics to order 2",
+    ]
+    for role, light in look.lights.items():
+        lines += ["", f"[{role}]"]
+        lines += [f"{name} = {_short(getattr(light, name))}" for name in _LIGHT]
+    return "\n".join(lines) + "\n"
+
+
+def _short(value):
+    values = [float(f"{number:.6g}") + 0.0 for number in np.ravel(value)]
+    return quote(values if np.ndim(value) else values[0])
+
+
+def write(path: FilePath, look: Look) -> None:
+    """Write a look to a file."""
+    atomic_files.write_atomically(path, to_toml(look).encode())
+
+
+def read(path: FilePath) -> Look:
+    """Read a look.
+
+    Raises
+    ------
+    ConfigError
+        A key is missing, unknown or out of range: names the file and the key.
+    InputError
+        The file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            table = tomllib.load(file)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+    lights = {role: table.pop(role) for role in ROLES if role in table}
+    values = _numbers(path, "", table, _NUMBERS)
+    if lights and "key" not in lights:
+        raise ConfigError(f"{path}: {next(iter(lights))}: needs a key light beside it: add the table [key]")
+    described = {}
+    for role, keys in lights.items():
+        if not isinstance(keys, dict):
+            raise ConfigError(f"{path}: {role}: got {keys!r}, expected a table [{role}]")
+        light = RoleLight(**_numbers(path, f"{role}.", keys, _LIGHT))
+        if not np.asarray(light.tint) @ LUMINANCE > 0:
+            raise ConfigError(f"{path}: {role}.tint: got black, expected a colour")
+        described[role] = light
+    if "key" in described and abs(described["key"].elevation) > 90:
+        raise ConfigError(f"{path}: key.elevation: got {described['key'].elevation:g}, expected -90 to 90")
+    gain = np.array(values.pop("gain"))
+    return Look(gain=gain, lights=described, **values)
+
+
+def _numbers(path, prefix, table, expected):
+    """Check that a table has the expected keys, with so many numbers in range."""
+    for name in table:
+        if name not in expected:
+            raise ConfigError(f"{path}: {prefix}{name}: unknown key, expected {', '.join(expected)}")
+    values = {}
+    for name, (count, low, high) in expected.items():
+        if name not in table:
+            raise ConfigError(f"{path}: {prefix}{name}: missing")
+        value = table[name]
+        numbers = value if isinstance(value, list) else [value]
+        right = len(numbers) == count and isinstance(value, list) == (count > 1)
+        right = right and all(type(one) in (int, float) and low <= one <= high for one in numbers)
+        if not right:
+            what = "a number" if count == 1 else f"{count} numbers"
+            wrong = f"{path}: {prefix}{name}: got {value!r}"
+            raise ConfigError(f"{wrong}, expected {what} from {low:g} to {high:g}")
+        values[name] = tuple(map(float, numbers)) if count > 1 else float(value)
+    return values

@@ -1,0 +1,161 @@
+"""The file of a map: read at its own resolution, and written in its own format and colour space."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from envedit import config, inputs
+from envedit.core.errors import ConfigError
+from envedit.core.radiance import HALF_MAX
+from envedit.core.types import FilePath
+from envedit.images import images
+from envedit.inputs import InputMap
+
+EXR, HDR = ".exr", ".hdr"
+"""Endings of the files that are written."""
+_ROWS = 256  # that are converted at a time
+
+
+def read(path: FilePath, repair: bool = False) -> InputMap:
+    """Read a map at the resolution of its file.
+
+    Parameters
+    ----------
+    path : path-like
+        OpenEXR or Radiance; PNG and JPEG are read as well.
+    repair : bool
+        Replace texels that are not finite instead of refusing them.
+
+    Returns
+    -------
+    InputMap
+        Its ``radiance`` is (H, W, 3) float32 in Rec. 709; ``as_stored`` turns edited radiance into the file's
+        colours.
+
+    Raises
+    ------
+    InputError
+        As of :func:`.images.load_envmap`.
+    """
+    return inputs.read_file(os.fsdecode(path), None, config.Input(repair=repair), 1.0)
+
+
+def as_stored(edited: np.ndarray, like: InputMap) -> np.ndarray:
+    """Return edited radiance (H, W, 3) in the colours of a map's file, as :meth:`.InputMap.as_stored`.
+
+    A map of another size has texels of its own, none of which are kept.
+    """
+    if like.chromaticities is None:
+        return edited
+    result = np.empty(edited.shape, np.float32)
+    stored = like.stored if like.stored.shape == edited.shape else np.zeros_like(edited)
+    for first in range(0, len(edited), _ROWS):
+        rows = slice(first, first + _ROWS)
+        result[rows] = replace(like, stored=stored[rows]).as_stored(edited[rows])
+    return result
+
+
+def output_path(
+    requested: FilePath | None, word: str, sources: Iterable[FilePath], overwrite: bool = False
+) -> Path:
+    """Return the file that a result goes to: as requested, or ``SOURCE_WORD`` in the working folder.
+
+    >>> output_path(None, "adjusted", ["skies/sky.hdr"])
+    PosixPath('sky_adjusted.hdr')
+
+    Parameters
+    ----------
+    requested : path-like, optional
+        The file, .exr or .hdr; None: named after the first source, of its format (PNG and JPEG: .exr), with
+        a number if there is one already.
+    word : str
+        What has been done.
+    sources : sequence of path-like
+        The files that are read; none of them is ever the result.
+    overwrite : bool
+        Whether a requested file may be replaced.
+
+    Raises
+    ------
+    ConfigError
+        The file is a source, or exists already, or ends otherwise.
+    """
+    names = [os.fsdecode(source) for source in sources]
+    if requested is None:
+        stem = f"{Path(names[0]).stem}_{word}" if names else word
+        ending = HDR if names and names[0].lower().endswith(HDR) else EXR
+        path, number = Path(stem + ending), 1
+        while path.exists():
+            number += 1
+            path = Path(f"{stem}_{number}{ending}")
+        return path
+    path = Path(os.fsdecode(requested))
+    if path.suffix.lower() not in (EXR, HDR):
+        raise ConfigError(f"{path}: got a name that ends in {path.suffix!r}, expected .exr or .hdr")
+    if os.path.realpath(path) in {os.path.realpath(name) for name in names}:
+        raise ConfigError(f"{path}: is read by this command: give another name with --out")
+    if path.exists() and not overwrite:
+        raise ConfigError(f"{path}: exists already: give another name with --out, or --overwrite")
+    return path
+
+
+def write(path: FilePath, values: np.ndarray, like: InputMap | None = None) -> list[str]:
+    """Write a map, by the ending of its name as OpenEXR or Radiance.
+
+    Parameters
+    ----------
+    path : path-like
+        Of :func:`output_path`.
+    values : ndarray (H, W, 3)
+        Linear values in the colours of ``like``.
+    like : InputMap, optional
+        The map that was read: OpenEXR is half where its file is, and its chromaticities are those of the
+        result. None: float, Rec. 709.
+
+    Returns
+    -------
+    list of str
+        Warnings: what half could not hold.
+
+    Raises
+    ------
+    ConfigError
+        The path is that of ``like``.
+    NumericalError
+        A value is not finite.
+    InputError
+        The file cannot be written.
+    """
+    path = Path(os.fsdecode(path))
+    if like is not None and os.path.realpath(path) == os.path.realpath(like.source):
+        raise ConfigError(f"{path}: is the map that was read: give another name")
+    space = None if like is None else like.chromaticities
+    if path.suffix.lower() == HDR:
+        images.write_hdr(path, values, space)
+        return []
+    marks = {} if like is None else {"source": like.source}
+    half = like is not None and like.half
+    warnings: list[str] = []
+    if half:
+        values, warnings = cut_to_half(values, path, "write it as .hdr, or darken the map")
+    images.write_exr(path, values, marks, half=half, chromaticities=space)
+    return warnings
+
+
+def cut_to_half(values: np.ndarray, path: FilePath, remedy: str) -> tuple[np.ndarray, list[str]]:
+    """Cut a map (H, W, 3) to what half can hold; returns it and a warning that ends in ``remedy``."""
+    over = (values > HALF_MAX).any(axis=2)
+    if not over.any():
+        return values, []
+    excess = np.maximum(values[over] - HALF_MAX, 0).sum(dtype=np.float64)
+    lost = 100 * float(excess / values.sum(dtype=np.float64))
+    warning = (
+        f"{os.fsdecode(path)}: {over.sum()} texels are brighter than {HALF_MAX:g}, the largest half, and are "
+        f"cut there: {lost:.2g} % of the sum of all texels is lost; {remedy}"
+    )
+    return np.minimum(values, np.float32(HALF_MAX)), [warning]

@@ -1,0 +1,121 @@
+"""A map as USD: a stage with a dome light, and with its sky and its lights apart as another variant.
+
+UsdLux places a lat-long texture as OpenEXR does, pole at +Y, longitude 0 at +Z and pi/2 at +X, falling from
+pi at the left edge to -pi at the right (schema of ``DomeLight``): the frame of Mitsuba's emitter. The prims
+carry the rotation of that frame in the scene. ``DistantLight`` shines along its -Z; normalized, its intensity
+times its colour is the irradiance of a surface that faces it, whatever its angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from envedit.config.toml import quote
+
+DEFAULT_VARIANT, LIGHTS_VARIANT = "map", "sky_and_lights"
+"""The two variants of the set ``lighting``: the whole map; the map without its lights, and these as lamps."""
+
+
+def text(
+    map_file: str,
+    sky_file: str,
+    lights: Sequence[dict],
+    to_world: np.ndarray | None = None,
+    scale: float = 1.0,
+) -> str:
+    """Return a stage (``.usda``) that is lit by a map.
+
+    Parameters
+    ----------
+    map_file, sky_file : str
+        The map, and the map without its lights, by names relative to the stage.
+    lights : list of dict
+        Its lights: ``direction``, ``angle`` and ``flux`` as of :func:`.light_list.listed`.
+    to_world : ndarray (3, 3), optional
+        Rotation from the map's frame (+y up) to the scene's; None: none.
+    scale : float
+        What the scene multiplies the files' values by.
+    """
+    rotation = np.eye(3) if to_world is None else np.asarray(to_world, np.float64)
+    up = "Z" if abs(rotation[2, 1]) > abs(rotation[1, 1]) else "Y"
+    dome, sky = (_dome(file, rotation, scale) for file in (map_file, sky_file))
+    lamps = [_distant(number, light) for number, light in enumerate(lights, 1)]
+    return f"""#usda 1.0
+(
+    defaultPrim = "Environment"
+    metersPerUnit = 1
+    upAxis = "{up}"
+)
+
+def Xform "Environment" (
+    variants = {{
+        string lighting = "{DEFAULT_VARIANT}"
+    }}
+    prepend variantSets = "lighting"
+)
+{{
+    variantSet "lighting" = {{
+        "{DEFAULT_VARIANT}" {{
+{dome}        }}
+        "{LIGHTS_VARIANT}" {{
+{sky}{"".join(lamps)}        }}
+    }}
+}}
+"""
+
+
+def _dome(file, rotation, scale):
+    return _prim(
+        'DomeLight "Dome"',
+        f"asset inputs:texture:file = @./{file}@",
+        'token inputs:texture:format = "latlong"',
+        *_brightness(scale, np.ones(3)),
+        *_placed(rotation),
+    )
+
+
+def _distant(number, light):
+    flux = np.asarray(light["flux"], np.float64)
+    intensity = flux.max()
+    return _prim(
+        f'DistantLight "Light_{number}"',
+        f"float inputs:angle = {light['angle']:.9g}",
+        "bool inputs:normalize = 1",
+        *_brightness(intensity, flux / intensity if intensity > 0 else np.ones(3)),
+        *_placed(_facing(np.asarray(light["direction"], np.float64))),
+    )
+
+
+def _brightness(intensity, colour):
+    shown = ", ".join(f"{channel:.9g}" for channel in colour)
+    return (
+        f"float inputs:intensity = {intensity:.9g}",
+        "float inputs:exposure = 0",
+        f"color3f inputs:color = ({shown})",
+    )
+
+
+def _placed(rotation):
+    """Write a rotation whose columns are where the axes go; USD has vectors as rows: its transpose."""
+    rows = [", ".join(quote(float(value) + 0.0) for value in column) for column in rotation.T]
+    matrix = ", ".join(f"({row}, 0)" for row in rows)
+    return (
+        f"matrix4d xformOp:transform = ( {matrix}, (0, 0, 0, 1) )",
+        'uniform token[] xformOpOrder = ["xformOp:transform"]',
+    )
+
+
+def _facing(direction):
+    """Return a rotation (3, 3) that takes +Z to a unit vector: the light then shines from there."""
+    helper = np.eye(3)[np.argmin(np.abs(direction))]
+    across = np.cross(helper, direction)
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(direction, across), direction], axis=1)
+
+
+def _prim(name, *lines):
+    indent = " " * 12
+    body = "".join(f"{indent}    {line}\n" for line in lines)
+    return f"{indent}def {name}\n{indent}{{\n{body}{indent}}}\n"

@@ -1,0 +1,1 @@
+"""Maps with several lights: which of them moved, and which stayed."""

@@ -55,12 +55,12 @@ def _apply(arguments, console):
 
     # ---- Map by map, each read once
     map_command.select_variant()
-    folder.mkdir(parents=True, exist_ok=True)
     console.facts["files"] = []
     for source, targets in zip(maps, files, strict=True):
         input_map = map_command.read(source, arguments, console)
         for amount, path in zip(amounts, targets, strict=True):
             edited = look_transfer.apply(input_map.radiance, given[-1], amount, start)
+            folder.mkdir(parents=True, exist_ok=True)
             for warning in map_file.write(path, input_map.as_stored(edited), input_map):
                 console.warn(warning)
             console.facts["files"].append({"map": source, "file": str(path), "amount": amount})

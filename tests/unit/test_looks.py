@@ -162,6 +162,7 @@ def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, monk
         (["evening.toml"], "got 1 looks (.toml) and 0 maps"),
         (["evening.toml", "evening.toml", "a.exr"], "got two looks: say where between them"),
         (["none.toml", "a.exr", "--out", "other"], "none.toml: No such file"),
+        (["evening.toml", "none.exr", "--out", "other"], "none.exr: no such file"),
     ):
         assert cli.main(["apply", *wrong]) in (2, 3)
         assert message in capsys.readouterr().err

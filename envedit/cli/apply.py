@@ -31,7 +31,9 @@ def main(argv: list[str] | None = None) -> int:
         "files", metavar="FILE", nargs="+", help="one look, or two to go between (.toml), and maps"
     )
     parser.add_argument(
-        "--amount", type=float, help="0: the map, or the first of two looks; 1 (default): the look"
+        "--amount",
+        type=map_command.number(0, 1),
+        help="0: the map, or the first of two looks; 1 (default): the look",
     )
     parser.add_argument("--frames", type=int, help="write so many maps, from amount 0 to 1")
     arguments = parser.parse_args(argv)
@@ -53,12 +55,12 @@ def _apply(arguments, console):
 
     # ---- Map by map, each read once
     map_command.select_variant()
-    folder.mkdir(parents=True, exist_ok=True)
     console.facts["files"] = []
     for source, targets in zip(maps, files, strict=True):
         input_map = map_command.read(source, arguments, console)
         for amount, path in zip(amounts, targets, strict=True):
             edited = look_transfer.apply(input_map.radiance, given[-1], amount, start)
+            folder.mkdir(parents=True, exist_ok=True)
             for warning in map_file.write(path, input_map.as_stored(edited), input_map):
                 console.warn(warning)
             console.facts["files"].append({"map": source, "file": str(path), "amount": amount})
@@ -73,8 +75,6 @@ def _amounts(arguments, names, maps):
         raise ConfigError(f"got {got}, expected one look, or two, and maps")
     if amount is not None and frames is not None:
         raise ConfigError("got --amount and --frames, expected one of them")
-    if amount is not None and not 0 <= amount <= 1:
-        raise ConfigError(f"--amount: got {amount:g}, expected a number from 0 to 1")
     if frames is not None and not 2 <= frames <= 9999:
         raise ConfigError(f"--frames: got {frames}, expected 2 to 9999")
     if len(names) == 2 and amount is None and frames is None:

@@ -256,8 +256,8 @@ def blended(start: Change, end: Change, amount: float) -> Change:
     """Return the change between two of the same map; a light that only one has fades."""
     lights = {}
     for i in start.lights.keys() | end.lights.keys():
-        one = start.lights.get(i) or replace(end.lights[i], flux=np.zeros(3))
-        other = end.lights.get(i) or replace(start.lights[i], flux=np.zeros(3))
+        one = start.lights.get(i) or _dark(i, start.lights, end.lights)
+        other = end.lights.get(i) or _dark(i, end.lights, start.lights)
         way = rotation_between(one.direction, other.direction)
         toward = rotated(one.direction, amount * way) if way.any() else other.direction
         both = (one.flux > 0) & (other.flux > 0)
@@ -271,6 +271,13 @@ def blended(start: Change, end: Change, amount: float) -> Change:
         _mix(start.log_saturation, end.log_saturation, amount),
         _mix(start.white_balance, end.white_balance, amount),
     )
+
+
+def _dark(i, here, there):
+    """Return a light that is only ``there``, without flux: where the light is ``here`` that it adds to."""
+    light = there[i]
+    same = [j for j in here if j in there and there[j].direction is light.direction]
+    return replace(light, direction=here[same[0]].direction if same else light.direction, flux=np.zeros(3))
 
 
 def _mix(start, end, amount):

@@ -60,16 +60,24 @@ def write_map(
 
 
 def write_lights(folder: Path, result: results.Result) -> None:
-    """Write ``edited_sky.exr``, ``edited_lights.exr``, ``lights.json`` and ``look.toml``."""
+    """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
     source = {"source": result.given.source}
     space = result.given.chromaticities
     sky, lights = light_list.split(result.envmap, result.given.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
     manifest.write_json(folder / "lights.json", result.lights)
+
+
+def write_look(folder: Path, result: results.Result) -> list[str]:
+    """Write ``look.toml``; returns a warning, if the edited map is too bright to be separated."""
     degrees = result.found.turn_degrees if result.found else 0.0
-    look = look_transfer.of_edit(result.maps["initial"], result.maps["edited"], degrees)
+    try:
+        look = look_transfer.of_edit(result.maps["initial"], result.maps["edited"], degrees)
+    except InputError as error:
+        return [f"look.toml is not written: {error}"]
     looks.write(folder / "look.toml", look)
+    return []
 
 
 def write_scene(

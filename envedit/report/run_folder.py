@@ -52,6 +52,7 @@ def write(
     _write_renderings(settings, folder, result)
     _write_full_resolution(settings, folder, result)
     map_files.write_lights(folder, result)
+    result.warnings += map_files.write_look(folder, result)
     if settings.output.scene:
         result.warnings += map_files.write_scene(settings, folder, result, base)
     maps_written = time.perf_counter()

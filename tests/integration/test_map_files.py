@@ -12,6 +12,7 @@ from envedit.core import latlong
 from envedit.core.errors import NumericalError
 from envedit.export import light_list
 from envedit.images import images
+from envedit.maps import looks
 from envedit.report import map_files
 from envedit.representations.layers.separation import separate
 from tests.oracles import users_scenes
@@ -77,6 +78,26 @@ def test_sky_and_lights_add_up_to_the_map(own, rng):
     assert set(lights) == {"before", "after"}
     assert {"id", "removed"} <= set(lights["before"][0])
     assert any("light 1 at azimuth" in line for line in measured(out)["choices"])
+
+
+@pytest.mark.slow
+def test_the_stage_and_the_look_of_a_run_are_of_its_scene_and_its_lights(own):
+    out = own / "c_out"
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core, of the extra dev, is not installed")
+    stage = usd.Stage.Open(str(out / "edited.usda"))
+    environment = stage.GetPrimAtPath("/Environment")
+    dome = stage.GetPrimAtPath("/Environment/Dome")
+    assert dome.GetAttribute("inputs:intensity").Get() == pytest.approx(0.55)
+    rotation = np.array(dome.GetAttribute("xformOp:transform").Get())[:3, :3].T
+    environment.GetVariantSet("lighting").SetVariantSelection("sky_and_lights")
+    lights = json.loads((out / "lights.json").read_text())["after"]
+    assert len(environment.GetChildren()) == 1 + len(lights) > 1
+    for entry in lights:
+        azimuth, elevation = np.radians([entry["azimuth"], entry["elevation"]])
+        across = np.cos(elevation)
+        there = across * np.sin(azimuth), np.sin(elevation), -across * np.cos(azimuth)
+        np.testing.assert_allclose(rotation @ there, entry["direction"], atol=1e-6)
+    looks.read(out / "look.toml")
 
 
 def test_lights_are_where_and_as_strong_as_in_the_map():

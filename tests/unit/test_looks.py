@@ -101,6 +101,15 @@ def test_between_two_looks_the_light_goes_along_a_great_circle():
     assert stops[0.0] == pytest.approx(3, abs=0.1) and stops[1.0] == pytest.approx(2.5, abs=0.1)
 
 
+def test_half_a_look_has_one_sun():
+    strong = Look(lights={"key": RoleLight(220.0, 24.0, 6.0, 0.0, (1.0, 1.0, 1.0))})
+    made = look_transfer.apply(sky(True), strong, 0.5)
+    middle = direction(100, 40) + strong.toward("key")
+    middle /= np.linalg.norm(middle)
+    bright = made @ LUMINANCE > 0.2 * (made @ LUMINANCE).max()
+    assert (latlong.directions(32, 64)[bright] @ middle).min() > np.cos(np.radians(12))
+
+
 def test_a_look_without_lights_puts_out_the_sun():
     made = look_transfer.apply(sky(True), Look())
     assert made.max() < 5 and made.mean() > 0.4
@@ -152,8 +161,8 @@ def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, monk
     for wrong, message in (
         (["evening.toml"], "got 1 looks (.toml) and 0 maps"),
         (["evening.toml", "evening.toml", "a.exr"], "got two looks: say where between them"),
-        (["evening.toml", "a.exr", "--amount", "2"], "--amount: got 2, expected a number from 0 to 1"),
         (["none.toml", "a.exr", "--out", "other"], "none.toml: No such file"),
+        (["evening.toml", "none.exr", "--out", "other"], "none.exr: no such file"),
     ):
         assert cli.main(["apply", *wrong]) in (2, 3)
         assert message in capsys.readouterr().err

@@ -77,7 +77,7 @@ def _adjust(arguments: argparse.Namespace, console: Console) -> None:
     # ---- The maps
     map_command.select_variant()
     input_map = map_command.read(arguments.map, arguments, console)
-    radiance, notes = adjusted(input_map.radiance, how)
+    radiance, notes = adjusted(map_file.radiance_of(input_map), how)
     for line in notes:
         console.say(line)
     for name, file in files.items():

@@ -9,6 +9,7 @@ from envedit.cli import map_command
 from envedit.cli.map_command import number
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
+from envedit.maps.conventions import QUARTERS, turned_for
 
 if TYPE_CHECKING:
     from envedit.cli.console import Console
@@ -37,12 +38,19 @@ def main(argv: list[str] | None = None) -> int:
             "envedit adjust sky.hdr --exposure 1 --white-balance 5500",
             "envedit adjust sky.hdr --horizon 2 --tilt -1.5 --turn 90",
             "envedit adjust sky.hdr --max-radiance 200 --background plate.hdr --background-blur 3",
+            "envedit adjust edited.exr --for unreal --out edited_unreal.hdr",
         ],
         default="MAP_adjusted.exr or .hdr, as the map",
     )
     parser.add_argument("map", metavar="MAP", help=map_command.MAP_HELP)
     for name, (kind, unit, text) in OPTIONS.items():
         parser.add_argument(f"--{name}", type=kind, metavar=unit, help=text)
+    parser.add_argument(
+        "--for",
+        dest="program",
+        choices=sorted(QUARTERS),
+        help="at last turn the map so that it stands in another program as in a Mitsuba scene",
+    )
     parser.add_argument(
         "--background", metavar="FILE", help="write a second map, to be seen and not to light"
     )
@@ -60,8 +68,9 @@ def _adjust(arguments: argparse.Namespace, console: Console) -> None:
     values = {name: getattr(arguments, name) for name in (key.replace("-", "_") for key in OPTIONS)}
     how = Adjustments(**{name: value for name, value in values.items() if value is not None})
     second = Adjustments(exposure=arguments.background_exposure, blur=arguments.background_blur)
-    if how == Adjustments() and not arguments.background:
-        raise ConfigError("nothing to adjust: give one of " + ", ".join(f"--{name}" for name in OPTIONS))
+    if how == Adjustments() and not arguments.background and not arguments.program:
+        names = ", ".join(f"--{name}" for name in (*OPTIONS, "for"))
+        raise ConfigError(f"nothing to adjust: give one of {names}")
     if second != Adjustments() and not arguments.background:
         raise ConfigError("--background-blur and --background-exposure need --background FILE")
 
@@ -77,7 +86,7 @@ def _adjust(arguments: argparse.Namespace, console: Console) -> None:
     # ---- The maps
     map_command.select_variant()
     input_map = map_command.read(arguments.map, arguments, console)
-    radiance, notes = adjusted(input_map.radiance, how)
+    radiance, notes = adjusted(map_file.radiance_of(input_map), how)
     for line in notes:
         console.say(line)
     for name, file in files.items():
@@ -85,6 +94,8 @@ def _adjust(arguments: argparse.Namespace, console: Console) -> None:
             radiance, done = adjusted(radiance, second)
             notes += [f"background: {line}" for line in done]
         stored = map_file.as_stored(radiance, input_map)
+        if arguments.program:
+            stored = turned_for(arguments.program, stored)
         for warning in map_file.write(file, stored, input_map):
             console.warn(warning)
         console.say(str(file))

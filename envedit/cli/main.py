@@ -19,7 +19,6 @@ COMMANDS = {
     "sky": "an analytic sky as a file, of a sun's position or of a place and a time",
     "compare": "how far two maps are apart, as pictures and as light",
     "apply": "give maps the light of an edit: its look",
-    "convert": "turn a map as another program expects it",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

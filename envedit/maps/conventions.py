@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.errors import ConfigError
 
 QUARTERS = {"blender": 1, "houdini": 0, "three": 1, "unity": 3, "unreal": 2, "usd": 0}
 """Quarters of the width by which a program looks up a direction farther to the right. Derived from
@@ -33,12 +32,5 @@ def turned_for(program: str, envmap: np.ndarray) -> np.ndarray:
         One of :data:`QUARTERS`.
     envmap : ndarray (H, W, 3)
         Moved by whole columns, without a change of any value, where W is a multiple of 4.
-
-    Raises
-    ------
-    ConfigError
-        The program is not known.
     """
-    if program not in QUARTERS:
-        raise ConfigError(f"--for: got {program!r}, expected one of {', '.join(sorted(QUARTERS))}")
     return latlong.rotate(envmap, -90.0 * QUARTERS[program])

@@ -1,0 +1,201 @@
+"""The flux of a clipped sun, estimated, and a disc with it put in its place.
+
+Two estimates of the flux F (irradiance on a surface that faces the sun, luminance) are averaged:
+
+- the **aureole**: log2 F = log2 L(a) - A(a) - 6.1 h(m), with L(a) the luminance at the first angle a outside
+  the clipped region and A(a) what clear suns have there (:data:`AUREOLE`);
+- the **sky**: log2 F = log2 E_sky + log2 (F / E_sky of the analytic sky at this elevation) + c(m).
+
+h(m) runs from 0 to 1 with the air mass m (Kasten and Young 1989) as haze takes the light of low suns.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.color import luminance
+from envedit.core.errors import ConfigError
+from envedit.images import analytic_sky
+from envedit.maps.clipped_light import CORE_DEGREES, PLATEAU, RING_DEGREES, ClippedLight
+
+AUREOLE = np.array([3.96, 2.51, 1.22, 0.43, -0.28, -0.96, -1.56, -2.02, -2.52, -2.83, -3.19, -3.73, -4.47])
+"""log2 of a clear sun's aureole over its flux, 1/sr, at the first of :data:`.RING_DEGREES`: mean of three.
+Measured by ``python -m experiments unclip.constants run``, as all that is called measured here."""
+HAZE_STOPS = 6.1
+"""Stops by which the flux of a low sun is less than the aureole says: mean of two, measured."""
+SKY_OFFSET = (-0.33, -6.27)
+"""Stops by which flux over sky is more than in the analytic model, of clear and of low suns, measured."""
+HAZE_AIR_MASS = (3.0, 7.0)
+"""Air masses of a clear sun at 18 degrees and of a hazy one at 7.5, between which haze sets in linearly. Not
+measured: there is no map between."""
+TURBIDITY = 3.0
+"""Of the analytic model: a clear day."""
+NEAR_DEGREES = 2.0
+"""Up to here the aureole has the sun's colour and is mostly the lens' glare, which tells more of the flux."""
+AUREOLE_STOPS = (0.85, 1.13)
+"""Standard deviation of the first estimate, with the first ring near and far: RMS over clear suns, each by
+the constants of the others, measured."""
+SKY_STOPS = 1.2
+"""Standard deviation of the second estimate, likewise."""
+FLUX_STOPS = (0.8, 1.1, 2.0)
+"""Standard deviation of the result: near and far, likewise; of a low sun more than the 0.8 that the
+two maps show, as two are few."""
+LEAST_GAIN = 1.0
+"""Stops that the sun must gain: with less it was not clipped, or not by more than the estimate's error."""
+LEAST_ELEVATION = 0.5
+"""Degrees below which a sun's flux does not follow from its horizontal irradiance: more than half is set."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Flux of a sun.
+
+    Attributes
+    ----------
+    flux : ndarray (3,)
+        Irradiance on a surface that faces it, linear RGB.
+    stops : float
+        Standard deviation of log2 of it.
+    """
+
+    flux: np.ndarray
+    stops: float
+
+
+def air_mass(elevation: float) -> float:
+    """Return the relative optical air mass at an elevation in degrees (Kasten and Young 1989, Eq. 3)."""
+    elevation = max(elevation, 0.0)
+    return 1 / (math.sin(math.radians(elevation)) + 0.50572 * (elevation + 6.07995) ** -1.6364)
+
+
+def analytic_fluxes(elevation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return flux of the sun and horizontal irradiance of the sky (3,) in the analytic model."""
+    width = 128
+    elevation = float(np.clip(elevation, 1, 90))
+    sky = analytic_sky.sunsky(width, 0, elevation, TURBIDITY, sun_scale=0).astype(np.float64)
+    sun = analytic_sky.sunsky(width, 0, elevation, TURBIDITY, sky_scale=0, ground_albedo=0).astype(np.float64)
+    omega = latlong.lookup_solid_angles(width // 2, width)[:, None, None]
+    cosine = np.maximum(latlong.directions(width // 2, width)[..., 1:2], 0)
+    return (sun * omega).sum(axis=(0, 1)), (sky * omega * cosine).sum(axis=(0, 1))
+
+
+def estimate(light: ClippedLight) -> Estimate:
+    """Estimate the flux of a clipped sun.
+
+    Parameters
+    ----------
+    light : ClippedLight
+        Any with a ring that is measured.
+    """
+    first = min(light.first or 0, len(AUREOLE) - 1)
+    near = RING_DEGREES[first] <= NEAR_DEGREES
+    haze = float(np.interp(air_mass(light.elevation), HAZE_AIR_MASS, (0, 1)))
+
+    # ---- Two estimates of the logarithm, and their mean, weighted by precision
+    ring = light.rings[light.first or 0]
+    by_aureole = _log2(luminance(ring)) - AUREOLE[first] - HAZE_STOPS * haze
+    sun, sky = analytic_fluxes(light.elevation)
+    by_sky = _log2(luminance(light.sky_irradiance)) + _log2(luminance(sun)) - _log2(luminance(sky))
+    by_sky += float(np.interp(haze, (0, 1), SKY_OFFSET))
+    precision = np.array([AUREOLE_STOPS[0 if near else 1], SKY_STOPS]) ** -2.0
+    stops = float(precision @ [by_aureole, by_sky] / precision.sum())
+
+    # ---- The colour: the aureole's near the sun; farther out it is bluer than the sun
+    colour = ring if near else np.sqrt(ring * sun)
+    spread = FLUX_STOPS[2] if haze > 0 else FLUX_STOPS[0 if near else 1]
+    return Estimate(2.0**stops * _unit(colour), spread)
+
+
+def is_clipped(light: ClippedLight, flux: np.ndarray) -> bool:
+    """Say whether a flux (3,) is enough more than what the map has."""
+    return _log2(luminance(flux)) - _log2(light.core_flux) > LEAST_GAIN
+
+
+def coloured(light: ClippedLight, flux: float) -> np.ndarray:
+    """Return a flux (3,) of a luminance in the colour of a light."""
+    return flux * _unit(estimate(light).flux)
+
+
+def flux_of_ratio(light: ClippedLight, ratio: float) -> float:
+    """Return the flux, luminance, of a sun whose horizontal irradiance is ``ratio`` times the sky's.
+
+    Raises
+    ------
+    ConfigError
+        It stands less than :data:`LEAST_ELEVATION` above the horizon.
+    """
+    if light.elevation < LEAST_ELEVATION:
+        raise ConfigError(
+            f"--ratio: the light is {light.elevation:.1f} degrees above the horizon, where a sun has no "
+            f"horizontal irradiance to speak of: give --flux"
+        )
+    return ratio * float(luminance(light.sky_irradiance)) / float(light.direction[1])
+
+
+def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.ndarray:
+    """Return a map with its sun: the aureole in the clipped region, and a disc.
+
+    The aureole between the core and the first ring is a power of the angle: at the ring as measured, at the
+    core as :data:`AUREOLE` has it for this flux. Clipped texels become as bright as that, where they are not.
+    The disc, 0.54 degrees across, has the flux that the core lacks.
+
+    Parameters
+    ----------
+    radiance : ndarray (H, W, 3)
+        The map in which the light has been found.
+    light : ClippedLight
+        Of :func:`.clipped_light.find`.
+    flux : ndarray (3,)
+        Of the sun, irradiance on a surface that faces it.
+
+    Returns
+    -------
+    ndarray (H, W, 3) float32
+        All other texels have their bits.
+    """
+    image = np.array(radiance, np.float32)
+    if light.first is not None and RING_DEGREES[light.first] > CORE_DEGREES:
+        _fill(image, light, float(luminance(flux)))
+    lacking = max(1 - light.core_flux / max(float(luminance(flux)), 1e-30), 0.0)
+    radius = math.radians(analytic_sky.SUN_APERTURE / 2)
+    points = analytic_sky.disc(light.direction, radius, image.shape[1])
+    share = np.broadcast_to(lacking * np.asarray(flux, np.float64) / len(points), points.shape)
+    analytic_sky.add_flux(image, points, share)
+    return image
+
+
+def _fill(image, light, flux):
+    """Raise clipped texels to the aureole, in place, in bands of rows."""
+    height, width, _ = image.shape
+    reach = RING_DEGREES[light.first]
+    ring = light.rings[light.first]
+    core = flux * 2.0 ** np.interp(np.log(CORE_DEGREES), np.log(RING_DEGREES[: len(AUREOLE)]), AUREOLE)
+    exponent = _log2(core / max(luminance(ring), 1e-30)) / math.log2(reach / CORE_DEGREES)
+    if exponent <= 0:
+        return
+    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
+    for top in range(0, height, 64):
+        rows = np.arange(top, min(top + 64, height))
+        theta = np.pi * rows / max(height - 1, 1)
+        directions = latlong.on_sphere(theta[:, None], phi)
+        angle = np.degrees(np.arccos(np.clip(directions @ light.direction, -1, 1)))
+        clipped = (image[rows] >= PLATEAU * light.level).any(axis=2)
+        inside = clipped & (angle < reach) & (directions[..., 1] > 0)
+        factor = (reach / np.maximum(angle[inside], CORE_DEGREES)) ** exponent
+        aureole = (factor[:, None] * ring).astype(np.float32)
+        band = image[top : top + len(rows)]
+        band[inside] = np.maximum(band[inside], aureole)
+
+
+def _unit(colour):
+    """Return a colour (3,) of luminance 1."""
+    return np.asarray(colour, np.float64) / max(float(luminance(colour)), 1e-30)
+
+
+def _log2(value):
+    """Return log2, of what is 0 that of 1e-30."""
+    return math.log2(max(float(value), 1e-30))

@@ -6,7 +6,7 @@ horizontal irradiance: it means the same at any resolution and exposure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,10 +26,10 @@ CLIPPED_SHARE = 0.5
 """Share of a ring below which clipping leaves its median. Derived."""
 LARGEST_DEGREES = 45.0
 """Radius from which on a clipped region is no aureole: half of the sky or more is as bright."""
-LEAST_FALL = 0.85
-"""Exponent of the fall of luminance with the angle, from the first ring that is not clipped over an octave,
-below which the region is cloud. Chosen by nine maps of ``experiments/unclip``: at most 0.7 around clouds that
-are clipped at 10 and more, at least 1.0 around suns."""
+LEAST_FALL = (0.52, 0.95)
+"""Exponents of :attr:`ClippedLight.fall` below which a region is cloud. Chosen by the nine maps of
+``experiments/unclip`` that choices are made by: suns have at least 0.59 and 1.0, but for one that is clipped
+at 3; clouds that are clipped at 10 and more have less than 0.46, or less than 0.75."""
 EDGE = 0.1
 """Luminance of the first ring over the plateau's below which a region wider than :data:`CORE_DEGREES` has the
 sharp edge of a lamp. Derived: a sun's aureole falls by at most 2^2.5 from ring to ring (:mod:`.unclip`)."""
@@ -89,6 +89,30 @@ class ClippedLight:
         return float(np.degrees(np.arctan2(self.direction[0], -self.direction[2])) % 360)
 
     @property
+    def fall(self) -> tuple[float, float]:
+        """Exponents by which luminance, and luminance over the darkest ring's, fall with the angle.
+
+        From the first ring that is measured, over an octave; 0 without such rings.
+        """
+        profile = luminance(self.rings)
+        measured = np.flatnonzero(np.isfinite(profile))
+        if len(measured) < 3 or not profile[measured].min() > 0:
+            return 0.0, 0.0
+        first = measured[0]
+        last = measured[2]
+        octaves = np.log2(RING_DEGREES[last] / RING_DEGREES[first])
+        darkest = (1 - 1e-6) * profile[measured].min()
+        over = (profile[first] - darkest) / (profile[last] - darkest)
+        return float(np.log2(profile[first] / profile[last]) / octaves), float(
+            np.log2(max(over, 1e-6)) / octaves
+        )
+
+    @property
+    def has_aureole(self) -> bool:
+        """Whether it falls as around a sun."""
+        return all(fall >= least for fall, least in zip(self.fall, LEAST_FALL, strict=True))
+
+    @property
     def first(self) -> int | None:
         """Index of the first ring that is measured; None without one."""
         measured = np.flatnonzero(np.isfinite(self.rings[:, 0]))
@@ -144,11 +168,9 @@ def find(radiance: np.ndarray) -> ClippedLight | None:
     outside = (angle > CORE_DEGREES) & above
     sky_irradiance = (small * (omega * directions[..., 1] * outside)[..., None]).sum(axis=(0, 1))
     core_flux = _core_flux(small, omega, angle)
-    sky = luminance(small[above])
-    kind, reason = _kind(
-        rings, radius, level, float(luminance(sky_irradiance)), float(np.median(sky)), others
-    )
-    return ClippedLight(kind, reason, middle, radius, level, rings, sky_irradiance, core_flux)
+    light = ClippedLight("cloud", "", middle, radius, level, rings, sky_irradiance, core_flux)
+    kind, reason = _kind(light, float(np.median(luminance(small[above]))), others)
+    return replace(light, kind=kind, reason=reason)
 
 
 def _region(covered, omega, directions):
@@ -214,22 +236,19 @@ def _core_flux(image, omega, angle):
     return float(luminance((np.maximum(image[core] - base, 0) * omega[core][:, None]).sum(axis=0)))
 
 
-def _kind(rings, radius, level, sky_irradiance, median, others):
-    """Return "sun", "lamp" or "cloud", and why."""
-    profile = luminance(rings)
-    measured = np.flatnonzero(np.isfinite(profile) & (profile > 0))
-    if radius > LARGEST_DEGREES or len(measured) < 2 or not sky_irradiance > 0:
-        return "cloud", f"most of the sky is clipped, over {radius:.0f} degrees to each side"
-    contrast = level * np.pi / sky_irradiance
-    first = measured[0]
-    last = measured[min(2, len(measured) - 1)]
-    fall = np.log(profile[first] / profile[last]) / np.log(RING_DEGREES[last] / RING_DEGREES[first])
-    if median * np.pi < DARK_SKY * sky_irradiance:
+def _kind(light, median, others):
+    """Return "sun", "lamp" or "cloud", and why; ``median`` luminance is of the upper half."""
+    sky = float(luminance(light.sky_irradiance))
+    if light.radius > LARGEST_DEGREES or light.first is None or not sky > 0:
+        return "cloud", f"the sky is clipped over {light.radius:.0f} degrees to each side"
+    if median * np.pi < DARK_SKY * sky:
         return "lamp", "its surroundings are dark, as in a room"
-    if radius > CORE_DEGREES and profile[first] < EDGE * level:
+    fall = f"luminance around it falls as angle^-{light.fall[0]:.1f}, over the sky's ^-{light.fall[1]:.1f}"
+    sharp = luminance(light.rings[light.first]) < EDGE * light.level
+    if sharp and light.radius > CORE_DEGREES:
         return "lamp", "it has a sharp edge, without an aureole"
-    if fall < LEAST_FALL:
-        return "cloud", f"around it luminance hardly falls, as angle^-{max(fall, 0):.1f}"
-    if others and contrast > CLEAR_CONTRAST:
+    if not light.has_aureole and not sharp:
+        return "cloud", fall
+    if others and light.level * np.pi > CLEAR_CONTRAST * sky:
         return "lamp", f"{others + 1} regions of its kind are clipped"
-    return "sun", f"around it luminance falls as angle^-{fall:.1f}"
+    return "sun", fall if light.has_aureole else "it is a disc of the sun's size, without glare"

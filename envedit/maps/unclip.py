@@ -102,6 +102,8 @@ def estimate(light: ClippedLight) -> Estimate:
     by_sky = _log2(luminance(light.sky_irradiance)) + _log2(luminance(sun)) - _log2(luminance(sky))
     by_sky += float(np.interp(haze, (0, 1), SKY_OFFSET))
     precision = np.array([AUREOLE_STOPS[0 if near else 1], SKY_STOPS]) ** -2.0
+    if not light.has_aureole:
+        precision[0] = 0  # no aureole: of a rendered sky, or of cloud
     stops = float(precision @ [by_aureole, by_sky] / precision.sum())
 
     # ---- The colour: the aureole's near the sun; farther out it is bluer than the sun
@@ -140,7 +142,8 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
     """Return a map with its sun: the aureole in the clipped region, and a disc.
 
     The aureole between the core and the first ring is a power of the angle: at the ring as measured, at the
-    core as :data:`AUREOLE` has it for this flux. Clipped texels become as bright as that, where they are not.
+    core as :data:`AUREOLE` has it for this flux. Clipped texels become as bright as that, where they are not,
+    if the light has an aureole.
     The disc, 0.54 degrees across, has the flux that the core lacks.
 
     Parameters
@@ -158,7 +161,7 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
         All other texels have their bits.
     """
     image = np.array(radiance, np.float32)
-    if light.first is not None and RING_DEGREES[light.first] > CORE_DEGREES:
+    if light.first is not None and light.has_aureole and RING_DEGREES[light.first] > CORE_DEGREES:
         _fill(image, light, float(luminance(flux)))
     lacking = max(1 - light.core_flux / max(float(luminance(flux)), 1e-30), 0.0)
     radius = math.radians(analytic_sky.SUN_APERTURE / 2)

@@ -48,7 +48,7 @@ def cases(args):
 
 
 def tabulate(cases, out, given) -> str:
-    """Return the constants, and the errors of each map by those without it, by the angle of the first ring."""
+    """Return the constants, and the errors of each map by those without it, by first ring."""
     suns = {done.case.name: done.metrics for done in done_of(cases, out)}
     if len(suns) < len(CLEAR + LOW):
         return "not all cases are done"

@@ -1,4 +1,4 @@
-"""The command ``envedit``: run, paint, fit, init, sweep, doctor, schema, cache, weights."""
+"""The command ``envedit``: its commands, and how they are called."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ COMMANDS = {
     "run": "carry out the edit that a configuration describes",
     "paint": "paint on the rendering in the browser, while the map follows",
     "fit": "fit a SIREN to a map, without an edit",
+    "lights": "list the lights of a map; write its sky and its lights apart",
+    "adjust": "exposure, colour, rotation, blur of a map; a second map as backplate",
+    "blend": "a map between two maps: lights move, skies blend",
+    "sky": "an analytic sky as a file, of a sun's position or of a place and a time",
+    "compare": "how far two maps are apart, as pictures and as light",
     "init": "write a commented configuration to start from",
     "sweep": "carry out many configurations, on this machine or a cluster",
     "doctor": "check whether this machine can run envedit",

@@ -15,6 +15,7 @@ The action says what it does by ``console.say`` and puts what programs read into
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,12 @@ MAP_HELP = "an OpenEXR or Radiance HDR file, lat-long, 2:1"
 
 
 def make_parser(
-    command: str, description: str, examples: Sequence[str], out: str = "FILE", default: str | None = None
+    command: str,
+    description: str,
+    examples: Sequence[str],
+    out: str = "FILE",
+    default: str | None = None,
+    repair: bool = True,
 ) -> argparse.ArgumentParser:
     """Make a parser with the options that all commands on a map have.
 
@@ -44,6 +50,8 @@ def make_parser(
         "FILE" or "DIR": what ``--out`` names.
     default : str, optional
         What it names without the option, for the help.
+    repair : bool
+        Whether there is the option of :func:`.map_file.read`.
     """
     parser = argparse.ArgumentParser(
         prog=f"envedit {command}",
@@ -57,11 +65,26 @@ def make_parser(
         parser.add_argument(
             "--overwrite", action="store_true", help="replace the file of --out, unless it is an input"
         )
-    parser.add_argument(
-        "--repair", action="store_true", help="replace texels that are not finite instead of refusing them"
-    )
+    if repair:
+        about = "replace texels that are not finite instead of refusing them"
+        parser.add_argument("--repair", action="store_true", help=about)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     return parser
+
+
+def number(low: float, high: float) -> Callable[[str], float]:
+    """Return the type of an option that is a number from ``low`` to ``high``."""
+
+    def read_number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # a NaN is in no range
+            raise argparse.ArgumentTypeError(f"got {text}, expected a number from {low:g} to {high:g}")
+        return value
+
+    return read_number
 
 
 def run(arguments: argparse.Namespace, action: Callable[[Console], None]) -> int:

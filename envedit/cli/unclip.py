@@ -45,7 +45,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _unclip(arguments: argparse.Namespace, console: Console) -> None:
-    from envedit.maps import clipped_light, map_file, unclip
+    from envedit.maps import map_file
+    from envedit.representations.layers import clipped_light, unclip
 
     _check(arguments)
     path = map_file.output_path(arguments.out, "unclipped", [arguments.map], arguments.overwrite)
@@ -87,6 +88,8 @@ def _unclip(arguments: argparse.Namespace, console: Console) -> None:
     ratio = horizontal / max(sky, 1e-30)
     console.facts |= {"added": True, "file": str(path), "flux": flux.tolist(), "stops": stops, "ratio": ratio}
     spread = f" (standard deviation {stops:.1f} stops)" if stops else ""
+    if stops and unclip.doubt(light):
+        console.warn(f"{arguments.map}: {unclip.doubt(light)}")
     values = " ".join(f"{value:.4g}" for value in flux)
     console.say(f"sun of flux {values}{spread}, horizontally {ratio:.2g} times the sky; {path}")
 
@@ -105,7 +108,7 @@ def _check(arguments):
 
 def _flux(arguments, light):
     """Return the flux (3,) as asked or estimated, and its standard deviation in stops, 0 as asked."""
-    from envedit.maps import unclip
+    from envedit.representations.layers import unclip
 
     if arguments.flux is not None and len(arguments.flux) == 3:
         return np.array(arguments.flux, np.float64), 0.0

@@ -46,8 +46,11 @@ MIN_HEIGHT, MIN_WIDTH = 3, 2
 # Directions and positions
 
 
-def directions(height: int, width: int) -> np.ndarray:
-    """Return the unit vectors ``(H, W, 3)`` float64 through the texel centres, in the emitter's frame."""
+def directions(height: int, width: int, rows: slice = slice(None)) -> np.ndarray:  # noqa: B008
+    """Return the unit vectors ``(H, W, 3)`` float64 through the texel centres, in the emitter's frame.
+
+    Of some ``rows`` only, if fewer are needed.
+    """
     _check_size(height, width)
     theta = np.array([math.pi / 2]) if height == 1 else np.pi * np.arange(height) / (height - 1)
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
@@ -55,7 +58,8 @@ def directions(height: int, width: int) -> np.ndarray:
     # sin(pi) is 1e-16 and not 0: the nadir would keep a hint of an azimuth.
     if height > 1:
         sin[-1] = 0.0
-    d = np.empty((height, width, 3))
+    sin, cos = sin[rows], cos[rows]
+    d = np.empty((len(sin), width, 3))
     d[..., 0] = sin[:, None] * np.sin(phi)
     d[..., 1] = cos[:, None]
     d[..., 2] = -sin[:, None] * np.cos(phi)

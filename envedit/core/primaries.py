@@ -35,6 +35,7 @@ NAMES = {
     "lin_ciexyzd65_scene": XYZ, "cie xyz-d65 - scene-referred": XYZ,
 }  # fmt: skip
 """Chromaticities by the names that programs write into a file, in small letters."""
+_ROWS = 256  # that are converted at a time
 _SAYING_NOTHING = {"unknown", "raw", "data", "none", "unspecified", "default", "non-color", "utility - raw"}
 SAME = 2e-3
 """Chromaticities that differ by no more are the same: programs write few digits."""
@@ -117,8 +118,12 @@ def to_rec709(chromaticities: Chromaticities) -> np.ndarray:
 
 def converted(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Multiply the colours of an image (H, W, 3) by a matrix; float32, infinite where it is too large."""
+    result = np.empty(image.shape, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        return (image.astype(np.float64) @ matrix.T).astype(np.float32)
+        for first in range(0, len(image), _ROWS):  # a large map is not copied as float64
+            band = slice(first, first + _ROWS)
+            result[band] = image[band].astype(np.float64) @ matrix.T
+    return result
 
 
 def _xyz(chromaticities):

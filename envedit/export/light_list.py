@@ -24,22 +24,32 @@ _POINTS = 100_000  # of a light, by which its radii are measured
 
 
 def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split a map (H, W, 3) into its sky, without lights but with their glow, and its lights.
+    """Split radiance (..., 3) into the sky, without lights but with their glow, and its lights.
 
     Parameters
     ----------
-    envmap : ndarray (H, W, 3)
+    envmap : ndarray (..., 3) float32
         Of the map.
-    core : ndarray (H, W, 3)
+    core : ndarray (..., 3)
         :attr:`.Separation.core` of the map, in its units.
 
     Returns
     -------
-    sky, lights : ndarray (H, W, 3) float32
-        Not negative; their sum is the map, to rounding. Where there is no light the sky has the map's bits.
+    sky, lights : ndarray (..., 3) float32
+        Not negative; their sum in float32 is the map, bit for bit. Where there is no light the sky has the
+        map's bits.
     """
+    envmap = np.asarray(envmap, np.float32)
     lights = np.minimum(core, envmap).astype(np.float32)
-    return np.where(lights > 0, envmap - lights, envmap).astype(np.float32), lights
+    sky = np.where(lights > 0, envmap - lights, envmap)
+    lights = envmap - sky
+    # Where the rounded sum is a neighbour of the map's value: both are made multiples of its spacing, and
+    # are then exact differences.
+    rounded = sky + lights != envmap
+    spacing = envmap[rounded] - np.nextafter(envmap[rounded], np.float32(0))
+    lights[rounded] = np.floor(lights[rounded] / spacing) * spacing
+    sky[rounded] = envmap[rounded] - lights[rounded]
+    return sky, lights
 
 
 def of_edit(
@@ -69,17 +79,19 @@ def of_edit(
     if given.unmoved is not None:
         last = kept(first, separate(given.radiance), given.unmoved, given.radiance, by_hand)
     last = kept(last, separate(edited), given.radiance, edited, degrees)
-    before, after = (listed(one, to_world) for one in (first, last))
+    before, after = (listed(one.lights, edited.shape[:2], to_world) for one in (first, last))
     return matched(before, after, by_hand + degrees), np.minimum(last.core, edited).astype(np.float32)
 
 
-def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
+def listed(separated: list[Light], shape: tuple[int, int], to_world: np.ndarray) -> list[dict]:
     """List the lights of a map, those with most flux first.
 
     Parameters
     ----------
-    found : separation.Separation
+    separated : list of separation.Light
         Of the map, linear radiance that reaches the scene.
+    shape : (int, int)
+        Rows and columns of the map.
     to_world : ndarray (3, 3)
         Rotation from the map's frame (+y up) to the scene's.
 
@@ -93,10 +105,10 @@ def listed(found: Separation, to_world: np.ndarray) -> list[dict]:
         ``flux``: integral of its radiance over its solid angle, RGB; this is its irradiance on a surface
         that faces it. ``irradiance``: on the horizontal plane of the map, flux max(sin(elevation), 0).
     """
-    height, width, _ = found.core.shape
+    height, width = shape
     omega = latlong.lookup_solid_angles(height, width)
     lights = []
-    for light in found.lights:
+    for light in separated:
         weight = omega[light.texels // width]
         flux = (np.float64(light.radiance) * weight[:, None]).sum(axis=0)
         solid = float(weight.sum())

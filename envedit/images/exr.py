@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
+import os
 import re
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -119,12 +122,29 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     return _to_display(image, (left, top), display, name, info)
 
 
+@contextlib.contextmanager
+def on_cores(count: int | None = None) -> Iterator[None]:
+    """Let the library use some threads, by default one a core; left alone it uses one, before 3.5 always."""
+    import OpenEXR
+
+    if not hasattr(OpenEXR, "set_global_thread_count"):
+        yield
+        return
+    before = OpenEXR.global_thread_count()
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    OpenEXR.set_global_thread_count(available if count is None else count)
+    try:
+        yield
+    finally:
+        OpenEXR.set_global_thread_count(before)
+
+
 def _decoded(name, count):
     """Decode the parts of a file that declares so many."""
     import OpenEXR
 
     try:
-        with quiet_libraries() as said:
+        with quiet_libraries() as said, on_cores():
             # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
             parts = OpenEXR.File(name, separate_channels=True).parts
     except MemoryError:

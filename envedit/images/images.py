@@ -431,7 +431,7 @@ def _checked(name, image):
 
 def _write_whole(name, suffix, write):
     """Call ``write(temporary name)`` and rename the result to ``name``."""
-    with replacing(name, suffix) as temporary, quiet_libraries():
+    with replacing(name, suffix) as temporary, quiet_libraries(), exr.on_cores():
         write(str(temporary))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 
 import numpy as np
@@ -12,6 +11,7 @@ from envedit.core.errors import ConfigError, NumericalError, place_of
 from envedit.core.primaries import REC709, Chromaticities
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import FilePath
+from envedit.images.exr import on_cores
 
 DEFAULT = "edited"
 """The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
@@ -83,7 +83,7 @@ def write(
         "chromaticities": chromaticities or REC709,
         "envmap": OpenEXR.ENVMAP_LATLONG,
     }
-    with replacing(name, ".exr") as temporary, quiet_libraries(), _threads(OpenEXR, threads):
+    with replacing(name, ".exr") as temporary, quiet_libraries(), on_cores(threads):
         OpenEXR.File(header, planes).write(str(temporary))
 
 
@@ -98,18 +98,3 @@ def _finite(name, layer, values):
             f"the first at {place_of(bad)}"
         )
     return values
-
-
-@contextlib.contextmanager
-def _threads(library, count):
-    """Let the library compress on several cores; by default it uses one, and before 3.5 always."""
-    if not hasattr(library, "set_global_thread_count"):
-        yield
-        return
-    before = library.global_thread_count()
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    library.set_global_thread_count(available if count is None else count)
-    try:
-        yield
-    finally:
-        library.set_global_thread_count(before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from envedit.inputs import InputMap
 
 EXR, HDR = ".exr", ".hdr"
 """Endings of the files that are written."""
+_ROWS = 256  # that are converted at a time
 
 
 def read(path: FilePath, repair: bool = False) -> InputMap:
@@ -41,6 +43,21 @@ def read(path: FilePath, repair: bool = False) -> InputMap:
         As of :func:`.images.load_envmap`.
     """
     return inputs.read_file(os.fsdecode(path), None, config.Input(repair=repair), 1.0)
+
+
+def as_stored(edited: np.ndarray, like: InputMap) -> np.ndarray:
+    """Return edited radiance (H, W, 3) in the colours of a map's file, as :meth:`.InputMap.as_stored`.
+
+    A map of another size has texels of its own, none of which are kept.
+    """
+    if like.chromaticities is None:
+        return edited
+    result = np.empty(edited.shape, np.float32)
+    stored = like.stored if like.stored.shape == edited.shape else np.zeros_like(edited)
+    for first in range(0, len(edited), _ROWS):
+        rows = slice(first, first + _ROWS)
+        result[rows] = replace(like, stored=stored[rows]).as_stored(edited[rows])
+    return result
 
 
 def output_path(

@@ -11,7 +11,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.color import linear_to_srgb, luminance, srgb_to_linear
 from envedit.images import images
-from envedit.maps.clipped_light import CORE_DEGREES
+from envedit.representations.layers.clipped_light import CORE_DEGREES
 from envedit.representations.layers.separation import separate
 
 KEPT = ("evening_road_01", "kloppenheim_06", "rustig_koppie", "syferfontein_18d_clear")

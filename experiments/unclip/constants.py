@@ -1,4 +1,4 @@
-"""Measure the constants of :mod:`envedit.maps.unclip`, and how far flux follows from aureole and sky at all.
+"""Measure the constants by which the flux of a clipped sun is estimated, and their errors.
 
 Over the suns of the maps that choices are made by: the aureole over the flux at the angles of the rings; sky
 and flux over the analytic model's. What is predicted for a map is of constants without this map.
@@ -8,8 +8,8 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.color import luminance
-from envedit.maps import unclip
-from envedit.maps.clipped_light import RING_DEGREES
+from envedit.representations.layers import unclip
+from envedit.representations.layers.clipped_light import RING_DEGREES
 from experiments import puresky
 from experiments.harness import Experiment, calling, done_of, markdown
 from experiments.unclip import clipping

@@ -7,7 +7,7 @@ import numpy as np
 
 from envedit.core.color import luminance, tonemap
 from envedit.images import images
-from envedit.maps import clipped_light, unclip
+from envedit.representations.layers import clipped_light, unclip
 from experiments import puresky
 from experiments.harness import Experiment, calling, number
 from experiments.summary import Numbers
@@ -55,7 +55,9 @@ def measure_map(settings, folder, file: str, map_name: str) -> dict:
                 "kind": light.kind if light else "nothing",
                 "added": added,
                 "spread": spread,
-                "false": added and not true.sunny and flux / exposure > clipping.SUNNY * true.sky,
+                "false": added
+                and not true.sunny
+                and flux > clipping.SUNNY * float(luminance(light.sky_irradiance)),
                 "off": float(off),
                 "true_ratio": stops(true.flux, true.sky),
                 "clipped_flux": stops(light.core_flux / exposure if light else 0.0, true.flux),
@@ -156,8 +158,9 @@ EXPERIMENT = Experiment(
         "sun added": lambda row: ("false" if row["false"] else "yes") if row["added"] else "",
         "off, degrees": lambda row: number(row["off"]),
         "true sun over sky, stops": lambda row: number(row["true_ratio"], "+.1f"),
-        "flux, stops: clipped": lambda row: number(row["clipped_flux"], "+.1f"),
-        "now": lambda row: number(row["flux"], "+.1f"),
+        "flux, stops: clipped": lambda row: number(row["clipped_flux"], "+.1f") if row["sunny"] else "",
+        "now": lambda row: number(row["flux"], "+.1f") if row["sunny"] else "",
+        "expected": lambda row: number(row["spread"]) if row["sunny"] else "",
         "irradiance, stops: clipped": lambda row: number(row["clipped_irradiance"], "+.2f"),
         "now ": lambda row: number(row["irradiance"], "+.2f"),
         "shadow: truth, clipped, now": "{true_contrast:.2f} {clipped_contrast:.2f} {contrast:.2f}",

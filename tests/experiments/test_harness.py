@@ -168,6 +168,7 @@ COUNTS = {
     "interiors": 5,
     "layers": 96,
     "light_estimation": 6,
+    "maps_alone": 26,
     "natural": 680,
     "natural.skies": 1,
     "paint.figure10": 7,

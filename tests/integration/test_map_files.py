@@ -85,7 +85,7 @@ def test_lights_are_where_and_as_strong_as_in_the_map():
     envmap = np.full((height, width, 3), 0.2, np.float32)
     envmap[row, column] = [900, 600, 300]
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
-    (found,) = light_list.listed(separate(envmap), turn)
+    (found,) = light_list.listed(separate(envmap).lights, envmap.shape[:2], turn)
     d = latlong.directions(height, width)[row, column]
     np.testing.assert_allclose(found["direction"], turn @ d, atol=1e-6)
     assert found["azimuth"] == pytest.approx(360 * (column + 0.5) / width, abs=1e-3)
@@ -112,12 +112,12 @@ def test_a_map_without_lights_is_all_sky(rng):
     assert (
         whole.tobytes() == even.tobytes()
         and not none.any()
-        and light_list.listed(separate(even), np.eye(3)) == []
+        and light_list.listed(separate(even).lights, even.shape[:2], np.eye(3)) == []
     )
     black = np.zeros((16, 32, 3), np.float32)
     assert (
         not any(part.any() for part in light_list.split(black, separate(black).core))
-        and light_list.listed(separate(black), np.eye(3)) == []
+        and light_list.listed(separate(black).lights, black.shape[:2], np.eye(3)) == []
     )
 
 

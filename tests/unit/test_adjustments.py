@@ -75,6 +75,15 @@ def test_a_spread_light_keeps_its_flux_and_its_disc(at, degrees):
         np.testing.assert_allclose(share, expected / expected.max(), atol=1e-6)
 
 
+def test_a_light_spread_on_a_coarser_grid_is_the_same_disc():
+    core = np.zeros((256, 512, 3))
+    core[40:44, 100:103] = [900, 500, 1e-3]
+    degrees = 30.0  # 43 texels: more than SPREAD_TEXELS
+    found, fine = adjustments.spread(core, degrees), adjustments._spread(core, degrees)
+    np.testing.assert_allclose(flux(found), flux(core), rtol=1e-5)
+    np.testing.assert_allclose(found / fine.max((0, 1)), fine / fine.max((0, 1)), atol=0.01)
+
+
 @pytest.mark.parametrize("scale", [1.0, 4.0])
 def test_no_texel_of_the_file_is_above_the_bound_and_the_light_is_kept(scale, rng):
     envmap = sunny(rng)

@@ -52,7 +52,7 @@ def test_a_turn_goes_the_way_of_the_map():
     envmap = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
     envmap[9, 50], envmap[6, 20] = 900, 500
     turned = latlong.rotate(envmap, 45.0)
-    lists = [light_list.listed(separate(one), np.eye(3)) for one in (envmap, turned)]
+    lists = [light_list.listed(separate(one).lights, one.shape[:2], np.eye(3)) for one in (envmap, turned)]
     assert [len(one) for one in lists] == [2, 2]
     start, end = (np.array([light_list._toward(one) for one in lights]) for lights in lists)
     np.testing.assert_allclose(light_list._turned(start, 45.0), end, atol=1e-4)
@@ -72,7 +72,7 @@ def test_a_light_that_the_edit_left_alone_is_the_same_light(changed):
     before, after = separate(envmap), separate(turned)
     assert len(before.lights) == 1 and not after.lights
     found = light_list.kept(before, after, envmap, turned, degrees)
-    lists = [light_list.listed(one, np.eye(3)) for one in (before, found)]
+    lists = [light_list.listed(one.lights, one.core.shape[:2], np.eye(3)) for one in (before, found)]
     said = light_list.summary(light_list.matched(*lists, degrees), HEIGHT)
     azimuth = round(50.5 / WIDTH * 360 - degrees)
     assert "is gone" in said if changed else f"to azimuth {azimuth}, elevation" in said
@@ -99,7 +99,9 @@ def test_radii_are_those_of_half_and_nearly_all_of_the_flux():
     disc[angle[..., 0] < 6] = 50
     sun[angle[..., 0] < 5] = 0.6
     sun[row, column] = 5000
-    (of_disc,), (of_sun,) = (light_list.listed(separate(one), np.eye(3)) for one in (disc, sun))
+    (of_disc,), (of_sun,) = (
+        light_list.listed(separate(one).lights, one.shape[:2], np.eye(3)) for one in (disc, sun)
+    )
     assert of_disc["radius_50"] == pytest.approx(6 * np.sqrt(0.5), abs=0.1)
     assert of_disc["radius_97"] == pytest.approx(6 * np.sqrt(0.97), abs=0.2)
     texel = 360 / width

@@ -24,7 +24,9 @@ def test_float_half_and_colour_space_of_an_exr_are_kept(sky, tmp_path):
         np.testing.assert_allclose(again.chromaticities, primaries.ACES_AP1, atol=1e-6)
 
 
-def test_a_radiance_file_keeps_its_texels_and_its_primaries(sky, tmp_path):
+@pytest.mark.parametrize("height", [6, 300])  # within a band of rows that is encoded, and beyond it
+def test_a_radiance_file_keeps_its_texels_and_its_primaries(height, rng, tmp_path):
+    sky = rng.uniform(0.1, 4, (height, 2 * height, 3)).astype(np.float32)
     images.write_hdr(tmp_path / "a.hdr", sky, primaries.REC2020)
     read = map_file.read(tmp_path / "a.hdr")
     np.testing.assert_allclose(read.chromaticities, primaries.REC2020)

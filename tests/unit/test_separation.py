@@ -249,11 +249,12 @@ def test_the_copy_in_which_lights_are_looked_for_lies_where_the_crop_does(rows):
     height, width = 350, 701
     d = latlong.directions(height, width)[slice(*rows)]
     small = separation._reduced(d - d.min() + 1, rows[0], height)
-    theta = small.upsampled(np.arccos(small.directions[..., 1:2]), *d.shape[:2])[2:-2, :, 0]
+    places = separation._Places(small.rows, small.image.shape[1], rows[0], height)
+    theta = places.upsampled(np.arccos(small.directions[..., 1:2]), *d.shape[:2])[2:-2, :, 0]
     np.testing.assert_allclose(theta, np.arccos(d[2:-2, :, 1]), atol=1e-7)
-    upsampled = small.upsampled(small.directions, *d.shape[:2])[2:-2]
+    upsampled = places.upsampled(small.directions, *d.shape[:2])[2:-2]
     assert np.degrees(np.linalg.norm(upsampled - d[2:-2], axis=-1)).max() < 0.1 * 360 / small.image.shape[1]
-    nearest = small.at(small.directions, *d.shape[:2])[2:-2]
+    nearest = places.at(small.directions, *d.shape[:2])[2:-2]
     assert np.degrees(np.linalg.norm(nearest - d[2:-2], axis=-1)).max() < 0.75 * 360 / small.image.shape[1]
     np.testing.assert_allclose(small.image + d.min() - 1, small.directions, atol=0.005)
 

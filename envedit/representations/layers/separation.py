@@ -134,7 +134,20 @@ class Survey:
     shares: list[float]
 
 
-def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int = MOST_LIGHTS) -> Separation:
+def survey_of(
+    image: np.ndarray, rows: tuple[int, int] | None = None, most: int = MOST_LIGHTS
+) -> Survey | None:
+    """Find the lights of a map on its small copy; None without lights. Parameters as of :func:`separate`."""
+    first, total = rows or (0, image.shape[0])
+    return _survey(_reduced(image, first, total), most)
+
+
+def separate(
+    image: np.ndarray,
+    rows: tuple[int, int] | None = None,
+    most: int = MOST_LIGHTS,
+    survey: Survey | None = None,
+) -> Separation:
     """Separate the lights of a map from its background.
 
     Parameters
@@ -145,6 +158,8 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int =
         First row of the image in its map, and the rows of that map; None: the image is a whole map.
     most : int
         Most lights, those with most flux; weaker ones stay in the background.
+    survey : Survey, optional
+        Of a larger part of the map, of which the image is a band; None: of the image.
 
     Returns
     -------
@@ -154,20 +169,17 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int =
     image = np.asarray(image, np.float64)
     first, total = rows or (0, image.shape[0])
     height, width = image.shape[:2]
-    small = _reduced(image, first, total)
-    survey = _survey(small, most)
+    if survey is None:
+        survey = survey_of(image, rows, most)
     if survey is None:
         return Separation(image, np.ones_like(image), np.zeros_like(image), [])
 
     # ---- Glow, cores and background at the map's own resolution
-    directions = latlong.directions(total, width)[first : first + height]
-    glow = np.ones_like(image)
-    for table, centre in zip(survey.glows, survey.centres, strict=True):
-        if table is not None:
-            glow *= 1 + glow_at(table, directions @ centre)
-    label = small.at(survey.label, height, width)
+    places = _Places(survey.rows, survey.label.shape[1], first, total)
+    glow = glow_of(survey, latlong.directions(total, width, slice(first, first + height)))
+    label = places.at(survey.label, height, width)
     inside = (label >= 0)[..., None]
-    below = small.upsampled(survey.below, height, width)
+    below = places.upsampled(survey.below, height, width)
     core = np.where(inside, np.maximum(image - below * glow, 0), 0)
     background = np.where(inside, (image - core) / glow, image / glow)
 
@@ -191,6 +203,15 @@ def separate(image: np.ndarray, rows: tuple[int, int] | None = None, most: int =
         shares=[survey.shares[i] for i in kept],
     )
     return Separation(background, glow, core, lights, survey)
+
+
+def glow_of(survey: Survey, directions: np.ndarray) -> np.ndarray:
+    """Return the product of 1 + G over all lights (..., 3) at directions (..., 3)."""
+    glow = np.ones_like(directions)
+    for table, centre in zip(survey.glows, survey.centres, strict=True):
+        if table is not None:
+            glow *= 1 + glow_at(table, directions @ centre)
+    return glow
 
 
 def _survey(small: _Small, most: int) -> Survey | None:
@@ -237,6 +258,19 @@ class _Small:
         size = np.linalg.norm(centre)
         return centre / size if size else centre
 
+
+@dataclass(frozen=True)
+class _Places:
+    """Where texels of an image lie among those of the small copy.
+
+    ``rows``: first row and total of the copy, ``columns``: its columns; ``first``, ``total``: of the image.
+    """
+
+    rows: tuple[int, int]
+    columns: int
+    first: int
+    total: int
+
     def at(self, values, height, width):
         """Values of the nearest texels at the image's own resolution."""
         r, c = self._places(height, width)
@@ -262,7 +296,7 @@ class _Small:
         start, small_total = self.rows
         scale = (small_total - 1) / max(self.total - 1, 1)
         rows = (np.arange(height) + self.first) * scale - start
-        return rows, (np.arange(width) + 0.5) * (self.image.shape[1] / width) - 0.5
+        return rows, (np.arange(width) + 0.5) * (self.columns / width) - 0.5
 
 
 def _reduced(image, first, total):
@@ -278,7 +312,7 @@ def _reduced(image, first, total):
         whole = latlong.resize(whole, h, w).astype(np.float64)[start:stop]
         small = whole[..., :3] / np.maximum(whole[..., 3:], 1e-6)
     else:
-        small, h, w, start, stop = image, total, width, first, first + height
+        small, h, w, start, stop = np.asarray(image, np.float64), total, width, first, first + height
     toward = latlong.directions(h, w)[start:stop]
     omega = np.repeat(latlong.solid_angles(h, w)[start:stop, None], w, axis=1)
     return _Small(small, toward, omega, first, total, (start, h))

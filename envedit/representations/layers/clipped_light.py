@@ -42,7 +42,9 @@ SEVERAL_SHARE = 0.25
 """Area of another clipped region over that of the first from which on it is one more of its kind."""
 CLEAR_CONTRAST = 5.0
 """Luminance of the plateau, times pi over the sky's horizontal irradiance, from which on several regions are
-lamps, as clouds are darker. Chosen by the same nine maps."""
+lamps, as clouds are darker; below, a sun may be a cloud. Chosen by the same nine maps."""
+LEAST_TEXELS = 2
+"""Texels of a plateau: a single one as bright as that is a maximum, not clipped. Derived."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,11 @@ class ClippedLight:
         return float(np.degrees(np.arctan2(self.direction[0], -self.direction[2])) % 360)
 
     @property
+    def contrast(self) -> float:
+        """Luminance of the plateau, if it is grey, times pi over the sky's horizontal irradiance."""
+        return self.level * np.pi / max(float(luminance(self.sky_irradiance)), 1e-30)
+
+    @property
     def fall(self) -> tuple[float, float]:
         """Exponents by which luminance, and luminance over the darkest ring's, fall with the angle.
 
@@ -130,7 +137,7 @@ def find(radiance: np.ndarray) -> ClippedLight | None:
     Returns
     -------
     ClippedLight or None
-        None where nothing above the horizon reaches the plateau: there is none in a black map.
+        None where less than :data:`LEAST_TEXELS` above the horizon are on the plateau, or all is black.
     """
     height, width, _ = radiance.shape
     level = float(radiance.max(initial=0))
@@ -143,10 +150,10 @@ def find(radiance: np.ndarray) -> ClippedLight | None:
     for channel in range(3):
         channels += radiance[..., channel] >= PLATEAU * level
     most = int(channels[:upper].max())
-    if most == 0:
-        return None
     plateau = channels == most
     plateau[upper:] = False
+    if most == 0 or plateau.sum() < LEAST_TEXELS:
+        return None
 
     # ---- A copy of a size that does not depend on the file's
     w = min(width, COPY_WIDTH)
@@ -249,6 +256,6 @@ def _kind(light, median, others):
         return "lamp", "it has a sharp edge, without an aureole"
     if not light.has_aureole and not sharp:
         return "cloud", fall
-    if others and light.level * np.pi > CLEAR_CONTRAST * sky:
+    if others and light.contrast > CLEAR_CONTRAST:
         return "lamp", f"{others + 1} regions of its kind are clipped"
     return "sun", fall if light.has_aureole else "it is a disc of the sun's size, without glare"

@@ -20,7 +20,14 @@ from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.core.errors import ConfigError
 from envedit.images import analytic_sky
-from envedit.maps.clipped_light import CORE_DEGREES, PLATEAU, RING_DEGREES, ClippedLight
+from envedit.representations.layers.clipped_light import (
+    CLEAR_CONTRAST,
+    CORE_DEGREES,
+    PLATEAU,
+    RING_DEGREES,
+    ClippedLight,
+    find,
+)
 
 AUREOLE = np.array([3.96, 2.51, 1.22, 0.43, -0.28, -0.96, -1.56, -2.02, -2.52, -2.83, -3.19, -3.73, -4.47])
 """log2 of a clear sun's aureole over its flux, 1/sr, at the first of :data:`.RING_DEGREES`: mean of three.
@@ -35,7 +42,8 @@ measured: there is no map between."""
 TURBIDITY = 3.0
 """Of the analytic model: a clear day."""
 NEAR_DEGREES = 2.0
-"""Up to here the aureole has the sun's colour and is mostly the lens' glare, which tells more of the flux."""
+"""Up to here the aureole has the sun's colour and is mostly the lens' glare, by which flux is
+known better."""
 AUREOLE_STOPS = (0.85, 1.13)
 """Standard deviation of the first estimate, with the first ring near and far: RMS over clear suns, each by
 the constants of the others, measured."""
@@ -93,7 +101,7 @@ def estimate(light: ClippedLight) -> Estimate:
     """
     first = min(light.first or 0, len(AUREOLE) - 1)
     near = RING_DEGREES[first] <= NEAR_DEGREES
-    haze = float(np.interp(air_mass(light.elevation), HAZE_AIR_MASS, (0, 1)))
+    haze = _haze(light.elevation)
 
     # ---- Two estimates of the logarithm, and their mean, weighted by precision
     ring = light.rings[light.first or 0]
@@ -108,8 +116,40 @@ def estimate(light: ClippedLight) -> Estimate:
 
     # ---- The colour: the aureole's near the sun; farther out it is bluer than the sun
     colour = ring if near else np.sqrt(ring * sun)
+
+    # ---- Its error, also of the elevation: the middle of a large region may be off by half its radius
     spread = FLUX_STOPS[2] if haze > 0 else FLUX_STOPS[0 if near else 1]
+    hazes = [_haze(light.elevation + sign * light.radius / 2) for sign in (-1, 1)]
+    spread = math.hypot(spread, HAZE_STOPS * (hazes[0] - hazes[1]) / 2)
     return Estimate(2.0**stops * _unit(colour), spread)
+
+
+def _haze(elevation):
+    """Return how far haze takes the light of a sun at an elevation, 0 to 1."""
+    return float(np.interp(air_mass(elevation), HAZE_AIR_MASS, (0, 1)))
+
+
+def with_sun(radiance: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return a map (H, W, 3) with its sun, if that was clipped, and what was done, a clause."""
+    light = find(radiance)
+    if light is None:
+        return radiance, "nothing is clipped above the horizon: no sun was added"
+    if light.kind != "sun":
+        return radiance, f"a {light.kind} is clipped, as {light.reason}: no sun was added"
+    sun = estimate(light)
+    if not is_clipped(light, sun.flux):
+        return radiance, "the sun has the flux that is expected: none was added"
+    sentence = f"sun of flux {luminance(sun.flux):.4g} added, standard deviation {sun.stops:.1f} stops"
+    return restored(radiance, light, sun.flux), "; ".join(filter(None, [sentence, doubt(light)]))
+
+
+def doubt(light: ClippedLight) -> str:
+    """Return a clause on a sun that may be none, "" for a clear one."""
+    if light.kind != "sun" or light.contrast > CLEAR_CONTRAST:
+        return ""
+    return (
+        "the sun is clipped close to the brightness of the sky, where half of such regions are bright cloud"
+    )
 
 
 def is_clipped(light: ClippedLight, flux: np.ndarray) -> bool:

@@ -1,0 +1,66 @@
+"""``envedit blend A B``: a map between two maps, with one sun and not two halves."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from envedit.cli import map_command
+from envedit.cli.streams import steady
+
+if TYPE_CHECKING:
+    from envedit.cli.console import Console
+
+
+@steady
+def main(argv: list[str] | None = None) -> int:
+    """Blend two maps; returns the exit code."""
+    parser = map_command.make_parser(
+        "blend",
+        "Blend two maps: lights move on great circles and change flux, skies blend in log radiance.\n"
+        "The result has the size, format and colour space of the first map; the second is resampled to it.",
+        [
+            "envedit blend noon.hdr dusk.hdr --amount 0.5",
+            "envedit blend a.exr b.exr --amount 0.25 --out c.exr",
+        ],
+        default="A_blended.exr or .hdr, as the first map",
+    )
+    parser.add_argument("first", metavar="A", help=map_command.MAP_HELP)
+    parser.add_argument("second", metavar="B", help="another")
+    parser.add_argument(
+        "--amount",
+        type=map_command.number(0, 1),
+        required=True,
+        metavar="T",
+        help="0: the first map; 1: the second",
+    )
+    arguments = parser.parse_args(argv)
+    return map_command.run(arguments, lambda console: _blend(arguments, console))
+
+
+def _blend(arguments: argparse.Namespace, console: Console) -> None:
+    from envedit.core import latlong
+    from envedit.maps import map_file
+    from envedit.maps.blended import blend
+
+    sources = [arguments.first, arguments.second]
+    path = map_file.output_path(arguments.out, "blended", sources, arguments.overwrite)
+    map_command.select_variant()
+    first = map_command.read(arguments.first, arguments, console)
+    second = map_command.read(arguments.second, arguments, console)
+    alike = first.chromaticities == second.chromaticities and first.size == second.size
+    lights: list[dict] = []
+    if arguments.amount == 0:
+        values = first.stored
+    elif arguments.amount == 1 and alike:
+        values = second.stored
+    else:
+        other = second.radiance
+        if first.size != second.size:
+            other = latlong.resize(other, *first.stored.shape[:2])
+        radiance, lights = blend(first.radiance, other, arguments.amount)
+        values = map_file.as_stored(radiance, first)
+    for warning in map_file.write(path, values, first):
+        console.warn(warning)
+    console.facts |= {"files": {"map": str(path)}, "amount": arguments.amount, "lights": lights}
+    console.say(f"{len(lights)} lights; {path}" if lights else str(path))

@@ -1,0 +1,102 @@
+"""Adjustments of a map alone: rotation, exposure, colour, lights, blur, in this order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit import config
+from envedit.core import latlong
+from envedit.core.color import luminance
+from envedit.export import adjustments
+from envedit.maps import sphere
+
+_ROWS = 256  # of a map that are worked on at a time
+
+
+@dataclass(frozen=True)
+class Adjustments:
+    """What is changed of a map; the defaults change nothing.
+
+    Attributes
+    ----------
+    turn, tilt, horizon : float
+        Degrees, as of :func:`.sphere.rotation`.
+    exposure : float
+        Stops.
+    white_balance : float
+        Kelvin of the light that becomes neutral; 0: as it is.
+    saturation : float
+        Factor on the distance of a colour from grey of its luminance.
+    soften : float
+        Radius in degrees over which each texel of a light is spread.
+    max_radiance : float
+        Bound that lights are spread to keep to, in the units of the file; 0: none.
+    blur : float
+        Standard deviation in degrees, of all of the map.
+    """
+
+    turn: float = 0.0
+    tilt: float = 0.0
+    horizon: float = 0.0
+    exposure: float = 0.0
+    white_balance: float = 0.0
+    saturation: float = 1.0
+    soften: float = 0.0
+    max_radiance: float = 0.0
+    blur: float = 0.0
+
+
+def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[str]]:
+    """Adjust a map.
+
+    Parameters
+    ----------
+    radiance : ndarray (H, W, 3) float32
+        Linear radiance in Rec. 709.
+    how : Adjustments
+        What is changed.
+
+    Returns
+    -------
+    adjusted : ndarray (H, W, 3) float32
+        Not negative.
+    notes : list of str
+        What was done.
+
+    Raises
+    ------
+    NumericalError
+        The adjusted map leaves single precision.
+    """
+    notes = []
+    if how.tilt or how.horizon:
+        radiance = sphere.rotate(radiance, sphere.rotation(how.turn, how.tilt, how.horizon))
+        notes.append(f"turned by {how.turn:g}, tilted by {how.tilt:g}, raised by {how.horizon:g} degrees")
+    elif how.turn:
+        radiance = latlong.rotate(radiance, how.turn)
+        notes.append(f"turned by {how.turn:g} degrees")
+    colour = config.Output(exposure=how.exposure, white_balance=how.white_balance)
+    radiance, done = adjustments.adjust(radiance, config.Lights(), colour)
+    notes += done
+    if how.saturation != 1:
+        radiance = saturated(radiance, how.saturation)
+        notes.append(f"saturation x {how.saturation:g}")
+    lights = config.Lights(soften_degrees=how.soften, max_radiance=how.max_radiance)
+    radiance, done = adjustments.adjust(radiance, lights, config.Output())
+    notes += done
+    if how.blur:
+        radiance = sphere.blur(radiance, how.blur)
+        notes.append(f"blurred by {how.blur:g} degrees")
+    return radiance, notes
+
+
+def saturated(radiance: np.ndarray, factor: float) -> np.ndarray:
+    """Scale the distance of colours (H, W, 3) from grey: max(L + s (E - L), 0) of luminance L, float32."""
+    result = np.empty_like(radiance)
+    for first in range(0, len(radiance), _ROWS):
+        rows = slice(first, first + _ROWS)
+        grey = luminance(radiance[rows])[..., None]
+        result[rows] = np.maximum(grey + factor * (radiance[rows] - grey), 0)
+    return result

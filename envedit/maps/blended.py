@@ -1,0 +1,126 @@
+"""A map between two maps: lights move on great circles, skies blend in log radiance.
+
+The lights of the maps are matched (:func:`.light_list.matched`). A matched light goes from one direction to
+the other; its flux changes geometrically, and its shape is that of both, at one place. One without a partner
+fades where it is. Glows move with their lights, and the backgrounds under them blend texel by texel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.rotations import rotated, rotation_between, rotation_vector
+from envedit.export import file_lights, light_list
+from envedit.maps import sphere
+from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
+
+BLACK = 1e-4
+"""Share of a sky's mean radiance that is added before its logarithm, and taken off again: black has none."""
+_ROWS = 128  # of a map that are worked on at a time
+
+
+@dataclass(frozen=True)
+class _Move:
+    """A light of the result: its direction, its parts with their fluxes, and the logarithm of 1 + glow."""
+
+    direction: np.ndarray
+    parts: list[tuple[Light, np.ndarray]]
+    log_glow: np.ndarray
+
+
+def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndarray, list[dict]]:
+    """Blend two maps of one size.
+
+    Parameters
+    ----------
+    first, second : ndarray (H, W, 3) float32
+        Linear radiance in Rec. 709. Both are overwritten: two maps of 8192 x 4096 texels are 0.8 GB.
+    amount : float
+        0: the first; 1: the second.
+
+    Returns
+    -------
+    blended : ndarray (H, W, 3) float32
+        It is ``first``, overwritten, where the amount is between.
+    lights : list of dict
+        ``direction`` and ``flux`` of each light of the result; empty where it is one of the maps.
+    """
+    if amount <= 0:
+        return first, []
+    if amount >= 1:
+        return second, []
+
+    # ---- Lights, matched, and the skies without them
+    maps = first, second
+    lights = [file_lights.lights_of(one).lights for one in maps]
+    moves = _moves(lights, first.shape[:2], amount)
+    for one, own in zip(maps, lights, strict=True):
+        file_lights.take_out(one, own)
+    offset = [max(BLACK * float(one.mean(dtype=np.float64)), 1e-30) for one in maps]
+    share = np.array([1 - amount, amount])
+    least = np.float32(np.exp(share @ np.log(offset)))
+
+    # ---- Backgrounds in log radiance, and the glows where the lights are
+    height, width = first.shape[:2]
+    for top in range(0, height, _ROWS):
+        rows = slice(top, top + _ROWS)
+        directions = latlong.directions(height, width, rows).astype(np.float32)
+        log_sky = np.zeros_like(first[rows])
+        for one, own, e, weight in zip(maps, lights, offset, share, strict=True):
+            for light in own:
+                if light.glow is not None:
+                    one[rows] /= 1 + glow_at(light.glow, directions @ np.float32(light.direction))
+            log_sky += np.float32(weight) * np.log(one[rows] + np.float32(e))
+        first[rows] = np.maximum(np.exp(log_sky) - least, 0)
+        for move in moves:
+            if move.log_glow.any():
+                first[rows] *= 1 + glow_at(np.expm1(move.log_glow), directions @ np.float32(move.direction))
+
+    # ---- Lights
+    for move in moves:
+        for light, flux in move.parts:
+            matrix = _matrix(rotation_vector(light.direction, move.direction))
+            sphere.add_rotated(first, light, matrix, flux)
+    return first, [
+        {
+            "direction": move.direction.tolist(),
+            "flux": np.sum([flux for _, flux in move.parts], axis=0).tolist(),
+        }
+        for move in moves
+    ]
+
+
+def _moves(lights, shape, amount):
+    """Return what each light of the two maps becomes."""
+    tables = [[light_list.listed([light], shape, np.eye(3))[0] for light in own] for own in lights]
+    matched = light_list.matched(tables[0], tables[1])
+    ends = [
+        {row["id"]: (light, np.array(row["flux"])) for row, light in zip(rows, own, strict=True)}
+        for rows, own in zip((matched["before"], matched["after"]), lights, strict=True)
+    ]
+    moves = []
+    for number in sorted({*ends[0], *ends[1]}):
+        start, end = (side.get(number) for side in ends)
+        if start is None or end is None:  # it fades where it is
+            (light, flux), weight = (start, 1 - amount) if end is None else (end, amount)
+            moves.append(_Move(light.direction, [(light, weight * flux)], weight * _log_glow(light)))
+            continue
+        (one, before), (other, after) = start, end
+        flux = before ** (1 - amount) * after**amount
+        turn = amount * rotation_between(one.direction, other.direction)
+        parts = [(one, (1 - amount) * flux), (other, amount * flux)]
+        glow = (1 - amount) * _log_glow(one) + amount * _log_glow(other)
+        moves.append(_Move(rotated(one.direction, turn), parts, glow))
+    return moves
+
+
+def _log_glow(light):
+    return np.zeros((len(GLOW_DEGREES), 3)) if light.glow is None else np.log1p(light.glow)
+
+
+def _matrix(vector):
+    """Return the matrix (3, 3) of a rotation vector."""
+    return np.stack([rotated(axis, vector) for axis in np.eye(3)], axis=1)

@@ -1,0 +1,122 @@
+"""Time the commands on a map alone, and their peak memory, on three public maps and on one of 8192 x 4096."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import envedit
+from envedit.core import latlong
+from envedit.images import images
+from experiments import puresky
+from experiments.harness import Experiment, calling
+
+LARGE = 8192
+"""Columns of the large map, an enlarged small one."""
+MOST_GB = 3.0
+"""Peak memory that a command may have on it."""
+COMMANDS = {
+    "lights": "lights {first}",
+    "adjust, rotation and colour": "adjust {first} --horizon 5 --tilt 3 --exposure 1 --saturation 0.8",
+    "adjust, bound of radiance": "adjust {first} --max-radiance 50",
+    "adjust, blur": "adjust {first} --blur 5",
+    "sky": "sky --elevation 30 --width {width}",
+    "blend": "blend {first} {second} --amount 0.5",
+    "compare": "compare {first} {second}",
+}
+"""What is run, by its name in the table."""
+
+
+def cases(given):
+    folder = puresky.data()
+    files = [puresky.file(name) for name in ("kloofendal_48d_partly_cloudy", "evening_road_01")]
+    files.append(str(folder / "hdri" / "studio_small_03_1k.hdr"))
+    found = []
+    for name, line in COMMANDS.items():
+        for k, file in enumerate(files if "{first}" in line else files[:1]):
+            found.append(case(name, line, file, files[k - 1], None))
+        found.append(case(name, line, files[0], files[1], LARGE))
+    return found
+
+
+def case(name, line, first, second, width):
+    """Return the case of a command on two files, enlarged where there is a width."""
+    tables = {"input": {"envmap": first}, "target": {"kind": "envmap", "file": second}}
+    size = f"{LARGE} x {LARGE // 2}" if width else "1024 x 512"
+    about = {"command": name, "size": size, "map": Path(first).stem}
+    title = f"{name.replace(', ', '-').replace(' ', '_')}-{Path(first).stem}-{width or 1024}"
+    return calling(title, "experiments.maps_alone.experiment:timed", tables, about, line=line, width=width)
+
+
+def timed(settings, folder: Path, line: str, width: int | None) -> dict:
+    """Run a command in a process of its own; its seconds, those of all cores, and its peak memory in MB."""
+    files = [settings.input.envmap, settings.target.file]
+    if width:
+        files = [enlarged(file, folder.parent / f"{Path(file).stem}_{width}.exr", width) for file in files]
+    names = {"first": files[0], "second": files[1], "width": str(width or 1024)}
+    command = [part.format(**names) for part in line.split()]
+    environment = os.environ | {"PYTHONPATH": str(Path(envedit.__file__).parents[1])}
+    before = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "envedit", *command, "--json"],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return {
+        "exit_code": process.returncode,
+        "seconds": time.perf_counter() - before,
+        "cpu_seconds": usage.ru_utime + usage.ru_stime,
+        "megabytes": usage.ru_maxrss / 1024,
+    }
+
+
+def enlarged(file: str, to: Path, width: int) -> str:
+    """Write a map enlarged, unless it is there; returns the file."""
+    if not to.exists():
+        envmap, _ = images.load_envmap(file)
+        images.write_exr(to, latlong.resize(envmap, width // 2, width))
+    return str(to)
+
+
+def combine(rows: list[dict]) -> list[dict]:
+    """Return a row for each command and size: the largest of its maps."""
+    keys = "seconds", "cpu_seconds", "megabytes"
+    found = []
+    for command, size in dict.fromkeys((row["command"], row["size"]) for row in rows):
+        some = [row for row in rows if (row["command"], row["size"]) == (command, size)]
+        worst = {key: float(np.max([row[key] for row in some])) for key in keys}
+        found.append({"command": command, "size": size, "maps": len(some)} | worst)
+    return found
+
+
+def failures(rows: list[dict]) -> list[str]:
+    """Say what failed, or took more memory than it may."""
+    wrong = [
+        f"{row['command']} on {row['map']}: exit code {row['exit_code']}" for row in rows if row["exit_code"]
+    ]
+    large = [row for row in rows if row["megabytes"] > 1024 * MOST_GB]
+    return wrong + [f"{row['command']} on {row['map']}: {row['megabytes']:.0f} MB" for row in large]
+
+
+EXPERIMENT = Experiment(
+    "maps_alone",
+    "Time the commands on a map alone, and measure their memory.",
+    cases,
+    columns={
+        "command": "{command}",
+        "map": "{size}",
+        "maps": "{maps}",
+        "seconds": "{seconds:.1f}",
+        "seconds of all cores": "{cpu_seconds:.1f}",
+        "peak memory, MB": "{megabytes:.0f}",
+    },
+    combine=combine,
+    failures=failures,
+    alone=True,
+)

@@ -14,8 +14,8 @@ from experiments.summary import Numbers
 from experiments.unclip import clipping
 
 GROUPS = ("used for choices", "kept out of all choices", "rooms, low sun, night")
-SHOWN = "8 bit"
-"""Clipping of the sheet."""
+SHOWN = ("100", "8 bit")
+"""Clippings of the sheet."""
 
 
 def stops(value: float, true: float) -> float:
@@ -71,9 +71,10 @@ def measure_map(settings, folder, file: str, map_name: str) -> dict:
                 "contrast": shadow.contrast(pictures[1]),
             }
         )
-        if level == SHOWN:
-            for label, one in zip(("truth", "clipped", "unclipped"), [picture, *pictures], strict=True):
-                images.write_exr(folder / f"{label}.exr", one, panorama=False)
+        if level in SHOWN:
+            for label, one in zip(("clipped", "unclipped"), pictures, strict=True):
+                images.write_exr(folder / f"{label}_{level}.exr", one, panorama=False)
+    images.write_exr(folder / "truth.exr", picture, panorama=False)
     return {"rows": rows}
 
 
@@ -140,8 +141,9 @@ def rms(values: np.ndarray) -> float:
 
 
 def panels(done):
-    """Return the shadow under the true, the clipped and the restored map, at one exposure."""
-    pictures = [done.picture(label) for label in ("truth", "clipped", "unclipped")]
+    """Return the shadow under the true map, and for each clipping before and after, at one exposure."""
+    labels = ["truth", *(f"{label}_{level}" for level in SHOWN for label in ("clipped", "unclipped"))]
+    pictures = [done.picture(label) for label in labels]
     white = 1.5 * np.median(luminance(pictures[0]))
     return [tonemap(picture / white, "gamma") for picture in pictures]
 

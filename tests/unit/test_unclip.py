@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from envedit import config, inputs
 from envedit.cli import main
 from envedit.core import latlong
 from envedit.core.color import linear_to_srgb, luminance
@@ -83,6 +84,14 @@ def test_an_eight_bit_picture_of_a_sun_gets_it_back(tmp_path, capsys):
     facts = json.loads(capsys.readouterr().out)
     assert facts["added"] and facts["light"]["kind"] == "sun"
     assert abs(np.log2(luminance(facts["flux"]) / luminance(exposure * flux))) < 2 * facts["stops"]
+
+
+def test_a_map_is_unclipped_at_file_size_when_it_is_read(tmp_path):
+    image, _ = sun(clip=30.0)
+    images.write_exr(tmp_path / "sky.exr", image)
+    read = inputs.read_map(config.Input(envmap=str(tmp_path / "sky.exr"), unclip=True), None, 64)
+    np.testing.assert_allclose(read.radiance, latlong.resize(unclip.with_sun(image)[0], 32, 64), rtol=1e-6)
+    assert read.unclipped.startswith("sun of flux")
 
 
 def test_cloud_and_lamp_are_named_and_left_alone(tmp_path, capsys):

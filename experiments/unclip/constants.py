@@ -41,9 +41,10 @@ def measure_sun(settings, folder, file: str, map_name: str) -> dict:
 
 
 def cases(args):
+    maps = {name: str(file) for name, file in puresky.find().items() if name in CLEAR + LOW}
     return [
-        calling(name, "experiments.unclip.constants:measure_sun", {}, file=puresky.file(name), map_name=name)
-        for name in CLEAR + LOW
+        calling(name, "experiments.unclip.constants:measure_sun", {}, file=file, map_name=name)
+        for name, file in maps.items()
     ]
 
 
@@ -51,7 +52,7 @@ def tabulate(cases, out, given) -> str:
     """Return the constants, and the errors of each map by those without it, by first ring."""
     suns = {done.case.name: done.metrics for done in done_of(cases, out)}
     if len(suns) < len(CLEAR + LOW):
-        return "not all cases are done"
+        return f"{len(suns)} of {len(CLEAR + LOW)} suns are measured"
     aureole, haze, offsets = _constants(suns, "")
     tables = [np.round(values, 2).tolist() for values in (aureole, offsets)]
     lines = [f"AUREOLE {tables[0]}, HAZE_STOPS {haze:.1f}, SKY_OFFSET {tables[1]}"]

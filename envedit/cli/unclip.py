@@ -85,7 +85,7 @@ def _unclip(arguments: argparse.Namespace, console: Console) -> None:
         console.warn(warning)
     horizontal = float(unclip.luminance(flux)) * max(float(light.direction[1]), 0)
     sky = float(unclip.luminance(light.sky_irradiance))
-    ratio = horizontal / max(sky, 1e-30)
+    ratio = horizontal / max(sky, 1e-300)
     console.facts |= {"added": True, "file": str(path), "flux": flux.tolist(), "stops": stops, "ratio": ratio}
     spread = f" (standard deviation {stops:.1f} stops)" if stops else ""
     if stops and unclip.doubt(light):

@@ -93,7 +93,7 @@ class ClippedLight:
     @property
     def contrast(self) -> float:
         """Luminance of the plateau, if it is grey, times pi over the sky's horizontal irradiance."""
-        return self.level * np.pi / max(float(luminance(self.sky_irradiance)), 1e-30)
+        return self.level * np.pi / max(float(luminance(self.sky_irradiance)), 1e-300)
 
     @property
     def fall(self) -> tuple[float, float]:

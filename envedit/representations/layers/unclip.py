@@ -50,7 +50,7 @@ the constants of the others, measured."""
 SKY_STOPS = 1.2
 """Standard deviation of the second estimate, likewise."""
 FLUX_STOPS = (0.8, 1.1, 2.0)
-"""Standard deviation of the result: near and far, likewise; of a low sun more than the 0.8 that the
+"""Standard deviation of the result: near and far, likewise; of a low sun more than the 0.7 that the
 two maps show, as two are few."""
 LEAST_GAIN = 1.0
 """Stops that the sun must gain: with less it was not clipped, or not by more than the estimate's error."""
@@ -203,7 +203,7 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
     image = np.array(radiance, np.float32)
     if light.first is not None and light.has_aureole and RING_DEGREES[light.first] > CORE_DEGREES:
         _fill(image, light, float(luminance(flux)))
-    lacking = max(1 - light.core_flux / max(float(luminance(flux)), 1e-30), 0.0)
+    lacking = max(1 - light.core_flux / max(float(luminance(flux)), 1e-300), 0.0)
     radius = math.radians(analytic_sky.SUN_APERTURE / 2)
     points = analytic_sky.disc(light.direction, radius, image.shape[1])
     share = np.broadcast_to(lacking * np.asarray(flux, np.float64) / len(points), points.shape)
@@ -217,7 +217,7 @@ def _fill(image, light, flux):
     reach = RING_DEGREES[light.first]
     ring = light.rings[light.first]
     core = flux * 2.0 ** np.interp(np.log(CORE_DEGREES), np.log(RING_DEGREES[: len(AUREOLE)]), AUREOLE)
-    exponent = _log2(core / max(luminance(ring), 1e-30)) / math.log2(reach / CORE_DEGREES)
+    exponent = _log2(core / max(luminance(ring), 1e-300)) / math.log2(reach / CORE_DEGREES)
     if exponent <= 0:
         return
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
@@ -236,9 +236,9 @@ def _fill(image, light, flux):
 
 def _unit(colour):
     """Return a colour (3,) of luminance 1."""
-    return np.asarray(colour, np.float64) / max(float(luminance(colour)), 1e-30)
+    return np.asarray(colour, np.float64) / max(float(luminance(colour)), 1e-300)
 
 
 def _log2(value):
-    """Return log2, of what is 0 that of 1e-30."""
-    return math.log2(max(float(value), 1e-30))
+    """Return log2, of what is 0 that of 1e-300."""
+    return math.log2(max(float(value), 1e-300))

@@ -181,8 +181,8 @@ def flux_of_ratio(light: ClippedLight, ratio: float) -> float:
 def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.ndarray:
     """Return a map with its sun: the aureole in the clipped region, and a disc.
 
-    The aureole between the core and the first ring is a power of the angle: at the ring as measured, at the
-    core as :data:`AUREOLE` has it for this flux. Clipped texels become as bright as that, where they are not,
+    The aureole in the region is a power of the angle in each channel: at the region's radius as bright as the
+    plateau, at the core as :data:`AUREOLE` has it for this flux. Darker clipped texels become as bright as that,
     if the light has an aureole.
     The disc, 0.54 degrees across, has the flux that the core lacks.
 
@@ -201,8 +201,8 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
         All other texels have their bits.
     """
     image = np.array(radiance, np.float32)
-    if light.first is not None and light.has_aureole and RING_DEGREES[light.first] > CORE_DEGREES:
-        _fill(image, light, float(luminance(flux)))
+    if light.has_aureole and light.radius > CORE_DEGREES:
+        _fill(image, light, flux)
     lacking = max(1 - light.core_flux / max(float(luminance(flux)), 1e-300), 0.0)
     radius = math.radians(analytic_sky.SUN_APERTURE / 2)
     points = analytic_sky.disc(light.direction, radius, image.shape[1])
@@ -214,12 +214,9 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
 def _fill(image, light, flux):
     """Raise clipped texels to the aureole, in place, in bands of rows."""
     height, width, _ = image.shape
-    reach = RING_DEGREES[light.first]
-    ring = light.rings[light.first]
-    core = flux * 2.0 ** np.interp(np.log(CORE_DEGREES), np.log(RING_DEGREES[: len(AUREOLE)]), AUREOLE)
-    exponent = _log2(core / max(luminance(ring), 1e-300)) / math.log2(reach / CORE_DEGREES)
-    if exponent <= 0:
-        return
+    share = 2.0 ** np.interp(np.log(CORE_DEGREES), np.log(RING_DEGREES[: len(AUREOLE)]), AUREOLE)
+    core = np.maximum(share * np.asarray(flux, np.float64), light.level)
+    exponent = np.log(core / light.level) / math.log(light.radius / CORE_DEGREES)
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
     for top in range(0, height, 64):
         rows = np.arange(top, min(top + 64, height))
@@ -227,9 +224,9 @@ def _fill(image, light, flux):
         directions = latlong.on_sphere(theta[:, None], phi)
         angle = np.degrees(np.arccos(np.clip(directions @ light.direction, -1, 1)))
         clipped = (image[rows] >= PLATEAU * light.level).any(axis=2)
-        inside = clipped & (angle < reach) & (directions[..., 1] > 0)
-        factor = (reach / np.maximum(angle[inside], CORE_DEGREES)) ** exponent
-        aureole = (factor[:, None] * ring).astype(np.float32)
+        inside = clipped & (angle < light.radius) & (directions[..., 1] > 0)
+        factor = (light.radius / np.maximum(angle[inside], CORE_DEGREES))[:, None] ** exponent
+        aureole = (factor * light.level).astype(np.float32)
         band = image[top : top + len(rows)]
         band[inside] = np.maximum(band[inside], aureole)
 

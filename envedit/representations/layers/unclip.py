@@ -182,8 +182,8 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
     """Return a map with its sun: the aureole in the clipped region, and a disc.
 
     The aureole in the region is a power of the angle in each channel: at the region's radius as bright as the
-    plateau, at the core as :data:`AUREOLE` has it for this flux. Clipped texels are raised to it, if the light
-    has an aureole.
+    plateau, at the core as :data:`AUREOLE` has it for this flux. Clipped texels are raised to it, if the
+    light has an aureole.
     The disc, 0.54 degrees across, has the flux that the core lacks.
 
     Parameters

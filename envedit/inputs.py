@@ -108,13 +108,13 @@ class InputMap:
         """
         colours = self._in_rec709
         if self.chromaticities is not None:
-            colours = np.maximum(colours, 0)
+            np.maximum(colours, 0, out=colours)
             require_radiance(colours, f"{self.source} in Rec. 709", brightest=BRIGHTEST)
         return scaled(colours, self.scale, self.source)
 
-    @functools.cached_property
+    @property
     def _in_rec709(self):
-        """The stored values in Rec. 709, where colours outside it have negative channels."""
+        """The stored values in Rec. 709, where colours outside it have negative channels: converted anew."""
         if self.chromaticities is None:
             return self.stored
         return primaries.converted(self.stored, primaries.to_rec709(self.chromaticities))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from typing import TYPE_CHECKING
 
 from envedit.cli import map_command
@@ -69,15 +70,16 @@ def _adjust(arguments: argparse.Namespace, console: Console) -> None:
     path = map_file.output_path(arguments.out, "adjusted", [arguments.map], arguments.overwrite)
     files = {"map": path}
     if arguments.background:
-        taken = [arguments.map, path]
         files["background"] = map_file.output_path(
-            arguments.background, "background", taken, arguments.overwrite
+            arguments.background, "background", [arguments.map], arguments.overwrite
         )
+        if os.path.realpath(files["background"]) == os.path.realpath(path):
+            raise ConfigError(f"--background: got {path}, where the map itself goes: give another name")
 
     # ---- The maps
     map_command.select_variant()
     input_map = map_command.read(arguments.map, arguments, console)
-    radiance, notes = adjusted(input_map.radiance, how)
+    radiance, notes = adjusted(map_file.radiance_of(input_map), how)
     for line in notes:
         console.say(line)
     for name, file in files.items():

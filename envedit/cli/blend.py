@@ -55,10 +55,11 @@ def _blend(arguments: argparse.Namespace, console: Console) -> None:
     elif arguments.amount == 1 and alike:
         values = second.stored
     else:
-        other = second.radiance
-        if first.size != second.size:
+        other = map_file.radiance_of(second)
+        del second  # 0.4 GB of a map of 8192 x 4096 texels, where it is in another colour space
+        if other.shape != first.stored.shape:
             other = latlong.resize(other, *first.stored.shape[:2])
-        radiance, lights = blend(first.radiance, other, arguments.amount)
+        radiance, lights = blend(map_file.radiance_of(first), other, arguments.amount)
         values = map_file.as_stored(radiance, first)
     for warning in map_file.write(path, values, first):
         console.warn(warning)

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from envedit.cli import map_command
 from envedit.cli.streams import steady
 
@@ -37,7 +39,7 @@ def _compare(arguments: argparse.Namespace, console: Console) -> None:
     from envedit.core import latlong
     from envedit.core.atomic_files import write_atomically
     from envedit.images.images import png
-    from envedit.maps.compared import compare
+    from envedit.maps import compared
     from envedit.report import manifest, output_folder, preview
 
     # ---- The maps and what is measured of them
@@ -48,8 +50,11 @@ def _compare(arguments: argparse.Namespace, console: Console) -> None:
     if first.size != second.size:
         other = latlong.resize(other, *first.stored.shape[:2])
         console.warn(f"{arguments.second}: resampled from {second.size[0]} to {first.size[0]} texels across")
-    measured = compare(first.radiance, other)
-    difference, scale = preview.difference_image(other, first.radiance, "stops")
+    identical = bool(np.array_equal(first.radiance, other))
+    lights = compared.lights(first.radiance, other)
+    small = compared.reduced(first.radiance), compared.reduced(other)
+    measured = compared.pictures(*small) | {"identical": identical, "lights": lights}
+    difference, scale = preview.difference_image(small[1], small[0], "stops")
     measured |= {"first": arguments.first, "second": arguments.second, "difference_stops": scale}
 
     # ---- The files

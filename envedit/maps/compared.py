@@ -13,34 +13,29 @@ from envedit.losses.perceptual import distances, installed
 from envedit.maps import map_lights
 
 METRIC_WIDTH = 2048
-"""Most columns of the copies that PSNR, SSIM and LPIPS are taken of: in double precision SSIM of 8192 columns
-would take 10 GB."""
+"""Most columns of the copies that pictures and irradiance are compared on: in double precision SSIM of 8192
+columns would take 10 GB."""
 
 
-def compare(first: np.ndarray, second: np.ndarray) -> dict:
-    """Compare a map with a reference of the same size.
+def reduced(radiance: np.ndarray) -> np.ndarray:
+    """Return a map (H, W, 3) at no more than :data:`METRIC_WIDTH` columns, with its flux."""
+    if radiance.shape[1] <= METRIC_WIDTH:
+        return radiance
+    return latlong.resize(radiance, METRIC_WIDTH // 2, METRIC_WIDTH)
 
-    Parameters
-    ----------
-    first, second : ndarray (H, W, 3) float32
-        The reference and the map, linear radiance in Rec. 709.
+
+def pictures(first: np.ndarray, second: np.ndarray) -> dict:
+    """Compare a reduced map with a reduced reference of the same size (H, W, 3), as pictures and as light.
 
     Returns
     -------
     dict
-        ``identical``; ``psnr``, ``ssim``, ``lpips``, ``log_rmse``, ``beyond_display`` of
-        :func:`.metrics.compare` at ``metric_width`` columns, ``lpips`` None without trained weights;
-        ``irradiance``: by axis, luminance ``first`` and ``second``, and ``stops``, log2 of the second over
-        the first ("+y" is the horizontal plane); ``lights``: ``before`` and ``after`` of
-        :func:`.light_list.matched`, where a light of both has ``stops_of_flux``.
+        ``psnr``, ``ssim``, ``lpips``, ``log_rmse``, ``beyond_display`` of :func:`.metrics.compare`, ``lpips``
+        None without trained weights; ``width``; ``irradiance``: by axis, luminance ``first`` and ``second``,
+        and ``stops``, log2 of the second over the first ("+y" is the horizontal plane).
     """
-    width = min(first.shape[1], METRIC_WIDTH)
-    small = [
-        latlong.resize(one, width // 2, width) if width < one.shape[1] else one for one in (first, second)
-    ]
-    measured = metrics.compare(small[1], small[0], lpips=_lpips())
-    measured |= {"identical": bool(np.array_equal(first, second)), "metric_width": width}
-    return measured | {"irradiance": _irradiance(first, second), "lights": _lights(first, second)}
+    measured = metrics.compare(second, first, lpips=_lpips())
+    return measured | {"width": first.shape[1], "irradiance": _irradiance(first, second)}
 
 
 def _irradiance(first, second):
@@ -53,8 +48,15 @@ def _irradiance(first, second):
     }
 
 
-def _lights(first, second):
-    """Match the lights of the maps, and compare their fluxes."""
+def lights(first: np.ndarray, second: np.ndarray) -> dict:
+    """Match the lights of two maps of one size (H, W, 3).
+
+    Returns
+    -------
+    dict
+        ``before`` and ``after`` of :func:`.light_list.matched`, the latter with ``stops_of_flux`` over that
+        of the light of the first map; None for one that is new.
+    """
     separated = [file_lights.lights_of(one).lights for one in (first, second)]
     tables = [light_list.listed(own, first.shape[:2], np.eye(3)) for own in separated]
     matched = light_list.matched(tables[0], tables[1])
@@ -67,8 +69,9 @@ def _lights(first, second):
 
 def _lpips():
     """Load LPIPS where its weights are; None elsewhere."""
-    files = installed.files(config.Config())
+    settings = config.Config()
+    files = installed.files(settings)
     if "backbone" not in files:
         return None
-    network = config.Config().perceptual.network
+    network = settings.perceptual.network
     return distances.Lpips(network, files["backbone"], files["heads"])

@@ -45,6 +45,11 @@ def read(path: FilePath, repair: bool = False) -> InputMap:
     return inputs.read_file(os.fsdecode(path), None, config.Input(repair=repair), 1.0)
 
 
+def radiance_of(input_map: InputMap) -> np.ndarray:
+    """Return :attr:`.InputMap.radiance` (H, W, 3), which the map does not keep in another colour space."""
+    return replace(input_map).radiance
+
+
 def as_stored(edited: np.ndarray, like: InputMap) -> np.ndarray:
     """Return edited radiance (H, W, 3) in the colours of a map's file, as :meth:`.InputMap.as_stored`.
 

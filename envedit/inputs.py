@@ -16,6 +16,7 @@ from envedit.core.primaries import Chromaticities
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images
+from envedit.representations.layers import unclip
 from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene as scenes
 from envedit.scene import supported
@@ -80,6 +81,8 @@ class InputMap:
         The :attr:`radiance` as the file has it, where lights were placed or the map was turned by hand.
     half : bool
         Whether the file is OpenEXR in half.
+    unclipped : str
+        What was done about a clipped sun, a clause; "" where that was not asked for.
     """
 
     source: str
@@ -92,6 +95,7 @@ class InputMap:
     array: np.ndarray | None = None
     unmoved: np.ndarray | None = None
     half: bool = False
+    unclipped: str = ""
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -267,7 +271,7 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
     width : int, optional
         Texels across; None: as many as the file has.
     settings : config.Input
-        ``repair`` and ``colour_space`` count.
+        ``repair``, ``unclip`` and ``colour_space`` count.
     scale : float
         What the scene multiplies it by.
 
@@ -277,7 +281,12 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
         As of :func:`.images.load_envmap`.
     """
     stored, info = images.load_envmap(
-        source, width, settings.repair, convert=False, name="envmap", space=settings.colour_space
+        source,
+        None if settings.unclip else width,
+        settings.repair,
+        convert=False,
+        name="envmap",
+        space=settings.colour_space,
     )
     array = source if isinstance(source, np.ndarray) else None
     name = images.ARRAY if isinstance(source, np.ndarray) else source
@@ -285,6 +294,8 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
     space = info["chromaticities"]
     half = info.get("half", False)
     input_map = InputMap(name, stored, scale, info["size"], warnings, space, array=array, half=half)
+    if settings.unclip:
+        input_map = _unclipped(input_map, width)
     if input_map.outside > 0:
         space = primaries.name_of(input_map.chromaticities)
         warnings.append(
@@ -292,6 +303,16 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
             "their negative channels are set to 0 while editing; unedited texels keep their colour"
         )
     return input_map
+
+
+def _unclipped(input_map, width):
+    """Return a map of its file's size with its sun, if that was clipped, at a width."""
+    plain = replace(input_map, scale=1.0)
+    radiance, done = unclip.with_sun(plain.radiance)
+    stored = plain.as_stored(radiance)
+    if width is not None:
+        stored = latlong.resize(stored, width // 2, width)
+    return replace(input_map, stored=stored, unclipped=done)
 
 
 def load_map(settings: config.Input, scene: Scene | None = None) -> tuple[np.ndarray, list[str]]:
@@ -339,6 +360,8 @@ def notes(settings: config.Input, scene: Scene, input_map: InputMap | None = Non
             f"the scene multiplies the map (which is not the scene's own) by scale {own.scale:g}; "
             "scene.scale = 1 drops that"
         )
+    if input_map is not None and input_map.unclipped:
+        last.append(f"input.unclip: {input_map.unclipped}")
     if input_map is not None and input_map.chromaticities is not None:
         space = primaries.name_of(input_map.chromaticities)
         last.append(f"map in {space}: edited in Rec. 709, written in {space}")

@@ -24,6 +24,7 @@ COMMANDS = {
     "doctor": "check whether this machine can run envedit",
     "schema": "print every key of the configuration, as JSON Schema or as a page",
     "cache": "show or delete what is kept on disk between runs",
+    "unclip": "give a map whose sun was clipped its sun back",
     "weights": "fetch the trained networks of LPIPS and DISTS",
 }
 

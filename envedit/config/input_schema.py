@@ -67,6 +67,11 @@ class Input(Table):
         Choice("auto", *SPACES),
         'colour space of the map\'s linear values; "auto": as its file says, Rec. 709 where it says nothing',
     )
+    unclip: bool = key(
+        False,
+        Boolean(),
+        "give a map whose sun was clipped its sun back, as envedit unclip does, before all else",
+    )
     repair: bool = key(
         False,
         Boolean(),

@@ -77,14 +77,12 @@ def sunsky(
     sky = _sunsky_emitter(sun_scale=0.0, sky_scale=sky_scale, **common)
     sun = _sunsky_emitter(sun_scale=sun_scale, sky_scale=0.0, **common)
 
-    disc = _disc(sun_direction, math.radians(SUN_APERTURE / 2), width)
-    flux = sun(disc) * (2 * math.pi * (1 - math.cos(math.radians(SUN_APERTURE / 2))) / len(disc))
-    irradiance = (flux * disc[:, 1:2]).sum(0) + _sky_irradiance(sky)
+    points = disc(sun_direction, math.radians(SUN_APERTURE / 2), width)
+    flux = sun(points) * (2 * math.pi * (1 - math.cos(math.radians(SUN_APERTURE / 2))) / len(points))
+    irradiance = (flux * points[:, 1:2]).sum(0) + _sky_irradiance(sky)
     image = _average(sky, height, width, ground_albedo * irradiance / math.pi)
 
-    row, column = latlong.texel_position(disc, height, width)
-    row, column = np.rint(row).astype(int), np.rint(column).astype(int) % width
-    np.add.at(image, (row, column), flux / latlong.lookup_solid_angles(height, width)[row, None])
+    add_flux(image, points, flux)
     return np.maximum(image, 0).astype(np.float32)  # the plugin's fit is negative beside a low sun
 
 
@@ -114,10 +112,19 @@ def _sunsky_emitter(sun_direction, **parameters):
     return radiance
 
 
-def _disc(centre, radius, width):
+def disc(centre: np.ndarray, radius: float, width: int) -> np.ndarray:
     """Return directions (N, 3) spread evenly over a disc of the sky, as Vogel's spiral.
 
     Enough of them that the texels inside the disc of a wide map are evenly filled.
+
+    Parameters
+    ----------
+    centre : ndarray (3,)
+        Unit vector to its centre.
+    radius : float
+        Radians.
+    width : int
+        Columns of the map.
     """
     count = 16384 + 512 * int(math.pi * (radius / (2 * math.pi / width)) ** 2)
     i = np.arange(count) + 0.5
@@ -128,6 +135,17 @@ def _disc(centre, radius, width):
     side /= np.linalg.norm(side)
     offset = np.cos(phi)[:, None] * side + np.sin(phi)[:, None] * np.cross(centre, side)
     return np.cos(angle)[:, None] * centre + np.sin(angle)[:, None] * offset
+
+
+def add_flux(image: np.ndarray, points: np.ndarray, flux: np.ndarray) -> None:
+    """Add flux (N, 3) from directions (N, 3) to the nearest texels of a map (H, W, 3), in place.
+
+    A rendering receives all of it, whatever the texels' size.
+    """
+    height, width, _ = image.shape
+    row, column = latlong.texel_position(points, height, width)
+    row, column = np.rint(row).astype(int), np.rint(column).astype(int) % width
+    np.add.at(image, (row, column), flux / latlong.lookup_solid_angles(height, width)[row, None])
 
 
 def _sky_irradiance(sky):

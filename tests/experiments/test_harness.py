@@ -181,6 +181,8 @@ COUNTS = {
     "scenes": 6,
     "solver.edits": 14,
     "tradeoff": 6,
+    "unclip": 12,
+    "unclip.constants": 4,
     "views": 36,
 }
 """Cases of every experiment over these maps."""

@@ -326,7 +326,7 @@ def _find(small: _Small, most: int) -> tuple[np.ndarray, int, list[float]]:
     base = _local_median(lum, *small.rows)
 
     # ---- Connected parts that stand out, and their shares of the map's light
-    parts = _components(lum > np.maximum(CONTRAST * base, 1e-12 * lum.max()))
+    parts = components(lum > np.maximum(CONTRAST * base, 1e-12 * lum.max()))
     excess = np.maximum(lum - base, 0) * small.omega
     numbers, inverse = np.unique(parts, return_inverse=True)
     share = np.bincount(inverse.ravel(), excess.ravel()) / total
@@ -399,7 +399,7 @@ def grown(label: np.ndarray) -> np.ndarray:
     return np.where(label < 0, most, label)
 
 
-def _components(mask):
+def components(mask: np.ndarray) -> np.ndarray:
     """Return a number for each connected part of a mask, -1 outside; columns are periodic."""
     far = mask.size
     label = np.where(mask, np.arange(far).reshape(mask.shape), far)

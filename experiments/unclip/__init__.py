@@ -1,0 +1,1 @@
+"""Maps whose sun is clipped, and given back."""

@@ -1,0 +1,149 @@
+"""Clipped versions of a map, what its sun truly is, and renderings of a shadow under it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.color import linear_to_srgb, luminance, srgb_to_linear
+from envedit.images import images
+from envedit.representations.layers.clipped_light import CORE_DEGREES
+from envedit.representations.layers.separation import separate
+
+KEPT = ("evening_road_01", "kloppenheim_06", "rustig_koppie", "syferfontein_18d_clear")
+"""Maps that no choice and no constant has seen: every third by name."""
+ROOMS = ("royal_esplanade", "studio_small_03")
+"""Of ENVEDIT_DATA/hdri, those without a sky."""
+LEVELS = ("1", "10", "100", "1000", "8 bit")
+MEDIAN = 0.3
+"""Median luminance of the sky, over solid angle, in an 8-bit picture: exposed for the sky, whose median
+is then 0.58 of the display's range."""
+SUNNY = 1 / 8
+"""Flux of the sun over the sky's horizontal irradiance from which on a map is sunny: with less, its
+shadows are hardly seen."""
+PIXELS = (96, 72)
+SAMPLES = 256
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The brightest light of a map.
+
+    Attributes
+    ----------
+    direction : ndarray (3,)
+        Unit vector to it.
+    flux, sky : float
+        Its irradiance on a surface that faces it, and the sky's horizontal irradiance; luminance.
+    sunny : bool
+        Whether it is a sun that casts shadows.
+    """
+
+    direction: np.ndarray
+    flux: float
+    sky: float
+    sunny: bool
+
+
+def load(file: str | Path) -> np.ndarray:
+    """Return a map (H, W, 3) float32."""
+    return images.load_envmap(str(file), None)[0]
+
+
+def clipped(radiance: np.ndarray, level: str) -> tuple[np.ndarray, float]:
+    """Return a map clipped at a level, or as 8-bit sRGB, and the exposure that it was given."""
+    if level != "8 bit":
+        return np.minimum(radiance, np.float32(level)), 1.0
+    height, width, _ = radiance.shape
+    above = luminance(radiance[: height // 2]).ravel()
+    omega = np.repeat(latlong.solid_angles(height, width)[: height // 2], width)
+    order = np.argsort(above, kind="stable")
+    share = np.cumsum(omega[order])
+    exposure = MEDIAN / float(above[order][np.searchsorted(share, share[-1] / 2)])
+    codes = np.rint(255 * linear_to_srgb(exposure * radiance.astype(np.float64)))
+    return srgb_to_linear(codes / 255).astype(np.float32), exposure
+
+
+def truth(radiance: np.ndarray, name: str) -> Truth:
+    """Measure the sun of an unclipped map: the core of the light of :func:`.separate` with most flux.
+
+    Where there is no light above the horizon, what is around the brightest texel.
+    """
+    height, width, _ = radiance.shape
+    omega = latlong.lookup_solid_angles(height, width)[:, None]
+    directions = latlong.directions(height, width)
+    lum = luminance(radiance)
+    lights = [light for light in separate(radiance).lights if light.direction[1] > 0]
+    direction = directions.reshape(-1, 3)[np.argmax(lum[: height // 2])]
+    if lights:
+        direction = lights[0].direction
+    near = directions @ direction > np.cos(np.radians(2 * CORE_DEGREES))
+    brightest = directions.reshape(-1, 3)[np.argmax(np.where(near, lum, 0))]
+    core = directions @ brightest > np.cos(np.radians(CORE_DEGREES))
+    direction = (directions * (lum * omega * core)[..., None]).sum(axis=(0, 1))
+    direction /= np.linalg.norm(direction)
+
+    # ---- As much as stands out within the core, and what is left for the sky
+    angle = np.degrees(np.arccos(np.clip(directions @ direction, -1, 1)))
+    around = (angle > 1.5 * CORE_DEGREES) & (angle < 2.5 * CORE_DEGREES)
+    core = angle < CORE_DEGREES
+    flux = float((np.maximum(lum - np.median(lum[around]), 0) * omega)[core].sum())
+    sky = float((lum * omega * np.maximum(directions[..., 1], 0))[~core].sum())
+    sunny = name not in ROOMS and bool(lights) and flux > SUNNY * sky
+    return Truth(direction, flux, sky, sunny)
+
+
+def horizontal(radiance: np.ndarray) -> float:
+    """Return the horizontal irradiance of a map, luminance."""
+    height, width, _ = radiance.shape
+    cosine = np.maximum(latlong.directions(height, width)[..., 1], 0)
+    return float((luminance(radiance) * latlong.lookup_solid_angles(height, width)[:, None] * cosine).sum())
+
+
+class Shadow:
+    """A sphere on a floor, seen from above: renderings, and the contrast of the true sun's shadow in them."""
+
+    def __init__(self, direction: np.ndarray):
+        columns, rows = PIXELS
+        self._parts = {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 3},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": mi.ScalarTransform4f().look_at([0, 6, 5], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": columns, "height": rows, "rfilter": {"type": "box"}},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(30),
+                "bsdf": {"type": "diffuse", "reflectance": 0.5},
+            },
+            "sphere": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7},
+        }
+        scene = mi.load_dict(self._parts)
+        v, u = np.meshgrid(
+            (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
+        )
+        pixel = mi.Point2f(u.ravel().astype(np.float32), v.ravel().astype(np.float32))
+        ray, _ = scene.sensors()[0].sample_ray(0.0, 0.0, pixel, mi.Point2f(0.5))
+        hit = scene.ray_intersect(ray)
+        floor = np.array(hit.p)[1] < 1e-3
+        blocked = np.array(scene.ray_test(hit.spawn_ray(mi.Vector3f(*direction.tolist()))))
+        self._shadow = (floor & blocked).reshape(rows, columns)
+        self._open = (floor & ~blocked).reshape(rows, columns)
+
+    def render(self, radiance: np.ndarray) -> np.ndarray:
+        """Return the picture (h, w, 3) under a map."""
+        bitmap = mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
+        scene = mi.load_dict(self._parts | {"light": {"type": "envmap", "bitmap": bitmap}})
+        return np.array(mi.render(scene, spp=SAMPLES, seed=0))[..., :3]
+
+    def contrast(self, picture: np.ndarray) -> float:
+        """Return 1 less the light in the true sun's shadow over that on the open floor."""
+        lum = luminance(picture)
+        return float(1 - lum[self._shadow].mean() / lum[self._open].mean())

@@ -1,0 +1,174 @@
+"""Clip maps at four levels and as 8-bit pictures, give their sun back, and compare with the truth.
+
+13 PureSky maps, four of which no choice has seen, and four of ENVEDIT_DATA/hdri: rooms, a low sun, a night.
+"""
+
+import numpy as np
+
+from envedit.core.color import luminance, tonemap
+from envedit.images import images
+from envedit.representations.layers import clipped_light, unclip
+from experiments import puresky
+from experiments.harness import Experiment, calling, number
+from experiments.summary import Numbers
+from experiments.unclip import clipping
+
+GROUPS = ("used for choices", "kept out of all choices", "rooms, low sun, night")
+SHOWN = ("100", "8 bit")
+"""Clippings of the sheet."""
+
+
+def stops(value: float, true: float) -> float:
+    """Return log2 of a ratio; NaN where either is 0."""
+    return float(np.log2(value / true)) if value > 0 and true > 0 else float("nan")
+
+
+def measure_map(settings, folder, file: str, map_name: str) -> dict:
+    """Return a row for every clipping of a map, and write the pictures of the sheet."""
+    radiance = clipping.load(file)
+    true = clipping.truth(radiance, map_name)
+    shadow = clipping.Shadow(true.direction)
+    picture = shadow.render(radiance)
+    rows = []
+    for level in clipping.LEVELS:
+        image, exposure = clipping.clipped(radiance, level)
+        light = clipped_light.find(image)
+        result = image
+        flux = 0.0 if light is None else light.core_flux
+        added = False
+        spread = float("nan")
+        if light is not None and light.kind == "sun":
+            estimate = unclip.estimate(light)
+            spread = estimate.stops
+            added = unclip.is_clipped(light, estimate.flux)
+            if added:
+                flux = float(luminance(estimate.flux))
+                result = unclip.restored(image, light, estimate.flux)
+        pictures = [shadow.render(one / np.float32(exposure)) for one in (image, result)]
+        off = (
+            np.degrees(np.arccos(np.clip(light.direction @ true.direction, -1, 1))) if light else float("nan")
+        )
+        rows.append(
+            {
+                "level": level,
+                "sunny": true.sunny,
+                "kind": light.kind if light else "nothing",
+                "added": added,
+                "spread": spread,
+                "false": added
+                and not true.sunny
+                and flux > clipping.SUNNY * float(luminance(light.sky_irradiance)),
+                "off": float(off),
+                "true_ratio": stops(true.flux, true.sky),
+                "clipped_flux": stops(light.core_flux / exposure if light else 0.0, true.flux),
+                "flux": stops(flux / exposure, true.flux),
+                "clipped_irradiance": stops(
+                    clipping.horizontal(image) / exposure, clipping.horizontal(radiance)
+                ),
+                "irradiance": stops(clipping.horizontal(result) / exposure, clipping.horizontal(radiance)),
+                "true_contrast": shadow.contrast(picture),
+                "clipped_contrast": shadow.contrast(pictures[0]),
+                "contrast": shadow.contrast(pictures[1]),
+            }
+        )
+        if level in SHOWN:
+            for label, one in zip(("clipped", "unclipped"), pictures, strict=True):
+                images.write_exr(folder / f"{label}_{level}.exr", one, panorama=False)
+    images.write_exr(folder / "truth.exr", picture, panorama=False)
+    return {"rows": rows}
+
+
+def cases(args):
+    hdri = puresky.data() / "hdri"
+    maps = [(name, file, GROUPS[name in clipping.KEPT]) for name, file in puresky.find().items()]
+    maps += [(file.name[:-7], file, GROUPS[2]) for file in sorted(hdri.glob("*_1k.hdr"))]
+    return [
+        calling(
+            name,
+            "experiments.unclip.experiment:measure_map",
+            {},
+            {"map": name, "set": of},
+            file=str(file),
+            map_name=name,
+        )
+        for name, file, of in maps
+    ]
+
+
+def summary(rows) -> str:
+    """Return, for every set of maps and clipping, the errors over sunny maps and what was taken for what."""
+    lines = [
+        "| maps | clipped at | sunny: sun found | flux, stops: clipped | RMS with the sun back (worst) "
+        "| irradiance, stops: clipped | RMS with the sun back | shadow: truth | clipped | with the sun back "
+        "| not sunny: false suns |",
+        "|---" * 11 + "|",
+    ]
+    for of in GROUPS:
+        for level in clipping.LEVELS:
+            some = [row for row in rows if row["set"] == of and row["level"] == level]
+            if not some:
+                continue
+            sunny = [row for row in some if row["sunny"]]
+            back = [row for row in sunny if row["added"]]
+            mean = {key: Numbers([row[key] for row in sunny]).mean for key in MEANS}
+            flux = np.array([row["flux"] for row in back])
+            irradiance = np.array([row["irradiance"] for row in back])
+            wrong = sum(row["false"] for row in some)
+            worst = float(flux[np.argmax(np.abs(flux))]) if len(flux) else float("nan")
+            cells = [
+                of,
+                level,
+                f"{len(back)} of {len(sunny)}",
+                number(mean["clipped_flux"], "+.1f"),
+                f"{number(rms(flux))} ({number(worst, '+.1f')})",
+                number(mean["clipped_irradiance"], "+.2f"),
+                number(rms(irradiance), ".2f"),
+                number(mean["true_contrast"], ".2f"),
+                number(mean["clipped_contrast"], ".2f"),
+                number(mean["contrast"], ".2f"),
+                f"{wrong} of {len(some) - len(sunny)}",
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+MEANS = ("clipped_flux", "clipped_irradiance", "true_contrast", "clipped_contrast", "contrast")
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def panels(done):
+    """Return the shadow under the true map, and for each clipping before and after, at one exposure."""
+    labels = ["truth", *(f"{label}_{level}" for level in SHOWN for label in ("clipped", "unclipped"))]
+    pictures = [done.picture(label) for label in labels]
+    white = 1.5 * np.median(luminance(pictures[0]))
+    return [tonemap(picture / white, "gamma") for picture in pictures]
+
+
+EXPERIMENT = Experiment(
+    "unclip",
+    "Clip maps at four levels and as 8-bit pictures, give their sun back, and compare with the truth.",
+    cases,
+    lambda done: done.metrics["rows"],
+    {
+        "map": "{map}",
+        "clipped at": "{level}",
+        "called": "{kind}",
+        "sun added": lambda row: ("false" if row["false"] else "yes") if row["added"] else "",
+        "off, degrees": lambda row: number(row["off"]),
+        "true sun over sky, stops": lambda row: number(row["true_ratio"], "+.1f"),
+        "flux, stops: clipped": lambda row: number(row["clipped_flux"], "+.1f") if row["sunny"] else "",
+        "now": lambda row: number(row["flux"], "+.1f") if row["sunny"] else "",
+        "expected": lambda row: number(row["spread"]) if row["sunny"] else "",
+        "irradiance, stops: clipped": lambda row: number(row["clipped_irradiance"], "+.2f"),
+        "now ": lambda row: number(row["irradiance"], "+.2f"),
+        "shadow: truth, clipped, now": "{true_contrast:.2f} {clipped_contrast:.2f} {contrast:.2f}",
+    },
+    group=lambda row: f"{row['set']}, {'sunny' if row['sunny'] else 'not sunny'}",
+    summary=summary,
+    panels=panels,
+    sheet=lambda case: "sheet.jpg",
+)

@@ -16,6 +16,9 @@ from experiments.harness import Experiment, calling
 
 LARGE = 8192
 """Columns of the large map, an enlarged small one."""
+CLIPPED_AT = 10.0
+"""Radiance at which a map is clipped for ``unclip``."""
+LOOK = Path(__file__).parents[1] / "looks" / "evening.toml"
 MOST_GB = 3.0
 """Peak memory that a command may have on it."""
 COMMANDS = {
@@ -26,6 +29,8 @@ COMMANDS = {
     "sky": "sky --elevation 30 --width {width}",
     "blend": "blend {first} {second} --amount 0.5",
     "compare": "compare {first} {second}",
+    "apply": "apply {look} {first}",
+    "unclip": "unclip {clipped}",
 }
 """What is run, by its name in the table."""
 
@@ -36,7 +41,7 @@ def cases(given):
     files.append(str(folder / "hdri" / "studio_small_03_1k.hdr"))
     found = []
     for name, line in COMMANDS.items():
-        for k, file in enumerate(files if "{first}" in line else files[:1]):
+        for k, file in enumerate(files if "{" in line.replace("{width}", "") else files[:1]):
             found.append(case(name, line, file, files[k - 1], None))
         found.append(case(name, line, files[0], files[1], LARGE))
     return found
@@ -56,7 +61,12 @@ def timed(settings, folder: Path, line: str, width: int | None) -> dict:
     files = [settings.input.envmap, settings.target.file]
     if width:
         files = [enlarged(file, folder.parent / f"{Path(file).stem}_{width}.exr", width) for file in files]
-    names = {"first": files[0], "second": files[1], "width": str(width or 1024)}
+    names = {"first": files[0], "second": files[1], "width": str(width or 1024), "look": str(LOOK)}
+    if "{clipped}" in line:
+        envmap, _ = images.load_envmap(files[0])
+        names["clipped"] = str(folder / "clipped.exr")
+        images.write_exr(names["clipped"], np.minimum(envmap, CLIPPED_AT))
+        del envmap
     command = [part.format(**names) for part in line.split()]
     environment = os.environ | {"PYTHONPATH": str(Path(envedit.__file__).parents[1])}
     before = time.perf_counter()

@@ -169,7 +169,7 @@ COUNTS = {
     "layers": 96,
     "light_estimation": 6,
     "looks": 12,
-    "maps_alone": 26,
+    "maps_alone": 34,
     "natural": 680,
     "natural.skies": 1,
     "paint.artists": 12,

@@ -53,6 +53,6 @@ EXPERIMENT = Experiment(
         },
     ),
     panels=panels,
-    sheet=lambda case: "artists",
+    sheet=lambda case: "artists.jpg",
     alone=True,
 )

@@ -192,8 +192,8 @@ def load_scene(
     Parameters
     ----------
     scene : mitsuba.Scene, dict or path
-        A Mitsuba XML file, the name of a shipped scene, such as "sphere", a dict of ``mi.load_dict``, or a
-        scene that Mitsuba has built, whose environment map is replaced when it is rendered.
+        A Mitsuba XML or USD file, the name of a shipped scene, such as "sphere", a dict of ``mi.load_dict``,
+        or a scene that Mitsuba has built, whose environment map is replaced when it is rendered.
     width, height : int
         Size of the rendering, pixels; height 0: by the scene's aspect. A built scene has its film's.
     parameters : dict, optional

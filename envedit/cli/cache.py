@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 
 from envedit.cli.streams import steady
@@ -11,6 +12,7 @@ KINDS = {
     "transport": "light transports of scenes",
     "fits": "SIRENs fitted to maps",
     "renderings": "renderings of initial and target maps",
+    "usd": "scenes that were USD files",
 }
 
 
@@ -58,13 +60,16 @@ def _visit(kind, empty):
     sizes = []
     failed = None
     try:
-        files = cache.files()
+        converted = cache.folder.glob("*/converted.json") if cache.folder else ()
+        files = [*cache.files(), *(state.parent for state in converted)]
     except OSError as error:
         return cache.folder, [], error
     for file in files:
         try:
-            size = file.stat().st_size
-            if empty:
+            size = sum(one.stat().st_size for one in (file, *file.rglob("*")))
+            if empty and file.is_dir():
+                shutil.rmtree(file)
+            elif empty:
                 file.unlink()
             sizes.append(size)
         except FileNotFoundError:  # another process deleted it first

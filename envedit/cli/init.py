@@ -25,7 +25,7 @@ envmap = {envmap}  # EXR or Radiance HDR, lat-long; "scene", its own; "sunsky", 
 width = 256  # texels while editing; afterwards the edit is carried to the size of the file
 
 [scene]
-file = {scene}  # a Mitsuba XML file, or one of {shipped}
+file = {scene}  # a Mitsuba XML or USD file, or one of {shipped}
 width = 128  # of the rendering while editing, pixels
 # parameters = {{ roughness = 0.3 }}  # values for the <default>s of the scene
 
@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
         metavar="SCENE",
         nargs="?",
         default="sphere",
-        help="a Mitsuba XML file, or the name of a shipped scene (default: sphere)",
+        help="a Mitsuba XML or USD file, or the name of a shipped scene (default: sphere)",
     )
     parser.add_argument(
         "--envmap",
@@ -88,7 +88,7 @@ def _write(arguments):
         raise ConfigError(f"{file}: exists already; delete it, or give another name with --out")
     lights = "auto", "scene", "sunsky"
     envmap = _file_name("--envmap", arguments.envmap, lights, "an EXR or Radiance HDR file", file.parent)
-    scene = _file_name("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML file", file.parent)
+    scene = _file_name("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML or USD file", file.parent)
     text = TEMPLATE.format(
         name=file.name,
         envmap=config.quote(envmap),

@@ -12,11 +12,13 @@ from envedit.cli.streams import steady
 COMMANDS = {
     "run": "carry out the edit that a configuration describes",
     "paint": "paint on the rendering in the browser, while the map follows",
+    "convert": "write a USD file as a Mitsuba scene",
     "fit": "fit a SIREN to a map, without an edit",
     "lights": "list the lights of a map; write its sky and its lights apart",
     "adjust": "exposure, colour, rotation, blur of a map; a second map as backplate",
     "blend": "a map between two maps: lights move, skies blend",
     "sky": "an analytic sky as a file, of a sun's position or of a place and a time",
+    "unclip": "give a map whose sun was clipped its sun back",
     "compare": "how far two maps are apart, as pictures and as light",
     "apply": "give maps the light of an edit: its look",
     "init": "write a commented configuration to start from",
@@ -24,7 +26,6 @@ COMMANDS = {
     "doctor": "check whether this machine can run envedit",
     "schema": "print every key of the configuration, as JSON Schema or as a page",
     "cache": "show or delete what is kept on disk between runs",
-    "unclip": "give a map whose sun was clipped its sun back",
     "weights": "fetch the trained networks of LPIPS and DISTS",
 }
 

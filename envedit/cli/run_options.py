@@ -29,8 +29,8 @@ def make_parser() -> argparse.ArgumentParser:
         "config",
         metavar="CONFIG",
         nargs="?",
-        help="a file, CONFIG.toml, or the name of a shipped one; or SCENE.xml, or the name of a shipped "
-        "scene, with --envmap and one of --paint, --target and --rotate",
+        help="a file, CONFIG.toml, or the name of a shipped one; or SCENE.xml, SCENE.usd, or the name of a "
+        "shipped scene, with --envmap and one of --paint, --target and --rotate",
     )
 
     # ---- An edit of a scene
@@ -44,6 +44,9 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="MAP",
         help="map to edit: a file, scene or sunsky (default: the scene's own light; of a shipped scene, an "
         "analytic sky)",
+    )
+    quick.add_argument(
+        "--camera", metavar="NAME", help="sensor by id, of a USD file by path (default: the only one)"
     )
     target = quick.add_mutually_exclusive_group()
     target.add_argument("--paint", metavar="PICTURE", help="target: the rendering, painted over")
@@ -121,13 +124,13 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def is_scene(name: str) -> bool:
-    """Distinguish a scene from a configuration: an XML file, or the name of a shipped scene."""
+    """Distinguish a scene from a configuration: an XML or USD file, or the name of a shipped scene."""
     plain = not os.path.isfile(name) and name in shipped.scenes() and name not in shipped.configurations()
-    return name.lower().endswith(".xml") or plain
+    return name.lower().endswith((".xml", *shipped.USD_ENDINGS)) or plain
 
 
 def quick(arguments: argparse.Namespace) -> list[str]:
-    """Return the overrides that --envmap, --paint, --target and --rotate stand for.
+    """Return the overrides that --envmap, --camera, --paint, --target and --rotate stand for.
 
     Raises
     ------
@@ -139,6 +142,7 @@ def quick(arguments: argparse.Namespace) -> list[str]:
 
     keys = {
         "envmap": (("input.envmap", arguments.envmap),),
+        "camera": (("scene.sensors", arguments.camera and [arguments.camera]),),
         "paint": (("target.kind", "image"), ("target.file", arguments.paint)),
         "target": (("target.file", arguments.target),),
         "rotate": (("target.rotate_degrees", arguments.rotate),),

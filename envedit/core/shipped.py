@@ -6,6 +6,9 @@ from pathlib import Path
 
 import envedit
 
+USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+"""Endings of USD files, in lower case."""
+
 
 def folder() -> Path | None:
     """Return the folder of the shipped files; None where the installation lacks them."""

@@ -42,6 +42,7 @@ from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_files, scene_text, supported
 from envedit.scene.scene_files import SceneFile
+from envedit.scene.usd import conversion as usd
 
 __all__ = ["Scene", "load"]
 
@@ -344,8 +345,9 @@ def load(
     Parameters
     ----------
     file : path, str or dict
-        A Mitsuba XML file, the name of a shipped scene (:func:`.shipped.scenes`, with or without ``.xml``; a
-        file of that name in the working folder comes first), or a dict as ``mi.load_dict`` takes it.
+        A Mitsuba XML file, a USD file (:func:`.usd.conversion.kept`), the name of a shipped scene
+        (:func:`.shipped.scenes`, with or without ``.xml``; a file of that name in the working folder comes
+        first), or a dict as ``mi.load_dict`` takes it.
     width, height : int, optional
         Size of the rendering in pixels. None or 0: the scene's own, or by its aspect if one of both is given.
     parameters : dict, optional
@@ -386,6 +388,8 @@ def load(
         own = supported.own_map(state, where, folders, scale)
     with refused.collected():
         asked = supported.take_integrator(state, where)
+    if usd.is_usd(file) and sensors != "all" and tuple(sensors) == (0,):
+        supported.require_one_sensor(state, where)
     with refused.collected():
         nodes, names, said = supported.take_sensors(state, where, sensors)
     for node in nodes:
@@ -401,7 +405,8 @@ def load(
         with refused.collected():
             parser.fit_to_stage(state, one)
     refused.raise_all()
-    notes = (*own.notes, *turned, *asked.notes, *supported.polarised(state), *said)
+    first = usd.kept(path).notes if path is not None and usd.is_usd(path) else ()
+    notes = (*first, *own.notes, *turned, *asked.notes, *supported.polarised(state), *said)
     read = [one.props["filename"] for one in state.nodes if "filename" in one.props]
     read += [] if own.file is None else [str(own.file)]
     digest = hashlib.sha256(b"envedit scene 1")
@@ -517,12 +522,13 @@ def _parsed(file, parameters, base):
         state = parser.called(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
-        filled, outline = _check_parameters(path, parameters or {})
-        where, folders = str(path), (path.parent, base, *outline.folders)
+        text = usd.kept(path).xml if usd.is_usd(path) else path
+        filled, outline = _check_parameters(text, parameters or {})
+        where, folders = str(path), (text.parent, base, *outline.folders)
         if wrong := scene_files.errors([SceneFile("spectrum", file) for file in outline.spectra]):
             raise wrong[0]
         with installed_plugins.restored():
-            state = parser.called(where, mi.parser.parse_file, config, str(path), **filled)
+            state = parser.called(where, mi.parser.parse_file, config, str(text), **filled)
     scene_text.check_references(state, where)
     parser.called(where, mi.parser.transform_all, config, state)
     parser.lower_names(state)
@@ -581,7 +587,7 @@ def relit(
 
 
 def find(file: FilePath) -> Path:
-    """Return the XML file meant by a path or by the bare name of a shipped scene."""
+    """Return the XML or USD file meant by a path, or by the bare name of a shipped scene."""
     path = Path(file)
     if os.path.isfile(path):  # False, and no error, in a folder that may not be entered
         return path.absolute()
@@ -590,9 +596,10 @@ def find(file: FilePath) -> Path:
     if bare and name in names and (folder := shipped.folder()):
         return folder / f"{name}.xml"
     if os.path.isdir(path):
-        raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML file")
+        raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML or USD file")
     close = difflib.get_close_matches(name, names, 1) if bare else []
-    wanted = f"expected a Mitsuba XML file or one of {', '.join(names) or 'none: install envedit again'}"
+    known = ", ".join(names) or "none: install envedit again"
+    wanted = f"expected a Mitsuba XML or USD file or one of {known}"
     hint = f"did you mean {close[0]}?" if close else wanted
     raise InputError(f"scene {file}: no such file; {hint}")
 
@@ -603,13 +610,16 @@ def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | Non
     Nothing is built. A scene that cannot be read has itself only.
     """
     path = Path(file).absolute()
+    sources: tuple[str, ...] = ()
     try:
-        path = find(file)
-        outline = scene_text.read(path, {name: str(value) for name, value in parameters.items()})
+        text = path = find(file)
+        if usd.is_usd(path):
+            text, _, sources = usd.kept(path)
+        outline = scene_text.read(text, {name: str(value) for name, value in parameters.items()})
     except EnveditError:
         return [path]
-    folders = path.parent, Path(base or ".").absolute(), *outline.folders
-    return [path, *(folder / name for name in outline.files for folder in folders)]
+    folders = text.parent, Path(base or ".").absolute(), *outline.folders
+    return [path, *map(Path, sources), *(folder / name for name in outline.files for folder in folders)]
 
 
 def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], scene_text.Outline]:

@@ -12,9 +12,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -40,10 +40,9 @@ IMAGE_MEMORY = 2**34
 _WAIT = 4  # times the processor time, on the clock
 _REMEMBERED_BYTES = 2**20  # of entries in the folder of caches: some 5,000 files
 _CODE = """
-import json, sys
-sys.path[:], files, seconds = json.load(sys.stdin)
-from envedit.scene import scene_files
-scene_files.main(files, seconds)
+import importlib, json, sys
+sys.path[:], module, arguments = json.load(sys.stdin)
+importlib.import_module(module).main(*arguments)
 """
 _HINTS = {"ply": ", as triangles", "spectrum": ", as NAME.spd"}  # what Mitsuba reads of these
 _remembered: set[str] = set()
@@ -101,25 +100,51 @@ def _key(file):
 def _answers(files):
     """Return what another process has to say of files: "" or what is wrong, up to the one that ended it."""
     seconds = SECONDS + sum(os.path.getsize(file.path) for file in files) // BYTES_PER_SECOND
+    _, *answers = lines_of(__name__, [files, seconds], seconds)
+    if len(answers) < len(files):
+        answers.append(f"Mitsuba stops as it reads this file, or takes over {seconds} s; export it again")
+    return answers
+
+
+def lines_of(
+    module: str, arguments: Sequence, seconds: float, environment: Mapping[str, str] | None = None
+) -> list[Any]:
+    """Return the lines of JSON that the ``main`` of a module writes in a process of its own.
+
+    Parameters
+    ----------
+    module : str
+        It writes a first line as soon as it has begun.
+    arguments : sequence
+        Of its ``main``, as JSON knows them.
+    seconds : float
+        Processor time that it allows itself.
+    environment : dict, optional
+        Variables of its environment beside those of this process.
+
+    Raises
+    ------
+    MachineError
+        It cannot be started.
+    """
     try:
         output = subprocess.run(
             [sys.executable, "-P", "-c", _CODE],
-            input=json.dumps([[os.fspath(folder) for folder in sys.path], files, seconds]).encode(),
+            input=json.dumps([[os.fspath(folder) for folder in sys.path], module, arguments]).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             timeout=_WAIT * seconds,
             start_new_session=True,  # Ctrl-C is for this process
+            env={**os.environ, **(environment or {})},
         ).stdout
     except subprocess.TimeoutExpired as error:
         output = error.stdout or b""
     except OSError as error:
         raise MachineError(f"{sys.executable}: cannot be started to read files ({error.strerror})") from None
-    begun, *answers = [json.loads(line) for line in output.splitlines()] or [None]
-    if begun is None:
+    lines = [json.loads(line) for line in output.splitlines()]
+    if not lines:
         raise MachineError(f"{sys.executable}: the process that reads files of a scene does not start")
-    if len(answers) < len(files):
-        answers.append(f"Mitsuba stops as it reads this file, or takes over {seconds} s; export it again")
-    return answers
+    return lines
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -134,11 +159,11 @@ def main(files: Sequence[Sequence], seconds: int) -> None:
     mi.set_log_level(mi.LogLevel.Error)
     dr.set_thread_count(2)  # on one, Mitsuba waits for ever for an EXR texture
     installed_plugins.come_first()
-    _limit("RLIMIT_CPU", seconds)
+    limit("RLIMIT_CPU", seconds)
     print(json.dumps("begun"), file=answers, flush=True)
     for plugin, path, shape_index in files:
         memory = IMAGE_MEMORY if plugin == "bitmap" else MEMORY + MEMORY_PER_BYTE * os.path.getsize(path)
-        _limit("RLIMIT_AS", _address_space() + memory)
+        limit("RLIMIT_AS", address_space() + memory)
         wrong = ""
         try:
             _read(plugin, path, shape_index)
@@ -179,7 +204,7 @@ def _read(plugin, path, shape_index):
         raise InputError(f"face {face} names vertex {faces.max()} of {mesh.vertex_count()}; export it again")
 
 
-def _address_space():
+def address_space() -> int:
     """Return the bytes of address space that this process has; 1 GiB where that is unknown."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
@@ -187,7 +212,7 @@ def _address_space():
         return 2**30
 
 
-def _limit(name, most):
+def limit(name: str, most: int) -> None:
     """Bound a resource of this process, where the platform has bounds."""
     try:
         import resource

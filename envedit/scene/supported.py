@@ -16,6 +16,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import shipped
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene.own_light import OwnLight
 from envedit.scene.parser import append, environment, place_of
@@ -89,8 +90,10 @@ def own_map(
     factor = 1.0 if isinstance(scale, str) else scale
     index = environment(state, where)
     if index is None:
-        emitter = '<emitter type="envmap"><string name="filename" value="FILE"/></emitter>'
-        missing = f"{where}: no environment emitter: add {emitter} inside <scene>, {_GIVE_MAP}"
+        emitter = '<emitter type="envmap"><string name="filename" value="FILE"/></emitter> inside <scene>'
+        if where.lower().endswith(shipped.USD_ENDINGS):
+            emitter = "a DomeLight"
+        missing = f"{where}: no environment emitter: add {emitter}, {_GIVE_MAP}"
         note = "no environment emitter: the map lights the scene beside its own lamps"
         return OwnMap(None, factor, (note,), missing=missing, added=True)
     node, place = state.nodes[index], place_of(state, state.nodes[index], where)
@@ -283,6 +286,21 @@ def take_sensors(
         return nodes, names, (said,)
     which = "the first" if chosen == [0] else "one"
     return nodes, names, (f"{len(found)} sensors: {which} is used ({used}), not {more}",)
+
+
+def require_one_sensor(state: mi.parser.ParserState, where: str) -> None:
+    """Refuse a scene with several sensors of which none was chosen.
+
+    Raises
+    ------
+    ConfigError
+        There are several; it names them.
+    """
+    names = [n.props.id() for n in state.nodes if n.type == mi.ObjectType.Sensor]
+    if len(names) > 1:
+        known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+        how = f'--camera {names[0]}, or [scene] sensors = ["{names[0]}"]'
+        raise ConfigError(f"{where}: {len(names)} cameras ({known}): choose one, such as {how}")
 
 
 def index_of(asked: int | str, names: list[str], shown: list[str], said: str, more: str = "") -> int:

@@ -203,6 +203,10 @@ def _scene_digests(name):
         if path in digests:
             continue
         digests[path] = _digest(path)
+        if path.suffix.lower() in shipped.USD_ENDINGS:
+            from envedit.scene.usd import conversion  # with Mitsuba
+
+            pending.append(conversion.kept(path).xml)
         if path.suffix.lower() == ".xml":
             names = re.findall(r"""(?:value|filename)\s*=\s*["']([^"'$]+)["']""", _text(path))
             pending += filter(None, (_file_in(path.parent, one) for one in names))

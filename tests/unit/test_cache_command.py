@@ -30,7 +30,8 @@ def test_nothing_kept(home, capsys):
     assert said[0] == f"{home}/transport: light transports of scenes: 0 entries, 0.0 MB"
     assert said[1] == f"{home}/fits: SIRENs fitted to maps: 0 entries, 0.0 MB"
     assert said[2].startswith(f"{home}/renderings: ")
-    assert said[3] == "to delete all entries: envedit cache --empty" and not home.exists()
+    assert said[3].startswith(f"{home}/usd: ")
+    assert said[4] == "to delete all entries: envedit cache --empty" and not home.exists()
     assert lines(capsys, "--empty")[0].endswith("0 entries, 0.0 MB deleted") and not home.exists()
 
 
@@ -43,6 +44,9 @@ def test_entries_and_sizes(home, capsys):
 
 def test_empty_deletes_the_entries_and_nothing_else(home, capsys):
     files = keep("transport", 2, 10) + keep("fits", 1, 10)
+    scene = home / "usd" / "0" / "converted.json"
+    scene.parent.mkdir(parents=True)
+    scene.write_text("{}")
     foreign = [
         home / "doctor-0123456789abcdef.json",
         home / "transport" / "notes.txt",
@@ -58,6 +62,7 @@ def test_empty_deletes_the_entries_and_nothing_else(home, capsys):
         f"{home}/transport: light transports of scenes: 2 entries, 0.0 MB deleted",
         f"{home}/fits: SIRENs fitted to maps: 1 entry, 0.0 MB deleted",
         f"{home}/renderings: renderings of initial and target maps: 0 entries, 0.0 MB deleted",
+        f"{home}/usd: scenes that were USD files: 1 entry, 0.0 MB deleted",
     ]
     assert not any(file.exists() for file in files)
     assert all(file.read_text() == "mine" for file in foreign)

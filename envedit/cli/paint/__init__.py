@@ -33,7 +33,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         opened = None
         if arguments.name is not None:
-            opened = project.opened(arguments.name, arguments.envmap or "", arguments.preset)
+            opened = project.opened(
+                arguments.name, arguments.envmap or "", arguments.preset, arguments.camera or ""
+            )
         elif arguments.envmap:
             opened = project.opened("sphere", arguments.envmap, arguments.preset)
         if opened is not None:
@@ -106,9 +108,11 @@ def _parser():
         "name",
         metavar="CONFIG | SCENE",
         nargs="?",
-        help="CONFIG.toml, SCENE.xml, or the name of a shipped one (default: a page to choose from)",
+        help="CONFIG.toml, SCENE.xml, SCENE.usd, or the name of a shipped one (default: a page to choose "
+        "from)",
     )
     parser.add_argument("--envmap", metavar="MAP", help="map to edit: a file, scene or sunsky")
+    parser.add_argument("--camera", metavar="NAME", help="sensor by id, of a USD file by path")
     parser.add_argument("--preset", choices=("draft", "standard"), help="named set of defaults")
     parser.add_argument("--port", type=int, default=PORT, help=f"port (default: {PORT}; 0: any)")
     parser.add_argument("--no-browser", action="store_true", help="only print the address")

@@ -140,7 +140,7 @@ def _resolved(text, folder):
     return replace(settings, output=_without(settings.output, dir=str(folder)))
 
 
-def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
+def opened(name: str, envmap: str = "", preset: str | None = None, camera: str = "") -> Project:
     """Open a configuration, a scene or what was painted before.
 
     Parameters
@@ -151,6 +151,8 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
         In place of the configuration's; "" for that.
     preset : str, optional
         In place of the configuration's.
+    camera : str
+        Id of the sensor, of a USD file its path; "": the configuration's.
 
     Raises
     ------
@@ -158,6 +160,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None) -> Project:
         As of :func:`.schema.load`; also for a target that is no paint, where the configuration says so.
     """
     overrides = [f"input.envmap={config.quote(_path(envmap))}"] if envmap else []
+    overrides += [f"scene.sensors={config.quote([camera])}"] if camera else []
     settings, file, base = run.load(name, preset, overrides)
     if settings.representation.kind != "layers" or settings.renderer.kind != "transport":
         raise ConfigError(

@@ -1,0 +1,185 @@
+"""USD files as Mitsuba scenes: ``scene.xml`` and a folder with meshes, made by a process of its own.
+
+The process loads no plugins but USD's own and runs no code of a file. Its bounds are in
+:mod:`envedit.scene.usd.stage`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.util
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from envedit.core import atomic_files, shipped
+from envedit.core.array_cache import cache_folder
+from envedit.core.errors import ConfigError, InputError, MachineError
+from envedit.core.types import FilePath
+from envedit.scene import scene_files
+
+_VERSION = 1  # of what is made of the same file
+_KEPT = 64  # converted scenes in the folder of caches
+SECONDS = 120
+"""Processor time of the other process."""
+_ENVIRONMENT = {
+    "PXR_PLUGINPATH_NAME": "",
+    "PXR_AR_DISABLE_PLUGIN_RESOLVER": "1",
+    "PXR_WORK_THREAD_LIMIT": "1",
+    "MALLOC_ARENA_MAX": "2",
+}
+
+
+class Converted(NamedTuple):
+    """A Mitsuba scene that was made of a USD file.
+
+    Attributes
+    ----------
+    xml : Path
+        The scene.
+    notes : tuple of str
+        What of the file is not used.
+    sources : tuple of str
+        Files that it was made of: layers and textures.
+    """
+
+    xml: Path
+    notes: tuple[str, ...]
+    sources: tuple[str, ...]
+
+
+def is_usd(file: object) -> bool:
+    """Return whether a name is that of a USD file."""
+    return isinstance(file, str | os.PathLike) and os.fspath(file).lower().endswith(shipped.USD_ENDINGS)
+
+
+def convert(file: FilePath, xml: Path, camera: str = "", time: float | None = None) -> Converted:
+    """Write a USD file as a Mitsuba scene.
+
+    Parameters
+    ----------
+    file : path
+        The USD file.
+    xml : Path
+        The scene to write, with ``NAME_files`` beside it; neither may exist.
+    camera : str
+        Path of its camera; "": the only one; "all": every one, each as a sensor with its path as id.
+    time : float, optional
+        Time code of animated values; None: the first of the stage.
+
+    Raises
+    ------
+    ConfigError
+        There are several cameras and none is chosen, or there is none of that path.
+    InputError
+        The USD file is missing, damaged or declares too much, names missing textures, or has no camera or no
+        surface; or a file is in the way.
+    MachineError
+        The extra ``usd`` is not installed.
+    """
+    file = Path(file).absolute()
+    if importlib.util.find_spec("pxr") is None:
+        how = "pip install 'envedit-hdr[usd]'"
+        raise MachineError(f"{file}: reading USD needs the package usd-core: {how}")
+    if not os.path.isfile(file):
+        raise InputError(f"{file}: no such file")
+    folder = xml.with_name(f"{xml.stem}_files")
+    for path in (xml, folder):
+        if path.exists() or path.is_symlink():
+            raise InputError(f"{path}: exists already; give the scene another name")
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{xml.name}.", dir=xml.parent) as temporary:
+            draft = Path(temporary) / xml.name
+            request = {"file": str(file), "xml": str(draft), "camera": camera, "time": time}
+            answer = _answer(file, request)
+            if (Path(temporary) / folder.name).exists():
+                os.rename(Path(temporary) / folder.name, folder)
+            os.rename(draft, xml)
+    except OSError as error:
+        raise InputError(f"{xml}: cannot be written ({error.strerror})") from None
+    return Converted(xml, tuple(f"{file.name}: {note}" for note in answer["notes"]), tuple(answer["sources"]))
+
+
+def _answer(file, request):
+    """Let another process convert; raises what it says."""
+    lines = scene_files.lines_of("envedit.scene.usd.stage", [request, SECONDS], SECONDS, _ENVIRONMENT)
+    if len(lines) < 2:
+        raise InputError(f"{file}: declares more than can be read in {SECONDS} s and 8 GiB, or is damaged")
+    answer = lines[1]
+    if "error" in answer:
+        raise (ConfigError if answer["usage"] else InputError)(answer["error"])
+    return answer
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Scenes that are kept
+
+
+def kept(file: FilePath) -> Converted:
+    """Return the scene of a USD file in the folder of caches, made anew where one of its sources has changed.
+
+    Raises
+    ------
+    ConfigError, InputError, MachineError
+        As of :func:`convert`, which is asked for all cameras.
+    """
+    file = Path(file).absolute()
+    root = cache_folder("usd")
+    if root is None:
+        root = Path(tempfile.mkdtemp(prefix="envedit_usd_"))
+    key = json.dumps([str(file), _digests([str(file)]), _VERSION])
+    name = hashlib.sha256(key.encode()).hexdigest()[:32]
+    folder = root / name
+    state = folder / "converted.json"
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        known = json.loads(state.read_text(encoding="utf-8"))
+        if known["sources"] == _digests(known["sources"]) and (folder / f"{file.stem}.xml").is_file():
+            os.utime(state)
+            return Converted(folder / f"{file.stem}.xml", tuple(known["notes"]), tuple(known["sources"]))
+
+    # ---- Made in a folder beside, which takes the place of the old one
+    try:
+        root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        draft = Path(tempfile.mkdtemp(prefix=".", dir=root))
+    except OSError as error:
+        raise InputError(f"{root}: cannot be written ({error.strerror})") from None
+    try:
+        made = convert(file, draft / f"{file.stem}.xml", "all")
+        text = json.dumps({"notes": made.notes, "sources": _digests(made.sources)})
+        (draft / state.name).write_text(text, encoding="utf-8")
+        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # another process was faster with the same
+            os.rename(draft, folder)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    for old in sorted(root.glob("*/converted.json"), key=_changed)[:-_KEPT]:
+        shutil.rmtree(old.parent, ignore_errors=True)
+    return Converted(folder / f"{file.stem}.xml", made.notes, made.sources)
+
+
+def _changed(path):
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _digests(files):
+    """Return the digest of each file, by its path; "" of one that cannot be read."""
+    found = {}
+    for file in files:
+        found[file] = ""
+        with contextlib.suppress(OSError):
+            status = os.stat(file)
+            found[file] = _digest(file, status.st_size, status.st_mtime_ns)
+    return found
+
+
+@functools.lru_cache(maxsize=1024)
+def _digest(path, size, changed):  # a run asks for the same scene several times
+    return atomic_files.digest(path).hex()

@@ -8,6 +8,7 @@ times its colour is the irradiance of a surface that faces it, whatever its angl
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +25,7 @@ def text(
     lights: Sequence[dict],
     to_world: np.ndarray | None = None,
     scale: float = 1.0,
+    below: tuple[str, dict] | None = None,
 ) -> str:
     """Return a stage (``.usda``) that is lit by a map.
 
@@ -37,19 +39,29 @@ def text(
         Rotation from the map's frame (+y up) to the scene's; None: none.
     scale : float
         What the scene multiplies the files' values by.
+    below : (str, dict), optional
+        USD file of the scene, relative to the stage, which becomes a layer above it, and its ``stage`` as of
+        :class:`.conversion.Converted`: its domes are switched off. None: lights alone.
     """
     rotation = np.eye(3) if to_world is None else np.asarray(to_world, np.float64)
     up = "Z" if abs(rotation[2, 1]) > abs(rotation[1, 1]) else "Y"
+    head = ['defaultPrim = "Environment"', "metersPerUnit = 1", f'upAxis = "{up}"']
+    off = ""
+    if below is not None:
+        file, stage = below
+        layer = file.replace(os.sep, "/")
+        head = [f"subLayers = [@@@{layer}@@@]", f"metersPerUnit = {stage['metersPerUnit']:.9g}"]
+        head.append(f'upAxis = "{stage["upAxis"]}"')
+        off = "".join(_switched_off(path) for path in stage["domes"])
+    metadata = "\n".join(f"    {line}" for line in head)
     dome, sky = (_dome(file, rotation, scale) for file in (map_file, sky_file))
     lamps = [_distant(number, light) for number, light in enumerate(lights, 1)]
     return f"""#usda 1.0
 (
-    defaultPrim = "Environment"
-    metersPerUnit = 1
-    upAxis = "{up}"
+{metadata}
 )
 
-def Xform "Environment" (
+{off}def Xform "Environment" (
     variants = {{
         string lighting = "{DEFAULT_VARIANT}"
     }}
@@ -64,6 +76,16 @@ def Xform "Environment" (
     }}
 }}
 """
+
+
+def _switched_off(path):
+    """Write an opinion that a prim is not active, by its path."""
+    *parents, name = path.strip("/").split("/")
+    lines = []
+    for parent in parents:
+        lines += [f'over "{parent}"', "{"]
+    lines += [f'over "{name}" (', "    active = false", ")", "{", "}"]
+    return "\n".join([*lines, *"}" * len(parents), "", ""])
 
 
 def _dome(file, rotation, scale):

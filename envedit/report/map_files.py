@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from envedit.images import images, layered_exr
 from envedit.maps import look_transfer, looks, map_file, usd_scene
 from envedit.report import manifest
 from envedit.scene import scene
+from envedit.scene.usd import conversion
 
 if TYPE_CHECKING:
     from envedit import results
@@ -92,10 +94,13 @@ def write_scene(
     """
     edited = f"edited.{settings.output.format}"
     lights = result.lights["after"]
-    stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale)
-    atomic_files.write_atomically(folder / "edited.usda", stage.encode())
     chosen = settings.scene
     try:
+        below = None
+        if conversion.is_usd(chosen.file):
+            below = os.path.relpath(chosen.file, folder), conversion.kept(chosen.file).stage
+        stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale, below)
+        atomic_files.write_atomically(folder / "edited.usda", stage.encode())
         text = scene.relit(
             chosen.file,
             edited,
@@ -105,6 +110,6 @@ def write_scene(
             chosen.scale,
         )
     except InputError as error:  # the scene's files may be gone by now
-        return [f"edited.xml is not written: {error}"]
+        return [f"edited.xml or edited.usda is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())
     return []

@@ -614,7 +614,8 @@ def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | Non
     try:
         text = path = find(file)
         if usd.is_usd(path):
-            text, _, sources = usd.kept(path)
+            made = usd.kept(path)
+            text, sources = made.xml, made.sources
         outline = scene_text.read(text, {name: str(value) for name, value in parameters.items()})
     except EnveditError:
         return [path]

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("pxr", reason="the extra envedit[usd] is not installed")
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
+import envedit
 from envedit import config, inputs
 from envedit.cli import convert
 from envedit.core.errors import ConfigError, EnveditError, InputError
@@ -567,3 +568,33 @@ def test_the_extra_is_named_where_it_is_not_installed(tmp_path, monkeypatch, cap
     monkeypatch.setattr(conversion.importlib.util, "find_spec", lambda name: None)
     assert convert.main([str(tmp_path / "shot.usda"), str(tmp_path / "a.xml")]) == 4
     assert "pip install 'envedit-hdr[usd]'" in capsys.readouterr().err
+
+
+def test_what_a_run_leaves_changes_nothing_of_the_file_but_its_sky(tmp_path, rng):
+    """The stage above the user's file is a scene again, and is rendered as the run rendered its result."""
+    images.write_exr(tmp_path / "sky.exr", rng.random((8, 16, 3), np.float32) + 0.1)
+    stage = new_stage(tmp_path, up="Z", unit=0.01)
+    add_camera(stage, "/World/camera")
+    add_square(stage, "/World/square")
+    dome = add_dome(stage, 2.0, "/World/lights/sky", "sky.exr")
+    place(dome, ((1, 0, 0), 90), ((0, 0, 1), 40))
+    stage.GetRootLayer().Save()
+    before = (tmp_path / "shot.usda").read_bytes()
+    tables = {
+        "input": {"width": 16},
+        "scene": {"file": str(tmp_path / "shot.usda"), "width": 16},
+        "target": {"kind": "none"},
+        "output": {"exposure": 1.0, "spp": 256},
+    }
+    result = envedit.edit(config.from_dict(tables, tmp_path))
+    result.save(tmp_path / "run")
+    assert (tmp_path / "shot.usda").read_bytes() == before
+    edited = Usd.Stage.Open(str(tmp_path / "run" / "edited.usda"))
+    assert UsdGeom.GetStageUpAxis(edited) == "Z" and UsdGeom.GetStageMetersPerUnit(edited) == 0.01
+    assert not edited.GetPrimAtPath("/World/lights/sky").IsActive()
+    assert edited.GetPrimAtPath("/World/square").IsA(UsdGeom.Mesh)
+    again = scene.load(tmp_path / "run" / "edited.usda", 16)
+    envmap, _ = inputs.load_map(config.Input(envmap="scene", width=16), again)
+    rendered = again.render(envmap, 256, 3)
+    np.testing.assert_allclose(rendered.mean(), result.render.mean(), rtol=0.02)
+    np.testing.assert_allclose(envmap, 2 * result.given.radiance, rtol=1e-5)

@@ -23,7 +23,7 @@ from envedit.core.errors import ConfigError, InputError, MachineError
 from envedit.core.types import FilePath
 from envedit.scene import scene_files
 
-_VERSION = 1  # of what is made of the same file
+_VERSION = 2  # of what is made of the same file
 _KEPT = 64  # converted scenes in the folder of caches
 SECONDS = 120
 """Processor time of the other process."""
@@ -46,11 +46,14 @@ class Converted(NamedTuple):
         What of the file is not used.
     sources : tuple of str
         Files that it was made of: layers and textures.
+    stage : dict
+        ``upAxis`` and ``metersPerUnit`` of the USD file, and the paths of its ``domes``.
     """
 
     xml: Path
     notes: tuple[str, ...]
     sources: tuple[str, ...]
+    stage: dict
 
 
 def is_usd(file: object) -> bool:
@@ -102,7 +105,8 @@ def convert(file: FilePath, xml: Path, camera: str = "", time: float | None = No
             os.rename(draft, xml)
     except OSError as error:
         raise InputError(f"{xml}: cannot be written ({error.strerror})") from None
-    return Converted(xml, tuple(f"{file.name}: {note}" for note in answer["notes"]), tuple(answer["sources"]))
+    notes = tuple(f"{file.name}: {note}" for note in answer["notes"])
+    return Converted(xml, notes, tuple(answer["sources"]), answer["stage"])
 
 
 def _answer(file, request):
@@ -140,7 +144,8 @@ def kept(file: FilePath) -> Converted:
         known = json.loads(state.read_text(encoding="utf-8"))
         if known["sources"] == _digests(known["sources"]) and (folder / f"{file.stem}.xml").is_file():
             os.utime(state)
-            return Converted(folder / f"{file.stem}.xml", tuple(known["notes"]), tuple(known["sources"]))
+            xml = folder / f"{file.stem}.xml"
+            return Converted(xml, tuple(known["notes"]), tuple(known["sources"]), known["stage"])
 
     # ---- Made in a folder beside, which takes the place of the old one
     try:
@@ -150,7 +155,8 @@ def kept(file: FilePath) -> Converted:
         raise InputError(f"{root}: cannot be written ({error.strerror})") from None
     try:
         made = convert(file, draft / f"{file.stem}.xml", "all")
-        text = json.dumps({"notes": made.notes, "sources": _digests(made.sources)})
+        known = {"notes": made.notes, "sources": _digests(made.sources), "stage": made.stage}
+        text = json.dumps(known)
         (draft / state.name).write_text(text, encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):  # another process was faster with the same
@@ -159,7 +165,7 @@ def kept(file: FilePath) -> Converted:
         shutil.rmtree(draft, ignore_errors=True)
     for old in sorted(root.glob("*/converted.json"), key=_changed)[:-_KEPT]:
         shutil.rmtree(old.parent, ignore_errors=True)
-    return Converted(folder / f"{file.stem}.xml", made.notes, made.sources)
+    return made._replace(xml=folder / f"{file.stem}.xml")
 
 
 def _changed(path):
@@ -171,13 +177,13 @@ def _changed(path):
 
 def _digests(files):
     """Return the digest of each file, by its path; "" of one that cannot be read."""
-    found = {}
+    digests = {}
     for file in files:
-        found[file] = ""
+        digests[file] = ""
         with contextlib.suppress(OSError):
             status = os.stat(file)
-            found[file] = _digest(file, status.st_size, status.st_mtime_ns)
-    return found
+            digests[file] = _digest(file, status.st_size, status.st_mtime_ns)
+    return digests
 
 
 @functools.lru_cache(maxsize=1024)

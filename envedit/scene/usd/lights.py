@@ -17,6 +17,10 @@ from envedit.images import images
 from envedit.scene.usd import assets
 from envedit.scene.usd.description import Description, add
 
+NEUTRAL = {"diffuse": 1.0, "specular": 1.0, "shaping:focus": 0.0, "shaping:ies:file": None}
+"""Inputs of lights that are not used, and their values that say nothing."""
+DOMES = ("DomeLight", "DomeLight_1")
+"""Types of the lights whose texture is the map that is edited."""
 _WHITE_KELVIN = 6500.0  # which is white, as the source says; the function of usd-core is 4 % off
 _WIDEST_SUN = 5.0  # degrees across, above which the missing penumbra is named
 _EMITS_ALONG_MINUS_Z = np.diag([-1.0, 1, -1, 1])  # from Mitsuba's +z to USD's -z
@@ -27,9 +31,9 @@ _LEVEL = 0.5  # cosine of the angle between pole and up axis, above which a sky 
 
 def add_light(scene: Description, prim: Any, to_world: np.ndarray) -> None:
     """Add the emitter of a light; ``to_world`` (4, 4) is its place in the stage."""
-    for key in ("inputs:diffuse", "inputs:specular"):
-        if _value(scene, prim, key, 1.0) != 1:
-            scene.leave_out("diffuse and specular multipliers of a light", prim.GetPath())
+    for key, neutral in NEUTRAL.items():
+        if _value(scene, prim, f"inputs:{key}", neutral) != neutral:
+            scene.leave_out(f"{key} of a light", prim.GetPath())
     if prim.GetRelationship("light:filters").GetTargets():
         scene.leave_out("filters of a light", prim.GetPath())
     radiance = _radiance(scene, prim)
@@ -118,7 +122,8 @@ def _add_dome(scene, prim, to_world, radiance):
         stored, info = images.load_envmap(str(scene.folder / file), convert=False)
         copy, name = scene.new_file("dome.exr")
         marks = {"source": str(path)}
-        images.write_exr(copy, stored * radiance.astype(np.float32), marks, info["chromaticities"])
+        coloured = stored * radiance.astype(np.float32)
+        images.write_exr(copy, coloured, marks, chromaticities=info["chromaticities"])
         file, scale = name, 1.0
     if not scale > 0:
         raise scene.error(path, "the dome light is black; expected an intensity above 0")
@@ -173,6 +178,8 @@ def _add_sphere(scene, prim, to_world, radiance):
     radius = float((own or 1.0) * np.cbrt(np.prod(scales)))
     radiance = _per_size(scene, prim, radiance, 4 * math.pi * radius**2)
     center = to_world[:3, 3]
+    if 90 <= cone < 180:
+        scene.leave_out("cone of a light that is 90 degrees or more", prim.GetPath())
     if not as_point:
         _add_area_emitter(add(scene.root, "shape", "sphere", radius=radius, center=center), radiance)
         return
@@ -196,8 +203,7 @@ def _add_area_emitter(shape, radiance):
 
 
 LIGHTS = {
-    "DomeLight": _add_dome,
-    "DomeLight_1": _add_dome,
+    **dict.fromkeys(DOMES, _add_dome),
     "DistantLight": _add_distant,
     "SphereLight": _add_sphere,
     "RectLight": _add_flat,

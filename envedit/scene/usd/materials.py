@@ -35,7 +35,7 @@ FALLBACKS: dict[str, tuple[Any, ...]] = {
 }
 """Values of inputs that the file does not have."""
 UNUSED = ("emissiveColor", "emission", "emission_luminance", "displacement", "normal", "geometry_normal",
-          "useSpecularWorkflow", "subsurface", "subsurface_weight")  # fmt: skip
+          "useSpecularWorkflow", "opacityThreshold", "subsurface", "subsurface_weight")  # fmt: skip
 """Inputs that are not used, which is noted where they are not 0."""
 _SMALLEST_ETA = 1.001  # Mitsuba divides by eta - 1
 _WRAPS = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp", "useMetadata": "clamp"}

@@ -82,12 +82,12 @@ def triangles(scene: Description, prim: Any, uv_name: str, faces: np.ndarray | N
     keys = np.ascontiguousarray(rows).view(f"V{rows.shape[1] * 4}").ravel()
     _, picked, inverse = np.unique(keys, return_index=True, return_inverse=True)
     vertices = rows[picked]
-    found = {"vertices": vertices[:, :3], "faces": inverse.reshape(-1, 3).astype(np.int32)}
+    mesh_arrays = {"vertices": vertices[:, :3], "faces": inverse.reshape(-1, 3).astype(np.int32)}
     if normals is not None:
-        found["normals"] = vertices[:, 3:6]
+        mesh_arrays["normals"] = vertices[:, 3:6]
     if uv is not None:
-        found["uv"] = np.stack([vertices[:, -2], 1 - vertices[:, -1]], axis=1)
-    return found
+        mesh_arrays["uv"] = np.stack([vertices[:, -2], 1 - vertices[:, -1]], axis=1)
+    return mesh_arrays
 
 
 def _array(attribute, time, kind):

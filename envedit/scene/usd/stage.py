@@ -23,13 +23,13 @@ from envedit.scene.usd import cameras, lights, materials, meshes
 from envedit.scene.usd.description import Description, add, add_matrix, column_matrix
 
 MEMORY = 2**33
-"""Address space in bytes; a mesh of 10 million triangles takes 3 GB."""
+"""Address space in bytes; three meshes of 252,000 triangles take 0.5 GB in all."""
 FILE_BYTES = 2**32
 """Size of a file that may be written."""
 MOST_PRIMS = 2**20
 """Prims that are visited, instances as often as they occur."""
-MOST_SHAPES = 50_000
-"""Meshes with instances; the scene reader accepts 100,000 elements with their transforms."""
+MOST_SHAPES = 10_000
+"""Meshes and instances; Mitsuba's parser takes 20 s for as many, and four times as long for twice as many."""
 _DEEPEST = 200  # prims inside one another, with those of instancers
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "RenderSettings",
@@ -42,7 +42,8 @@ _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "R
 class Shape:
     """A mesh, or faces of it, with a material: what instances share.
 
-    ``key`` is the path of its prim, of the first subset's index, the material and whether it is mirrored.
+    ``key`` has the path of its prim, the number of the part, the path of its material, and whether its
+    transform mirrors.
     """
 
     key: tuple[str, int, str, bool]
@@ -93,7 +94,8 @@ def convert(file: str, xml: str, camera: str = "", time: float | None = None) ->
     Returns
     -------
     dict
-        ``notes``: what is not used; ``sources``: absolute paths of the layers and textures.
+        ``notes``: what is not used; ``sources``: absolute paths of the layers and textures; ``stage``: its
+        ``upAxis`` and ``metersPerUnit``, and the paths of its ``domes``.
 
     Raises
     ------
@@ -114,17 +116,17 @@ def convert(file: str, xml: str, camera: str = "", time: float | None = None) ->
 
     # ---- What is in it
     add(scene.root, "integrator", "path")
-    found = _Walk(scene)
-    found.visit(stage.GetPseudoRoot(), np.eye(4), UsdGeom.Tokens.default_, 0)
-    for prim, matrix in cameras.choose(file, found.cameras, camera):
+    walk = _Walk(scene)
+    walk.visit(stage.GetPseudoRoot(), np.eye(4), UsdGeom.Tokens.default_, 0)
+    for prim, matrix in cameras.choose(file, walk.cameras, camera):
         cameras.add_camera(scene, prim, matrix)
-    if not found.shapes:
+    if not walk.shapes:
         raise InputError(f"{file}: no surface to light: no visible mesh of purpose default or render")
-    for prim, matrix in found.lights:
+    for prim, matrix in walk.lights:
         lights.add_light(scene, prim, matrix)
-    if not found.lights:
+    if not walk.lights:
         scene.leave_out("no light in the stage: give a map", "/")
-    _add_shapes(scene, found.shapes)
+    _add_shapes(scene, walk.shapes)
 
     # ---- The file, and what it came from
     ET.indent(scene.root)
@@ -132,7 +134,13 @@ def convert(file: str, xml: str, camera: str = "", time: float | None = None) ->
     layers = [layer.realPath for layer in stage.GetUsedLayers() if layer.realPath]
     layers = [Ar.SplitPackageRelativePathOuter(layer)[0] or layer for layer in layers]
     sources = {*map(os.path.abspath, layers), *scene.textures}
-    return {"notes": scene.notes(), "sources": sorted(sources)}
+    domes = [str(prim.GetPath()) for prim, _ in walk.lights if prim.GetTypeName() in lights.DOMES]
+    about = {
+        "upAxis": str(UsdGeom.GetStageUpAxis(stage)),
+        "metersPerUnit": float(UsdGeom.GetStageMetersPerUnit(stage)),
+        "domes": domes,
+    }
+    return {"notes": scene.notes(), "sources": sorted(sources), "stage": about}
 
 
 class _Walk:
@@ -145,7 +153,6 @@ class _Walk:
         self.shapes: dict[tuple, tuple[Shape, list[np.ndarray]]] = {}
         self._prims = 0
         self._count = 0
-        self._faces: dict[Any, list] = {}
 
     def visit(self, prim: Any, to_world: np.ndarray, purpose: str, depth: int) -> None:
         """Visit a prim and those inside it.

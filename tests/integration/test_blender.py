@@ -1,20 +1,17 @@
 """Blender's scenes by its USD exporter, beside Cycles: directions and strengths of every kind of light.
 
-Blender (PyPI's ``bpy``) runs in an interpreter of its own: ``ENVEDIT_BPY`` names one, by default this one.
+Blender is PyPI's ``bpy``, in an interpreter that ``ENVEDIT_BPY`` names.
 """
 
 import json
-import os
-import subprocess
-import sys
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit import config, inputs
 from envedit.images import images
 from envedit.scene import scene
+from tests.oracles import blender
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_cache")]
 
@@ -95,33 +92,12 @@ for name in names:
 def exported(tmp_path_factory):
     """Return a folder with a USD file and Cycles' picture of every scene."""
     pytest.importorskip("pxr", reason="the extra envedit[usd] is not installed")
-    python = os.environ.get("ENVEDIT_BPY", sys.executable)
-    if subprocess.run([python, "-c", "import bpy"], capture_output=True).returncode:
-        pytest.skip("bpy is not installed: ENVEDIT_BPY names a Python that has it")
     folder = tmp_path_factory.mktemp("blender")
     sky = np.full((128, 256, 3), 0.1, np.float32)
     sky[40, 100] = 8000
     images.write_exr(folder / "sky.exr", sky)
-    script = SCRIPT.replace("SIZE", str(SIZE))
-    asked = json.dumps([str(folder), SCENES])
-    # The variables of this process are not Blender's: it has a Python path of its own.
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
-        [python, "-c", script], input=asked, text=True, capture_output=True, env=environment
-    )
-    assert done.returncode == 0, done.stderr
+    blender.run(SCRIPT.replace("SIZE", str(SIZE)), json.dumps([str(folder), SCENES]))
     return folder
-
-
-def normals(found):
-    """Return the normal in every pixel, (h, w, 3), and whether a surface is seen there."""
-    width, height = SIZE
-    columns, rows = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
-    position = mi.Point2f(columns.ravel().astype(np.float32), rows.ravel().astype(np.float32))
-    ray, _ = found.mi.sensors()[0].sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
-    seen = found.mi.ray_intersect(ray)
-    normal = np.array(mi.Vector3f(seen.sh_frame.n)).T.reshape(height, width, 3)
-    return normal, np.array(seen.is_valid()).reshape(height, width)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -130,20 +106,7 @@ def test_light_has_the_direction_and_strength_that_cycles_gives_it(name, exporte
     settings = config.Input(envmap="auto", width=256)
     black = np.zeros((4, 8, 3), np.float32)
     ours = found.render(inputs.read_map(settings, found).radiance if name == "dome" else black, 256)
-    cycles = np.array(mi.Bitmap(str(exported / f"{name}.exr")).convert(mi.Bitmap.PixelFormat.RGB))
-    normal, seen = normals(found)
-    inside = seen & np.all([np.roll(seen, step, axis) for axis in (0, 1) for step in (1, -1)], axis=0)
-    pictures = [picture.mean(axis=2) for picture in (ours, cycles)]
-
-    # ---- The light as radiance = normal . light + constant, where it shines
-    bright = inside & np.all([picture > 0.3 * picture.max() for picture in pictures], axis=0)
-    assert bright.sum() > 200
-    basis = np.concatenate([normal[bright], np.ones((bright.sum(), 1))], axis=1)
-    lights = [np.linalg.lstsq(basis, picture[bright], rcond=None)[0][:3] for picture in pictures]
-    strength = np.prod([np.linalg.norm(light) for light in lights])
-    angle = np.degrees(np.arccos(np.clip(lights[0] @ lights[1] / strength, -1, 1)))
-
-    stops = np.log2(pictures[0][inside].mean() / pictures[1][inside].mean())
+    angle, stops = blender.difference(found, SIZE, ours, blender.read(exported / f"{name}.exr"))
     print(f"{name}: {angle:.2f} degrees, {stops:+.3f} stops")
     # Blender 5.0.1 writes a quarter of the strength of a sun.
     assert angle < 1 and abs(stops - (-2 if name == "SUN" else 0)) < 0.1

@@ -1,0 +1,1 @@
+"""Extensions of other programs: they start envedit, import nothing of it, and are not installed with it."""

@@ -52,9 +52,10 @@ def _compare(arguments: argparse.Namespace, console: Console) -> None:
         console.warn(f"{arguments.second}: resampled from {second.size[0]} to {first.size[0]} texels across")
     identical = bool(np.array_equal(first.radiance, other))
     lights = compared.lights(first.radiance, other)
-    small = compared.reduced(first.radiance), compared.reduced(other)
-    measured = compared.pictures(*small) | {"identical": identical, "lights": lights}
-    difference, scale = preview.difference_image(small[1], small[0], "stops")
+    reference = compared.reduced(first.radiance)
+    small = compared.reduced(other)
+    measured = compared.pictures(reference, small) | {"identical": identical, "lights": lights}
+    difference, scale = preview.difference_image(small, reference, "stops")
     measured |= {"first": arguments.first, "second": arguments.second, "difference_stops": scale}
 
     # ---- The files

@@ -75,16 +75,7 @@ for name in names:
             lamp.data.spot_blend = 0
             lamp.data.spot_size = math.radians(60)
         aim(lamp, (0, 0, 0))
-    scene.render.engine = "CYCLES"
-    scene.cycles.samples = 256
-    scene.cycles.sample_clamp_indirect = 0
-    scene.cycles.use_denoising = False
-    scene.render.threads_mode = "FIXED"
-    scene.render.threads = 2
-    scene.render.resolution_x, scene.render.resolution_y = SIZE
-    scene.view_settings.view_transform = "Standard"
-    scene.render.image_settings.file_format = "OPEN_EXR"
-    scene.render.image_settings.color_depth = "32"
+    use_cycles(scene, SIZE)
     scene.render.filepath = f"{folder}/{name}.exr"
     bpy.ops.wm.usd_export(filepath=f"{folder}/{name}.usdc", generate_materialx_network=True)
     bpy.ops.render.render(write_still=True)
@@ -205,18 +196,9 @@ for name in names:
     bpy.ops.object.camera_add(location=eye)
     scene.camera = bpy.context.object
     scene.camera.rotation_euler = (Vector(target) - Vector(eye)).to_track_quat("-Z", "Y").to_euler()
-    scene.render.engine = "CYCLES"
-    scene.cycles.samples = 256
-    scene.cycles.sample_clamp_indirect = 0
+    use_cycles(scene, SIZE)
     scene.cycles.blur_glossy = 0
     scene.cycles.max_bounces = scene.cycles.diffuse_bounces = 64
-    scene.cycles.use_denoising = False
-    scene.render.threads_mode = "FIXED"
-    scene.render.threads = 2
-    scene.render.resolution_x, scene.render.resolution_y = SIZE
-    scene.view_settings.view_transform = "Standard"
-    scene.render.image_settings.file_format = "OPEN_EXR"
-    scene.render.image_settings.color_depth = "32"
     scene.render.filepath = f"{folder}/{name}.exr"
     bpy.ops.wm.usd_export(filepath=f"{folder}/{name}.usdc", generate_materialx_network=True)
     bpy.ops.render.render(write_still=True)

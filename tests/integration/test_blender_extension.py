@@ -79,16 +79,7 @@ bpy.ops.object.camera_add(location=(5, 5, 5))
 bpy.ops.object.camera_add(location=(1, -4, 1.5))
 here.camera = bpy.context.object
 here.camera.rotation_euler = (-here.camera.location).to_track_quat("-Z", "Y").to_euler()
-here.render.engine = "CYCLES"
-here.cycles.samples = 256
-here.cycles.sample_clamp_indirect = 0
-here.cycles.use_denoising = False
-here.render.threads_mode = "FIXED"
-here.render.threads = 2
-here.render.resolution_x, here.render.resolution_y = SIZE
-here.view_settings.view_transform = "Standard"
-here.render.image_settings.file_format = "OPEN_EXR"
-here.render.image_settings.color_depth = "32"
+use_cycles(here, SIZE)
 
 
 def error(operator):

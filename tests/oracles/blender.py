@@ -8,6 +8,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+CYCLES = '''
+def use_cycles(scene, size):
+    """Render by Cycles, without what changes radiance, as linear OpenEXR."""
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 256
+    scene.cycles.sample_clamp_indirect = 0
+    scene.cycles.use_denoising = False
+    scene.render.threads_mode = "FIXED"
+    scene.render.threads = 2
+    scene.render.resolution_x, scene.render.resolution_y = size
+    scene.view_settings.view_transform = "Standard"
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_depth = "32"
+'''
+"""What every script has: settings of Cycles."""
+
 
 def run(script, text=""):
     """Run a script with ``bpy`` in an interpreter of its own, and return what it printed.
@@ -19,7 +35,9 @@ def run(script, text=""):
         pytest.skip("bpy is not installed: ENVEDIT_BPY names a Python that has it")
     # The variables of this process are not Blender's: it has a Python path of its own.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run([python, "-c", script], input=text, text=True, capture_output=True, env=environment)
+    done = subprocess.run(
+        [python, "-c", CYCLES + script], input=text, text=True, capture_output=True, env=environment
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

@@ -129,16 +129,20 @@ def test_what_paint_cannot_solve_is_refused(tmp_path):
         project.opened(str(file))
 
 
-def test_memory_is_given_back_when_nothing_is_left_to_do(monkeypatch):
+def test_memory_is_given_back_at_rest_and_now_and_then(monkeypatch):
     given, resting = [], session.Session.__new__(session.Session)
     monkeypatch.setattr(session, "give_back_memory", lambda: given.append(resting.phase))
     states = (True, False, "done"), (False, True, "dragging")
     for resting.resting, resting._dragged, resting.phase in states:
         assert not resting.advance()
+    assert given == ["done"], "while a light is dragged the next frame needs the buffers"
     resting._worked = lambda: True
     resting._dragged = False
-    assert resting.advance()
-    assert given == ["done"], "while a light is dragged the next frame needs the buffers"
+    for due, phase, times in ((np.inf, "done", 1), (0.0, "drawing", 1), (0.0, "done", 2), (None, "done", 2)):
+        resting.phase = phase
+        resting._memory_due = resting._memory_due if due is None else due
+        assert resting.advance()
+        assert len(given) == times
 
 
 @on_cpu

@@ -8,7 +8,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from envedit.config.validators import Check, Integer, Number, Numbers, Schema, WantedError, meant, named, show
+from envedit.config.validators import (
+    Boolean,
+    Check,
+    Integer,
+    Number,
+    Numbers,
+    Schema,
+    String,
+    WantedError,
+    meant,
+    named,
+    show,
+)
 from envedit.core.errors import ConfigError
 
 MOST_PLACED = 64
@@ -16,9 +28,16 @@ MOST_PLACED = 64
 _BRIGHTEST = 1e6
 _FLUX = Numbers(*3 * [Number(0, _BRIGHTEST)])
 _PLACE: dict[str, Check] = {"azimuth": Number(-360, 720), "elevation": Number(-90, 90)}
-OWN: dict[str, Check] = {"light": Integer(1, 8), **_PLACE, "flux": _FLUX, "size": Number(0.01, 20)}
+_LISTED: dict[str, Check] = {"name": String(), "muted": Boolean(), "locked": Boolean()}
+OWN: dict[str, Check] = {
+    "light": Integer(1, 8),
+    **_PLACE,
+    "flux": _FLUX,
+    "size": Number(0.01, 20),
+    **_LISTED,
+}
 """Of a light of the map: its number, those with most flux first; where it goes; factors on flux and size."""
-ADDED: dict[str, Check] = {**_PLACE, "flux": _FLUX, "size": Number(0.01, 90)}
+ADDED: dict[str, Check] = {**_PLACE, "flux": _FLUX, "size": Number(0.01, 90), **_LISTED}
 """Of a light that is added: where; its flux, radiance times steradian; its radius in degrees."""
 MEANINGS = {
     "light": "number of a light of the map, those with most flux first; without it a light is added",
@@ -26,6 +45,9 @@ MEANINGS = {
     "elevation": "likewise, degrees above the horizon",
     "flux": "of the map's light: factors on its; of an added one: radiance times steradian; needed",
     "size": "of the map's light: factor on its size, to 20; of an added one: radius in degrees",
+    "name": "what it is called in the page of `envedit paint`",
+    "muted": "whether it is switched off",
+    "locked": "whether an edit of layers leaves it, with its glow, as it is here",
 }
 """What each key is, for the reference."""
 SIZE = 0.5

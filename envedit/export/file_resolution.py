@@ -11,7 +11,7 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.rows import Rows
 from envedit.export import adjustments, full_resolution
-from envedit.representations import Representation
+from envedit.representations import Layers, Representation
 from envedit.representations.layers import placed_lights
 
 if TYPE_CHECKING:
@@ -51,9 +51,18 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
     source = latlong.rotate(full.radiance, found.turn_degrees)
     rows = inputs.active_rows(settings.input.rows, before.shape[0])
     edited = found.edited
+    others = placed_lights.without_locked(settings.input.lights)
+    locked = None
+    if others is not None and isinstance(found.representation, Layers):
+        locked = np.clip(
+            source - _by_hand(replace(settings.input, lights=others), result.given).radiance, 0, source
+        )
+        source = source - locked
     carried = full_resolution.carry(
         found.representation, found.params, before, edited, source, rows, found.free
     )
+    if locked is not None:
+        carried += locked
     return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)
 
 

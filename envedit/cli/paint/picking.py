@@ -12,7 +12,7 @@ from envedit.cli.paint.protocol import Document, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
-from envedit.representations.layers.placed_lights import PlacedLights, angles, direction
+from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
 from envedit.scene import highlight, shadow
 from envedit.scene.scene import Scene
 from envedit.transport.light_transport import LightTransport
@@ -39,9 +39,9 @@ def lights(placed: PlacedLights, document: Document) -> list[Placed]:
     for i, light in enumerate(placed.lights):
         entry = entries.get(i + 1, {"flux": (1.0, 1.0, 1.0)})
         where = (entry["azimuth"], entry["elevation"]) if "azimuth" in entry else angles(light.direction)
-        found.append((where, placed.layers.lights.flux[i] * np.float64(entry["flux"])))
+        found.append((where, placed.layers.lights.flux[i] * flux_of(entry)))
     added = [light for light in document.lights if "light" not in light]
-    found += [((light["azimuth"], light["elevation"]), np.float64(light["flux"])) for light in added]
+    found += [((light["azimuth"], light["elevation"]), flux_of(light)) for light in added]
     turned = document.rotate_degrees
     return [Placed(direction(azimuth - turned, elevation), flux) for (azimuth, elevation), flux in found]
 

@@ -65,6 +65,12 @@ class Document:
     rest: str = Target.rest
     freedom: float = Solve.freedom
 
+    @property
+    def placing(self) -> tuple:
+        """What decides where the lights of the map are before paint: not their names."""
+        lights = [{key: value for key, value in light.items() if key != "name"} for light in self.lights]
+        return lights, self.rotate_degrees
+
     def plain(self) -> dict:
         """Return it as JSON has it."""
         return {name: getattr(self, name) for name in _CHECKS}

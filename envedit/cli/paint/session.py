@@ -174,7 +174,7 @@ class Session:
         """
         began = time.perf_counter()
         before, self.document = self.document, edit.document
-        moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
+        moved = before.placing != edit.document.placing
         # What is feasible under any map does not depend on how far this one may go.
         reach = self.reach if replace(before, freedom=edit.document.freedom) == edit.document else None
         self.phase, self._rendered, self.resting = edit.phase, None, False
@@ -212,7 +212,10 @@ class Session:
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon)
+        locked = self.placed.locked(document.lights)
+        if locked is not None:
+            locked = latlong.rotate(locked, document.rotate_degrees)[self.rows.slice]
+        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon, fixed=locked)
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)

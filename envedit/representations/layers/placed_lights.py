@@ -61,7 +61,7 @@ class PlacedLights:
             i = light.get("light", 0) - 1
             if not 0 <= i < len(self.lights):
                 continue
-            flux = np.maximum(np.float64(light["flux"]), 1e-30)
+            flux = np.maximum(flux_of(light), 1e-30)
             values["flux"][i] = np.maximum(np.log(flux), DARK) / scales["flux"]
             values["size"][i] = np.log(light["size"]) / scales["size"]
             if "azimuth" in light:
@@ -86,6 +86,23 @@ class PlacedLights:
         envmap = add(envmap, [light for light in placed if "light" not in light])
         require_radiance(envmap, "input.lights", brightest=BRIGHTEST)
         return envmap
+
+    def locked(self, placed: Sequence[dict]) -> np.ndarray | None:
+        """Return what locked lights add to the placed map, (H, W, 3) float32; None where none is locked."""
+        others = without_locked(placed)
+        return None if others is None else np.maximum(self.place(placed) - self.place(others), 0)
+
+
+def flux_of(light: dict) -> np.ndarray:
+    """Return the flux of an entry (3,), 0 of a muted one; in its units."""
+    return np.zeros(3) if light.get("muted") else np.float64(light["flux"])
+
+
+def without_locked(placed: Sequence[dict]) -> list[dict] | None:
+    """Return the entries with locked lights muted; None where none is locked."""
+    if not any(light.get("locked") for light in placed):
+        return None
+    return [light | {"muted": True} if light.get("locked") else light for light in placed]
 
 
 def missing(placed: Sequence[dict], count: int) -> list[int]:
@@ -112,7 +129,7 @@ def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
         lobe = np.where(angle < 5 * size, np.exp(-0.5 * (angle / size) ** 2), 0.0)
         total = float((lobe * omega).sum())
         if total > 0:
-            radiance += (lobe / total)[..., None] * np.float64(light["flux"])
+            radiance += (lobe / total)[..., None] * flux_of(light)
     with np.errstate(over="ignore"):
         return radiance.astype(np.float32)
 

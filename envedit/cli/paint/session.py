@@ -331,7 +331,7 @@ class Session:
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
         more = not self._dragged and not self.resting and self._worked()
-        if self.phase == "done" and not (more and time.monotonic() < self._memory_due):
+        if (not more and self.phase == "done") or time.monotonic() > self._memory_due:
             give_back_memory()
             self._memory_due = time.monotonic() + MEMORY_EVERY_S
         return more

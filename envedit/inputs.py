@@ -130,11 +130,12 @@ class InputMap:
         colours = self._in_rec709
         return float((colours < -_ROUNDING * np.abs(colours).max(axis=2, keepdims=True)).any(axis=2).mean())
 
-    def at_file_size(self, settings: config.Input) -> InputMap:
-        """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
+    def at_file_size(self, settings: config.Input, widest: int | None = None) -> InputMap:
+        """Read the map anew, as wide as its file is or ``widest``; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
-        return read_file(self.source if self.array is None else self.array, None, settings, self.scale)
+        width = None if widest is None else min(widest, self.size[0])
+        return read_file(self.source if self.array is None else self.array, width, settings, self.scale)
 
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.

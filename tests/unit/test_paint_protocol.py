@@ -30,8 +30,8 @@ def message(**more):
     [
         ("", "expected JSON"),
         ("[" * 5000, "expected JSON"),
-        ("[]", "expected document, pick, choose, open or save"),
-        ('{"type": "run"}', "expected document, pick, choose, open or save"),
+        ("[]", "expected document, pick, choose, open, sky or save"),
+        ('{"type": "run"}', "expected document, pick, choose, open, sky or save"),
         (b"\x00\x01", "expected JSON text"),
         (" " * (protocol.MOST_BYTES + 1), "at most"),
         (message(document=3), "expected keys among"),

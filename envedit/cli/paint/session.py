@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,7 +35,7 @@ from envedit.core.color import luminance, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
-from envedit.export import adjustments
+from envedit.export import adjustments, file_resolution
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
@@ -59,6 +60,8 @@ PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
 MEMORY_EVERY_S = 10.0
 """Seconds of work after which freed buffers are given back: that takes 0.1 s, 1 % of the time."""
+SKY_WIDTH = 2048
+"""Most texels across of the map that is shown large: more than most displays have."""
 NOT_WHITE = 0.95
 """Share of the pixels of the rendering that the page does not show white when it is opened."""
 
@@ -140,6 +143,7 @@ class Session:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
             self._quick = renderers.trace(fewer, self.scene, self.map.shape[:2], self._progress)
         self._sharp: Scene | None = None
+        self._wide: inputs.InputMap | None = None  # the map as it is shown large
         self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
@@ -331,10 +335,14 @@ class Session:
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
         more = not self._dragged and not self.resting and self._worked()
-        if (not more and self.phase == "done") or time.monotonic() > self._memory_due:
+        self._give_back_memory(resting=not more and self.phase == "done")
+        return more
+
+    def _give_back_memory(self, resting=False):
+        """Give freed buffers back when nothing is left to do, and when that is due."""
+        if resting or time.monotonic() > self._memory_due:
             give_back_memory()
             self._memory_due = time.monotonic() + MEMORY_EVERY_S
-        return more
 
     def _worked(self):
         """Do a piece of work; False where there is none left."""
@@ -446,6 +454,7 @@ class Session:
         self.tell_state()
 
     def _unless_newer(self, *_):
+        self._give_back_memory()
         if self.newer():
             raise SupersededError
 
@@ -548,6 +557,23 @@ class Session:
             target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
             self.tell.frame("difference", source, target - solution, self.scene.rows)
 
+    def sky(self) -> None:
+        """Show the map large, as it is edited and as it was given, at the resolution of its file."""
+        if self._dragged:
+            return
+        document, settings = self.document, self.project.settings.input
+        self._tell_doing("composing the map at the resolution of its file")
+        if self._wide is None:
+            self._wide = self.given.at_file_size(settings, SKY_WIDTH)
+        by_hand = replace(settings, lights=document.lights, rotate_degrees=document.rotate_degrees)
+        given = replace(self.given, placed=self.placed if document.lights else None)
+        params = self.problem.found(self.run.state)
+        edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
+        _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)
+        self.tell.frame("sky-before", "transport", self._wide.radiance)
+        self.tell.frame("sky", "transport", self._adjusted(carried))
+        self.tell_state()
+
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
         self.resting, self._shown = False, None
@@ -562,10 +588,21 @@ class Session:
     def _tell_lights(self):
         """Say which lights the map has, and where the solution has put them."""
         own = []
+        height, width = self.map.shape[:2]
+        omega = latlong.lookup_solid_angles(height, width)
         for i, light in enumerate(self.placed.lights):
             azimuth, elevation = angles(light.direction)
             flux = self.placed.layers.lights.flux[i].tolist()
-            own.append({"light": i + 1, "azimuth": azimuth, "elevation": elevation, "flux": flux})
+            radius = math.degrees(math.sqrt(omega[light.texels // width].sum() / math.pi))
+            own.append(
+                {
+                    "light": i + 1,
+                    "azimuth": azimuth,
+                    "elevation": elevation,
+                    "flux": flux,
+                    "radius": radius,
+                }
+            )
         found, layers = [], self.problem.layers
         for i in self.problem.shining(self.run.state):
             azimuth, elevation = angles(self.problem.direction(self.run.state, i))

@@ -1,10 +1,13 @@
 // The page: what is sent when, and what is shown where.
 
+import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { accelerated, Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
+import { LightList } from "./light_list.js";
 import { Lights, linear } from "./lights.js";
 import { Strokes } from "./strokes.js";
+import { Zoom } from "./zoom.js";
 
 const $ = (id) => document.getElementById(id);
 const canvas = new URLSearchParams(location.search).get("canvas"); // "2d" or "webgl2": as it is asked for
@@ -24,14 +27,21 @@ const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // la
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [], explanation: [] }; // the last of each view
 
 let view = 0, views = [], outlined = false;
+let thumbDue = false; // the picture of the present step is taken when it is drawn next
 let client = "", painting = 0, sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
 
 const history = new History((phase, document) => {
   send(document ?? history.document, phase);
-  if (phase === "done") refresh();
+  if (phase !== "done") return;
+  lights.solo = -1;
+  refresh();
 });
+
+const compare = new Compare(frames, displays, history, plain, { view: () => view, send: (message) => connection.send(message) });
+const zooms = [new Zoom($("render").parentElement, redraw, () => strokes.cancel()), new Zoom($("map-stack"), redraw)];
+function redraw() { displays.render.draw(); displays.map.draw(); strokes.draw(); }
 
 function send(document, phase) {
   waiting = { document, phase };
@@ -62,15 +72,16 @@ function note(entry) {
 const connection = new Connection({
   lost() { state("error", "The server cannot be reached; trying again"); },
   frame(frame) {
-    frames[frame.kind][frame.view] = frame;
+    if (frames[frame.kind]) frames[frame.kind][frame.view] = frame;
     if (frame.kind === "explanation") explanations[frame.view]?.show(frame);
+    else if (frame.kind.startsWith("sky")) compare.sky(frame);
     else if (frame.view === view || frame.kind === "map") show(frame);
   },
   message(message) { RECEIVED[message.type]?.(message); },
 });
 
 function show(frame) {
-  if (frame.kind === "before") { displays.render.compare(frame); return; }
+  if (frame.kind === "before") { compare.show(); return; }
   if (frame.kind === "render") {
     $("render-stack").parentElement.style.setProperty("--aspect", frame.width / frame.height);
     $("badge").textContent = NAMES[frame.source];
@@ -135,6 +146,7 @@ function chooseView(i) {
 }
 
 displays.render.drawn = (frame) => {
+  if (thumbDue) { thumbDue = false; compare.take(); }
   $("status").dataset.frame = frame.number;
   $("status").dataset.source = frame.source;
   note({ frame: frame.number, source: frame.source });
@@ -165,9 +177,11 @@ const RECEIVED = {
     if (!opened || painting !== message.painting) {
       $("exposure").value = message.exposure;
       look({ stops: message.exposure });
+      compare.forget();
     }
     $("rest").disabled = message.hold !== "auto";
     $("rest").title = $("rest").disabled ? `[target] hold = ${message.hold} is given` : "";
+    listed.white = message.white;
     opened = true;
     painting = message.painting;
     if (mine) flush();
@@ -182,6 +196,11 @@ const RECEIVED = {
     $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
     advise(message.advice ?? null);
+    if (message.state === "rendering" || message.state === "done") {
+      thumbDue = true;
+      displays.render.draw();
+    }
+    if (message.state === "done") compare.again();
     if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps, residual: message.residual });
     state(message.state, message.text ?? told(message));
   },
@@ -209,10 +228,9 @@ function told(message) {
     parts.push(`${percent(message.reached)} of the paint reached${feasible}`);
   }
   parts.push(WORDS[message.state]);
-  if (message.iterations) parts.push(`${message.iterations} iterations`);
-  if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
-  if (message.hold) parts.push(`target.hold = ${+message.hold.toPrecision(3)}`);
   if (message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
+  $("technical").textContent = `${message.iterations} iterations · ${Math.round(message.ms ?? 0)} ms`
+    + (message.hold ? ` · target.hold = ${+message.hold.toPrecision(3)}` : "");
   return parts.join(" · ");
 }
 
@@ -335,7 +353,10 @@ const lights = new Lights($("map-stack"), $("handles"), {
   document: () => history.document,
   preview: (change) => history.preview(change, "dragging"),
   done: (change) => history.push(change),
+  back: () => send(history.document, "done"),
+  drawn: (all) => listed.draw(all),
 });
+const listed = new LightList($("light-list"), lights);
 
 // ---- controls
 
@@ -357,6 +378,7 @@ function refresh() {
   lights.draft = null;
   lights.draw();
   strokes.draw();
+  compare.draw();
 }
 
 function choose(name, value) {
@@ -429,7 +451,7 @@ function outline() {
 
 function look(changed) {
   $("exposure-value").textContent = $("exposure").value;
-  for (const one of [displays.render, displays.map, ...explanations]) one.set(changed);
+  for (const one of [displays.render, displays.map, displays.sky, ...explanations]) one.set(changed);
 }
 
 function save() {
@@ -439,7 +461,7 @@ function save() {
 }
 
 window.addEventListener("keydown", (event) => {
-  if (!opened || event.target.matches("input, select") || $("keys").open) return;
+  if (!opened || event.target.matches("input, select") || $("keys").open || $("sky-dialog").open) return;
   const key = event.key.toLowerCase();
   if (event.ctrlKey || event.metaKey) {
     if (key === "z" && !event.shiftKey) history.undo();
@@ -448,6 +470,11 @@ window.addEventListener("keydown", (event) => {
     else return;
   } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
   else if (key === "o" && !event.repeat) outline();
+  else if (key === "m") compare.large();
+  else if (key === "a") compare.keep();
+  else if (key === "h") compare.toggle();
+  else if (key === "+" || key === "-") zooms[0].by(key === "+" ? 1.2 : 1 / 1.2);
+  else if (key === "0") for (const zoom of zooms) zoom.reset();
   else if (key === "[" || key === "]") {
     $("size")[key === "[" ? "stepDown" : "stepUp"]();
     valued($("size"));
@@ -460,6 +487,7 @@ window.addEventListener("keydown", (event) => {
 window.addEventListener("keyup", (event) => {
   if (event.key.toLowerCase() === "b") displays.render.set({ split: Number($("split").value) });
 });
+$("details").addEventListener("toggle", () => { displays.difference.draw(); displays.unreachable.draw(); });
 window.addEventListener("resize", () => { for (const one of Object.values(displays)) one.draw(); strokes.draw(); });
 
 // ---- start page

@@ -131,7 +131,7 @@ class InputMap:
         return float((colours < -_ROUNDING * np.abs(colours).max(axis=2, keepdims=True)).any(axis=2).mean())
 
     def at_file_size(self, settings: config.Input, widest: int | None = None) -> InputMap:
-        """Read the map anew, as wide as its file is or ``widest``; errors as of :func:`.images.load_envmap`."""
+        """Read the map anew, as wide as its file or ``widest``; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
         width = None if widest is None else min(widest, self.size[0])

@@ -217,9 +217,11 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         until(lambda: "rest" not in kept.read_text())
         assert page.page.get_by_test_id("rest").input_value() == "follow"
         # ---- What is done where little is reached
-        advice = {"text": "", "light": 0, "azimuth": 200, "elevation": 30, "factor": 0.5, "reaches": 0.8}
+        light = {"light": 1, "flux": [0.5] * 3, "size": 1.0, "azimuth": 200, "elevation": 30}
+        action = {"label": "Drag light 1 there", "change": {"lights": [light], "strokes": []}}
+        advice = {"text": "", "actions": [action]}
         # In one go: the session's own advice may come at any time.
-        button = "document.querySelector('[data-testid=advice-do]')"
+        button = "document.querySelector('[data-testid=advice-0]')"
         page.page.evaluate(f"(advice) => {{ envedit.advise(advice); {button}.click(); }}", advice)
         until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
         assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]

@@ -26,10 +26,11 @@ SAME_LIGHT = np.cos(np.radians(10.0))
 
 @dataclass(frozen=True)
 class Placed:
-    """A light as a document has it: direction (3,) in the turned map, and flux (3,)."""
+    """A light as a document has it: direction (3,) in the turned map, flux (3,), and its entry."""
 
     direction: np.ndarray
     flux: np.ndarray
+    entry: dict[str, Any]
 
 
 def lights(placed: PlacedLights, document: Document) -> list[Placed]:
@@ -37,13 +38,16 @@ def lights(placed: PlacedLights, document: Document) -> list[Placed]:
     entries = {light["light"]: light for light in document.lights if "light" in light}
     found = []
     for i, light in enumerate(placed.lights):
-        entry = entries.get(i + 1, {"flux": (1.0, 1.0, 1.0)})
+        entry = entries.get(i + 1, {"light": i + 1, "flux": (1.0, 1.0, 1.0), "size": 1.0})
         where = (entry["azimuth"], entry["elevation"]) if "azimuth" in entry else angles(light.direction)
-        found.append((where, placed.layers.lights.flux[i] * flux_of(entry)))
+        found.append((where, placed.layers.lights.flux[i] * flux_of(entry), entry))
     added = [light for light in document.lights if "light" not in light]
-    found += [((light["azimuth"], light["elevation"]), flux_of(light)) for light in added]
+    found += [((light["azimuth"], light["elevation"]), flux_of(light), light) for light in added]
     turned = document.rotate_degrees
-    return [Placed(direction(azimuth - turned, elevation), flux) for (azimuth, elevation), flux in found]
+    return [
+        Placed(direction(azimuth - turned, elevation), flux, entry)
+        for (azimuth, elevation), flux, entry in found
+    ]
 
 
 def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:

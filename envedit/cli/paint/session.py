@@ -18,7 +18,7 @@ import gc
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -500,7 +500,10 @@ class Session:
         bare = strokes.Painted(self.base, np.zeros_like(self.coverage))
         tonemap = self._chosen.target.display_tonemap
         alone = [self._on_views(bare, [one], tonemap).coverage for one in document.strokes]
-        text = advice.said(document, painted, self.point.rendering, self.reach, alone)
+        white = self.transport.linear(tensor(np.ones_like(self.map))).numpy()
+        lamps = self.transport.apply(tensor(np.zeros_like(self.map))).numpy()
+        light = advice.Light(white, lamps)
+        text, actions = advice.said(document, painted, self.point.rendering, self.reach, alone, light)
         if text:
             self.advised = False
             self._tell_doing("looking for a better place of the light")
@@ -510,13 +513,11 @@ class Session:
             weight = pixel_weight(self.coverage, self._hidden, paint, first_hold(self._chosen))
             likelihood = Likelihood.of_paint(weight, self.coverage, self.base, self.target)
             self.problem.aimed_at(self.target, likelihood, self.point)
-            better = advice.moved(self.problem, self.still, self.run.state, painted, listed)
+            actions += advice.lights(self.problem, self.still, self.run.state, painted, listed, document)
             there = self.problem.evaluate(self.run.state)  # that has taken its columns
             self.point = self.problem.aimed_at(self.target, held, there)
-            self.advised, self.status["advice"] = True, {"text": text}
-            if better is not None:
-                found = {"light": better.light, "factor": better.factor, "reaches": better.share}
-                self.status["advice"] |= found | picking.place(better.direction, document)
+            self.advised = True
+            self.status["advice"] = {"text": text, "actions": [asdict(action) for action in actions]}
         self.tell_state()
 
     @property

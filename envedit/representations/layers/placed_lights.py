@@ -95,14 +95,14 @@ class PlacedLights:
 
 def flux_of(light: dict) -> np.ndarray:
     """Return the flux of an entry (3,), 0 of a muted one; in its units."""
-    return np.zeros(3) if light.get("muted") else np.float64(light["flux"])
+    return np.zeros(3) if light.get("muted") else np.array(light["flux"], np.float64)
 
 
-def without_locked(placed: Sequence[dict]) -> list[dict] | None:
+def without_locked(placed: Sequence[dict]) -> tuple[dict, ...] | None:
     """Return the entries with locked lights muted; None where none is locked."""
     if not any(light.get("locked") for light in placed):
         return None
-    return [light | {"muted": True} if light.get("locked") else light for light in placed]
+    return tuple(light | {"muted": True} if light.get("locked") else light for light in placed)
 
 
 def missing(placed: Sequence[dict], count: int) -> list[int]:

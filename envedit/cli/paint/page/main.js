@@ -236,22 +236,20 @@ function told(message) {
 
 function percent(share) { return `${Math.round(100 * share)} %`; }
 
-// What reaches more where little is reached, with a button where another place of a light does.
-let advised = null;
+// Which strokes are missed and why, with a button for each thing that reaches more.
 function advise(advice) {
-  advised = advice;
   $("advice").hidden = !advice;
   $("advice-text").textContent = advice?.text ?? "";
-  $("advice-do").hidden = advice?.light === undefined;
-  if (!$("advice-do").hidden) $("advice-do").textContent = `Drag light ${advice.light + 1} there: ${percent(advice.reaches)}`;
+  $("advice-do").replaceChildren(...(advice?.actions ?? []).map(({ label, change }, i) => {
+    const button = Object.assign(document.createElement("button"), { textContent: label, title: "Ctrl+Z takes it back" });
+    button.dataset.testid = `advice-${i}`;
+    button.addEventListener("click", () => {
+      advise(null);
+      history.push(change);
+    });
+    return button;
+  }));
 }
-$("advice-do").addEventListener("click", () => {
-  const { light, azimuth, elevation, factor } = advised, { entry } = lights.list()[light];
-  advise(null);
-  lights.choose(light);
-  const moved = lights.changed(light, { azimuth, elevation, flux: entry.flux.map((v) => v * factor) });
-  history.push({ lights: moved, strokes: history.document.strokes.filter((one) => one.type === "hold") });
-});
 
 function state(name, text) {
   const status = $("status");

@@ -204,6 +204,7 @@ class Session:
             self.project.keep(self.document)
             self._kept = self.document
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
+        self._give_back_memory()  # edits may come so fast that nothing is done between them
         self.tell_state()
 
     def _tell_document(self, client):

@@ -284,11 +284,18 @@ def states_are_compared(page, kept):
     until(lambda: "muted" in kept.read_text())
     get("step-0").click()
     until(lambda: "lights" not in kept.read_text())
+    get("map-exposure-slide").fill("1.5")
+    get("map-temperature-slide").fill("4000")
+    until(lambda: "exposure = 1.5" in kept.read_text() and "temperature = 4000" in kept.read_text())
+    assert get("map-exposure").input_value() == "1.5"
+    get("map-temperature-slide").fill("6500")
+    until(lambda: "temperature" not in kept.read_text())
 
 
 def map_is_large_and_rendering_zoomed(page):
     """The map beside the original; wheel and keys zoom the rendering."""
     page.settled(False)
+    page.page.locator("#overlay").focus()
     page.page.keyboard.press("m")
     sync_api.expect(page.page.locator("#sky-size")).to_have_text("64 x 32 texels")
     page.page.get_by_test_id("sky-split").fill("0.5")

@@ -229,6 +229,7 @@ export class Lights {
     const { set, name, flux, color, size, mute, remove, fluxValue, sizeValue } = this.panel;
     set.disabled = !light;
     name.textContent = light ? `${light.own ? "Light of the map" : "Added light"} ${this.chosen + 1}` : "No light chosen";
+    if (!light) fluxValue.textContent = sizeValue.textContent = "";
     if (!light) return;
     const most = Math.max(...light.entry.flux), muted = off(light);
     if (most > 0) {

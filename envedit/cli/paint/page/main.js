@@ -370,6 +370,8 @@ function refresh() {
   $("degrees").value = now.rotate_degrees;
   $("map-exposure").value = now.exposure;
   $("map-temperature").value = now.temperature;
+  $("map-exposure-slide").value = now.exposure;
+  $("map-temperature-slide").value = now.temperature || 6500;
   $("rest").value = now.rest ?? "follow";
   $("freedom").value = now.freedom ?? 0;
   valued($("freedom"));
@@ -439,6 +441,13 @@ for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposu
       refresh();
     } else history.push({ [key]: value });
   });
+}
+
+// The sliders of the whole map: 6500 K changes nothing.
+for (const [id, key, nothing] of [["map-exposure", "exposure", 0], ["map-temperature", "temperature", 6500]]) {
+  const slide = $(`${id}-slide`), change = () => ({ [key]: Number(slide.value) === nothing ? 0 : Number(slide.value) });
+  slide.addEventListener("input", () => { $(id).value = change()[key]; history.preview(change(), "drawing"); });
+  slide.addEventListener("change", () => history.push(change()));
 }
 
 function outline() {

@@ -49,12 +49,12 @@ def illuminating(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
         No surface is seen there, it only reflects as a mirror, or no part of the map is seen from it.
     """
     seen, normal, _ = _surface(scene, view, x, y)
-    matte = int(mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy)
-    if not (seen.bsdf().flags().numpy()[0] & matte):
+    scatters = int(mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy)
+    if not seen.bsdf().flags().numpy()[0] & scatters:
         raise NoPlaceError("the surface only mirrors: use Move highlight")
     toward = np.concatenate([[normal], _hemisphere(normal)])
     free = ~_blocked(scene, seen, toward)
-    gain = (toward @ normal) * _share_within(toward, free, CLEARANCE_DEGREES)
+    gain = free * (toward @ normal) * _share_within(toward, free, CLEARANCE_DEGREES)
     if not gain.any():
         raise NoPlaceError("objects stand on all sides: no light of the map reaches the place")
     return scene.to_world.T @ toward[np.argmax(gain)]

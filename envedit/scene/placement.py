@@ -13,8 +13,9 @@ RAYS = 2048
 """Directions that are tried, spread evenly over the hemisphere above a surface: 3 degrees apart."""
 CLEARANCE_DEGREES = 10.0
 """Radius around a direction that should be free of objects, for a light that illuminates."""
-COVER_DEGREES = 4.0
-"""Likewise that objects should fill, for one that is shaded: more than the distance between directions."""
+COVER_DEGREES = 8.0
+"""Likewise that objects should fill, for a shadow: a sun of a texel at 64 texels of width is 6 degrees wide to
+each side. Not measured; an object that is smaller is aimed at in its middle."""
 GRAZING_DEGREES = 10.0
 """Angle of a rim light above the tangent plane of the picked place; at 0 it would light what lies beyond."""
 

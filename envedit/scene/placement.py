@@ -14,8 +14,8 @@ RAYS = 2048
 CLEARANCE_DEGREES = 10.0
 """Radius around a direction that should be free of objects, for a light that illuminates."""
 COVER_DEGREES = 8.0
-"""Likewise that objects should fill, for a shadow: a sun of a texel at 64 texels of width is 6 degrees wide to
-each side. Not measured; an object that is smaller is aimed at in its middle."""
+"""Likewise that objects should fill, for a shadow: a sun of a texel reaches 6 degrees to each side in a map
+64 texels wide. Not measured; an object that is smaller is aimed at in its middle."""
 GRAZING_DEGREES = 10.0
 """Angle of a rim light above the tangent plane of the picked place; at 0 it would light what lies beyond."""
 

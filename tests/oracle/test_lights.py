@@ -536,7 +536,7 @@ PATHS = ["texel borders", "seam", "over the pole", "past the pole", "over the na
 @pytest.mark.parametrize("by", ["radiance", "flux"])
 def test_gradient_along_a_path_adds_up_to_the_change(name, top, by, rng):
     """Many copies of a light, one at every step of the path: a linear loss is the sum of theirs."""
-    light, count = patch(rng, top, 46), 2000
+    light, count = patch(rng, top, 46), 1000
     start, end = over(light, name)
     weight = weights() * (latlong.lookup_solid_angles(H, W)[:, None, None] if by == "flux" else 1)
     at = place(made := Lights([light] * count, (0, H), W), turn=path(start, end, count))

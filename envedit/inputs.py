@@ -79,6 +79,8 @@ class InputMap:
         The whole map, where it came as an array and not from a file.
     unmoved : ndarray (H, W, 3), optional
         The :attr:`radiance` as the file has it, where lights were placed or the map was turned by hand.
+    locked : ndarray (H, W, 3), optional
+        What of :attr:`radiance` is of lights that ``[[input.lights]]`` locks.
     half : bool
         Whether the file is OpenEXR in half.
     unclipped : str
@@ -94,6 +96,7 @@ class InputMap:
     placed: PlacedLights | None = None
     array: np.ndarray | None = None
     unmoved: np.ndarray | None = None
+    locked: np.ndarray | None = None
     half: bool = False
     unclipped: str = ""
 
@@ -127,11 +130,12 @@ class InputMap:
         colours = self._in_rec709
         return float((colours < -_ROUNDING * np.abs(colours).max(axis=2, keepdims=True)).any(axis=2).mean())
 
-    def at_file_size(self, settings: config.Input) -> InputMap:
-        """Read the map anew, as wide as its file is; errors as of :func:`.images.load_envmap`."""
+    def at_file_size(self, settings: config.Input, widest: int | None = None) -> InputMap:
+        """Read the map anew, as wide as its file or ``widest``; errors as of :func:`.images.load_envmap`."""
         if self.source == SUNSKY:
             return self
-        return read_file(self.source if self.array is None else self.array, None, settings, self.scale)
+        width = None if widest is None else min(widest, self.size[0])
+        return read_file(self.source if self.array is None else self.array, width, settings, self.scale)
 
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
@@ -246,11 +250,13 @@ def _by_hand(settings, input_map):
     if not settings.lights and not settings.rotate_degrees:
         return input_map
     stored = input_map.stored
-    placed = None
+    placed = locked = None
     warnings = [*input_map.warnings]
     if settings.lights:
         placed = PlacedLights(input_map.radiance, settings.horizon)
         stored = input_map.as_stored(placed.place(settings.lights))
+        locked = placed.locked(settings.lights)
+        locked = None if locked is None else latlong.rotate(locked, settings.rotate_degrees)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
             lights = f"the map has {count} light{'s' if count != 1 else ''}"
@@ -258,7 +264,8 @@ def _by_hand(settings, input_map):
             numbers = ", ".join(map(str, lacking))
             warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
     turned = latlong.rotate(stored, settings.rotate_degrees)
-    return replace(input_map, stored=turned, warnings=warnings, placed=placed, unmoved=input_map.radiance)
+    unmoved = input_map.radiance
+    return replace(input_map, stored=turned, warnings=warnings, placed=placed, unmoved=unmoved, locked=locked)
 
 
 def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:

@@ -249,6 +249,7 @@ class _Edit:
             self.watch,
             self.dists,
             self.clock,
+            self.map.locked,
         )
         preparation.trace()
         return preparation

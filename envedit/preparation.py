@@ -93,6 +93,8 @@ class Preparation:
         As for :class:`.edit_state.EditState`.
     clock : callable
         ``with clock(name):`` adds up seconds.
+    locked : ndarray (H, W, 3), optional
+        Radiance of lights that layers leave as they are; the sky is then not turned.
     """
 
     settings: config.Config
@@ -103,6 +105,7 @@ class Preparation:
     watch: Watch
     dists: distances.Dists | None
     clock: Callable[[str], AbstractContextManager]
+    locked: np.ndarray | None = None
     renderer: renderers.Renderer | None = None
     _recordings: initialization.Recordings | None = None
 
@@ -175,7 +178,7 @@ class Preparation:
     def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""
         chosen, transport = self.settings.representation.turn, self.renderer.transport
-        if chosen is False or transport is None or not self.rows.all:
+        if chosen is False or transport is None or not self.rows.all or self.locked is not None:
             return None
         if chosen == "auto" and target.coverage is not None:  # most of a painted picture is to stay
             return None
@@ -293,6 +296,7 @@ class Preparation:
             lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
             self.rows.place,
             self._horizon(),
+            None if self.locked is None else self.locked[self.rows.slice],
         )
 
     def _explained(self, job, params, octaves, notes, transport):

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from envedit.config.validators import (
+    Boolean,
     Check,
     Choice,
     Integer,
     Number,
     Numbers,
     Schema,
+    String,
     WantedError,
     meant,
     named,
@@ -27,7 +29,14 @@ MOST_PLACED = 64
 _BRIGHTEST = 1e6
 _FLUX = Numbers(*3 * [Number(0, _BRIGHTEST)])
 _PLACE: dict[str, Check] = {"azimuth": Number(-360, 720), "elevation": Number(-90, 90)}
-OWN: dict[str, Check] = {"light": Integer(1, 8), **_PLACE, "flux": _FLUX, "size": Number(0.01, 20)}
+_LISTED: dict[str, Check] = {"name": String(), "muted": Boolean(), "locked": Boolean()}
+OWN: dict[str, Check] = {
+    "light": Integer(1, 8),
+    **_PLACE,
+    "flux": _FLUX,
+    "size": Number(0.01, 20),
+    **_LISTED,
+}
 """Of a light of the map: its number, those with most flux first; where it goes; factors on flux and size."""
 SHAPES = {"gaussian": 1.0, "disc": 1.0, "rectangle": 1.0, "ring": 1.0, "gradient": 1.0, "strip": 0.1}
 """Shapes of a light that is added, each with its ``aspect`` where none is given."""
@@ -39,6 +48,7 @@ ADDED: dict[str, Check] = {
     "aspect": Number(0.01, 1),
     "rotation": Number(-360, 360),
     "softness": Number(0, 1),
+    **_LISTED,
 }
 """Of a light that is added: where; its flux, radiance times steradian; its radius in degrees; its shape."""
 MEANINGS = {
@@ -53,6 +63,9 @@ MEANINGS = {
     "aspect": "of an added light: its shorter side over its longer one; without it 1, of a strip 0.1",
     "rotation": "likewise: degrees by which its longer side is turned to the left from the horizontal",
     "softness": "likewise, but not of a Gaussian: 0 has a sharp border, 1 fades from the middle",
+    "name": "what it is called in the page of `envedit paint`",
+    "muted": "whether it is switched off",
+    "locked": "whether an edit of layers leaves it, with its glow, as it is here",
 }
 """What each key is, for the reference."""
 SIZE = 0.5

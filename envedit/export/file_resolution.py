@@ -11,7 +11,7 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.rows import Rows
 from envedit.export import adjustments, full_resolution
-from envedit.representations import Representation
+from envedit.representations import Layers, Representation
 from envedit.representations.layers import placed_lights
 
 if TYPE_CHECKING:
@@ -43,30 +43,63 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
     """
     if result.given.size[0] <= settings.input.width:
         return None
-    full, found = _by_hand(settings.input, result.given), result.found
-    adjusted = settings.lights, settings.output, full.scale
+    found, own = result.found, result.given.at_file_size(settings.input)
+    adjusted = settings.lights, settings.output, own.scale
     if found is None:
+        full = _by_hand(settings.input, result.given, own)
         return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
-    before = latlong.rotate(result.maps["initial"], found.turn_degrees)
+    full, made = carried(settings.input, result.given, own, found, result.maps["initial"])
+    return full.as_stored(adjustments.adjust(made, *adjusted)[0], found.turn_degrees)
+
+
+def carried(
+    settings: config.Input, given: inputs.InputMap, own: inputs.InputMap, found: Found, initial: np.ndarray
+) -> tuple[inputs.InputMap, np.ndarray]:
+    """Carry an edit to the map as its file has it.
+
+    Parameters
+    ----------
+    settings : config.Input
+        With the lights that were placed by hand.
+    given, own : InputMap
+        The map at working size, and as the file has it.
+    found : Found
+        The edit.
+    initial : ndarray (h, w, 3)
+        The working map that was edited.
+
+    Returns
+    -------
+    InputMap, ndarray (H, W, 3)
+        The map with its lights placed, and its edit, radiance before adjustments.
+    """
+    full = _by_hand(settings, given, own)
+    before = latlong.rotate(initial, found.turn_degrees)
     source = latlong.rotate(full.radiance, found.turn_degrees)
-    rows = inputs.active_rows(settings.input.rows, before.shape[0])
+    rows = inputs.active_rows(settings.rows, before.shape[0])
+    others = placed_lights.without_locked(settings.lights)
+    locked = None
+    if others is not None and isinstance(found.representation, Layers):
+        dark = _by_hand(replace(settings, lights=others), given, own).radiance
+        locked = np.clip(source - dark, 0, source)
+        source = source - locked
     edited = found.edited
-    carried = full_resolution.carry(
+    made = full_resolution.carry(
         found.representation, found.params, before, edited, source, rows, found.free
     )
-    return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)
+    return full, made if locked is None else made + locked
 
 
-def _by_hand(settings: config.Input, given: inputs.InputMap) -> inputs.InputMap:
-    """Read a map at its file's size, and place and turn its lights as it was done at working size."""
-    full = given.at_file_size(settings)
+def _by_hand(settings: config.Input, given: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
+    """Place and turn the lights of the map as the file has it as it was done at working size."""
+    full = own
     if given.placed is not None:
-        own = given.placed
-        before, rows = own.envmap, Rows.of(len(own.envmap))
+        placed = given.placed
+        before, rows = placed.envmap, Rows.of(len(placed.envmap))
         moved = full.radiance
         if any("light" in light for light in settings.lights):
             moved = full_resolution.carry(
-                own.layers, own.params(settings.lights), before, before, moved, rows
+                placed.layers, placed.params(settings.lights), before, before, moved, rows
             )
         moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
         full = replace(full, stored=full.as_stored(moved))

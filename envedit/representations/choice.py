@@ -52,10 +52,11 @@ def encoded(
     progress: Callable[[int, int, float], None] | None = None,
     rows: tuple[int, int] | None = None,
     horizon: Horizon = "free",
+    fixed: np.ndarray | None = None,
 ) -> tuple[Representation, Params]:
     """Return an image (rows, W, 3) in the representation that a configuration asks for, and its parameters.
 
-    ``horizon`` is of layers alone (:meth:`.Layers.of`); the others are as for :func:`make`.
+    ``horizon`` and ``fixed`` are of layers alone (:meth:`.Layers.of`); the others are as for :func:`make`.
     """
     if settings.representation.kind != "layers":
         fitted = make(settings, folder, progress, rows)
@@ -63,5 +64,6 @@ def encoded(
     cycles = settings.representation.cycles
     # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
     painted = settings.target.kind in ("image", "strokes")
-    layers = Layers.of(image, rows, CYCLES if isinstance(cycles, str) else cycles, horizon, aureoles=painted)
+    cycles = CYCLES if isinstance(cycles, str) else cycles
+    layers = Layers.of(image, rows, cycles, horizon, aureoles=painted, fixed=fixed)
     return layers, layers.start()

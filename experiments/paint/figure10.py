@@ -61,7 +61,7 @@ def prepared(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def opened(work: Path):
-    """Start ``envedit paint`` in a folder of :func:`prepared`; yields its page, once strokes are taken."""
+    """Start ``envedit paint`` in a folder of :func:`prepared`; yields page and process."""
     from playwright.sync_api import sync_playwright
 
     file = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
@@ -82,7 +82,7 @@ def opened(work: Path):
             with browser.new_page(viewport={"width": 1280, "height": 720}) as page:
                 page.goto(line.split()[-1])
                 page.wait_for_function(DRAWN, timeout=300_000)
-                yield page
+                yield page, process
         finally:
             process.send_signal(signal.SIGINT)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -163,7 +163,7 @@ def paint(page, stroke):
 def edit(settings, folder, strokes) -> dict:
     """Paint an edit in the page and save it; returns seconds, the edit's figures and the strokes as saved."""
     work = prepared(folder)
-    with opened(work) as page:
+    with opened(work) as (page, _):
         set_to(page, "exposure", 0)  # amounts of light are of what is shown as white
         began = time.perf_counter()
         for stroke in strokes:
@@ -185,7 +185,7 @@ def edit(settings, folder, strokes) -> dict:
 
 def picture(settings, folder, strokes) -> dict:
     """Paint an edit and take the picture of the page, path traced, with the outlines of its strokes."""
-    with opened(prepared(folder)) as page:
+    with opened(prepared(folder)) as (page, _):
         for stroke in strokes:
             paint(page, stroke)
         page.wait_for_function(FEASIBLE, timeout=300_000)

@@ -11,6 +11,7 @@ import pytest
 from envedit import config, pipeline
 from envedit.core.color import luminance
 from envedit.images import images
+from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, served, until
 
@@ -122,6 +123,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         page.shot("painted")
         assert page.picture("map") != begun, "the map did not follow the stroke"
         assert 'type = "shadow"' in (folder / "painted.toml").read_text(), "the stroke was not kept"
+        page.page.locator("#details summary").click()
         sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_visible()
         page.page.get_by_test_id("undo").click()
         until(lambda: "[[target.strokes]]" not in (folder / "painted.toml").read_text())
@@ -130,8 +132,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_hidden()
         page.page.get_by_test_id("redo").click()
         page.settled()
-        handle = page.page.get_by_test_id("handle-1").bounding_box()
-        x, y = handle["x"] + 13, handle["y"] + 13
+        x, y = page.at("[data-testid=handle-1]", 0.5, 0.5)
         painted = page.picture("map")
         page.drag((x, y), (x - 30, y + 5), (x - 60, y + 5))
         until(lambda: "[[input.lights]]" in (folder / "painted.toml").read_text())
@@ -216,9 +217,11 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         until(lambda: "rest" not in kept.read_text())
         assert page.page.get_by_test_id("rest").input_value() == "follow"
         # ---- What is done where little is reached
-        advice = {"text": "", "light": 0, "azimuth": 200, "elevation": 30, "factor": 0.5, "reaches": 0.8}
+        light = {"light": 1, "flux": [0.5] * 3, "size": 1.0, "azimuth": 200, "elevation": 30}
+        action = {"label": "Drag light 1 there", "change": {"lights": [light], "strokes": []}}
+        advice = {"text": "", "actions": [action]}
         # In one go: the session's own advice may come at any time.
-        button = "document.querySelector('[data-testid=advice-do]')"
+        button = "document.querySelector('[data-testid=advice-0]')"
         page.page.evaluate(f"(advice) => {{ envedit.advise(advice); {button}.click(); }}", advice)
         until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
         assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]
@@ -267,6 +270,99 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path):
         until(lambda: any(one.get("light") == 1 for one in lights()))
         page.settled(False)
         page.shot("placed")
+
+
+def lights_are_listed(page, kept):
+    """The list: name, flux, size, colour, lock, mute; solo is not kept."""
+    get = page.page.get_by_test_id
+
+    def write(name, value):
+        get(name).fill(str(value))
+        page.page.keyboard.press("Enter")
+
+    get("add-light").click()
+    write("list-name-1", "key")
+    write("list-stops-1", -1)
+    write("list-kelvin-2", 3000)
+    write("list-radius-2", 8)
+    get("list-lock-2").click()
+    get("list-mute-1").click()
+    until(lambda: "muted" in kept.read_text())
+    added, key = sorted(config.load(kept).input.lights, key=lambda light: "light" in light)
+    assert (key["name"], key["flux"]) == ("key", pytest.approx([0.5] * 3, rel=1e-3))
+    color = np.divide(added["flux"], luminance(np.array(added["flux"])))
+    assert added["size"] == 8 and added["locked"] and np.allclose(color, gains(3000), rtol=0.02)
+    assert get("list-kelvin-2").input_value() == "3000"
+    write("list-radius-2", -3)  # cannot be: what was there comes back
+    assert get("list-radius-2").input_value() == "8"
+    page.settled(False)
+    get("list-solo-1").click()
+    sync_api.expect(page.status).to_have_attribute("data-state", "moving")
+    get("list-solo-1").click()
+    page.settled()
+    assert "muted" in kept.read_text(), "solo was kept"
+    get("list-choose-2").click()
+    sync_api.expect(get("handle-2")).to_have_attribute("aria-pressed", "true")
+    page.shot("lights")
+
+
+def states_are_compared(page, kept):
+    """A state A beside another; the steps as pictures."""
+    get = page.page.get_by_test_id
+    first = page.picture("render")
+    get("keep-a").click()
+    get("list-mute-1").click()
+    page.settled()
+    assert page.picture("render") != first
+    get("split").fill("1")
+    assert page.picture("render") == first, "A is not what is shown before"
+    get("reference").select_option("0")
+    assert page.picture("render") != first
+    get("split").fill("0")
+    get("past").click()
+    steps = get("steps").locator("button")
+    assert steps.count() == 9 and steps.nth(8).locator("canvas").count() == 1
+    page.shot("steps")
+    get("back-a").click()
+    until(lambda: "muted" in kept.read_text())
+    get("step-0").click()
+    until(lambda: "lights" not in kept.read_text())
+    get("map-exposure-slide").fill("1.5")
+    get("map-temperature-slide").fill("4000")
+    until(lambda: "exposure = 1.5" in kept.read_text() and "temperature = 4000" in kept.read_text())
+    assert get("map-exposure").input_value() == "1.5"
+    get("map-temperature-slide").fill("6500")
+    until(lambda: "temperature" not in kept.read_text())
+
+
+def map_is_large_and_rendering_zoomed(page):
+    """The map beside the original; wheel and keys zoom the rendering."""
+    page.settled(False)
+    page.page.locator("#overlay").focus()
+    page.page.keyboard.press("m")
+    sync_api.expect(page.page.locator("#sky-size")).to_have_text("64 x 32 texels")
+    page.page.get_by_test_id("sky-split").fill("0.5")
+    assert not page.page.evaluate(UNNAMED) and not page.page.evaluate(FAINT)
+    page.shot("large")
+    page.page.get_by_test_id("sky-close").click()
+    rendering = page.page.locator("#overlay")
+    before = rendering.bounding_box()
+    page.page.mouse.move(*page.at("#render-stack", 0.25, 0.25))
+    page.page.mouse.wheel(0, -100)
+    until(lambda: rendering.bounding_box()["width"] > 1.1 * before["width"])
+    page.page.keyboard.press("0")
+    assert rendering.bounding_box() == before
+
+
+def test_lights_listed_states_compared_the_map_large_and_zoom(browser, tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    kept = tmp_path / "edit_out" / "painted.toml"
+    with served(tmp_path / "edit.toml") as server:
+        page = Page(browser, server.url)
+        page.settled(False)
+        lights_are_listed(page, kept)
+        states_are_compared(page, kept)
+        map_is_large_and_rendering_zoomed(page)
         assert not page.faults, page.faults
 
 

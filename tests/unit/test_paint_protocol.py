@@ -30,8 +30,8 @@ def message(**more):
     [
         ("", "expected JSON"),
         ("[" * 5000, "expected JSON"),
-        ("[]", "expected document, pick, choose, open or save"),
-        ('{"type": "run"}', "expected document, pick, choose, open or save"),
+        ("[]", "expected document, pick, choose, open, sky or save"),
+        ('{"type": "run"}', "expected document, pick, choose, open, sky or save"),
         (b"\x00\x01", "expected JSON text"),
         (" " * (protocol.MOST_BYTES + 1), "at most"),
         (message(document=3), "expected keys among"),
@@ -129,16 +129,21 @@ def test_what_paint_cannot_solve_is_refused(tmp_path):
         project.opened(str(file))
 
 
-def test_memory_is_given_back_when_nothing_is_left_to_do(monkeypatch):
+def test_memory_is_given_back_at_rest_and_now_and_then(monkeypatch):
     given, resting = [], session.Session.__new__(session.Session)
     monkeypatch.setattr(session, "give_back_memory", lambda: given.append(resting.phase))
-    states = (True, False, "done"), (False, True, "dragging")
-    for resting.resting, resting._dragged, resting.phase in states:
-        assert not resting.advance()
     resting._worked = lambda: True
-    resting._dragged = False
-    assert resting.advance()
-    assert given == ["done"], "while a light is dragged the next frame needs the buffers"
+    later = np.inf  # what is due
+    for resting.resting, resting._dragged, resting.phase, resting._memory_due, more, times in (
+        (True, False, "done", later, False, 1),
+        (False, True, "dragging", later, False, 1),  # the next frame needs the buffers
+        (False, False, "drawing", later, True, 1),
+        (False, False, "drawing", 0.0, True, 2),
+        (False, True, "dragging", 0.0, False, 3),
+    ):
+        assert resting.advance() == more
+        assert len(given) == times
+    assert resting.advance() is False and len(given) == 3, "given back again at once"
 
 
 @on_cpu

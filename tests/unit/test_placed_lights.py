@@ -203,3 +203,50 @@ def test_the_full_map_has_the_same_lights(tmp_path):
     assert np.abs(np.subtract(sun, shown)).max() <= 1
     # azimuth 300 degrees, turned by 90 to the left: column 210 / 360 of the width
     assert abs(shown[1] - 210 / 360 * 64) < 2
+
+
+def test_a_muted_light_is_off_and_keeps_its_flux(sky):
+    placed = PlacedLights(sky)
+    added = {"azimuth": 30.0, "elevation": 20.0, "flux": [1.0] * 3, "size": 6.0}
+    off = placed.place([{"light": 1, "flux": [2.0] * 3, "size": 1.0, "muted": True}, added | {"muted": True}])
+    assert np.array_equal(off, placed.place([{"light": 1, "flux": [0.0] * 3, "size": 1.0}]))
+
+
+@on_cpu
+@pytest.mark.slow
+def test_a_locked_light_is_left_by_the_edit_at_both_resolutions(tmp_path):
+    """Under a target that asks for half the light, all but the locked sun gets darker."""
+    wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
+    images.write_exr(tmp_path / "sky.exr", wide, {})
+    text = """
+    [input]
+    envmap = "sky.exr"
+    width = 64
+    rotate_degrees = 90
+    [[input.lights]]
+    light = 1
+    name = "key"
+    locked = true
+    [scene]
+    width = 8
+    [target]
+    kind = "strokes"
+    [[target.strokes]]
+    type = "shadow"
+    rectangle = [0.0, 0.0, 1.0, 1.0]
+    amount = 0.5
+    [renderer]
+    spp = 4
+    max_depth = 2
+    [optimizer]
+    iterations = 3
+    [output]
+    spp = 4
+    """
+    settings = config.loads(text, tmp_path)
+    result = pipeline.run(settings)
+    full = file_resolution.at_full_resolution(settings, result)
+    for edited, before in ((result.envmap, result.maps["initial"]), (full, latlong.rotate(wide, 90))):
+        sun = before.mean(axis=2) > 0.5 * before.mean(axis=2).max()
+        assert np.allclose(edited[sun], before[sun], rtol=1e-3)
+        assert edited[~sun].mean() < 0.9 * before[~sun].mean(), "what is free does not follow"

@@ -1,9 +1,10 @@
-"""What to do where little of the paint is reached: one line, and a light that would reach more elsewhere."""
+"""What to do where little of the paint is reached: which strokes, why, and what reaches more."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,19 @@ from envedit.cli.paint.protocol import Document
 from envedit.core.color import tonemap
 from envedit.core.rotations import rotation_vector
 from envedit.losses import metrics
-from envedit.representations.layers.lights import DARK
+from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
 from envedit.solve.map_problem import SIGMA, Problem
+
+UNLIT_SHARE = 0.02
+"""Light of a white sky at a stroke, over the picture's mean, below which hardly any of the map's reaches it.
+Not measured."""
+UNEVEN_SHARE = 0.3
+"""Mean of what is not feasible in a stroke, over its mean size, up to which its brightness is right and its
+pattern is not. Not measured."""
+MOST_NAMED = 3
+"""Strokes that are named."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +49,46 @@ class Painted:
         towards = metrics.painted(rendering, self.target, self.base, self.coverage)["towards"]
         return 1.0 if towards is None else towards
 
+    def of_stroke(self, picture: np.ndarray, cover: np.ndarray) -> float:
+        """Return the share of one stroke's change that a picture has, by its coverage (h, w, 1)."""
+        asked = (cover * np.abs(tonemap(self.target) - tonemap(self.base))).sum(dtype=np.float64)
+        left = (cover * np.abs(tonemap(self.target) - tonemap(picture))).sum(dtype=np.float64)
+        return float(np.clip(1 - left / asked, 0, 1)) if asked > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class Light:
+    """What lights the pixels, (h, w, 3) each.
+
+    Attributes
+    ----------
+    white : ndarray
+        The rendering under a map of radiance 1, without lamps.
+    lamps : ndarray
+        That of the scene's lamps alone.
+    """
+
+    white: np.ndarray
+    lamps: np.ndarray
+
+
+@dataclass(frozen=True)
+class Action:
+    """What reaches more: a button's text, and what it changes of the document."""
+
+    label: str
+    change: dict[str, Any]
+
 
 def said(
-    document: Document, painted: Painted, rendering: np.ndarray, reach: Reach, strokes: Sequence[np.ndarray]
-) -> str:
-    """Return one line on the stroke of which most is left, and what reaches more; "" if enough is reached.
+    document: Document,
+    painted: Painted,
+    rendering: np.ndarray,
+    reach: Reach,
+    strokes: Sequence[np.ndarray],
+    light: Light,
+) -> tuple[str, list[Action]]:
+    """Say which strokes are missed, why the worst is, and what can be done; "" if enough is reached.
 
     Parameters
     ----------
@@ -55,91 +100,155 @@ def said(
         What is feasible.
     strokes : sequence of ndarray (h, w, 1)
         Coverage of each stroke by itself.
+    light : Light
+        What lights the pixels.
     """
-    if painted.reached(rendering) >= WARNED_SHARE:
-        return ""
-    # ---- Which stroke, and how
+    shares = {
+        i: painted.of_stroke(rendering, cover)
+        for i, cover in enumerate(strokes)
+        if document.strokes[i]["type"] != "hold"
+    }
+    missed = sorted((i for i in shares if shares[i] < WARNED_SHARE), key=lambda i: shares[i])
+    if painted.reached(rendering) >= WARNED_SHARE or not missed:
+        return "", []
+    worst = missed[0]
     left = np.float64(tonemap(painted.target)) - tonemap(rendering)
-    missed = [
-        (float((cover * np.abs(left)).sum()), i)
-        for i, (one, cover) in enumerate(zip(document.strokes, strokes, strict=True))
-        if one["type"] != "hold"
-    ]
-    _, i = max(missed, key=lambda one: one[0])
-    dark = float((strokes[i] * left).sum()) > 0
-    stays, wanted = ("too dark", "brighter") if dark else ("too bright", "darker")
-    which = f"stroke {i + 1} ({document.strokes[i]['type']}) stays {stays}"
-    # ---- Why, and what reaches more
+    dark = float((strokes[worst] * left).sum()) > 0
+    stays = "too dark" if dark else "too bright"
+    text = f"stroke {worst + 1} ({document.strokes[worst]['type']}) stays {stays}"
+    why, actions = _why(document, painted, reach, strokes[worst], light, worst, dark)
+    others = [f"{i + 1} ({_percent(shares[i])})" for i in missed[1:MOST_NAMED]]
+    also = f"; little is reached of {', '.join(others)} too" if others else ""
+    return f"{text}: {why}{also}", actions
+
+
+def _why(document, painted, reach, cover, light, i, dark):
+    """Return a phrase on why a stroke is missed, and what can be done about it in the document."""
+    change = "brighter" if dark else "darker"
+    follow = Action("Let the rest follow", {"rest": "follow"})
+    free = Action("Let the sky change freely", {"freedom": 1.0})
+    area = max(float(cover.sum()), 1e-30)
+
+    def mean(picture):
+        return float((cover * picture).sum()) / (3 * area)
+
+    # ---- Where the map cannot make it so
+    if dark and mean(light.white) < UNLIT_SHARE * light.white.mean():
+        return "hardly any light of the map reaches it", []
+    if not dark and mean(light.lamps) > 0.5 * mean(painted.base):
+        return "most of its light is of lamps of the scene, which no map changes", []
+    # ---- Where the settings keep it from being so
     if document.rest == "keep":
-        return f"{which}: the rest, which stays, keeps it so; try “follows”"
-    if reach.share < WARNED_SHARE:
-        return f"{which}: no light makes it {wanted} and leaves the mean of the rest; paint less"
-    if document.freedom < WARNED_SHARE:
-        return f"{which}: lights alone do not make it {wanted}; let the sky change more"
-    return f"{which}: what would make it {wanted} is unlikely for a sky; move or add a light"
+        return "the rest, which stays, keeps it so", [follow]
+    feasible = painted.of_stroke(reach.picture, cover)
+    if feasible >= WARNED_SHARE:
+        if document.freedom < WARNED_SHARE:
+            return f"a sky that may change so little does not make it {change}", [free]
+        return f"what would make it {change} is unlikely for a sky", []
+    # ---- Where no map makes it so and leaves the mean of the rest
+    less = _less(document, i, feasible)
+    uneven = abs(float((cover * reach.residual).sum()))
+    if uneven < UNEVEN_SHARE * float((cover * np.abs(reach.residual)).sum()):
+        return "no light shows a pattern so fine on that surface", less
+    return f"what makes it {change} makes the rest {change} too", less
 
 
-@dataclass(frozen=True)
-class Better:
-    """A light that reaches more of the paint by itself.
-
-    Attributes
-    ----------
-    light : int
-        Index among those of :func:`.picking.lights`.
-    direction : ndarray (3,)
-        Where it must stand, in the turned map.
-    factor : float
-        Of its flux.
-    share : float
-        What the rendering then has of the painted change.
-    """
-
-    light: int
-    direction: np.ndarray
-    factor: float
-    share: float
+def _less(document, i, feasible):
+    """Offer a stroke as strong as is feasible."""
+    if feasible < 0.05:  # too little to be seen
+        return []
+    strokes = [dict(stroke) for stroke in document.strokes]
+    strokes[i]["opacity"] = round(feasible * strokes[i].get("opacity", 1.0), 3)
+    return [Action(f"Paint {_percent(feasible)} of stroke {i + 1}", {"strokes": strokes})]
 
 
-def moved(
-    problem: Problem, start: dict, state: dict, painted: Painted, lights: list[picking.Placed]
-) -> Better | None:
-    """Find where the map's strongest light would reach more by itself than a solution does.
+def lights(
+    problem: Problem,
+    start: dict,
+    state: dict,
+    painted: Painted,
+    listed: list[picking.Placed],
+    document: Document,
+) -> list[Action]:
+    """Find where the map's strongest light, or one more, would by itself reach more than a solution does.
 
     Parameters
     ----------
     problem : Problem
-        Of the paint, where the rest follows: it does where a light is moved by hand.
+        Of the paint, where the rest follows: it does where a light is placed by hand.
     start, state : dict
         The map as it is, and the solution.
     painted : Painted
         What was asked for.
-    lights : list of Placed
-        The document's.
+    listed : list of Placed
+        The document's lights.
+    document : Document
+        Of which strokes are taken out.
 
     Returns
     -------
-    Better or None
-        None where there is no such place.
+    list of Action
+        That which reaches most first.
     """
-    own = [k for k in problem.shining(start) if k < problem.layers.lights.own]
-    if not own:
-        return None
-    flux = problem.layers.lights.flux
-    k = max(own, key=lambda k: flux[k].sum())
-    toward = problem.layers.lights.centres[k]
-    i, now = picking.index_of(lights, toward), problem.evaluate(state, resolve=False).rendering
-    if i is None or now is None:
-        return None
-    without = _with(start, k, flux=DARK)
-    most, best = painted.reached(now), None
-    for direction, factor, _ in painted_places.best(problem, without, k, SIGMA, problem.direction(state, k)):
-        turn = rotation_vector(toward, direction)
-        rendering = problem.evaluate(_with(start, k, turn=turn, flux=factor)).rendering
-        share = -np.inf if rendering is None else painted.reached(rendering)
-        if share > most:
-            most, best = share, Better(i, direction, float(np.exp(factor[0])), share)
+    now = problem.evaluate(state, resolve=False).rendering
+    if now is None:
+        return []
+    held = [stroke for stroke in document.strokes if stroke["type"] == "hold"]
+    found = []
+    for share, label, entries in _placed(problem, start, state, painted, listed, document):
+        if share > painted.reached(now):
+            change = {"lights": entries, "strokes": held}
+            found.append((share, Action(f"{label} there: {_percent(share)}", change)))
+    return [action for _, action in sorted(found, key=lambda one: -one[0])]
+
+
+def _placed(problem, start, state, painted, listed, document):
+    """Yield what a light in its best place reaches, what is done, and the document's lights with it."""
+    layers = problem.layers.lights
+    own = [k for k in problem.shining(start) if k < layers.own]
+    strongest = max(own, key=lambda k: layers.flux[k].sum(), default=None)
+    # ---- The strongest light, elsewhere
+    i = None if strongest is None else picking.index_of(listed, layers.centres[strongest])
+    if i is not None:
+        dark = _with(start, strongest, flux=DARK)
+        away = problem.direction(state, strongest)
+        share, toward, factor = _best(problem, dark, start, strongest, painted, away)
+        if toward is not None:
+            entry = listed[i].entry
+            flux = [factor * value for value in entry["flux"]]
+            others = [light for light in document.lights if light is not entry]
+            yield (
+                share,
+                f"Drag light {i + 1}",
+                [*others, entry | {"flux": flux} | picking.place(toward, document)],
+            )
+    # ---- One more
+    spare, size = layers.own, layers.log_size(LOBE_DEGREES)
+    lobe = _with(start, spare, size=size)
+    share, toward, factor = _best(problem, start, lobe, spare, painted)
+    if toward is not None:
+        flux = (factor * layers.flux[spare]).tolist()
+        added = {"flux": flux, "size": LOBE_DEGREES} | picking.place(toward, document)
+        yield share, "Add a light", [*document.lights, added]
+
+
+def _best(problem, without, start, k, painted, away=None):
+    """Return what a light reaches at most, where, and the factor of its flux; None where it reaches nothing.
+
+    ``without`` is a state where it is dark, ``start`` one with its size, ``away`` where it is not to be.
+    """
+    best: tuple[float, np.ndarray | None, float] = 0.0, None, 1.0
+    for toward, log_flux, _ in painted_places.best(problem, without, k, SIGMA, away):
+        turn = rotation_vector(problem.layers.lights.centres[k], toward)
+        rendering = problem.evaluate(_with(start, k, turn=turn, flux=log_flux)).rendering
+        share = 0.0 if rendering is None else painted.reached(rendering)
+        if share > best[0]:
+            best = share, toward, float(np.exp(log_flux[0]))
     return best
+
+
+def _percent(share):
+    return f"{100 * share:.0f} %"
 
 
 def _with(state, k, **values):

@@ -12,7 +12,7 @@ from envedit.cli.paint.protocol import Document, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
-from envedit.representations.layers.placed_lights import PlacedLights, angles, direction
+from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
 from envedit.scene import highlight, placement, shadow
 from envedit.scene.scene import Scene
 from envedit.transport.light_transport import LightTransport
@@ -29,10 +29,11 @@ SAME_LIGHT = np.cos(np.radians(10.0))
 
 @dataclass(frozen=True)
 class Placed:
-    """A light as a document has it: direction (3,) in the turned map, and flux (3,)."""
+    """A light as a document has it: direction (3,) in the turned map, flux (3,), and its entry."""
 
     direction: np.ndarray
     flux: np.ndarray
+    entry: dict[str, Any]
 
 
 def lights(placed: PlacedLights, document: Document) -> list[Placed]:
@@ -40,13 +41,16 @@ def lights(placed: PlacedLights, document: Document) -> list[Placed]:
     entries = {light["light"]: light for light in document.lights if "light" in light}
     found = []
     for i, light in enumerate(placed.lights):
-        entry = entries.get(i + 1, {"flux": (1.0, 1.0, 1.0)})
+        entry = entries.get(i + 1, {"light": i + 1, "flux": (1.0, 1.0, 1.0), "size": 1.0})
         where = (entry["azimuth"], entry["elevation"]) if "azimuth" in entry else angles(light.direction)
-        found.append((where, placed.layers.lights.flux[i] * np.float64(entry["flux"])))
+        found.append((where, placed.layers.lights.flux[i] * flux_of(entry), entry))
     added = [light for light in document.lights if "light" not in light]
-    found += [((light["azimuth"], light["elevation"]), np.float64(light["flux"])) for light in added]
+    found += [((light["azimuth"], light["elevation"]), flux_of(light), light) for light in added]
     turned = document.rotate_degrees
-    return [Placed(direction(azimuth - turned, elevation), flux) for (azimuth, elevation), flux in found]
+    return [
+        Placed(direction(azimuth - turned, elevation), flux, entry)
+        for (azimuth, elevation), flux, entry in found
+    ]
 
 
 def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:

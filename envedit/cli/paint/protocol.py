@@ -25,7 +25,7 @@ MOST_BYTES = 1 << 20
 """Length of a message from the page."""
 MOST_STROKES, MOST_POINTS = 500, 20_000
 """Of a document: what is more would take seconds to paint."""
-KINDS = ("render", "map", "difference", "unreachable", "before", "explanation")
+KINDS = ("render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before")
 SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
@@ -64,6 +64,12 @@ class Document:
     temperature: float = 0.0
     rest: str = Target.rest
     freedom: float = Solve.freedom
+
+    @property
+    def placing(self) -> tuple:
+        """What decides where the lights of the map are before paint: not their names."""
+        lights = [{key: value for key, value in light.items() if key != "name"} for light in self.lights]
+        return lights, self.rotate_degrees
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -160,11 +166,16 @@ class Choose:
 
 
 @dataclass(frozen=True)
+class Sky:
+    """Show the map large, as edited and as it was given."""
+
+
+@dataclass(frozen=True)
 class Save:
     """Write the results."""
 
 
-def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | Save:
+def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | Sky | Save:
     """Read a message from the page.
 
     Raises
@@ -202,9 +213,9 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | S
             return Choose(_count(found.get("explanation")))
     except WantedError as error:
         raise BadMessageError(f"{kind}: expected {error}") from None
-    if kind == "save":
-        return Save()
-    raise BadMessageError(f"type: got {show(kind)[:80]}, expected document, pick, choose, open or save")
+    if kind in ("sky", "save"):
+        return Sky() if kind == "sky" else Save()
+    raise BadMessageError(f"type: got {show(kind)[:80]}, expected document, pick, choose, open, sky or save")
 
 
 def _refused(name):

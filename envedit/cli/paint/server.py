@@ -58,7 +58,8 @@ class Client:
         self.event = asyncio.Event()
 
     def put(self, key: str, value: bytes | dict) -> None:
-        """Let something wait, in the place of what waits under that key."""
+        """Let something wait, after all else, and drop what waits under that key."""
+        self.waiting.pop(key, None)
         self.waiting[key] = value
         self.event.set()
 

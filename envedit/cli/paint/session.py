@@ -15,9 +15,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from envedit.core.color import luminance, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
-from envedit.export import adjustments
+from envedit.export import adjustments, file_resolution
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
@@ -57,6 +58,10 @@ SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
 """Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
+MEMORY_EVERY_S = 10.0
+"""Seconds of work after which freed buffers are given back: that takes 0.1 s, 1 % of the time."""
+SKY_WIDTH = 2048
+"""Most texels across of the map that is shown large: more than most displays have."""
 NOT_WHITE = 0.95
 """Share of the pixels of the rendering that the page does not show white when it is opened."""
 
@@ -107,6 +112,7 @@ class Session:
         self.explanations: list[search.Explanation] = []  # of the paint; one of them is shown
         self.explanation = 0
         self._kept = project.document  # as painted.toml has it
+        self._memory_due = 0.0  # when freed buffers are given back while work goes on
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
         self._shown: np.ndarray | None = None  # the rendering by T that the pages show
@@ -137,6 +143,7 @@ class Session:
             fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
             self._quick = renderers.trace(fewer, self.scene, self.map.shape[:2], self._progress)
         self._sharp: Scene | None = None
+        self._wide: inputs.InputMap | None = None  # the map as it is shown large
         self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
@@ -171,7 +178,7 @@ class Session:
         """
         began = time.perf_counter()
         before, self.document = self.document, edit.document
-        moved = (before.lights, before.rotate_degrees) != (edit.document.lights, edit.document.rotate_degrees)
+        moved = before.placing != edit.document.placing
         # What is feasible under any map does not depend on how far this one may go.
         reach = self.reach if replace(before, freedom=edit.document.freedom) == edit.document else None
         self.phase, self._rendered, self.resting = edit.phase, None, False
@@ -197,6 +204,7 @@ class Session:
             self.project.keep(self.document)
             self._kept = self.document
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
+        self._give_back_memory()  # edits may come so fast that nothing is done between them
         self.tell_state()
 
     def _tell_document(self, client):
@@ -209,7 +217,10 @@ class Session:
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon)
+        locked = self.placed.locked(document.lights)
+        if locked is not None:
+            locked = latlong.rotate(locked, document.rotate_degrees)[self.rows.slice]
+        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon, fixed=locked)
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
@@ -325,9 +336,14 @@ class Session:
     def advance(self) -> bool:
         """Do the next piece of work; False where there is none left."""
         more = not self._dragged and not self.resting and self._worked()
-        if not more and self.phase == "done":
-            give_back_memory()
+        self._give_back_memory(resting=not more and self.phase == "done")
         return more
+
+    def _give_back_memory(self, resting=False):
+        """Give freed buffers back when nothing is left to do, and when that is due."""
+        if resting or time.monotonic() > self._memory_due:
+            give_back_memory()
+            self._memory_due = time.monotonic() + MEMORY_EVERY_S
 
     def _worked(self):
         """Do a piece of work; False where there is none left."""
@@ -439,6 +455,7 @@ class Session:
         self.tell_state()
 
     def _unless_newer(self, *_):
+        self._give_back_memory()
         if self.newer():
             raise SupersededError
 
@@ -484,7 +501,10 @@ class Session:
         bare = strokes.Painted(self.base, np.zeros_like(self.coverage))
         tonemap = self._chosen.target.display_tonemap
         alone = [self._on_views(bare, [one], tonemap).coverage for one in document.strokes]
-        text = advice.said(document, painted, self.point.rendering, self.reach, alone)
+        white = self.transport.linear(tensor(np.ones_like(self.map))).numpy()
+        lamps = self.transport.apply(tensor(np.zeros_like(self.map))).numpy()
+        light = advice.Light(white, lamps)
+        text, actions = advice.said(document, painted, self.point.rendering, self.reach, alone, light)
         if text:
             self.advised = False
             self._tell_doing("looking for a better place of the light")
@@ -494,13 +514,11 @@ class Session:
             weight = pixel_weight(self.coverage, self._hidden, paint, first_hold(self._chosen))
             likelihood = Likelihood.of_paint(weight, self.coverage, self.base, self.target)
             self.problem.aimed_at(self.target, likelihood, self.point)
-            better = advice.moved(self.problem, self.still, self.run.state, painted, listed)
+            actions += advice.lights(self.problem, self.still, self.run.state, painted, listed, document)
             there = self.problem.evaluate(self.run.state)  # that has taken its columns
             self.point = self.problem.aimed_at(self.target, held, there)
-            self.advised, self.status["advice"] = True, {"text": text}
-            if better is not None:
-                found = {"light": better.light, "factor": better.factor, "reaches": better.share}
-                self.status["advice"] |= found | picking.place(better.direction, document)
+            self.advised = True
+            self.status["advice"] = {"text": text, "actions": [asdict(action) for action in actions]}
         self.tell_state()
 
     @property
@@ -541,6 +559,23 @@ class Session:
             target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
             self.tell.frame("difference", source, target - solution, self.scene.rows)
 
+    def sky(self) -> None:
+        """Show the map large, as it is edited and as it was given, at the resolution of its file."""
+        if self._dragged:
+            return
+        document, settings = self.document, self.project.settings.input
+        self._tell_doing("composing the map at the resolution of its file")
+        if self._wide is None:
+            self._wide = self.given.at_file_size(settings, SKY_WIDTH)
+        by_hand = replace(settings, lights=document.lights, rotate_degrees=document.rotate_degrees)
+        given = replace(self.given, placed=self.placed if document.lights else None)
+        params = self.problem.found(self.run.state)
+        edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
+        _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)
+        self.tell.frame("sky-before", "transport", self._wide.radiance)
+        self.tell.frame("sky", "transport", self._adjusted(carried))
+        self.tell_state()
+
     def again(self) -> None:
         """Show everything anew, to a page that has just come."""
         self.resting, self._shown = False, None
@@ -555,10 +590,21 @@ class Session:
     def _tell_lights(self):
         """Say which lights the map has, and where the solution has put them."""
         own = []
+        height, width = self.map.shape[:2]
+        omega = latlong.lookup_solid_angles(height, width)
         for i, light in enumerate(self.placed.lights):
             azimuth, elevation = angles(light.direction)
             flux = self.placed.layers.lights.flux[i].tolist()
-            own.append({"light": i + 1, "azimuth": azimuth, "elevation": elevation, "flux": flux})
+            radius = math.degrees(math.sqrt(omega[light.texels // width].sum() / math.pi))
+            own.append(
+                {
+                    "light": i + 1,
+                    "azimuth": azimuth,
+                    "elevation": elevation,
+                    "flux": flux,
+                    "radius": radius,
+                }
+            )
         found, layers = [], self.problem.layers
         for i in self.problem.shining(self.run.state):
             azimuth, elevation = angles(self.problem.direction(self.run.state, i))

@@ -10,12 +10,18 @@ from pathlib import Path
 
 from envedit.cli import run
 from envedit.cli.paint import project
-from envedit.cli.paint.protocol import Choose, Edit, Open, Pick, Save
+from envedit.cli.paint.protocol import Choose, Edit, Open, Pick, Save, Sky
 from envedit.cli.paint.session import Session, SupersededError, Tell
 from envedit.core.errors import EnveditError, unwrapped
+from envedit.targets.strokes import gains
 
-ORDER = (Open, Pick, Edit, Choose, Save)
+ORDER = (Open, Pick, Edit, Choose, Sky, Save)
 """Of requests that wait, which kind goes first: what is saved has all edits."""
+
+
+WHITES = [round(1e6 / mired, 1) for mired in range(40, 501, 10)]
+"""Kelvin of the black bodies that colours of lights are compared with, 10 mired apart: the page goes between
+them."""
 
 
 class Again:
@@ -95,7 +101,7 @@ class Worker(threading.Thread):
             self._open(project.opened(request.name, request.envmap))
             if before is not None:
                 with self._lock:  # what came meanwhile is about what was open before
-                    for kind in (Edit, Pick, Choose, Save):
+                    for kind in (Edit, Pick, Choose, Sky, Save):
                         self._waiting.pop(kind, None)
         elif self.session is None:
             if not isinstance(request, Again):
@@ -107,6 +113,8 @@ class Worker(threading.Thread):
             self.session.pick(request)
         elif isinstance(request, Choose):
             self.session.choose(request.explanation)
+        elif isinstance(request, Sky):
+            self.session.sky()
         elif isinstance(request, Save):
             self.tell.say({"type": "status", "state": "saving", "text": "saving"})
             try:
@@ -157,6 +165,7 @@ class Worker(threading.Thread):
                 "notes": self.session.notes,
                 "exposure": self.session.exposure,
                 "hold": opened.settings.target.hold,
+                "white": [[kelvin, *gains(kelvin).tolist()] for kelvin in WHITES],
             }
         )
         self.session.again()

@@ -119,6 +119,8 @@ class Layers:
         The rows that follow.
     free : ndarray of bool (rows, W) or None
         Texels that gain and saturation act on; None: all.
+    fixed : ndarray (rows, W, 3) or None
+        Radiance of locked lights, which is added to the cores whatever the parameters are; None: 0.
     """
 
     rows: tuple[int, int]
@@ -130,6 +132,7 @@ class Layers:
     behind: BehindGlow | None = None
     below: Below | None = None
     free: np.ndarray | None = None
+    fixed: np.ndarray | None = None
 
     lr = 0.03
     models_edit = True
@@ -145,6 +148,7 @@ class Layers:
         cycles: int = CYCLES,
         horizon: Horizon = "free",
         aureoles: bool | np.ndarray = True,
+        fixed: np.ndarray | None = None,
     ) -> Layers:
         """Separate an image.
 
@@ -162,6 +166,8 @@ class Layers:
         aureoles : bool or ndarray
             Lights that are added have the glow of the map's strongest, or of a sun in a clear sky, or that of
             a table, as for :class:`.Lights`.
+        fixed : ndarray (rows, W, 3), optional
+            What of the image is of locked lights: it is left out of the separation, and never changes.
 
         Raises
         ------
@@ -171,6 +177,9 @@ class Layers:
         rows = rows or (0, len(image))
         require_radiance(image, "layers", rows[0], BRIGHTEST)
         image = np.ascontiguousarray(image, np.float32)
+        if fixed is not None:
+            fixed = np.minimum(fixed, image)
+            image = image - fixed
 
         # ---- Rows above the horizon, and rows below that follow them
         above, low = image, image[:0]
@@ -193,7 +202,7 @@ class Layers:
             behind = behind_glow.behind_glow(separation.background, separation.glow, away, rows)
 
         gain = GridGain(cycles, len(above) / rows[1], rows[0] == 0)
-        layers = cls(rows, image.shape[:2], separation, lights, gain, base, behind)
+        layers = cls(rows, image.shape[:2], separation, lights, gain, base, behind, fixed=fixed)
         return replace(layers, below=layers._below(low, horizon, away)) if len(low) else layers
 
     def _below(self, low, horizon, away):
@@ -260,7 +269,8 @@ class Layers:
         return mi.TensorXf(sky, (*self.whole, 3)), core
 
     def _core(self, real):
-        return self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+        return core if self.fixed is None else core + tensor(self.fixed)
 
     def _above(self, real, fields=None):
         """Compose the rows above the horizon, by default with the fields of the parameters."""

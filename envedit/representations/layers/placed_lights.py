@@ -66,7 +66,7 @@ class PlacedLights:
             i = light.get("light", 0) - 1
             if not 0 <= i < len(self.lights):
                 continue
-            flux = np.maximum(np.float64(light["flux"]), 1e-30)
+            flux = np.maximum(flux_of(light), 1e-30)
             values["flux"][i] = np.maximum(np.log(flux), DARK) / scales["flux"]
             values["size"][i] = np.log(light["size"]) / scales["size"]
             if "azimuth" in light:
@@ -91,6 +91,23 @@ class PlacedLights:
         envmap = add(envmap, [light for light in placed if "light" not in light])
         require_radiance(envmap, "input.lights", brightest=BRIGHTEST)
         return envmap
+
+    def locked(self, placed: Sequence[dict]) -> np.ndarray | None:
+        """Return what locked lights add to the placed map, (H, W, 3) float32; None where none is locked."""
+        others = without_locked(placed)
+        return None if others is None else np.maximum(self.place(placed) - self.place(others), 0)
+
+
+def flux_of(light: dict) -> np.ndarray:
+    """Return the flux of an entry (3,), 0 of a muted one; in its units."""
+    return np.zeros(3) if light.get("muted") else np.array(light["flux"], np.float64)
+
+
+def without_locked(placed: Sequence[dict]) -> tuple[dict, ...] | None:
+    """Return the entries with locked lights muted; None where none is locked."""
+    if not any(light.get("locked") for light in placed):
+        return None
+    return tuple(light | {"muted": True} if light.get("locked") else light for light in placed)
 
 
 def missing(placed: Sequence[dict], count: int) -> list[int]:
@@ -119,7 +136,7 @@ def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
         total = sum(float((shape * omega[band]).sum()) for shape, band in zip(shapes, bands, strict=True))
         for shape, band in zip(shapes, bands, strict=True):
             with np.errstate(over="ignore"):
-                radiance[band] += (shape[..., None] * (np.float64(light["flux"]) / total)).astype(np.float32)
+                radiance[band] += (shape[..., None] * (flux_of(light) / total)).astype(np.float32)
     return radiance
 
 

@@ -30,6 +30,12 @@ export class History {
   // What is being changed, by a pointer that is still down: shown, and no step of its own.
   preview(change, phase) { this.changed(phase, { ...this.document, ...change }); }
 
+  go(i) {
+    if (i === this.at || !this.steps[i]) return;
+    this.at = i;
+    this.changed("done");
+  }
+
   undo() { if (this.undoable) { this.at--; this.changed("done"); } }
   redo() { if (this.redoable) { this.at++; this.changed("done"); } }
 

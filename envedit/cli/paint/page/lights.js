@@ -9,6 +9,7 @@ export class Lights {
     this.chosen = -1;
     this.turning = false;
     this.draft = null;
+    this.solo = -1;
     holder.addEventListener("pointerdown", (e) => this.turn(e));
     panel.flux.addEventListener("input", () => this.change("flux"));
     panel.color.addEventListener("input", () => this.change("flux"));
@@ -151,13 +152,26 @@ export class Lights {
     this.preview(this.chosen, next);
   }
 
-  mute() {
-    const light = this.list()[this.chosen];
-    if (!light) return;
-    const dark = light.entry.flux.every((v) => v === 0), back = this.before?.[this.chosen];
-    this.before = { ...this.before, [this.chosen]: light.entry.flux };
-    this.preview(this.chosen, { flux: dark ? (back ?? [1, 1, 1]).map((v) => v * 1) : [0, 0, 0] });
+  // Change a light for good; a key that is undefined is taken out.
+  edit(index, change) {
+    this.preview(index, change);
     this.commit();
+  }
+
+  mute(index = this.chosen) {
+    const light = this.list()[index];
+    if (!light) return;
+    const dark = light.entry.flux.every((v) => v === 0); // of paintings without the key `muted`
+    this.edit(index, dark ? { flux: [1, 1, 1], muted: undefined } : { muted: !light.entry.muted || undefined });
+  }
+
+  // Show one light alone, until the next edit or until this is asked again; nothing is kept of it.
+  hear(index) {
+    this.solo = this.solo === index ? -1 : index;
+    const lights = this.list().map(({ entry }, i) => (i === this.solo ? entry : { ...entry, muted: true }));
+    if (this.solo < 0) this.on.back();
+    else this.on.preview({ lights });
+    this.draw();
   }
 
   // One of the map's own can only be muted.
@@ -210,10 +224,10 @@ export class Lights {
         handle.addEventListener("wheel", (e) => this.wheel(e, i), { passive: false });
         this.holder.append(handle);
       }
-      const muted = light.entry.flux.every((v) => v === 0);
+      const muted = off(light);
       handle.classList.toggle("muted", muted);
       handle.setAttribute("aria-pressed", String(i === this.chosen));
-      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
+      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
       place(handle, light, false);
     });
     this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());
@@ -227,6 +241,7 @@ export class Lights {
       this.holder.append(ring);
     }
     this.fill(lights[this.chosen]);
+    this.on.drawn(lights);
   }
 
   fill(light) {
@@ -234,9 +249,10 @@ export class Lights {
     set.disabled = !light;
     shaped.hidden = !light || Boolean(light.own);
     name.textContent = light ? `${light.own ? "Light of the map" : "Added light"} ${this.chosen + 1}` : "No light chosen";
+    if (!light) fluxValue.textContent = sizeValue.textContent = "";
     if (!light) return;
-    const most = Math.max(...light.entry.flux), muted = most === 0;
-    if (!muted) {
+    const most = Math.max(...light.entry.flux), muted = off(light);
+    if (most > 0) {
       flux.value = Math.log2(most / (light.own ? 1 : this.unit));
       color.value = hex(light.entry.flux.map((v) => v / most));
     }
@@ -247,8 +263,8 @@ export class Lights {
     rotation.value = light.entry.rotation ?? 0;
     softness.value = light.entry.softness ?? 0;
     softness.disabled = shape.value === "gaussian";
-    fluxValue.textContent = muted ? "off" : light.own ? `x${(+most).toPrecision(2)}` : (+most).toPrecision(2);
-    sizeValue.textContent = light.own ? `x${(+light.entry.size).toPrecision(2)}` : `${(+light.entry.size).toPrecision(2)}°`;
+    fluxValue.textContent = muted ? "off" : `${signed(stops(light, this.unit))} st`;
+    sizeValue.textContent = `${+degrees(light).toPrecision(2)}°`;
     mute.setAttribute("aria-pressed", String(muted));
     remove.disabled = Boolean(light.own);
   }
@@ -256,6 +272,13 @@ export class Lights {
 
 const SHAPED = ["shape", "aspect", "rotation", "softness"]; // keys of an added light only
 const aspectOf = (shape) => (shape === "strip" ? 0.1 : 1); // where none is given
+export const off = ({ entry }) => entry.muted || entry.flux.every((v) => v === 0);
+// Flux of a light as it is, over that of the map's or, if it was added, over that of the map's strongest.
+export const flux = ({ entry, own }) => entry.flux.map((v, c) => v * (own ? own.flux[c] : 1));
+export const stops = (light, unit) => Math.log2(luminance(flux(light)) / (light.own ? luminance(light.own.flux) : unit));
+export const degrees = ({ entry, own }) => entry.size * (own ? own.radius : 1);
+export const luminance = ([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
+export const signed = (v) => `${v < -0.05 ? "−" : v > 0.05 ? "+" : ""}${Math.abs(v).toFixed(1)}`;
 const round = (v) => Math.round(v * 100) / 100;
 // sRGB of a colour input from and to linear values.
 export const linear = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));

@@ -1,10 +1,13 @@
 // The page: what is sent when, and what is shown where.
 
+import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { accelerated, Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
+import { LightList } from "./light_list.js";
 import { Lights, linear } from "./lights.js";
 import { Strokes } from "./strokes.js";
+import { Zoom } from "./zoom.js";
 
 const $ = (id) => document.getElementById(id);
 const canvas = new URLSearchParams(location.search).get("canvas"); // "2d" or "webgl2": as it is asked for
@@ -29,14 +32,21 @@ const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // la
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [], explanation: [] }; // the last of each view
 
 let view = 0, views = [], outlined = false;
+let thumbDue = false; // the picture of the present step is taken when it is drawn next
 let client = "", painting = 0, sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
 
 const history = new History((phase, document) => {
   send(document ?? history.document, phase);
-  if (phase === "done") refresh();
+  if (phase !== "done") return;
+  lights.solo = -1;
+  refresh();
 });
+
+const compare = new Compare(frames, displays, history, plain, { view: () => view, send: (message) => connection.send(message) });
+const zooms = [new Zoom($("render").parentElement, redraw, () => strokes.cancel()), new Zoom($("map-stack"), redraw)];
+function redraw() { displays.render.draw(); displays.map.draw(); strokes.draw(); }
 
 function send(document, phase) {
   waiting = { document, phase };
@@ -67,15 +77,16 @@ function note(entry) {
 const connection = new Connection({
   lost() { state("error", "The server cannot be reached; trying again"); },
   frame(frame) {
-    frames[frame.kind][frame.view] = frame;
+    if (frames[frame.kind]) frames[frame.kind][frame.view] = frame;
     if (frame.kind === "explanation") explanations[frame.view]?.show(frame);
+    else if (frame.kind.startsWith("sky")) compare.sky(frame);
     else if (frame.view === view || frame.kind === "map") show(frame);
   },
   message(message) { RECEIVED[message.type]?.(message); },
 });
 
 function show(frame) {
-  if (frame.kind === "before") { displays.render.compare(frame); return; }
+  if (frame.kind === "before") { compare.show(); return; }
   if (frame.kind === "render") {
     $("render-stack").parentElement.style.setProperty("--aspect", frame.width / frame.height);
     $("badge").textContent = NAMES[frame.source];
@@ -140,6 +151,7 @@ function chooseView(i) {
 }
 
 displays.render.drawn = (frame) => {
+  if (thumbDue) { thumbDue = false; compare.take(); }
   $("status").dataset.frame = frame.number;
   $("status").dataset.source = frame.source;
   note({ frame: frame.number, source: frame.source });
@@ -170,9 +182,11 @@ const RECEIVED = {
     if (!opened || painting !== message.painting) {
       $("exposure").value = message.exposure;
       look({ stops: message.exposure });
+      compare.forget();
     }
     $("rest").disabled = message.hold !== "auto";
     $("rest").title = $("rest").disabled ? `[target] hold = ${message.hold} is given` : "";
+    listed.white = message.white;
     opened = true;
     painting = message.painting;
     if (mine) flush();
@@ -187,6 +201,11 @@ const RECEIVED = {
     $("unreachable").classList.toggle("stale", message.reachable == null);
     $("progress").hidden = message.state !== "loading" && message.state !== "saving";
     advise(message.advice ?? null);
+    if (message.state === "rendering" || message.state === "done") {
+      thumbDue = true;
+      displays.render.draw();
+    }
+    if (message.state === "done") compare.again();
     if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps, residual: message.residual });
     state(message.state, message.text ?? told(message));
   },
@@ -214,31 +233,28 @@ function told(message) {
     parts.push(`${percent(message.reached)} of the paint reached${feasible}`);
   }
   parts.push(WORDS[message.state]);
-  if (message.iterations) parts.push(`${message.iterations} iterations`);
-  if (message.ms) parts.push(`${Math.round(message.ms)} ms`);
-  if (message.hold) parts.push(`target.hold = ${+message.hold.toPrecision(3)}`);
   if (message.samples) parts.push(`path traced with ${message.samples} samples a pixel`);
+  $("technical").textContent = `${message.iterations} iterations · ${Math.round(message.ms ?? 0)} ms`
+    + (message.hold ? ` · target.hold = ${+message.hold.toPrecision(3)}` : "");
   return parts.join(" · ");
 }
 
 function percent(share) { return `${Math.round(100 * share)} %`; }
 
-// What reaches more where little is reached, with a button where another place of a light does.
-let advised = null;
+// Which strokes are missed and why, with a button for each thing that reaches more.
 function advise(advice) {
-  advised = advice;
   $("advice").hidden = !advice;
   $("advice-text").textContent = advice?.text ?? "";
-  $("advice-do").hidden = advice?.light === undefined;
-  if (!$("advice-do").hidden) $("advice-do").textContent = `Drag light ${advice.light + 1} there: ${percent(advice.reaches)}`;
+  $("advice-do").replaceChildren(...(advice?.actions ?? []).map(({ label, change }, i) => {
+    const button = Object.assign(document.createElement("button"), { textContent: label, title: "Ctrl+Z takes it back" });
+    button.dataset.testid = `advice-${i}`;
+    button.addEventListener("click", () => {
+      advise(null);
+      history.push(change);
+    });
+    return button;
+  }));
 }
-$("advice-do").addEventListener("click", () => {
-  const { light, azimuth, elevation, factor } = advised, { entry } = lights.list()[light];
-  advise(null);
-  lights.choose(light);
-  const moved = lights.changed(light, { azimuth, elevation, flux: entry.flux.map((v) => v * factor) });
-  history.push({ lights: moved, strokes: history.document.strokes.filter((one) => one.type === "hold") });
-});
 
 function state(name, text) {
   const status = $("status");
@@ -351,7 +367,10 @@ const lights = new Lights($("map-stack"), $("handles"), {
   document: () => history.document,
   preview: (change) => history.preview(change, "dragging"),
   done: (change) => history.push(change),
+  back: () => send(history.document, "done"),
+  drawn: (all) => listed.draw(all),
 });
+const listed = new LightList($("light-list"), lights);
 
 // ---- controls
 
@@ -367,12 +386,15 @@ function refresh() {
   $("degrees").value = now.rotate_degrees;
   $("map-exposure").value = now.exposure;
   $("map-temperature").value = now.temperature;
+  $("map-exposure-slide").value = now.exposure;
+  $("map-temperature-slide").value = now.temperature || 6500;
   $("rest").value = now.rest ?? "follow";
   $("freedom").value = now.freedom ?? 0;
   valued($("freedom"));
   lights.draft = null;
   lights.draw();
   strokes.draw();
+  compare.draw();
 }
 
 function choose(name, value) {
@@ -437,6 +459,13 @@ for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposu
   });
 }
 
+// The sliders of the whole map: 6500 K changes nothing.
+for (const [id, key, nothing] of [["map-exposure", "exposure", 0], ["map-temperature", "temperature", 6500]]) {
+  const slide = $(`${id}-slide`), change = () => ({ [key]: Number(slide.value) === nothing ? 0 : Number(slide.value) });
+  slide.addEventListener("input", () => { $(id).value = change()[key]; history.preview(change(), "drawing"); });
+  slide.addEventListener("change", () => history.push(change()));
+}
+
 function outline() {
   outlined = !outlined;
   $("outlines").setAttribute("aria-pressed", String(outlined));
@@ -445,7 +474,7 @@ function outline() {
 
 function look(changed) {
   $("exposure-value").textContent = $("exposure").value;
-  for (const one of [displays.render, displays.map, ...explanations]) one.set(changed);
+  for (const one of [displays.render, displays.map, displays.sky, ...explanations]) one.set(changed);
 }
 
 function save() {
@@ -455,7 +484,7 @@ function save() {
 }
 
 window.addEventListener("keydown", (event) => {
-  if (!opened || event.target.matches("input, select") || $("keys").open) return;
+  if (!opened || event.target.matches("input, select") || $("keys").open || $("sky-dialog").open) return;
   const key = event.key.toLowerCase(), lettered = [...document.querySelectorAll("[data-key]")].find((button) => button.dataset.key === key);
   if (event.ctrlKey || event.metaKey) {
     if (key === "z" && !event.shiftKey) history.undo();
@@ -464,6 +493,11 @@ window.addEventListener("keydown", (event) => {
     else return;
   } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
   else if (key === "o" && !event.repeat) outline();
+  else if (key === "m") compare.large();
+  else if (key === "a") compare.keep();
+  else if (key === "h") compare.toggle();
+  else if (key === "+" || key === "-") zooms[0].by(key === "+" ? 1.2 : 1 / 1.2);
+  else if (key === "0") for (const zoom of zooms) zoom.reset();
   else if (key === "[" || key === "]") {
     $("size")[key === "[" ? "stepDown" : "stepUp"]();
     valued($("size"));
@@ -478,6 +512,7 @@ window.addEventListener("keydown", (event) => {
 window.addEventListener("keyup", (event) => {
   if (event.key.toLowerCase() === "b") displays.render.set({ split: Number($("split").value) });
 });
+$("details").addEventListener("toggle", () => { displays.difference.draw(); displays.unreachable.draw(); });
 window.addEventListener("resize", () => { for (const one of Object.values(displays)) one.draw(); strokes.draw(); });
 
 // ---- start page

@@ -1,0 +1,105 @@
+// What is compared: the rendering with the original or with a state A, the map large with the original, all steps.
+
+import { Display } from "./display.js";
+import { Zoom } from "./zoom.js";
+
+const $ = (id) => document.getElementById(id);
+const SHOWN_STEPS = 60;
+const THUMB = 48; // pixels high
+const NAMES = { strokes: "strokes", lights: "lights", rotate_degrees: "turn of the sky", exposure: "map exposure", temperature: "map temperature", rest: "the rest", freedom: "the sky may change" };
+
+export class Compare {
+  constructor(frames, displays, history, plain, on) {
+    Object.assign(this, { frames, displays, history, on, kept: null, thumbs: new WeakMap(), asked: false }); // on: view(), send(message)
+    displays.sky = new Display($("sky"), "radiance", plain);
+    this.zoom = new Zoom($("sky").parentElement, () => displays.sky.draw());
+    $("keep-a").addEventListener("click", () => this.keep());
+    $("back-a").addEventListener("click", () => history.push(this.kept.document));
+    $("reference").addEventListener("change", () => this.show());
+    $("past").addEventListener("click", () => this.toggle());
+    $("large").addEventListener("click", () => this.large());
+    $("sky-close").addEventListener("click", () => $("sky-dialog").close());
+    $("sky-split").addEventListener("input", () => displays.sky.set({ split: Number($("sky-split").value) }));
+  }
+
+  // ---- a state A
+
+  keep() {
+    this.kept = { document: this.history.document, render: [...this.frames.render] };
+    $("reference").options[1].disabled = $("back-a").disabled = false;
+    $("reference").value = "1";
+    this.show();
+  }
+
+  forget() {
+    this.kept = null;
+    $("reference").options[1].disabled = $("back-a").disabled = true;
+    $("reference").value = "0";
+  }
+
+  // The picture that is shown before, of the present view.
+  show() {
+    const frame = ($("reference").value === "1" ? this.kept.render : this.frames.before)[this.on.view()];
+    if (frame) this.displays.render.compare(frame);
+  }
+
+  // ---- the map, large
+
+  large() {
+    this.asked = true;
+    $("sky-size").textContent = "";
+    this.displays.sky.show(this.frames.map[0]);
+    $("sky-dialog").showModal();
+    this.zoom.reset();
+    this.on.send({ type: "sky" });
+  }
+
+  sky(frame) {
+    if (frame.kind === "sky-before") { this.displays.sky.compare(frame); return; }
+    this.displays.sky.show(frame);
+    $("sky-size").textContent = `${frame.width} x ${frame.height} texels`;
+  }
+
+  // The solution has gone on: what is shown large is of before.
+  again() { if ($("sky-dialog").open) this.on.send({ type: "sky" }); }
+
+  // ---- the history in pictures
+
+  toggle() {
+    const open = $("steps").hidden;
+    $("steps").hidden = !open;
+    $("past").setAttribute("aria-expanded", String(open));
+    this.draw();
+  }
+
+  // Keep what the canvas shows now as the picture of the present step.
+  take() {
+    const canvas = $("render"), thumb = document.createElement("canvas");
+    Object.assign(thumb, { height: THUMB, width: Math.max(1, Math.round((THUMB * canvas.width) / canvas.height)) });
+    thumb.getContext("2d").drawImage(canvas, 0, 0, thumb.width, thumb.height);
+    this.thumbs.set(this.history.document, thumb);
+    this.draw();
+  }
+
+  draw() {
+    if ($("steps").hidden) return;
+    const { steps, at } = this.history, first = Math.max(0, steps.length - SHOWN_STEPS);
+    $("steps").replaceChildren(...steps.slice(first).map((step, k) => {
+      const i = first + k, button = document.createElement("button"), thumb = this.thumbs.get(step);
+      button.dataset.testid = `step-${i}`;
+      button.title = i ? changed(steps[i - 1], step) : "the beginning";
+      button.setAttribute("aria-label", `Step ${i}: ${button.title}`);
+      button.setAttribute("aria-pressed", String(i === at));
+      button.append(thumb ?? String(i));
+      button.addEventListener("click", () => this.history.go(i));
+      return button;
+    }));
+    $("steps").children[at - first]?.scrollIntoView({ block: "nearest", inline: "nearest" });
+  }
+}
+
+function changed(before, after) {
+  if (after.strokes.length === before.strokes.length + 1) return `stroke: ${after.strokes.at(-1).type}`;
+  const keys = Object.keys(NAMES).filter((key) => JSON.stringify(before[key]) !== JSON.stringify(after[key]));
+  return keys.map((key) => NAMES[key]).join(", ") || "names";
+}

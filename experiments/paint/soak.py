@@ -1,0 +1,162 @@
+"""Random use of the page of ``envedit paint`` in a real browser, and the memory of its server meanwhile."""
+
+import random
+import re
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from experiments.harness import Experiment, calling, done_of, figure
+from experiments.paint.figure10 import opened, place, prepared
+
+MEMORY_EVERY_S = 1.0
+ACTIONS = ["stroke"] * 6 + ["light"] * 3 + ["undo", "redo", "button", "turn", "wheel", "key", "reload"]
+BUTTONS = ("add-light", "light-mute", "light-delete", "clear", "shape-polygon")
+KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
+LONGEST_PAUSE_S = 2.0
+"""Between two actions, so that some of them are solved for and others are superseded."""
+OWN = {"edit.toml", "edit_out", "server.log"}
+"""What may lie in the folder that the command works in."""
+
+
+def resident_mb(process) -> float:
+    """Return the resident memory of a process, MB; NaN once it has ended."""
+    found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{process.pid}/status").read_text())
+    return int(found[1]) / 1024 if found else float("nan")
+
+
+def act(page, chance: random.Random) -> str:
+    """Do something at random; returns what."""
+    what = chance.choice(ACTIONS)
+    spot = lambda name: place(page, name, chance.random(), chance.random())  # noqa: E731
+    if what == "stroke":
+        for name in ("[data-tool]", "[data-shape]:visible"):
+            buttons = page.locator(name)
+            if buttons.count():
+                buttons.nth(chance.randrange(buttons.count())).click()
+        drag(page, [spot("#overlay") for _ in range(chance.randrange(2, 12))])
+    elif what == "light":
+        handles = page.locator(".handle")
+        handles.nth(chance.randrange(handles.count())).hover(force=True)
+        drag(page, [spot("#map-stack") for _ in range(chance.randrange(1, 12))], begun=True)
+    elif what in ("undo", "redo"):
+        page.get_by_test_id(what).click(force=True)
+    elif what == "button":
+        button = page.get_by_test_id(chance.choice(BUTTONS))
+        if button.is_visible() and button.is_enabled():
+            button.click()
+    elif what == "turn":
+        page.get_by_test_id("degrees").fill(str(chance.randrange(-400, 400)))
+        page.keyboard.press("Enter")
+    elif what == "wheel":
+        page.mouse.move(*spot("#map-stack"))
+        page.mouse.wheel(0, chance.choice([-100, 100]))
+    elif what == "key":
+        page.keyboard.press(chance.choice(KEYS))
+    else:
+        page.reload()
+        page.wait_for_selector("#work:not([hidden])", timeout=120_000)
+        page.wait_for_selector(".handle", state="attached", timeout=120_000)
+    time.sleep(LONGEST_PAUSE_S * chance.random())
+    return what
+
+
+def drag(page, places, begun=False):
+    """Drag the pointer over places; ``begun``: from where it is."""
+    if not begun:
+        page.mouse.move(*places[0])
+    page.mouse.down()
+    for spot in places:
+        page.mouse.move(*spot)
+        time.sleep(0.03)
+    page.mouse.up()
+
+
+def soak(settings, folder, minutes) -> dict:
+    """Use the page for some minutes; the configuration's seed is that of the actions."""
+    chance, done, errors, work = random.Random(settings.seed), Counter(), [], prepared(folder)
+    memory, ended = [], threading.Event()
+    with opened(work) as (page, process):
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        began = time.monotonic()
+
+        def watch():
+            while not ended.wait(MEMORY_EVERY_S) and process.poll() is None:
+                memory.append([time.monotonic() - began, resident_mb(process)])
+
+        watching = threading.Thread(target=watch)
+        watching.start()
+        try:
+            while time.monotonic() < began + 60 * minutes and process.poll() is None:
+                done[act(page, chance)] += 1
+        finally:
+            ended.set()
+            watching.join()
+        alive = process.poll() is None
+    return {
+        "minutes": minutes,
+        "actions": done,
+        "memory": memory,
+        "page_errors": errors,
+        "alive": alive,
+        "server_log": (work / "server.log").read_text()[-2000:],
+        "files_outside": sorted(path.name for path in work.iterdir() if path.name not in OWN),
+    }
+
+
+def measure(done) -> dict:
+    """Return what was done, and the mean memory of the three thirds of the time."""
+    memory = np.array(done.metrics["memory"])[:, 1]
+    return done.metrics | {"thirds": [float(np.mean(third)) for third in np.array_split(memory, 3)]}
+
+
+def failures(rows) -> list[str]:
+    """Say what the page or the server did that they must not do."""
+    found = []
+    for row in rows:
+        wrong = {
+            f"errors of the page: {'; '.join(row['page_errors'])}": row["page_errors"],
+            "the server ended before its time": not row["alive"],
+            f"the server wrote to its log: {row['server_log']}": row["server_log"],
+            f"files where there must be none: {', '.join(row['files_outside'])}": row["files_outside"],
+            "the last third has 5 % more memory than the one before": row["thirds"][2]
+            > 1.05 * row["thirds"][1],
+        }
+        found += [sentence for sentence, holds in wrong.items() if holds]
+    return found
+
+
+def draw(cases, out, to, given):
+    """Draw the server's memory over time: ``memory.png``."""
+    with figure(to / "memory.png", 1, 1, (7, 2.8), squeeze=False) as panels:
+        for one in done_of(cases, out):
+            seconds, memory = np.array(one.metrics["memory"]).T
+            panels[0, 0].plot(seconds / 60, memory, linewidth=0.8)
+        panels[0, 0].set(xlabel="minutes of random use", ylabel="memory of the server, MB", ylim=(0, None))
+    return [to / "memory.png"]
+
+
+def cases(given):
+    tables = {"input": {"envmap": "sunsky"}, "scene": {"file": "sphere", "width": 128}}
+    return [calling("soak", f"{__name__}:{soak.__name__}", tables, minutes=given.minutes)]
+
+
+EXPERIMENT = Experiment(
+    "paint.soak",
+    "Random use of the page of envedit paint: memory over time, errors.",
+    cases,
+    measure,
+    {
+        "minutes": "{minutes:g}",
+        "actions": lambda row: str(sum(row["actions"].values())),
+        "of them": lambda row: ", ".join(f"{row['actions'][what]} {what}" for what in sorted(row["actions"])),
+        "memory in the first, second, last third, MB": "{thirds[0]:.0f}, {thirds[1]:.0f}, {thirds[2]:.0f}",
+    },
+    failures=failures,
+    options=lambda parser: parser.add_argument("--minutes", type=float, default=15.0, metavar="N"),
+    draw=draw,
+    alone=True,
+)

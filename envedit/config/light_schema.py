@@ -11,6 +11,7 @@ from typing import Any
 from envedit.config.validators import (
     Boolean,
     Check,
+    Choice,
     Integer,
     Number,
     Numbers,
@@ -37,14 +38,31 @@ OWN: dict[str, Check] = {
     **_LISTED,
 }
 """Of a light of the map: its number, those with most flux first; where it goes; factors on flux and size."""
-ADDED: dict[str, Check] = {**_PLACE, "flux": _FLUX, "size": Number(0.01, 90), **_LISTED}
-"""Of a light that is added: where; its flux, radiance times steradian; its radius in degrees."""
+SHAPES = {"gaussian": 1.0, "disc": 1.0, "rectangle": 1.0, "ring": 1.0, "gradient": 1.0, "strip": 0.1}
+"""Shapes of a light that is added, each with its ``aspect`` where none is given."""
+ADDED: dict[str, Check] = {
+    **_PLACE,
+    "flux": _FLUX,
+    "size": Number(0.01, 90),
+    "shape": Choice(*SHAPES),
+    "aspect": Number(0.01, 1),
+    "rotation": Number(-360, 360),
+    "softness": Number(0, 1),
+    **_LISTED,
+}
+"""Of a light that is added: where; its flux, radiance times steradian; its radius in degrees; its shape."""
 MEANINGS = {
     "light": "number of a light of the map, those with most flux first; without it a light is added",
     "azimuth": "where it goes, degrees along the columns; needed for a light that is added",
     "elevation": "likewise, degrees above the horizon",
     "flux": "of the map's light: factors on its; of an added one: radiance times steradian; needed",
-    "size": "of the map's light: factor on its size, to 20; of an added one: radius in degrees",
+    "size": "of the map's light: factor on its size, to 20; of an added one: radius in degrees, or half "
+    "of its longer side",
+    "shape": "of an added light; ring: the hole has half the radius; gradient: a rectangle that falls from "
+    "its upper side to black at its lower one; strip: with round ends",
+    "aspect": "of an added light: its shorter side over its longer one; without it 1, of a strip 0.1",
+    "rotation": "likewise: degrees by which its longer side is turned to the left from the horizontal",
+    "softness": "likewise, but not of a Gaussian: 0 has a sharp border, 1 fades from the middle",
     "name": "what it is called in the page of `envedit paint`",
     "muted": "whether it is switched off",
     "locked": "whether an edit of layers leaves it, with its glow, as it is here",
@@ -86,7 +104,7 @@ class LightList(Check):
         return f"at most {MOST_PLACED}"
 
     def _schema(self) -> Schema:
-        keys = {key: {**(OWN | ADDED)[key].schema(), "description": MEANINGS[key]} for key in OWN}
+        keys = {key: {**(OWN | ADDED)[key].schema(), "description": MEANINGS[key]} for key in MEANINGS}
         light: Schema = {"type": "object", "properties": keys, "additionalProperties": False}
         light["dependencies"] = {"azimuth": ["elevation"], "elevation": ["azimuth"]}
         return {"type": "array", "items": light, "maxItems": MOST_PLACED}
@@ -96,7 +114,7 @@ def _light(name: str, light: dict[str, Any]) -> dict[str, Any]:
     keys = OWN if "light" in light else ADDED
     for unknown in (k for k in light if k not in keys):
         hint = meant(str(unknown), keys)
-        hint = hint if hint.startswith("did") else f"known: {', '.join(OWN)}"
+        hint = hint if hint.startswith("did") else f"known: {', '.join(dict.fromkeys(['light', *keys]))}"
         raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
     found = {key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light}
     if ("azimuth" in found) != ("elevation" in found):

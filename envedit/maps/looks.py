@@ -23,7 +23,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 from envedit.export import light_list
 from envedit.representations.layers import below_horizon
-from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.layers import Layers, ground_irradiance
 from envedit.representations.layers.placed_lights import angles, direction
 
 ROLES = ("key", "fill", "rim")
@@ -135,12 +135,8 @@ def layers_of(envmap: np.ndarray, aureole: np.ndarray | None = None) -> Layers:
 
 
 def sky_irradiance(layers: Layers, sky: np.ndarray) -> float:
-    """Return the luminance of the irradiance of the horizontal plane by a sky (rows, W, 3) without lights."""
-    rows, columns = layers.shape
-    total = layers.rows[1]
-    cosine = np.maximum(np.cos(np.pi * np.arange(rows) / (total - 1)), 0)
-    weight = latlong.lookup_solid_angles(total, columns)[:rows] * cosine
-    return float(weight @ (sky[:rows].astype(np.float64) @ LUMINANCE).sum(axis=1))
+    """Return the luminance of the irradiance of level ground by a sky (rows, W, 3) without lights."""
+    return ground_irradiance(sky[: layers.shape[0]], layers.rows)
 
 
 def smallest(width: int) -> float:

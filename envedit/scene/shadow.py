@@ -47,10 +47,10 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
     offset = NEAR / [scene.width, rows.stop - rows.start]
     offset = offset[np.argsort(np.abs(NEAR).sum(axis=1), kind="stable")]
     places = np.clip(np.array([x, y]) + offset, 0, 1)
-    seen = _seen(scene, view, places)
+    seen = surfaces_seen(scene, view, places)
     ahead = mi.Vector3f(scene.to_world @ np.float64(toward))
     facing = seen.is_valid() & (dr.dot(seen.n, ahead) * dr.dot(seen.n, seen.to_world(seen.wi)) > 0)
-    hit = _first(scene, seen.spawn_ray(ahead), facing)
+    hit = first_surfaces(scene, seen.spawn_ray(ahead), facing)
     blocked = hit.is_valid().numpy()
     if blocked.any():
         return hit.p.numpy().T[int(np.argmax(blocked))].astype(np.float64)
@@ -81,7 +81,7 @@ def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) ->
     NoShadowError
         No surface is seen there, or it faces away from the point.
     """
-    seen = _seen(scene, view, np.array([[x, y]]))
+    seen = surfaces_seen(scene, view, np.array([[x, y]]))
     if not seen.is_valid().numpy()[0]:
         raise NoShadowError("no surface is seen there")
     toward = np.float64(point) - seen.p.numpy()[:, 0]
@@ -92,13 +92,13 @@ def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) ->
     return found / np.linalg.norm(found)
 
 
-def _seen(scene, view, places):
-    """Return the surfaces that are seen at places (n, 2)."""
+def surfaces_seen(scene: Scene, view: int, places: np.ndarray) -> mi.SurfaceInteraction3f:
+    """Return the surfaces that are seen at places (n, 2) of a view, as shares of its width and height."""
     ray = camera_paths.rays_through(scene.mi, view, places)
-    return _first(scene, ray, dr.full(mi.Bool, True, len(places)))
+    return first_surfaces(scene, ray, dr.full(mi.Bool, True, len(places)))
 
 
-def _first(scene, ray, active):
+def first_surfaces(scene: Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
     """Return the first surfaces on rays that do more than let light through."""
     found = scene.mi.ray_intersect(ray, active)
     for _ in range(PASSED):

@@ -29,7 +29,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
             ("painted", 60),
             ("weights", 60),
             ("scene", 60),
-            ("asset", 40),
+            ("asset", 20),
             ("entry", 40),
             ("checkpoint", 100),
         ],

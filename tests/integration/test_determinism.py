@@ -47,7 +47,7 @@ def configured(folder, rng, kind, renderer="transport"):
     return world(folder, rng, **tables)
 
 
-CASES = [("transport", kind) for kind in KINDS] + [("path", "siren"), ("path", "layers")]
+CASES = [("transport", kind) for kind in KINDS] + [("path", "siren")]
 
 
 @pytest.mark.slow

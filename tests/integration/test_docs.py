@@ -54,21 +54,14 @@ def test_the_site_builds_offline_without_a_warning(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("edit_a_map", [r"rendering: \d\d\.\d -> [3-9]\d\.\d dB", r"light at azimuth (5\d|6\d),"]),
-        ("table_1_in_small", [r"R-SIREN HDR +\d\d\.\d dB", r"Layers \(ours\) .* 3\d\.\d dB"]),
-    ],
-)
-def test_a_notebook_runs(name, says, tmp_path):
+def test_the_notebook_runs(tmp_path):
     for package in ("jupytext", "ipykernel", "nbconvert"):
         pytest.importorskip(package, reason="the extra envedit[docs] is not installed")
     made = tmp_path / "made.ipynb"
     notebook = [sys.executable, "-m", "jupytext", "--to", "ipynb", "--execute", "--output", str(made)]
     own = {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run(
-        [*notebook, str(DOCS / "notebooks" / f"{name}.md")],
+        [*notebook, str(DOCS / "notebooks" / "table_1_in_small.md")],
         env=os.environ | own,
         capture_output=True,
         text=True,
@@ -76,7 +69,8 @@ def test_a_notebook_runs(name, says, tmp_path):
     assert done.returncode == 0, done.stderr
     cells = json.loads(made.read_text())["cells"]
     printed = "".join("".join(o.get("text", [])) for cell in cells for o in cell.get("outputs", []))
-    assert all(re.search(line, printed) for line in says), printed
+    for line in (r"R-SIREN HDR +\d\d\.\d dB", r"Layers \(ours\) .* 3\d\.\d dB"):
+        assert re.search(line, printed), printed
 
 
 @pytest.mark.slow

@@ -28,10 +28,8 @@ ADAM = ["optimizer.kind=adam", "representation.turn=false"]  # a turned map woul
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind, light_moves", [("layers", False), ("siren", True), ("pixels", True)]
-)
-def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monkeypatch):
+@pytest.mark.parametrize("kind", ["siren", "pixels"])
+def test_no_kernel_is_compiled_after_the_third_iteration(kind, monkeypatch):
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
     settings = config.loads("", overrides=[*SMALL, f"representation.kind={kind}", *ADAM])
     fresh, columns, launched = {}, [], []
@@ -55,8 +53,7 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, light_moves, monk
         pipeline.run(settings)
     assert len(fresh) == 45 and min(launched) > 10  # the history was kept
     assert {step: count for step, count in fresh.items() if step >= 3 and count} == {}
-    # Else nothing was traced after the first step, and nothing shown.
-    assert columns[-1] > columns[1] or not light_moves
+    assert columns[-1] > columns[1]  # else nothing was traced after the first step, and nothing shown
 
 
 @pytest.mark.slow

@@ -229,6 +229,49 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         assert not page.faults, page.faults
 
 
+def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    kept = tmp_path / "edit_out" / "painted.toml"
+
+    def lights():
+        return config.load(kept).input.lights if kept.exists() else ()
+
+    with served(tmp_path / "edit.toml") as server:
+        page = Page(browser, server.url)
+        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
+        message = page.page.get_by_test_id("message")
+        # ---- One new light by a drag, which is chosen then; why it cannot move; the same behind the ball
+        page.page.keyboard.press("i")
+        page.drag(page.at("#overlay", 0.45, 0.5), page.at("#overlay", 0.6, 0.4))
+        sync_api.expect(message).to_contain_text("Light 2 illuminates this place")
+        until(lambda: len(lights()) == 1 and "light" not in lights()[0])
+        in_front = lights()[0]
+        page.page.keyboard.press("r")
+        page.page.mouse.click(*page.at("#overlay", 0.5, 0.45))
+        sync_api.expect(message).to_contain_text("faces the camera")
+        page.page.mouse.click(*page.at("#overlay", 0.68, 0.4))
+        sync_api.expect(message).to_contain_text("Light 2 lights the rim")
+        until(lambda: abs(lights()[0]["azimuth"] - in_front["azimuth"]) > 60)
+        # ---- Its shape, one step of history each
+        for key, value in (("shape", "strip"), ("rotation", "30"), ("softness", "0.5"), ("aspect", "0.3")):
+            control = page.page.get_by_test_id(f"light-{key}")
+            control.select_option(value) if key == "shape" else control.fill(value)
+            until(lambda key=key, value=value: str(lights()[0].get(key)) in (value, f"{value}.0"))
+        page.shot("shaped")
+        page.page.get_by_test_id("undo").click()
+        until(lambda: lights()[0]["aspect"] == 0.1)
+        # ---- Without a chosen light, the sun casts the shadow
+        page.page.keyboard.press("Escape")
+        sync_api.expect(page.page.get_by_test_id("light-panel")).to_contain_text("No light chosen")
+        page.page.get_by_test_id("tool-cast").click()
+        page.page.mouse.click(*page.at("#overlay", 0.25, 0.85))
+        sync_api.expect(message).to_contain_text("Light 1 casts a shadow here")
+        until(lambda: any(one.get("light") == 1 for one in lights()))
+        page.settled(False)
+        page.shot("placed")
+
+
 def lights_are_listed(page, kept):
     """The list: name, flux, size, colour, lock, mute; solo is not kept."""
     get = page.page.get_by_test_id

@@ -118,7 +118,7 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
     session, heard = painting
 
     def picked(row, column, **more):
-        session.pick(Pick((column + 0.5) / 48, (row + 0.5) / 48, of="shadow", **more))
+        session.pick(Pick((column + 0.5) / 48, (row + 0.5) / 48, **{"of": "shadow"} | more))
         return heard.last["picked"]
 
     for turn, (tip, there) in DRAGGED.items():
@@ -133,6 +133,13 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         assert after[there] < 0.5 * before[there], "the shadow is not where it was dragged to"
         assert after[tip] > before[tip]
         assert "in no shadow" in picked(45, 45)["text"]
+        # ---- A click does the same with the strongest light; to illuminate, one is to be added
+        to = picked(*tip, of="cast")
+        light |= {"azimuth": to["azimuth"], "elevation": to["elevation"]}
+        session.update(Edit(document({"rotate_degrees": turn, "lights": [light]})))
+        assert to["light"] == 0 and session.base[tip][1] < 0.5 * after[tip], "the shadow does not fall there"
+        added = picked(20, 24, of="illuminate")
+        assert added["light"] == -1 and -90 <= added["elevation"] <= 90
         lights = session.problem.layers.lights
         session.run.state["turn"][0] = rotation_vector(lights.centres[0], lights.centres[0] * [-1, 1, -1])
         assert "in no shadow" in picked(*there)["text"], "the light is not where paint has put it"

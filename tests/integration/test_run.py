@@ -186,7 +186,7 @@ def test_rows_that_are_not_active_come_back_bit_for_bit(done):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rows, active", [("all", [0, 7]), ([2, 2], [2, 2]), ([5, 7], [5, 7])])
+@pytest.mark.parametrize("rows, active", [("all", [0, 7]), ([2, 2], [2, 2])])
 def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
     adam = {"kind": "adam", "iterations": 4}  # Gauss-Newton leaves a row be that changes nothing but noise
     path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows}, optimizer=adam)
@@ -260,9 +260,11 @@ def test_without_iterations_the_map_is_the_original_and_its_two_renderings_are_t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
-@pytest.mark.parametrize("renderer", ["transport", "path"])
-def test_every_representation_runs_with_every_renderer(kind, renderer, tmp_path, rng):
+@pytest.mark.parametrize(
+    ("kind", "renderer"),
+    [*((kind, "transport") for kind in ("layers", "siren", "pixels", "log-pixels")), ("siren", "path")],
+)
+def test_every_representation_runs(kind, renderer, tmp_path, rng):
     path = world(tmp_path, rng)
     settings = changed(representation__kind=kind, renderer__kind=renderer, optimizer__iterations=2)
     assert call(path, "--quiet", *settings) == 0

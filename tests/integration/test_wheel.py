@@ -66,6 +66,7 @@ def wheel(tmp_path_factory):
     offline = ["--no-isolation"] if recent else []  # else setuptools is fetched
     call(sys.executable, "-m", "build", *offline, "--outdir", folder, source, cwd=folder)
     (built,), (archive,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    assert built.name.startswith("envedit_hdr-")
     assert built.name.split("-")[:2] == archive.name.removesuffix(".tar.gz").split("-")
     return built
 

@@ -11,8 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from envedit.core import latlong
+from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotation_vector
-from envedit.representations.layers import lights
+from envedit.images import images
+from envedit.representations.layers import layers, lights
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 from tests.oracles.plain import single
@@ -416,6 +418,30 @@ def test_spare_lights_are_round(width, degrees, rng):
         assert 0.95 * expected < moments.mean() < 1.05 * (expected + (apart**2 - 1) * texel**2 / 6)
 
 
+def test_without_a_glow_in_the_map_spare_lights_have_that_of_a_clear_sun(rng):
+    own = [patch(rng, 4, 10)]
+    made = Lights(own, (0, H), W, irradiance=3.0)
+    turn, flux, _ = (np.array(p) for p in place(made, flux=DARK))
+    flux[1] = np.log(2.0)
+    at = np.radians([10.0, 60.0, 130.0])
+    d = mi.Vector3f(np.stack([np.sin(at), np.cos(at), 0 * at]).astype(np.float32))
+    expected = 1 + 2 * np.exp(-np.array([10, 60, np.inf]) / 12)[:, None] * 2 * made.flux[1] / 3
+    np.testing.assert_allclose(made.glow_of(1, single(turn), single(flux), d).numpy().T, expected, rtol=1e-4)
+    for irradiance in (0.0, 1e-300):
+        table = Lights(own, (0, H), W, irradiance=irradiance).glows[1]
+        assert table is None or np.isfinite(np.float32(table)).all()
+
+
+@pytest.mark.parametrize("name", ["autumn_field", "rustig_koppie", "syferfontein_18d_clear"])
+def test_the_glow_of_a_clear_sun_is_that_of_photographed_ones(name, data):
+    image, _ = images.load_envmap(str(data / "puresky" / f"{name}_puresky_1k.hdr"), 256)
+    made = layers.Layers.of(image[:64], (0, 128))
+    irradiance = layers.ground_irradiance(made.base, (0, 128))
+    expected = lights.clear_glow(made.lights.flux[0] / irradiance)[5:31] @ LUMINANCE
+    ratio = made.lights.glows[0][5:31] @ LUMINANCE / expected
+    assert 0.55 < ratio.min() < 1 < ratio.max() < 1.6
+
+
 def test_spare_lights_have_the_glow_of_the_strongest_light_in_proportion_to_flux(rng):
     table = np.exp(-GLOW_DEGREES / 10)[:, None] * [4.0, 3.0, 2.0] * (GLOW_DEGREES < 60)[:, None]
     own = [patch(rng, 4, 10, peak=100.0, glow=table), patch(rng, 8, 30, peak=3.0, glow=table / 7)]
@@ -510,7 +536,7 @@ PATHS = ["texel borders", "seam", "over the pole", "past the pole", "over the na
 @pytest.mark.parametrize("by", ["radiance", "flux"])
 def test_gradient_along_a_path_adds_up_to_the_change(name, top, by, rng):
     """Many copies of a light, one at every step of the path: a linear loss is the sum of theirs."""
-    light, count = patch(rng, top, 46), 2000
+    light, count = patch(rng, top, 46), 1000
     start, end = over(light, name)
     weight = weights() * (latlong.lookup_solid_angles(H, W)[:, None, None] if by == "flux" else 1)
     at = place(made := Lights([light] * count, (0, H), W), turn=path(start, end, count))

@@ -173,9 +173,10 @@ def agree(outcome, kind, said):
 HEAD = """# Extremes
 
 What happens where a map, a target or a scene is as odd as it can be. This page is written from the tests
-(`python -m tests.oracles.extremes > docs/extremes.md`), which check every cell. *ok*: the result is finite
-and correct, by the definition of its stage; a number in brackets is a note below on what is correct there.
-*refused*: with the words of the note. *seen*: the stage's value is not finite, and a later stage detects it.
+(`python -m tests.oracles.extremes > docs/extremes.md`), which check every exception and a third of the other
+cells; the command checks all. *ok*: the result is finite and correct, by the definition of its stage; a
+number in brackets is a note below on what is correct there. *refused*: with the words of the note. *seen*:
+the stage's value is not finite, and a later stage detects it.
 """
 
 

@@ -55,9 +55,10 @@ def small(source, size=WORKING):
     return latlong.resize(source, *size)
 
 
-def encoded(working, rows=ROWS, free=None):
+def encoded(working, rows=ROWS, free=None, aureoles=True):
     first, count = rows
-    made = Layers.of(working[first : first + count], (first, len(working))).keeping(free)
+    image = working[first : first + count]
+    made = Layers.of(image, (first, len(working)), aureoles=aureoles).keeping(free)
     return made, {k: v.numpy().copy() for k, v in made.start().items()}
 
 
@@ -168,7 +169,7 @@ def test_kept_texels_keep_their_gain_and_their_neighbours_fall_off(rng):
 def test_texels_far_from_a_moved_light_without_glow_keep_their_bits():
     source = sky(256, 512, glow=False)
     working = small(source)
-    made, params = encoded(working)
+    made, params = encoded(working, aureoles=False)
     assert not made.lights.glowing
     old, new = made.lights.centres[0], toward(50, 90)
     result, _ = carried(made, sent(made, params, new), working, source)

@@ -4,11 +4,19 @@ import numpy as np
 import pytest
 
 from envedit import config, inputs, pipeline
+from envedit.config import light_schema
 from envedit.core import latlong
 from envedit.core.errors import ConfigError
 from envedit.export import file_resolution
 from envedit.images import images
-from envedit.representations.layers.placed_lights import PlacedLights, add, angles, direction, missing
+from envedit.representations.layers.placed_lights import (
+    PlacedLights,
+    add,
+    angles,
+    direction,
+    missing,
+    profile,
+)
 from tests.oracles.devices import on_cpu
 
 
@@ -71,6 +79,63 @@ def test_an_added_light_has_its_flux_at_any_size_resolution_and_place(size, elev
         assert np.allclose(flux(found), [1, 2, 1e6], rtol=1e-4)
 
 
+A = np.radians(6)
+AREA = {
+    "disc": 0.5 * np.pi * A**2,
+    "rectangle": 2 * A**2,
+    "ring": 0.375 * np.pi * A**2,
+    "gradient": A**2,  # times the radiance at its upper side
+    "strip": A**2 + np.pi * A**2 / 4,
+}
+"""Of each shape in steradian, for a size of 6 degrees and an aspect of 1/2, as if the sphere were flat."""
+
+
+@pytest.mark.parametrize("shape", light_schema.SHAPES)
+@pytest.mark.parametrize("softness", [0.0, 1.0])
+@pytest.mark.parametrize("elevation", [-90.0, 20.0, 89.9])
+def test_a_shape_has_its_flux_its_area_and_its_place(shape, softness, elevation):
+    light = {"azimuth": 359.0, "elevation": elevation, "flux": [1.0, 2.0, 3.0], "size": 6.0, "aspect": 0.5}
+    light |= {"shape": shape, "softness": softness, "rotation": 30.0}
+    for height in (16, 160):
+        for size in (0.01, 6.0, 90.0):
+            found = add(np.zeros((height, 2 * height, 3), np.float32), [light | {"size": size}])
+            assert np.allclose(flux(found), [1, 2, 3], rtol=1e-6) and np.isfinite(found).all()
+    if softness == 0 and shape in AREA:
+        sharp = add(np.zeros((320, 640, 3), np.float32), [light])
+        assert sharp[..., 0].max() == pytest.approx(1 / AREA[shape], rel=0.06)
+    fine = latlong.resize(add(np.zeros((192, 384, 3), np.float32), [light | {"size": 30.0}]), 48, 96)
+    coarse = add(np.zeros((48, 96, 3), np.float32), [light | {"size": 30.0}])
+    omega = latlong.solid_angles(48, 96)[:, None, None]
+    assert (omega * np.abs(fine - coarse)).sum() < 0.05 * 6, "another shape at another resolution"
+
+
+def test_a_disc_of_ninety_degrees_is_a_half_dome():
+    light = {"azimuth": 200.0, "elevation": 30.0, "flux": [1.0] * 3, "size": 90.0, "shape": "disc"}
+    dome = add(np.zeros((64, 128, 3), np.float32), [light])
+    cosine = latlong.directions(64, 128) @ direction(200, 30)
+    assert np.allclose(dome[cosine > 0.06], 1 / (2 * np.pi), rtol=2e-3) and not dome[cosine < -0.06].any()
+
+
+@pytest.mark.parametrize("elevation", [0.0, 60.0, 90.0])
+def test_rotation_turns_a_shape_to_the_left_and_softness_moves_no_border(elevation):
+    light = {"azimuth": 120.0, "elevation": elevation, "flux": [1.0] * 3, "size": 20.0, "aspect": 0.25}
+    light |= {"shape": "rectangle"}
+    toward = direction(120, elevation)
+    east = direction(210, 0)
+    up = np.cross(east, toward)
+    for rotation in (0.0, 40.0, -90.0):
+        turn = np.radians(rotation)
+        longer = np.cos(turn) * east + np.sin(turn) * up
+        shorter = np.cos(turn) * up - np.sin(turn) * east
+        for softness in (0.0, 0.3, 1.0):
+            placed = light | {"rotation": rotation, "softness": softness}
+            for axis, half in ((longer, 20.0), (shorter, 5.0)):
+                angle = np.radians([half - 0.01, half + 0.01])[:, None]
+                border = profile(placed, np.cos(angle) * toward + np.sin(angle) * axis, np.radians(0.2))
+                assert border.mean() == pytest.approx(0.5, abs=0.02)
+                assert profile(placed, toward, np.radians(0.2)) == 1
+
+
 def test_what_the_map_does_not_have_is_told(sky):
     settings = config.Input(envmap="sunsky", width=64, lights=[{"light": 5, "flux": [0, 0, 0]}])
     given = inputs.read_map(settings, None, 64)
@@ -87,6 +152,10 @@ def test_keys_that_cannot_be_are_named():
         ({"light": 1, "flux": [1, 1, 2e6]}, "flux"),
         ({"flux": [1, 1, 1]}, "azimuth"),
         ({"light": 1, "sise": 2}, "did you mean size"),
+        ({"light": 1, "shape": "disc"}, "has no key 'shape'"),
+        ({"azimuth": 1, "elevation": 2, "flux": [1, 1, 1], "shape": "discs"}, "shape.*did you mean disc"),
+        ({"azimuth": 1, "elevation": 2, "flux": [1, 1, 1], "softness": np.nan}, r"lights\[0\].softness"),
+        ({"azimuth": 1, "elevation": 2, "flux": [1, 1, 1], "aspect": 0}, r"lights\[0\].aspect"),
     ]:
         with pytest.raises(ConfigError, match=said):
             config.Input(lights=[light])
@@ -113,7 +182,10 @@ def test_the_full_map_has_the_same_lights(tmp_path):
     azimuth = 30
     elevation = 20
     flux = [0.3, 0.2, 0.1]
-    size = 6
+    size = 12
+    shape = "strip"
+    softness = 0.5
+    rotation = 30
     [scene]
     width = 8
     [target]

@@ -118,14 +118,14 @@ def test_an_edit_on_fewer_pixels_is_judged_at_full_size():
     found = {}
     for pixels in (32 * 32, 64 * 64):
         tables = {
-            "input": {"width": 64},
+            "input": {"width": 32},
             "scene": {"file": "sphere", "width": 64},
-            "target": {"rotate_degrees": 60.0, "spp": 256},
-            "output": {"spp": 256},
+            "target": {"rotate_degrees": 60.0, "spp": 64},
+            "output": {"spp": 64},
             "renderer": {"pixels": pixels},
             "representation": {"turn": False},
         }
-        found[pixels] = envedit.edit(tables, envmap=envedit.sunsky(64))
+        found[pixels] = envedit.edit(tables, envmap=envedit.sunsky(32))
     fewer, all_of_them = found.values()
     assert "solved on a picture of 32x32 pixels" in fewer.notes
     assert not any("solved on" in note for note in all_of_them.notes)

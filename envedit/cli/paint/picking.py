@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,12 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
 from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
-from envedit.scene import highlight, shadow
+from envedit.scene import highlight, placement, shadow
 from envedit.scene.scene import Scene
 from envedit.transport.light_transport import LightTransport
+
+PLACES = ("illuminate", "rim", "cast")
+"""Of what is picked: a light is placed by a click, and not one that shows there dragged."""
 
 PATCH = 1
 """Pixels to each side of a picked one whose rows of T are added: single rows are noisy."""
@@ -84,15 +87,20 @@ class Picking:
         """Return ``light``, and where it must stand, or ``text``: why nowhere.
 
         Without a light one is chosen: that of a highlight adds most at the pixel, that of a shadow has most
-        flux of those whose shadow it is in; ``point`` is what casts it. ``shown`` are the document's lights
-        where the rendering that is shown has them.
+        flux of those whose shadow it is in; ``point`` is what casts it. For :data:`PLACES` it is -1, a light
+        to be added, but for "cast" that of most flux. ``shown`` are the document's lights where the rendering
+        that is shown has them.
         """
         view = min(asked.view, len(self.scene.rows) - 1)
-        if asked.light >= 0:
+        if asked.of == "cast" and asked.light < 0:
+            shining = [i for i in range(len(shown)) if shown[i].flux.any()]
+            strongest = max(shining, key=lambda i: shown[i].flux.sum(), default=-1)
+            asked = replace(asked, light=strongest)
+        if asked.light >= 0 or asked.of in PLACES:
             found: dict[str, Any] = {"light": asked.light}
             try:
-                toward = self._direction(asked, view)
-            except (highlight.NoHighlightError, shadow.NoShadowError) as reason:
+                toward = self._direction(asked, view, shown)
+            except (highlight.NoHighlightError, shadow.NoShadowError, placement.NoPlaceError) as reason:
                 return found | {"text": str(reason)}
             row, _ = latlong.texel_position(toward, *self.placed.envmap.shape[:2])
             if not self.rows.first <= round(float(row)) < self.rows.stop:
@@ -102,12 +110,20 @@ class Picking:
             return {"light": self._lit_by(self._seen(view, asked.x, asked.y), document)}
         return self._shadowed(asked, view, shown)
 
-    def _direction(self, asked, view):
+    def _direction(self, asked, view, shown):
+        place = self.scene, view, asked.x, asked.y
+        if asked.of == "illuminate":
+            return placement.illuminating(*place)
+        if asked.of == "rim":
+            return placement.rimming(*place)
+        if asked.of == "cast":
+            known = 0 <= asked.light < len(shown)
+            return placement.shading(*place, shown[asked.light].direction if known else None)
         if asked.of == "highlight":
-            return highlight.direction(self.scene, view, asked.x, asked.y)
+            return highlight.direction(*place)
         if not asked.point:
             raise shadow.NoShadowError("no shadow was picked")
-        return shadow.direction(self.scene, view, asked.x, asked.y, np.array(asked.point))
+        return shadow.direction(*place, np.array(asked.point))
 
     def _shadowed(self, asked, view, listed):
         """Return the light of most flux whose shadow lies at a place, and what casts it."""

@@ -44,6 +44,23 @@ SATURATION_STEP = 0.05
 tangent: ``docs/decisions/slope_of_the_saturation.md``."""
 
 
+def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
+    """Return the luminance of the irradiance of level ground by a sky without lights.
+
+    Parameters
+    ----------
+    sky : ndarray (n, W, 3)
+        Linear radiance.
+    rows : (int, int)
+        Its first row in the map, and the rows of the map; those below the horizon light nothing.
+    """
+    first, total = rows
+    polar = np.pi * np.arange(first, first + len(sky)) / max(total - 1, 1)
+    cosine = np.maximum(np.cos(polar), 0)
+    weight = latlong.lookup_solid_angles(total, sky.shape[1])[first : first + len(sky)] * cosine
+    return float(weight @ (sky.astype(np.float64) @ LUMINANCE).sum(axis=1))
+
+
 @dataclass(frozen=True)
 class TexelFields:
     """What parameters do to every texel of a working map, (rows, W, 3) float32 each.
@@ -147,8 +164,8 @@ class Layers:
             What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
             ``below_horizon.py``, or "free": edited as those above.
         aureoles : bool or ndarray
-            Lights that are added have the glow of the map's strongest, or that of a table, as for
-            :class:`.Lights`.
+            Lights that are added have the glow of the map's strongest, or of a sun in a clear sky, or that of
+            a table, as for :class:`.Lights`.
         fixed : ndarray (rows, W, 3), optional
             What of the image is of locked lights: it is left out of the separation, and never changes.
 
@@ -172,8 +189,9 @@ class Layers:
 
         # ---- Lights, and the map without their cores
         separation = separate(above, rows, MOVABLE)
-        lights = Lights(separation.lights, rows, image.shape[1], aureoles)
         core = separation.core
+        irradiance = ground_irradiance(np.maximum(above - core, 0), rows)
+        lights = Lights(separation.lights, rows, image.shape[1], aureoles, irradiance)
         base = np.where((core > 0).any(axis=2, keepdims=True), above - core, above)
         base = np.maximum(base, 0).astype(np.float32)
 

@@ -47,6 +47,13 @@ NARROWEST = 0.4
 """Radius in texels from which a lobe is round. With the tents of its points, of variance 1/6, it makes 0.57:
 where its centre lies between texels changes its second moments by less than 2 % (derived;
 ``tests/oracle/test_lights.py`` measures it). A narrower one is interpolated as a single texel is."""
+CLEAR_GLOW = 2.0
+CLEAR_GLOW_DEGREES = 12.0
+"""Glow of a sun in a clear sky: CLEAR_GLOW F / E exp(-angle / CLEAR_GLOW_DEGREES) of its radiance, F the
+sun's flux and E the irradiance of the ground by the sky. Measured on three PureSky maps with clear suns
+(``tests/oracle/test_lights.py`` compares them)."""
+MOST_GLOW = 1e30
+"""Most of F / E: of a sky of 1e-30 the glow stays within float32. Derived."""
 LOG_SIZES = (-6.0, 3.0)
 """Log sizes are cut to these: from a texel's fraction to twenty times the light. Not measured."""
 MOST_LOG_FLUX = 30.0
@@ -81,6 +88,8 @@ class Lights:
     aureoles : bool or ndarray (len(GLOW_DEGREES), 3)
         Spare lights have a glow; without it what surrounds a light that is added is left to the gain. A table
         is the glow that they have.
+    irradiance : float
+        Of the ground by the sky without its lights, luminance.
 
     Attributes
     ----------
@@ -93,11 +102,17 @@ class Lights:
         :data:`FAINTEST` of it in every channel, or 1.
     glows : list of ndarray (len(GLOW_DEGREES), 3) or None
         As of :class:`.separation.Light`, of lights of :attr:`flux`. Spare ones have that of the strongest
-        light with a glow, in proportion to flux, None where none has; or the table of ``aureoles``.
+        light with a glow, or of a sun in a clear sky where none has one, in proportion to flux; or the table
+        of ``aureoles``.
     """
 
     def __init__(
-        self, lights: list[Light], rows: tuple[int, int], width: int, aureoles: bool | np.ndarray = True
+        self,
+        lights: list[Light],
+        rows: tuple[int, int],
+        width: int,
+        aureoles: bool | np.ndarray = True,
+        irradiance: float = 0.0,
     ):
         first, total = rows
         self.own = len(lights)
@@ -145,6 +160,8 @@ class Lights:
         added = aureoles if isinstance(aureoles, np.ndarray) else None
         if aureoles is True:
             added = _glow_in_proportion(self.glows, own, spare)
+            if added is None and irradiance > 0:
+                added = clear_glow(spare / irradiance)
         self.glows += [added] * SPARE
         self._glow = [
             None if glow is None else dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
@@ -385,6 +402,17 @@ def _glow_in_proportion(glows, fluxes, flux):
     if not strength or not strength[i] > 0:
         return None
     return glows[i] * (flux / np.maximum(fluxes[i], FAINTEST * fluxes[i].max()))
+
+
+def clear_glow(ratio: np.ndarray) -> np.ndarray:
+    """Return the glow (len(GLOW_DEGREES), 3) of a sun in a clear sky.
+
+    ``ratio`` (3,) is its flux over the irradiance of the ground by the sky.
+    """
+    ratio = np.minimum(ratio, MOST_GLOW)
+    table = CLEAR_GLOW * np.exp(-GLOW_DEGREES / CLEAR_GLOW_DEGREES)[:, None] * ratio
+    table[-1] = 0
+    return table
 
 
 def _row(kind, values, i):

@@ -1,7 +1,7 @@
 """Lights of a map that are moved, changed or added by hand, before any edit: ``[[input.lights]]``.
 
-Lights of the map move as :mod:`.layers` moves them, with their glow. A light that is added is a lobe: its
-radiance falls off as a Gaussian of the angle, and its sum over the texels' solid angles is its flux.
+Lights of the map move as :mod:`.layers` moves them, with their glow. A light that is added has a shape
+(:func:`profile`), and its sum over the texels' solid angles is its flux.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from envedit.config import light_schema
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
@@ -23,6 +24,10 @@ from envedit.representations.layers.unseen import unseen_kept
 ADDED_LEAST_TEXELS = 0.6
 """Least standard deviation of an added light in texels: a narrower one would vanish between them. Not
 measured."""
+GAUSSIAN_REACH = 5.0
+"""Standard deviations at which a Gaussian light ends, at 4e-6 of its peak."""
+ROWS = 128
+"""Rows of a map that are worked on at a time: some 100 MB of a map 8192 texels wide."""
 
 
 class PlacedLights:
@@ -113,25 +118,90 @@ def missing(placed: Sequence[dict], count: int) -> list[int]:
 def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
     """Add lights to a map (H, W, 3) of any resolution.
 
-    A light's radiance is flux g / sum(g omega), with g = exp(-angle^2 / (2 size^2)) and omega the solid
-    angles by which Mitsuba looks texels up.
+    A light's radiance is flux g / sum(g omega), with g its :func:`profile` and omega the solid angles by
+    which Mitsuba looks texels up.
     """
     if not added:
         return envmap
     height, width, _ = envmap.shape
-    radiance = envmap.astype(np.float64)
+    radiance = envmap.astype(np.float32)
     omega = latlong.lookup_solid_angles(height, width)[:, None]
-    toward = latlong.directions(height, width)
+    texel = max(np.pi / max(height - 1, 1), 2 * np.pi / width)
+    elevations = 90 - np.linspace(0, 180, height)
     for light in added:
-        size = max(np.radians(light["size"]), ADDED_LEAST_TEXELS * np.pi / max(height - 1, 1))
-        cosine = toward @ direction(light["azimuth"], light["elevation"])
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        lobe = np.where(angle < 5 * size, np.exp(-0.5 * (angle / size) ** 2), 0.0)
-        total = float((lobe * omega).sum())
-        if total > 0:
-            radiance += (lobe / total)[..., None] * flux_of(light)
-    with np.errstate(over="ignore"):
-        return radiance.astype(np.float32)
+        reach = GAUSSIAN_REACH * light["size"] + np.degrees(3 * texel)  # the widest of all shapes
+        near = np.flatnonzero(np.abs(elevations - light["elevation"]) < reach)
+        bands = [slice(row, min(row + ROWS, near[-1] + 1)) for row in range(near[0], near[-1] + 1, ROWS)]
+        shapes = [profile(light, latlong.directions(height, width, band), texel) for band in bands]
+        total = sum(float((shape * omega[band]).sum()) for shape, band in zip(shapes, bands, strict=True))
+        for shape, band in zip(shapes, bands, strict=True):
+            with np.errstate(over="ignore"):
+                radiance[band] += (shape[..., None] * (flux_of(light) / total)).astype(np.float32)
+    return radiance
+
+
+def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
+    """Return the radiance of an added light, 1 at its brightest, in directions (..., 3) of the map.
+
+    Shapes lie in the azimuthal equidistant projection around the light's direction, x to larger azimuths and
+    y up, both turned by ``rotation``: a disc of 90 degrees is a half dome. With a = ``size`` half of the
+    longer side, b = ``aspect`` a half of the shorter one, and d(x, y) the distance inwards from a border,
+
+        g = 3 t^2 - 2 t^3,    t = clip(1/2 + d / max(2 softness c, texel), 0, 1),
+
+    where c is the largest d. A "rectangle" is the product of such g across both pairs of sides, a "gradient"
+    the rectangle times a ramp along y, a "gaussian" exp(-(x/a)^2 / 2 - (y/b)^2 / 2).
+
+    Parameters
+    ----------
+    light : dict
+        Without ``light``, as of :func:`.light_schema.LightList`.
+    toward : ndarray (..., 3)
+        Unit vectors in the frame of the map.
+    texel : float
+        Spacing of the texels in radians: the least width of a border, and about the least of a light.
+    """
+    shape = light.get("shape", "gaussian")
+    aspect = light.get("aspect", light_schema.SHAPES[shape])
+
+    # ---- Coordinates in radians along the sides
+    azimuth, elevation, rotation = np.radians(
+        [light["azimuth"], light["elevation"], light.get("rotation", 0)]
+    )
+    centre = direction(light["azimuth"], light["elevation"])
+    east = np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
+    up = np.cross(east, centre)
+    across = toward @ (np.cos(rotation) * east + np.sin(rotation) * up)
+    along = toward @ (np.cos(rotation) * up - np.sin(rotation) * east)
+    sine = np.hypot(across, along)
+    stretch = np.arctan2(sine, toward @ centre) / np.maximum(sine, 1e-12)
+    x, y = stretch * across, stretch * along
+    a, b = (np.radians(light["size"]) * part for part in (1.0, aspect))
+
+    # ---- The Gaussian has no border
+    if shape == "gaussian":
+        least = ADDED_LEAST_TEXELS * texel
+        radius = np.hypot(x / max(a, least), y / max(b, least))
+        return np.where(radius < GAUSSIAN_REACH, np.exp(-0.5 * radius**2), 0.0)
+
+    # ---- The others have one as wide as asked for, and no narrower than a texel
+    a, b = max(a, texel / 2), max(b, texel / 2)
+    middle = b / 4 if shape == "ring" else b
+
+    def inside(distance):
+        t = np.clip(0.5 + distance / max(2 * light.get("softness", 0) * middle, texel), 0, 1)
+        return t * t * (3 - 2 * t)
+
+    if shape in ("disc", "ring"):
+        radius = np.hypot(x / a, y / b)
+        slope = np.hypot(x / a**2, y / b**2)
+        unit = np.where(radius > 0, radius / np.maximum(slope, 1e-12), b)  # of the radius, in radians
+        hole = (radius - 0.5) * unit if shape == "ring" else np.inf
+        return inside(np.minimum((1 - radius) * unit, hole))
+    if shape == "strip":
+        return inside(b - np.hypot(np.maximum(np.abs(x) - (a - b), 0), y))
+    rectangle = inside(a - np.abs(x)) * inside(b - np.abs(y))
+    return rectangle * np.clip(0.5 + 0.5 * y / b, 0, 1) if shape == "gradient" else rectangle
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:

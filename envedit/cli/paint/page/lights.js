@@ -14,7 +14,8 @@ export class Lights {
     panel.flux.addEventListener("input", () => this.change("flux"));
     panel.color.addEventListener("input", () => this.change("flux"));
     panel.size.addEventListener("input", () => this.change("size"));
-    for (const input of [panel.flux, panel.color, panel.size]) input.addEventListener("change", () => this.commit());
+    for (const key of SHAPED) panel[key].addEventListener("input", () => this.change(key));
+    for (const input of [panel.flux, panel.color, panel.size, ...SHAPED.map((key) => panel[key])]) input.addEventListener("change", () => this.commit());
     panel.mute.addEventListener("click", () => this.mute());
     panel.remove.addEventListener("click", () => this.remove());
   }
@@ -49,7 +50,10 @@ export class Lights {
 
   preview(index, change) {
     const lights = this.changed(index, change);
-    if (!lights) return;
+    if (lights) this.show(lights);
+  }
+
+  show(lights) {
     this.pending = lights;
     this.draft = { ...this.on.document(), lights };
     this.on.preview({ lights });
@@ -141,7 +145,10 @@ export class Lights {
     const { flux, color, size } = this.panel;
     const tint = linear(color.value), most = Math.max(...tint, 1e-3);
     const strength = 2 ** Number(flux.value) * (light.own ? 1 : this.unit);
-    const next = what === "flux" ? { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) } : { size: round(2 ** Number(size.value)) };
+    let next = { [what]: Number(this.panel[what].value) }; // aspect, rotation, softness
+    if (what === "flux") next = { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) };
+    if (what === "size") next = { size: Math.min(light.own ? 20 : 90, round(2 ** Number(size.value))) };
+    if (what === "shape") next = { shape: this.panel.shape.value, aspect: aspectOf(this.panel.shape.value) };
     this.preview(this.chosen, next);
   }
 
@@ -179,9 +186,21 @@ export class Lights {
 
   add() {
     const rotate = this.on.document().rotate_degrees, n = this.list().length;
-    const entry = { azimuth: (180 + rotate + 40 * n + 360) % 360, elevation: 40, flux: [1, 1, 1].map((v) => v * Math.min(1e6, 0.5 * this.unit)), size: 3 };
-    this.on.done({ lights: [...this.on.document().lights, entry] });
+    this.on.done({ lights: this.withAdded({ azimuth: (180 + rotate + 40 * n + 360) % 360, elevation: 40 }) });
     this.choose(n);
+  }
+
+  // The document's lights and another one.
+  withAdded({ azimuth, elevation }) {
+    const flux = [1, 1, 1].map((v) => v * Math.min(1e6, 0.5 * this.unit));
+    return [...this.on.document().lights, { azimuth: round(azimuth), elevation: round(elevation), flux, size: 3 }];
+  }
+
+  // Place a light, or another one (-1), until it is committed.
+  place(index, { azimuth, elevation }) {
+    if (index >= 0) this.moveTo(index, azimuth, elevation);
+    else this.show(this.withAdded({ azimuth, elevation }));
+    this.choose(index >= 0 ? index : this.list().length - 1);
   }
 
   draw() {
@@ -226,8 +245,9 @@ export class Lights {
   }
 
   fill(light) {
-    const { set, name, flux, color, size, mute, remove, fluxValue, sizeValue } = this.panel;
+    const { set, name, flux, color, size, mute, remove, fluxValue, sizeValue, shaped, shape, aspect, rotation, softness } = this.panel;
     set.disabled = !light;
+    shaped.hidden = !light || Boolean(light.own);
     name.textContent = light ? `${light.own ? "Light of the map" : "Added light"} ${this.chosen + 1}` : "No light chosen";
     if (!light) fluxValue.textContent = sizeValue.textContent = "";
     if (!light) return;
@@ -236,7 +256,13 @@ export class Lights {
       flux.value = Math.log2(most / (light.own ? 1 : this.unit));
       color.value = hex(light.entry.flux.map((v) => v / most));
     }
+    size.max = light.own ? 4 : 6.5;
     size.value = Math.log2(light.entry.size);
+    shape.value = light.entry.shape ?? "gaussian";
+    aspect.value = light.entry.aspect ?? aspectOf(shape.value);
+    rotation.value = light.entry.rotation ?? 0;
+    softness.value = light.entry.softness ?? 0;
+    softness.disabled = shape.value === "gaussian";
     fluxValue.textContent = muted ? "off" : `${signed(stops(light, this.unit))} st`;
     sizeValue.textContent = `${+degrees(light).toPrecision(2)}°`;
     mute.setAttribute("aria-pressed", String(muted));
@@ -244,6 +270,8 @@ export class Lights {
   }
 }
 
+const SHAPED = ["shape", "aspect", "rotation", "softness"]; // keys of an added light only
+const aspectOf = (shape) => (shape === "strip" ? 0.1 : 1); // where none is given
 export const off = ({ entry }) => entry.muted || entry.flux.every((v) => v === 0);
 // Flux of a light as it is, over that of the map's or, if it was added, over that of the map's strongest.
 export const flux = ({ entry, own }) => entry.flux.map((v, c) => v * (own ? own.flux[c] : 1));

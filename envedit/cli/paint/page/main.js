@@ -23,6 +23,11 @@ const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
 window.envedit = { log, displays, advise };
 
+// Tools that ask the server about a place of the rendering. Those with a sentence place a light by a click.
+const PICKS = {
+  move: ["highlight"], "move-shadow": ["shadow"], illuminate: ["illuminate", "illuminates this place"],
+  rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"],
+};
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [], explanation: [] }; // the last of each view
 
@@ -278,6 +283,7 @@ function list(holder, entries) {
 
 const strokes = new Strokes($("overlay"), () => ({
   type: tool,
+  picks: PICKS[tool],
   shape,
   size: Number($("size").value),
   softness: Number($("softness").value),
@@ -309,7 +315,14 @@ function viewed(stroke) {
 const UNANSWERED = 5000;
 let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0;
 function pick(phase, x, y) {
-  if (phase === "start") { clearTimeout(unanswered); picked = -1; point = []; place = null; ended = false; }
+  const placing = PICKS[tool]?.[1];
+  if (phase === "start") {
+    clearTimeout(unanswered);
+    picked = placing && lights.list()[lights.chosen] ? lights.chosen : -1;
+    point = [];
+    place = null;
+    ended = false;
+  }
   if (phase === "end") {
     ended = true;
     if (answered === asked) lights.commit();
@@ -317,11 +330,11 @@ function pick(phase, x, y) {
     return;
   }
   if (phase === "move") place = [x, y];
-  if (phase === "move" && picked < 0) return; // asked once it is known whose it is
+  if (phase === "move" && picked < 0 && !placing) return; // asked once it is known whose it is
   ask(x, y);
 }
 function ask(x, y) {
-  connection.send({ type: "pick", of: tool === "move-shadow" ? "shadow" : "highlight", point, x, y, light: picked, view, number: ++asked });
+  connection.send({ type: "pick", of: PICKS[tool][0], point, x, y, light: picked, view, number: ++asked });
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
@@ -336,8 +349,10 @@ RECEIVED.picked = (message) => {
       if (place) ask(...place);
     }
   } else {
-    say("");
-    lights.moveTo(message.light, message.azimuth, message.elevation);
+    picked = message.light;
+    lights.place(picked, message);
+    const does = PICKS[tool]?.[1];
+    say(does && `Light ${lights.chosen + 1} ${does}: azimuth ${Math.round(message.azimuth)}, elevation ${Math.round(message.elevation)} degrees`, true);
   }
   if (!ended || answered !== asked) return;
   clearTimeout(unanswered); // what is dragged meanwhile by its handle is not at its end
@@ -346,6 +361,7 @@ RECEIVED.picked = (message) => {
 
 const lights = new Lights($("map-stack"), $("handles"), {
   set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),
+  shaped: $("light-shaped"), shape: $("light-shape"), aspect: $("light-aspect"), rotation: $("light-rotation"), softness: $("light-softness"),
   mute: $("light-mute"), remove: $("light-delete"), hint: $("ring-hint"), fluxValue: $("light-flux-value"), sizeValue: $("light-size-value"),
 }, {
   document: () => history.document,
@@ -391,7 +407,7 @@ function choose(name, value) {
   }
   if (AMOUNTS[tool]) [$("amount").max, $("amount").value] = AMOUNTS[tool];
   valued($("amount"));
-  $("shapes").hidden = $("options").hidden = tool.startsWith("move");
+  $("shapes").hidden = $("options").hidden = Boolean(PICKS[tool]);
   strokes.reset();
   strokes.draw();
 }
@@ -469,7 +485,7 @@ function save() {
 
 window.addEventListener("keydown", (event) => {
   if (!opened || event.target.matches("input, select") || $("keys").open || $("sky-dialog").open) return;
-  const key = event.key.toLowerCase();
+  const key = event.key.toLowerCase(), lettered = [...document.querySelectorAll("[data-key]")].find((button) => button.dataset.key === key);
   if (event.ctrlKey || event.metaKey) {
     if (key === "z" && !event.shiftKey) history.undo();
     else if (key === "y" || key === "z") history.redo();
@@ -487,6 +503,8 @@ window.addEventListener("keydown", (event) => {
     valued($("size"));
     strokes.draw();
   }
+  else if (key === "escape") lights.choose(-1);
+  else if (lettered) choose("tool", lettered.dataset.tool);
   else if (/^[1-9]$/.test(key)) choose("tool", document.querySelectorAll("[data-tool]")[key - 1].dataset.tool);
   else return;
   event.preventDefault();

@@ -5,7 +5,7 @@ const STEP = 0.015; // of the width, for the arrow keys
 export class Strokes {
   constructor(overlay, options, on) {
     this.overlay = overlay;
-    this.options = options; // () => {type, shape, size, softness, ...}
+    this.options = options; // () => {type, picks, shape, size, softness, ...}
     this.on = on; // preview(stroke), done(stroke), drag(phase, x, y)
     this.cursor = [0.5, 0.5];
     this.shown = false;
@@ -37,8 +37,8 @@ export class Strokes {
   }
 
   begin(place, event) {
-    const { type, shape } = this.options();
-    if (type.startsWith("move")) { this.dragging = true; this.on.drag("start", ...place); return; }
+    const { picks, shape } = this.options();
+    if (picks) { this.dragging = true; this.on.drag("start", ...place); return; }
     if (shape === "polygon") {
       if (!this.corners) { this.reset(); this.corners = true; }
       const last = this.points.at(-1);
@@ -102,7 +102,7 @@ export class Strokes {
       else if (this.drawing) this.finish();
       else this.begin(this.cursor);
     } else if (event.key === "Enter") this.close();
-    else if (event.key === "Escape") this.cancel();
+    else if (event.key === "Escape" && (this.dragging || this.drawing || this.corners)) this.cancel();
     else return;
     event.preventDefault();
     event.stopPropagation();
@@ -146,7 +146,7 @@ export class Strokes {
     const o = this.options(), place = this.shown ? this.cursor : this.hover;
     const stroke = this.drawing && this.stroke();
     for (const one of [...o.outlined, ...(stroke ? [stroke] : [])]) outline(pen, one, width, height);
-    if (place && !o.type.startsWith("move")) {
+    if (place && !o.picks) {
       const radius = o.shape === "brush" || o.shape === "line" ? Math.max(2, (o.size * width) / 2) : 4;
       for (const [color, line] of [["#000", 3], ["#fff", 1.2]]) {
         pen.strokeStyle = color;

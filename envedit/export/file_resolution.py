@@ -43,26 +43,29 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
     """
     if result.given.size[0] <= settings.input.width:
         return None
-    full, found = _by_hand(settings.input, result.given), result.found
-    adjusted = settings.lights, settings.output, full.scale
-    if found is None:
-        return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
-    before = latlong.rotate(result.maps["initial"], found.turn_degrees)
-    source = latlong.rotate(full.radiance, found.turn_degrees)
+    full = _by_hand(settings.input, result.given)
+    solution = result.found
+    if solution is None:
+        adjusted, _ = adjustments.adjust(full.radiance, settings.lights, settings.output, full.scale)
+        return full.as_stored(adjusted)
+    before = latlong.rotate(result.maps["initial"], solution.turn_degrees)
+    source = latlong.rotate(full.radiance, solution.turn_degrees)
     rows = inputs.active_rows(settings.input.rows, before.shape[0])
-    edited = found.edited
+    edited = solution.edited
     carried = full_resolution.carry(
-        found.representation, found.params, before, edited, source, rows, found.free
+        solution.representation, solution.params, before, edited, source, rows, solution.free
     )
-    return full.as_stored(adjustments.adjust(carried, *adjusted)[0], found.turn_degrees)
+    adjusted, _ = adjustments.adjust(carried, settings.lights, settings.output, full.scale)
+    return full.as_stored(adjusted, solution.turn_degrees)
 
 
-def _by_hand(settings: config.Input, given: inputs.InputMap) -> inputs.InputMap:
+def _by_hand(settings: config.Input, input_map: inputs.InputMap) -> inputs.InputMap:
     """Read a map at its file's size, and place and turn its lights as it was done at working size."""
-    full = given.at_file_size(settings)
-    if given.placed is not None:
-        own = given.placed
-        before, rows = own.envmap, Rows.of(len(own.envmap))
+    full = input_map.at_file_size(settings)
+    if input_map.placed is not None:
+        own = input_map.placed
+        before = own.envmap
+        rows = Rows.of(len(own.envmap))
         moved = full.radiance
         if any("light" in light for light in settings.lights):
             moved = full_resolution.carry(

@@ -273,7 +273,10 @@ class _Edit:
         if self.small is self.scene:
             self.target = self.job.target  # a resumed run has the picture that it began with
         elif photo is not None:
-            self.target = self.target.developed(replace(photo, camera=self.job.target.photo.camera))
+            found = self.job.target.photo
+            laid = photo.laid(photo.values.shape, found.placed)
+            laid = replace(laid, camera=found.camera, recognised=found.recognised)
+            self.target = self.target.developed(laid)
 
     @contextlib.contextmanager
     def _carrying(self, envmap=None):
@@ -420,12 +423,15 @@ class _Edit:
         """Set the camera of the metrics, and the pixels that the light does not explain."""
         photo, weight = self.target.photo, self.target.weight
         likelihood = task.likelihood(self.target)
-        residual = photo.camera.shown(self.renders["edited"]) - photo.values
+        residual = photo.missed(self.renders["edited"])
         deviations = sizes(residual)[..., 0] / likelihood.noise(residual, SIGMA)
         self.outliers = (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
         counted = 1.0 if weight is None else float((weight > 0).mean())
         share = float(self.outliers.mean()) / counted
         self.metrics["camera"] = {**photo.measures, "outliers": share}
+        if photo.aligns and not photo.recognised:
+            line = "target.file: its outlines are not clearly those of the scene: is it of this view?"
+            self.warnings.append(line)
         line = f"camera: {photo.summary}"
         if photo.stops is None:
             line += "; one picture does not tell exposure from the map's brightness, which stays as it was "

@@ -256,8 +256,8 @@ class Target(Table):
                 'turned; remove one, or set rotate_degrees = "auto"'
             )
         if self.kind in ("image", "photo") and not self.file:
-            named = "painted image" if self.kind == "image" else "photograph"
-            raise ConfigError(f'target.file: got "", expected the {named}, as target.kind is "{self.kind}"')
+            what = "painted image" if self.kind == "image" else "photograph"
+            raise ConfigError(f'target.file: got "", expected the {what}, as target.kind is "{self.kind}"')
         if self.kind == "strokes" and not self.strokes:
             raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
         if self.kind == "none" and (self.file or self.mask):

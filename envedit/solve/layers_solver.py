@@ -164,7 +164,7 @@ class LayersSolver:
                 )
                 if photographed:
                     self._take_off_camera(solution)
-                    following = self._another_curve(solution) or self._another(solution, interrupt)
+                    following = self._settled(solution) or self._another(solution, interrupt)
                     following = following or self._corrected(solution)
                 elif edit.rendered:
                     following = self._another(solution, interrupt) or self._corrected(solution)
@@ -185,7 +185,7 @@ class LayersSolver:
         if "saturation" in solution.params and not solution.note:
             kept = 100 * float(np.exp(solution.params["saturation"].numpy()[0, 0]))
             notes.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
-        if self._curves:
+        if len(self._curves) > 1:
             values = ", ".join(f"{name} {value:.0f}" for name, value in self._curves.items())
             notes.append(f"-2 log likelihood of the photograph by tone curve: {values}")
         if run.corrected:
@@ -234,35 +234,39 @@ class LayersSolver:
             self.edit.target = self.edit.target.developed(photo.exposed_by(state["camera"][0]))
         solution.run.state = state | {"camera": np.zeros((1, 3))}
 
-    def _another_curve(self, solution):
-        """Return a run that goes on under the likeliest tone curve of the photograph; None under the same.
+    def _settled(self, solution):
+        """Return a run that goes on with the photograph as it is seen best; None where it was settled before.
 
-        They are compared by values of the photograph, each after a few steps.
+        It is aligned again, with the rendering of the solution, and tone curves are compared: by values of
+        the photograph, each after a few steps.
         """
-        edit, run, before = self.edit, solution.run, self.edit.target
-        if not self._goes_on(solution) or len(before.photo.curves) == 1:
+        edit, run, photo = self.edit, solution.run, self.edit.target.photo
+        if photo.settled or not self._goes_on(solution):
             return None
+
+        # ---- Where it lies
         rendering = edit.problem().evaluate(run.state, resolve=False).rendering
+        aligned = photo.aligned(rendering)
+        if np.abs(aligned.placed.shares).max() <= 1:
+            photo = aligned
+        before = edit.target.developed(replace(photo, settled=True))
+
+        # ---- Its curve
         tried = []
-        for curve in before.photo.curves:
-            if curve == before.photo.camera.curve:
-                photo = before.photo
-            else:
-                photo = before.photo.under(curve, rendering, before.weight)
-            edit.target = before.developed(photo)
+        for curve in photo.curves:
+            edit.target = before.developed(before.photo.under(curve, rendering, before.weight))
             problem = edit.problem()
             one = gauss_newton.Run(run.state, run.start, history=list(run.history))
             point = problem.evaluate(one.state)
-            if point.residual is not None:
-                point = gauss_newton.descended(problem, one, point, self._sigma, search.EXPLANATION_STEPS)
-                photo = photo.exposed_by(one.state["camera"][0])
-                missed = photo.camera.shown(point.rendering) - photo.values
-                unlikeliness = problem.likelihood.at_best(missed, SIGMA)
-                unlikeliness += problem.penalty(one.state, one.start)
-                tried.append((unlikeliness, photo, one))
-        _, photo, one = min(tried, key=lambda three: three[0])
+            if point.residual is None:
+                continue
+            point = gauss_newton.descended(problem, one, point, self._sigma, search.EXPLANATION_STEPS)
+            seen = edit.target.photo.exposed_by(one.state["camera"][0])
+            unlikeliness = problem.likelihood.at_best(seen.missed(point.rendering), SIGMA)
+            tried.append((unlikeliness + problem.penalty(one.state, one.start), seen, one))
+        _, seen, one = min(tried, key=lambda three: three[0])
         self._curves = {other.camera.curve: float(value) for value, other, _ in tried}
-        edit.target = before.developed(replace(photo, curves=(photo.camera.curve,)))
+        edit.target = before.developed(seen)
         one.state = one.state | {"camera": np.zeros((1, 3))}
         return replace(one, finished=False, most=len(one.history) + gauss_newton.MOST_STEPS)
 

@@ -64,9 +64,7 @@ class Placement:
     def shares(self) -> np.ndarray:
         """Shifts, scale and rotation over the largest that are looked for, (4,)."""
         size = np.log(self.scale) / np.log1p(MOST_SCALE)
-        return np.array(
-            [self.right / MOST_SHIFT, self.down / MOST_SHIFT, size, self.degrees / MOST_ROTATION]
-        )
+        return np.array([self.right / MOST_SHIFT, self.down / MOST_SHIFT, size, self.degrees / MOST_ROTATION])
 
     def sampled(self, picture: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
         """Sample a picture of the photograph at the pixels of a film, bilinearly.

@@ -267,7 +267,8 @@ def _resampled(values, alpha, clipped, shape, premultiplied):
 
 def check_finite(file: FilePath, pixels: np.ndarray, advice: str) -> None:
     """Refuse a picture (H, W, C) with values that are not finite: InputError with the place and an advice."""
-    if (bad := ~np.isfinite(pixels)).any():
+    bad: np.ndarray = ~np.isfinite(pixels)
+    if bad.any():
         raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
 
 

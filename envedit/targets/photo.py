@@ -8,8 +8,7 @@ brightness of the map are not told apart: both are drawn to what they are withou
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from envedit.core.color import AXES, linear_to_srgb, luminance, srgb_to_linear
 from envedit.core.errors import InputError
 from envedit.core.resampling import fit
 from envedit.core.tone_curves import TONE_CURVES
-from envedit.core.types import FilePath
+from envedit.core.types import FilePath, Shape
 from envedit.images import images
 from envedit.targets import alignment, painted_image
 from envedit.targets.strokes import gains
@@ -41,6 +40,10 @@ WHITE = 1 - 2.5 / 255
 """Display value from which on a pixel is at least so bright: a JPEG's white is not quite."""
 SUPERSAMPLED = 2
 """Pixels of the photograph for one of the rendering, along each axis, when it is aligned."""
+
+
+def _nothing():
+    return np.zeros((0, 0, 3))
 
 
 @dataclass(frozen=True)
@@ -86,27 +89,61 @@ class Photo:
 
     Attributes
     ----------
-    values : ndarray (h, w, 3)
-        Display values in [0, 1], or linear radiance.
-    clipped : ndarray of bool (h, w, 3)
-        Values that say "at least so bright".
+    file : ndarray (H, W, 7)
+        Of the file, at most :data:`SUPERSAMPLED` times as wide as the film: linear radiance, which of its
+        values are clipped, and how much a pixel counts.
     camera : Camera
         As far as it is known.
     curves : tuple of str
         Curves that the camera may have.
+    placed : alignment.Placement
+        Where the film lies in the file's picture.
+    values : ndarray (h, w, 3)
+        On the film: display values in [0, 1], or linear radiance.
+    clipped : ndarray of bool (h, w, 3)
+        Values that say "at least so bright".
+    counts : ndarray (h, w, 1) float32
+        How much each pixel counts.
     stops, kelvin : float or None
         Exposure and white balance, where they are known.
-    placed : alignment.Placement
-        Where the file's picture lay.
+    aligns, recognised : bool
+        It may lie otherwise than as it is; its outlines are those of the scene.
+    settled : bool
+        Curve and placement have been compared under the light that was found.
     """
 
-    values: np.ndarray
-    clipped: np.ndarray
+    file: np.ndarray
     camera: Camera
     curves: tuple[str, ...]
-    placed: alignment.Placement
+    placed: alignment.Placement = alignment.Placement()
+    values: np.ndarray = field(default_factory=_nothing)
+    clipped: np.ndarray = field(default_factory=_nothing)
+    counts: np.ndarray = field(default_factory=_nothing)
     stops: float | None = None
     kelvin: float | None = None
+    aligns: bool = True
+    recognised: bool = False
+    settled: bool = False
+
+    def laid(self, shape: Shape, placed: alignment.Placement | None = None) -> Photo:
+        """Return it on a film of shape (h, w, ...), or placed otherwise on it."""
+        placed = placed or self.placed
+        height, width = shape[:2]
+        stack, inside = placed.sampled(self.file, SUPERSAMPLED * height, SUPERSAMPLED * width)
+        stack[..., -1] *= inside
+        stack = fit(stack, height, width).astype(np.float64)
+        linear, clipped, counts = np.split(stack, (3, 6), axis=2)
+        values = linear if self.camera.curve == "linear" else linear_to_srgb(linear)
+        counts = counts.astype(np.float32)
+        return replace(self, placed=placed, values=values, clipped=clipped > 0, counts=counts)
+
+    def aligned(self, rendering: np.ndarray) -> Photo:
+        """Return it where its outlines are those of a rendering (h, w, 3), if they are and it may move."""
+        if not self.aligns:
+            return self
+        placed, clear = alignment.find(luminance(self.file[..., :3]), luminance(rendering))
+        moved = self.laid(rendering.shape, placed) if clear else self
+        return replace(moved, recognised=clear or self.recognised)
 
     @property
     def precision(self) -> np.ndarray:
@@ -170,6 +207,10 @@ class Photo:
         line = f"exposure {camera.stops:+.1f} stops, white balance {round(camera.kelvin, -2):.0f} K, "
         return line + f"curve {camera.curve}" + (f", {placed}" if placed else "")
 
+    def missed(self, rendering: np.ndarray) -> np.ndarray:
+        """Return what the camera shows of a rendering (h, w, 3) less the photograph's values."""
+        return self.camera.shown(rendering) - self.values
+
     def exposed_by(self, log_factor: np.ndarray) -> Photo:
         """Return it with a camera whose log factor is larger by (3,)."""
         camera = replace(self.camera, log_factor=self.camera.log_factor + log_factor)
@@ -177,26 +218,18 @@ class Photo:
 
     @property
     def array(self) -> np.ndarray:
-        """What is known of the camera, for a checkpoint: number of the curve, of curves left, log factor."""
+        """What is known of it, for a checkpoint: camera, placement, and whether it is settled."""
         curve = -1 if self.camera.curve == "linear" else list(TONE_CURVES).index(self.camera.curve)
-        return np.array([curve, len(self.curves), *self.camera.log_factor])
+        known = curve, self.settled, self.recognised
+        return np.array([*known, *self.camera.log_factor, *astuple(self.placed)])
 
     def of_array(self, array: np.ndarray) -> Photo:
         """Return it with what :attr:`array` knew."""
-        number, left = array[:2].astype(int)
+        number, settled, recognised = array[:3].astype(int)
         curve = "linear" if number < 0 else list(TONE_CURVES)[number]
-        curves = (curve,) if left == 1 else self.curves
-        return replace(self, camera=Camera(curve, array[2:]), curves=curves)
-
-    def resized(self, at_size: Callable[[np.ndarray], np.ndarray]) -> Photo:
-        """Return it on another film; ``at_size`` averages pictures (h, w, 3)."""
-        values = at_size(self.values) if self.camera.curve == "linear" else _averaged(self.values, at_size)
-        return replace(self, values=values, clipped=at_size(np.float32(self.clipped)) > 0)
-
-
-def _averaged(values, average):
-    """Average display values as light."""
-    return linear_to_srgb(average(srgb_to_linear(values).astype(np.float32)).astype(np.float64))
+        camera, placed = Camera(curve, array[3:6]), alignment.Placement(*array[6:].tolist())
+        photo = self.laid(self.values.shape, placed)
+        return replace(photo, camera=camera, settled=bool(settled), recognised=bool(recognised))
 
 
 def _balance(kelvin):
@@ -205,9 +238,7 @@ def _balance(kelvin):
     return gain / float(luminance(gain))
 
 
-def read(
-    file: FilePath, mask: FilePath, rendering: np.ndarray, align: bool = True
-) -> tuple[Photo, np.ndarray, list[str]]:
+def read(file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = True) -> tuple[Photo, list[str]]:
     """Read a photograph and lay it on the film of a rendering.
 
     Parameters
@@ -215,7 +246,7 @@ def read(
     file, mask : path-like
         OpenEXR, Radiance, PNG or JPEG; "" for no mask, which is white where the photograph counts, and of the
         photograph's size.
-    rendering : ndarray (h, w, 3)
+    outlines : ndarray (h, w, 3)
         The scene under light from everywhere, linear radiance.
     align : bool
         Find how it is shifted, scaled and rotated; otherwise it lies as it is.
@@ -224,8 +255,6 @@ def read(
     -------
     Photo
         With a camera that changes nothing.
-    ndarray (h, w, 1) float32
-        How much each pixel counts.
     list of str
         Warnings.
 
@@ -241,7 +270,7 @@ def read(
     values, alpha, _ = painted_image.planes(file, pixels, warnings)
     clipped = np.zeros(values.shape) if info["hdr"] else np.float64(values >= WHITE)
     counts = alpha[..., None] * (painted_image.read_mask(mask, alpha.shape) if mask else 1)
-    (rows, columns), (height, width) = alpha.shape, rendering.shape[:2]
+    (rows, columns), (height, width) = alpha.shape, outlines.shape[:2]
     aspect = columns * height / (rows * width)
     if not 1 / MOST_ASPECT < aspect < MOST_ASPECT:
         raise InputError(
@@ -250,27 +279,19 @@ def read(
         )
 
     # ---- At most as many pixels as are needed, averaged as light
-    linear = values if info["hdr"] else srgb_to_linear(values)
-    stack = np.concatenate([linear, clipped, counts], axis=2)
+    stack = np.concatenate([values if info["hdr"] else srgb_to_linear(values), clipped, counts], axis=2)
     film = SUPERSAMPLED * height, SUPERSAMPLED * width
     stack = fit(stack, min(rows, film[0]), min(columns, film[1])).astype(np.float64)
+    curves = ("linear",) if info["hdr"] else tuple(TONE_CURVES)
+    photo = Photo(stack, Camera(curves[0]), curves, aligns=align).laid((height, width))
+    if not photo.counts.any():
+        raise InputError(f"{file}: no pixel counts: all are masked or transparent")
 
     # ---- Where it lies
-    placed, clear = alignment.Placement(), True
-    if align:
-        placed, clear = alignment.find(luminance(stack[..., :3]), luminance(rendering))
-    if not clear:
-        warnings.append(f"{file}: its outlines are not those of the scene: it is used as it lies")
-    if np.abs(placed.shares).max() > 1:
+    photo = photo.aligned(outlines)
+    if np.abs(photo.placed.shares).max() > 1:
         raise InputError(
-            f"{file}: fits the scene best if {placed.summary}, which is more than is corrected: "
+            f"{file}: fits the scene best if {photo.placed.summary}, which is more than is corrected: "
             "give the scene the photograph's camera, or set [target] align = false"
         )
-    stack, inside = placed.sampled(stack, *film)
-    stack[..., -1] *= inside
-    stack = fit(stack, height, width).astype(np.float64)
-    linear, clipped, counts = np.split(stack, (3, 6), axis=2)
-    values = linear if info["hdr"] else linear_to_srgb(linear)
-    curves = ("linear",) if info["hdr"] else tuple(TONE_CURVES)
-    photo = Photo(values, clipped > 0, Camera(curves[0]), curves, placed)
-    return photo, counts.astype(np.float32), warnings
+    return photo, warnings

@@ -24,7 +24,8 @@ from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.targets import initial_rendering, painted_image, photo, rendered_anew, strokes
+from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
+from envedit.targets import photo as photographs
 from envedit.targets.pixel_weights import first_hold, pixel_weight
 
 FOUND_ANEW = (
@@ -66,7 +67,7 @@ class Target:
     compared : ndarray (h, w, 3) or None
         What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
         (:meth:`seen_as`).
-    photo : photo.Photo or None
+    photo : Photo or None
         The photograph that the picture is, as far as its camera is known.
     """
 
@@ -81,7 +82,7 @@ class Target:
     noise: np.ndarray | None = None
     spp: int | None = None
     compared: np.ndarray | None = None
-    photo: photo.Photo | None = None
+    photo: photographs.Photo | None = None
 
     @property
     def aim(self) -> np.ndarray:
@@ -99,10 +100,16 @@ class Target:
         """
         return replace(self, compared=np.maximum(self.picture + (seen - rendering), 0).astype(np.float32))
 
-    def developed(self, photograph: photo.Photo) -> Target:
-        """Return the target with a photograph whose camera is known better."""
+    def developed(self, photograph: photographs.Photo) -> Target:
+        """Return the target with its photograph, whose camera and place are known better."""
         picture = np.minimum(photograph.picture, np.float32(BRIGHTEST))
-        return replace(self, photo=photograph, picture=picture, compared=None)
+        weight = self.weight
+        if self.photo is not None and photograph.placed != self.photo.placed:
+            before = self.photo.counts
+            weight = np.ones_like(before) if weight is None else weight
+            share = np.divide(weight, before, out=np.zeros_like(before), where=before > 0)
+            weight = share * photograph.counts
+        return replace(self, photo=photograph, picture=picture, weight=weight, compared=None)
 
     def held(self, paint: float, hold: float) -> Target:
         """Return the target with other weights of paint and rest, among the pixels that count."""
@@ -255,21 +262,20 @@ def _of_photo(settings, scene, envmap, picture, mask):
     spp, cache = chosen.spp, settings.renderer.cache
     outlines, _, _ = rendered(scene, everywhere, spp, Seeds.of(settings.seed).target_again, cache)
     file = chosen.files[0]
-    found, weight, warnings = photo.read(file, "".join(chosen.masks), outlines, chosen.align)
-    if not weight.any():
-        raise InputError(f"{file}: no pixel counts: all are masked or transparent")
+    found, warnings = photographs.read(file, "".join(chosen.masks), outlines, chosen.align)
 
     # ---- Its camera
     initial, spp, _ = with_noise(settings, scene, envmap)
     curves = found.curves if chosen.curve == "auto" or found.curves == ("linear",) else (chosen.curve,)
     known = [None if value == "auto" else value for value in (chosen.exposure, chosen.white_balance)]
     found = replace(found, curves=curves, stops=known[0], kelvin=known[1])
-    found = found.under(curves[0], initial, weight)
+    found = found.under(curves[0], initial, found.counts)
     asked = tuple(np.fromfile(one, np.uint8) for one in (*chosen.files, *chosen.masks) if one)
     placed = f", {found.placed.summary}" if found.placed.summary else ""
     source = f"a photograph of the scene: {file}{placed}"
-    counts = None if (weight == 1).all() else weight
-    target = Target(found.picture, counts, None, source, tuple(warnings), asked=asked).developed(found)
+    counts = None if (found.counts == 1).all() else found.counts
+    target = Target(found.picture, counts, None, source, tuple(warnings), asked=asked, photo=found)
+    target = target.developed(found)
 
     # ---- Its noise
     noise = rendered_anew.noise(target.picture, scene.rows)

@@ -83,8 +83,7 @@ def worked_on(
     if target.coverage is None or target.initial is None or target.weight is None:
         weight = None
         if target.photo is not None:
-            photograph = target.photo.resized(lambda image: at_size(image, scene, small))
-            target = target.developed(photograph)
+            target = target.developed(target.photo.laid((small.height, small.width)))
             picture, noise, spp = target.picture, rendered_anew.noise(target.picture, small.rows), target.spp
         elif target.envmap is None:  # a picture of the scene
             picture = at_size(target.picture, scene, small)

@@ -267,8 +267,7 @@ def _resampled(values, alpha, clipped, shape, premultiplied):
 
 def check_finite(file: FilePath, pixels: np.ndarray, advice: str) -> None:
     """Refuse a picture (H, W, C) with values that are not finite: InputError with the place and an advice."""
-    bad: np.ndarray = ~np.isfinite(pixels)
-    if bad.any():
+    if (bad := ~np.isfinite(pixels)).any():
         raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
 
 
@@ -305,7 +304,7 @@ def planes(
     if values.shape[2] == 1:
         values = values.repeat(3, axis=2)
         warnings.append(f"{file}: read as grey")
-    if (negative := (values < 0).any(axis=2)).any():
+    if (negative := np.any(values < 0, axis=2)).any():
         where = f"the first at {place_of(negative)}"
         warnings.append(f"{file}: {negative.sum()} pixels are negative, {where}: set to 0")
     return np.maximum(values, 0), alpha, top

@@ -39,7 +39,7 @@ MOST_ASPECT = 1.03
 WHITE = 1 - 2.5 / 255
 """Display value from which on a pixel is at least so bright: a JPEG's white is not quite."""
 SUPERSAMPLED = 2
-"""Pixels of the photograph for one of the rendering, along each axis, when it is aligned."""
+"""Pixels of the photograph for one of the rendering, along each axis, at most, when it is aligned."""
 
 
 def _nothing():
@@ -129,7 +129,8 @@ class Photo:
         """Return it on a film of shape (h, w, ...), or placed otherwise on it."""
         placed = placed or self.placed
         height, width = shape[:2]
-        stack, inside = placed.sampled(self.file, SUPERSAMPLED * height, SUPERSAMPLED * width)
+        factor = min(max(1, len(self.file) // height), SUPERSAMPLED)
+        stack, inside = placed.sampled(self.file, factor * height, factor * width)
         stack[..., -1] *= inside
         stack = fit(stack, height, width).astype(np.float64)
         linear, clipped, counts = np.split(stack, (3, 6), axis=2)

@@ -424,7 +424,8 @@ class _Edit:
         photo, weight = self.target.photo, self.target.weight
         likelihood = task.likelihood(self.target)
         residual = photo.missed(self.renders["edited"])
-        deviations = sizes(residual)[..., 0] / likelihood.noise(residual, SIGMA)
+        of_rendering = 0.0 if self.noise is None else self.noise
+        deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual, SIGMA), of_rendering)
         self.outliers = (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
         counted = 1.0 if weight is None else float((weight > 0).mean())
         share = float(self.outliers.mean()) / counted
@@ -434,7 +435,7 @@ class _Edit:
             self.warnings.append(line)
         line = f"camera: {photo.summary}"
         if photo.stops is None:
-            line += "; one picture does not tell exposure from the map's brightness, which stays as it was "
+            line += "; one picture does not tell exposure from the sky's brightness, which stays as it was "
             line += "as far as it can: target.exposure fixes it"
         self.notes.append(line)
         self.notes.append(f"{100 * share:.3g} % of the photograph's pixels are not explained by light")

@@ -93,14 +93,18 @@ class LayersSolver:
         """
         problem, rendered = self.edit.problem(transport), self.edit.rendered
         problem.evaluate(begun.state)  # another explanation may have taken its columns of T
-        return gauss_newton.solve(
+        photographed = self.edit.target.photo is not None
+        solution = gauss_newton.solve(
             problem,
             params,
             self._sigma,
             run=begun,
             sparing=rendered,
-            judge=self._display_error if rendered else None,
-        ).params
+            judge=self._display_error if rendered and not photographed else None,
+        )
+        if photographed:
+            self._take_off_camera(solution)
+        return solution.params
 
     def settle(self, params: Params) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
@@ -112,7 +116,11 @@ class LayersSolver:
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
         if point.residual is not None:  # what T errs by may have been fitted
-            point = replace(point, residual=self._missed(point.edited).astype(np.float64))
+            if problem.photographed:
+                residual = problem.residual(point.state, self._path_traced(point.edited))
+            else:
+                residual = self._missed(point.edited).astype(np.float64)
+            point = replace(point, residual=residual)
         return search.score(problem, solution.run, point, self._sigma)
 
     def go_on_from(self, file: str, params: Params) -> None:
@@ -312,9 +320,13 @@ class LayersSolver:
 
     def _missed(self, envmap):
         """Return display values of Mitsuba's rendering of a map less the target's."""
-        edit, seed = self.edit, Seeds.of(self.edit.settings.seed).step_check
-        shown = display_curve.to_display(tensor(edit.scene.render(envmap, CHECKED_SPP, seed)))
-        return shown.numpy() - display_curve.to_display(tensor(edit.target.picture)).numpy()
+        shown = display_curve.to_display(tensor(self._path_traced(envmap)))
+        return shown.numpy() - display_curve.to_display(tensor(self.edit.target.picture)).numpy()
+
+    def _path_traced(self, envmap):
+        """Return Mitsuba's rendering of a map, (h, w, 3)."""
+        seed = Seeds.of(self.edit.settings.seed).step_check
+        return self.edit.scene.render(envmap, CHECKED_SPP, seed)
 
 
 class _Checkpoints:

@@ -155,7 +155,7 @@ class Problem(Unknowns):
     def aimed_at(self, picture: np.ndarray, likelihood: Likelihood | None, point: Point) -> Point:
         """Take another target, with its likelihood; returns a point with its residual from that target."""
         self._aim(picture, likelihood)
-        return replace(point, residual=self._residual(point.state, point.rendering))
+        return replace(point, residual=self.residual(point.state, point.rendering))
 
     # ---- F -------------------------------------------------------------------------------------------------
 
@@ -170,13 +170,13 @@ class Problem(Unknowns):
         if resolve:
             self.transport.resolve(edited, limit=COLUMNS_A_LOOK)
         rendering = self.transport.apply(tensor(edited)).numpy()
-        residual = self._residual(state, rendering)
+        residual = self.residual(state, rendering)
         if not np.isfinite(residual).all():
             return Point(state, edited, sky, None, None)
         return Point(state, edited, sky, rendering, residual)
 
-    def _residual(self, state, rendering):
-        """Return display values of a rendering, under the camera's factor, less those of the target."""
+    def residual(self, state: dict, rendering: np.ndarray) -> np.ndarray:
+        """Return display values of a rendering (h, w, 3), under a camera's factor, less the target's."""
         shown = display_curve.to_display(tensor(rendering * self._exposure(state))).numpy()
         residual = np.float64(shown) - self.target
         if self.photo is None:

@@ -29,6 +29,8 @@ from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility, task
 from envedit.solve.edit_state import Interrupted, Stopped, Watch, keeping
+from envedit.solve.likelihood import sizes
+from envedit.solve.map_problem import SIGMA
 from envedit.targets import working_size
 from envedit.targets.target import Target
 from envedit.targets.target import make as make_target
@@ -40,6 +42,8 @@ OF_FIT = ("log_psnr", "peak_ratio", "epochs", "cached", "seconds")
 """What the metrics have of the fit of a network."""
 TONEMAP_TEXT = {"gamma": "clip(E, 0, 1)^(1/2.2)"}
 """What the metrics call a tonemap, where that is not its name."""
+OUTLIER_DEVIATIONS = 3.0
+"""Standard deviations beyond which a pixel of a photograph shows what no light of the map explains."""
 LEAST_GAIN = 0.05
 """Share of the residual below which an edit has achieved nothing, or made nothing worse: 0.45 dB."""
 
@@ -93,6 +97,8 @@ def run(
     edit.render()
     edit.render_variants()
     edit.measure()
+    if edit.target.photo:
+        edit.compare_photograph()
     if edit.job:
         edit.warn_of_quality()
     return edit.result()
@@ -136,6 +142,7 @@ class _Edit:
     transport = None
     job = None
     feasible = None
+    outliers = None
     frozen = None
     degrees = 0.0
 
@@ -263,8 +270,14 @@ class _Edit:
             self.watch.stage("editing")
             self.params, self.state = self.job.optimise(self.start.params, self.start.crop, resume)
             self.solved_map = self.job.decode(self.params)
+        photo = self.target.photo
         if self.small is self.scene:
             self.target = self.job.target  # a resumed run has the picture that it began with
+        elif photo is not None:
+            found = self.job.target.photo
+            laid = photo.laid(photo.values.shape, found.placed)
+            laid = replace(laid, camera=found.camera, recognised=found.recognised)
+            self.target = self.target.developed(laid)
 
     @contextlib.contextmanager
     def _carrying(self, envmap=None):
@@ -397,6 +410,7 @@ class _Edit:
             "non_finite_steps": self.state.bad_steps,
             "transport": None,
             "turn_degrees": self.degrees,
+            "camera": None,
         }
         if self.transport:
             frozen = float(self.frozen[self.rows.slice].mean())
@@ -405,6 +419,27 @@ class _Edit:
                 "predicted_error": self.predicted_error,
                 "frozen": frozen,
             }
+
+    def compare_photograph(self):
+        """Set the camera of the metrics, and the pixels that the light does not explain."""
+        photo, weight = self.target.photo, self.target.weight
+        likelihood = task.likelihood(self.target)
+        residual = photo.missed(self.renders["edited"])
+        of_rendering = 0.0 if self.noise is None else self.noise
+        deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual, SIGMA), of_rendering)
+        self.outliers = (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
+        counted = 1.0 if weight is None else float((weight > 0).mean())
+        share = float(self.outliers.mean()) / counted
+        self.metrics["camera"] = {**photo.measures, "outliers": share}
+        if photo.aligns and not photo.recognised:
+            line = "target.file: its outlines are not clearly those of the scene: is it of this view?"
+            self.warnings.append(line)
+        line = f"camera: {photo.summary}"
+        if photo.stops is None:
+            line += "; one picture does not tell exposure from the sky's brightness, which stays as it was "
+            line += "as far as it can: target.exposure fixes it"
+        self.notes.append(line)
+        self.notes.append(f"{100 * share:.3g} % of the photograph's pixels are not explained by light")
 
     def _compared(self, rows, views=()):
         """Compare rows of the renderings with those of the target."""
@@ -527,6 +562,8 @@ class _Edit:
             alpha=self.scene.alpha,
             found=found,
             posterior=job.layers.posterior if job else None,
+            photo=self.target.photo,
+            outliers=self.outliers,
             variants=self.others,
             settings=self.settings,
             memory=self.memory,

@@ -280,7 +280,7 @@ class Preparation:
             if octaves:
                 envmap = original.copy()
                 envmap[representation.active] = representation.decode(params).numpy()
-                job.target, more = initialization.trusted(envmap, recordings, target)
+                job.target, more = initialization.trusted(envmap, recordings, job.target)
                 notes += more
         if octaves:
             job.representation = representation.refined(octaves)

@@ -21,6 +21,7 @@ from envedit.representations.layers.separation import Separation
 from envedit.scene.scene import View
 from envedit.solve.feasibility import Reach
 from envedit.solve.map_problem import Posterior
+from envedit.targets.photo import Photo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,6 +71,10 @@ class Result:
         Share of each pixel that sees a surface, where the scene hides what lights it.
     found : file_resolution.Found, optional
         What the map was decoded from, for :func:`.file_resolution.at_full_resolution`.
+    photo : photo.Photo, optional
+        The photograph that was the target, with its camera.
+    outliers : ndarray of bool (h, w), optional
+        Its pixels that the light does not explain.
     variants : list of Variant
         Other explanations of paint, likeliest first.
     settings : config.Config, optional
@@ -99,6 +104,8 @@ class Result:
     alpha: np.ndarray | None = None
     found: file_resolution.Found | None = None
     posterior: Posterior | None = None
+    photo: Photo | None = None
+    outliers: np.ndarray | None = None
     variants: list[Variant] = field(default_factory=list)
     settings: config.Config | None = None
     memory: inputs.Given | None = None

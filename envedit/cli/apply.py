@@ -50,8 +50,8 @@ def _apply(arguments, console):
     folder = Path(arguments.out or f"{Path(names[-1]).stem}_applied")
     files = [_files(folder, source, len(amounts)) for source in maps]
     _check(files)
-    given = [looks.read(name) for name in names]
-    start = given[0] if len(given) == 2 else None
+    selected = [looks.read(name) for name in names]
+    start = selected[0] if len(selected) == 2 else None
 
     # ---- Map by map, each read once
     map_command.select_variant()
@@ -59,7 +59,7 @@ def _apply(arguments, console):
     for source, targets in zip(maps, files, strict=True):
         input_map = map_command.read(source, arguments, console)
         for amount, path in zip(amounts, targets, strict=True):
-            edited = look_transfer.apply(input_map.radiance, given[-1], amount, start)
+            edited = look_transfer.apply(input_map.radiance, selected[-1], amount, start)
             folder.mkdir(parents=True, exist_ok=True)
             for warning in map_file.write(path, input_map.as_stored(edited), input_map):
                 console.warn(warning)
@@ -95,10 +95,10 @@ def _files(folder, source, count):
 
 def _check(files):
     """Refuse to write a file twice, or one that is there."""
-    seen = set()
+    written = set()
     for path in (path for targets in files for path in targets):
-        if path in seen:
+        if path in written:
             raise ConfigError(f"{path}: two maps have this name: apply the look to one at a time")
         if os.path.lexists(path):
             raise ConfigError(f"{path}: exists already: give another folder with --out")
-        seen.add(path)
+        written.add(path)

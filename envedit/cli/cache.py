@@ -66,7 +66,7 @@ def _visit(kind, empty):
         return cache.folder, [], error
     for file in files:
         try:
-            size = sum(one.stat().st_size for one in (file, *file.rglob("*")))
+            size = sum(path.stat().st_size for path in (file, *file.rglob("*")))
             if empty and file.is_dir():
                 shutil.rmtree(file)
             elif empty:

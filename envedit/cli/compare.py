@@ -78,7 +78,7 @@ def _lines(measured: dict) -> list[str]:
     lpips = "LPIPS -" if measured["lpips"] is None else f"LPIPS {measured['lpips']:.4f}"
     score = f"PSNR {measured['psnr']:.2f} dB, SSIM {measured['ssim']:.4f}, {lpips}"
     lines = ["the maps are identical"] if measured["identical"] else [score]
-    parts = [f"{axis} {_stops(one['stops'])}" for axis, one in measured["irradiance"].items()]
+    parts = [f"{axis} {_stops(entry['stops'])}" for axis, entry in measured["irradiance"].items()]
     lines.append(f"irradiance of B over A, stops (+y: horizontal): {', '.join(parts)}")
     before = {light["id"]: light for light in measured["lights"]["before"]}
     for light in measured["lights"]["after"]:

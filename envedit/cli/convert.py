@@ -44,7 +44,7 @@ def _convert(arguments, console):
             raise ConfigError(f"FILE: got {arguments.file}, expected a .usd, .usda, .usdc or .usdz file")
         if not arguments.scene.lower().endswith(".xml"):
             raise ConfigError(f"SCENE: got {arguments.scene}, expected a name that ends in .xml")
-        made = conversion.convert(
+        converted = conversion.convert(
             arguments.file, Path(arguments.scene).absolute(), arguments.camera, arguments.time
         )
     except EnveditError as error:
@@ -53,9 +53,9 @@ def _convert(arguments, console):
     except KeyboardInterrupt:
         console.error("interrupted; nothing was written")
         return 130
-    for note in made.notes:
+    for note in converted.notes:
         console.warn(note)
-    console.facts["files"] = {made.xml.name: str(made.xml)}
+    console.facts["files"] = {converted.xml.name: str(converted.xml)}
     console.say(f"{arguments.scene}: written; now, for example: envedit paint {arguments.scene}")
     return 0
 

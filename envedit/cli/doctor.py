@@ -36,8 +36,7 @@ from envedit.cli.streams import steady
 from envedit.core.array_cache import cache_home
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
-
-__all__ = ["Diagnosis", "check", "ensure", "main"]
+from envedit.sweep.process import cores
 
 ALBEDO = 0.5
 _VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb")
@@ -78,8 +77,7 @@ class Diagnosis:
     versions: dict = field(default_factory=dict)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The parent
+# ---- The parent --------------------------------------------------------------------------------------------
 
 
 def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
@@ -239,8 +237,7 @@ def _stamp(path: str | None) -> list | None:
     return [path, status.st_size, status.st_mtime_ns]
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The child
+# ---- The child ---------------------------------------------------------------------------------------------
 
 
 def _probe(variant: str) -> None:
@@ -321,8 +318,7 @@ def _matmul_rate(mi: ModuleType, dr: ModuleType, size: int = 256, repeats: int =
     return round(2 * size**3 * repeats / (time.perf_counter() - start) / 1e9, 1)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The command line
+# ---- The command line --------------------------------------------------------------------------------------
 
 
 @steady
@@ -344,7 +340,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"python    {platform.python_version()} ({sys.executable})")
     for package in ("mitsuba", "drjit", "OpenEXR", "numpy"):
         print(f"{package.lower():9} {_version(package) or 'missing'}")
-    print(f"cores     {_cores()}")
+    print(f"cores     {cores()}")
     print(f"memory    {_memory_size()}")
 
     # ---- What the self test found
@@ -366,12 +362,6 @@ def main(arguments: list[str] | None = None) -> int:
     for line in diagnosis.lines:
         print(line, file=sys.stderr)
     return 0 if diagnosis.ok else MachineError.exit_code
-
-
-def _cores() -> int:
-    with contextlib.suppress(AttributeError):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _memory_size() -> str:

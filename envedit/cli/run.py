@@ -348,6 +348,8 @@ def _verdict(measured):
             line += f", map {_change(measured['initial_envmap'], measured['envmap'])}"
         if measured["ceiling"]:
             line += f", noise alone leaves {metrics.score(measured['ceiling'], [measured['render']])}"
+    if camera := measured["camera"]:
+        line += f"; {camera['summary']}"
     return line + f", {measured['timing']['total_s']:.1f} s"
 
 

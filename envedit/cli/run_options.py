@@ -102,9 +102,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="only write the target, dry_run.png and dry_run.exr in the folder of the results: no edit",
     )
     instead.add_argument(
-        "--budget",
-        metavar="TIME",
-        help="choose widths and samples so that the run ends within 30, 30s or 2m",
+        "--budget", metavar="TIME", help="choose widths and samples so that the run ends within 30, 30s or 2m"
     )
 
     # ---- Output

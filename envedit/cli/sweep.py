@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
             command=command,
             stream=stream,
         )
-        missing = [one for one in outcomes if one.state not in ("done", "skipped")]
+        missing = [outcome for outcome in outcomes if outcome.state not in ("done", "skipped")]
         if not arguments.quiet:
             print(sweeps.table(outcomes))
         elif missing:

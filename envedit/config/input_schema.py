@@ -13,13 +13,15 @@ from envedit.core import extensions
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 from envedit.core.primaries import SPACES
+from envedit.core.tone_curves import TONE_CURVES
 
 TURN_DEGREES = 60.0
 """Turn of the target's map where neither a map nor a turn is given."""
-TARGET_KINDS = ("envmap", "rendering", "image", "strokes", "none")
+TARGET_KINDS = ("envmap", "rendering", "photo", "image", "strokes", "none")
 """Kinds of target that are built in."""
 _PAINTED = {"target.kind": ("image", "strokes")}
-_PICTURES = "rendering", "image"
+_PICTURES = "rendering", "photo", "image"
+_PHOTO = {"target.kind": ("photo",)}
 _SUNSKY = {"input.envmap": ("sunsky", "auto")}
 
 
@@ -125,13 +127,15 @@ class Target(Table):
     kind: str = key(
         "envmap",
         Choice(*TARGET_KINDS, group=extensions.TARGETS),
-        "given by: another map, a picture of the scene under other light, a painted image, or strokes; "
+        "given by: another map, a picture of the scene under other light, a photograph of it, a painted "
+        "image, or strokes; "
         '"none": only [lights], exposure, white balance',
     )
     file: str | tuple[str, ...] = key(
         "",
         OneOrMore(String()),
-        "kind envmap: the other map, which is not turned; kinds rendering and image: the picture, or a list",
+        "kind envmap: the other map, which is not turned; kinds rendering and image: the picture, or a list; "
+        "kind photo: the picture",
     )
     rotate_degrees: float | str = key(
         "auto",
@@ -157,6 +161,30 @@ class Target(Table):
         "PNG reinhard where gamma clips 0.1 % of its pixels; an image is read as it says or shows itself, "
         "a rendering that says nothing as sRGB",
         when={"target.kind": ("rendering", "image", "strokes")},
+    )
+    curve: str = key(
+        "auto",
+        Choice("auto", *TONE_CURVES),
+        "tone curve of the photograph; auto: the likeliest; an EXR has none",
+        when=_PHOTO,
+    )
+    exposure: float | str = key(
+        "auto",
+        OrAuto(Number(-30, 30)),
+        "exposure of the photograph, a factor 2^exposure of the scene's radiance; auto: found, while the map "
+        "keeps its brightness as far as it can",
+        "stops",
+        _PHOTO,
+    )
+    white_balance: float | str = key(
+        "auto",
+        OrAuto(Number(2000, 25000)),
+        "temperature of the light that the photograph shows as neutral; auto: found",
+        "kelvin",
+        _PHOTO,
+    )
+    align: bool = key(
+        True, Boolean(), "find by how little the photograph is shifted, scaled and rotated", when=_PHOTO
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
     paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
@@ -227,8 +255,9 @@ class Target(Table):
                 "target.file and target.rotate_degrees: got both, expected one: the other map, or the input "
                 'turned; remove one, or set rotate_degrees = "auto"'
             )
-        if self.kind == "image" and not self.file:
-            raise ConfigError('target.file: got "", expected the painted image, as target.kind is "image"')
+        if self.kind in ("image", "photo") and not self.file:
+            what = "painted image" if self.kind == "image" else "photograph"
+            raise ConfigError(f'target.file: got "", expected the {what}, as target.kind is "{self.kind}"')
         if self.kind == "strokes" and not self.strokes:
             raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
         if self.kind == "none" and (self.file or self.mask):

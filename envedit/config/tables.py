@@ -18,7 +18,7 @@ When = dict[str, tuple[Any, ...]]
 but an empty one or 0. The key ``solver`` is not one of a file: the steps that are made, "gauss-newton" or
 "adam"."""
 
-EDITED: When = {"target.kind": ("envmap", "rendering", "image", "strokes")}
+EDITED: When = {"target.kind": ("envmap", "rendering", "photo", "image", "strokes")}
 LAYERS: When = {"representation.kind": ("layers",)}
 SIREN: When = {"representation.kind": ("siren",)}
 TRANSPORT: When = {"renderer.kind": ("transport",)}

@@ -4,7 +4,7 @@ An entry is one file: a header with the whole key and a digest of every array, b
 arrays, which are mapped into memory and not parsed. A file that is damaged, cut short or foreign is as good
 as none, as is one in a folder that others may write to, and one that cannot be written costs nothing but the
 time to make its arrays again. A digest detects damage, not intent: callers check shapes and ranges too
-(``wanted``).
+(``is_whole``).
 
 SHA-256 reads 1.8 GB/s a core where the processor has instructions for it, BLAKE2b 0.9 GB/s.
 """
@@ -31,7 +31,8 @@ from envedit.core.errors import InputError
 MOST_BYTES = 4_000_000_000
 """Size above which a folder loses the entries that were not used for longest."""
 _MAGIC = b"envedit3"
-_ALIGNED, _PART = 64, 1 << 23
+_ALIGNED = 64
+_PART = 1 << 23
 _START = len(_MAGIC) + 8 + 32  # magic, length and SHA-256 of the description
 _OURS = re.compile(r"[0-9a-f]{32}\.arrays|(?P<temporary>\.[0-9a-f]{32}\.arrays\.\d+)")
 _ABANDONED = 3600.0  # seconds after which a temporary file belongs to no writer that is still alive
@@ -52,7 +53,7 @@ class DiskCache:
         self.folder, self.most_bytes = folder, most_bytes
 
     def load(
-        self, key: dict, wanted: Callable[[dict[str, np.ndarray]], bool] | None = None
+        self, key: dict, is_whole: Callable[[dict[str, np.ndarray]], bool] | None = None
     ) -> dict[str, np.ndarray] | None:
         """Return the arrays that were stored under a key; None if there are none, or none that are whole.
 
@@ -60,7 +61,7 @@ class DiskCache:
         ----------
         key : dict
             What the arrays were made from, as JSON knows it.
-        wanted : callable, optional
+        is_whole : callable, optional
             Returns whether arrays are such as :meth:`store` was given: names, types, shapes and ranges. What
             it raises is a no.
 
@@ -74,7 +75,7 @@ class DiskCache:
         path = self._path(key)
         try:
             arrays = _read(path, _text(key))
-            if wanted is not None and not wanted(arrays):
+            if is_whole is not None and not is_whole(arrays):
                 return None
         except Exception:  # what a header that is believed can lead to has many names
             return None
@@ -121,16 +122,16 @@ class DiskCache:
 
     def _make_room(self, size, replaced):
         """Delete the entries used longest ago until ``size`` bytes fit; nothing that is not ours."""
-        found = []
+        entries = []
         for entry in os.scandir(self.folder):
             if (ours := _OURS.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
                 about = entry.stat(follow_symlinks=False)
                 if ours["temporary"] and time.time() - about.st_mtime > _ABANDONED:
                     os.unlink(entry.path)
                 elif entry.name != replaced.name:
-                    found.append((about.st_mtime_ns, about.st_size, entry.path, ours["temporary"]))
-        total = sum(bytes_ for _, bytes_, _, _ in found)
-        for _, bytes_, path, temporary in sorted(found, key=lambda one: one[0]):
+                    entries.append((about.st_mtime_ns, about.st_size, entry.path, ours["temporary"]))
+        total = sum(bytes_ for _, bytes_, _, _ in entries)
+        for _, bytes_, path, temporary in sorted(entries, key=lambda entry: entry[0]):
             if total + size <= self.most_bytes:
                 break
             if not temporary:  # somebody is writing it
@@ -151,11 +152,11 @@ def _digest(array):
     data = array.reshape(-1).view(np.uint8)
     parts = [data[i : i + _PART] for i in range(0, max(len(data), 1), _PART)]
     if len(parts) == 1:
-        found = [hashlib.sha256(parts[0]).digest()]
+        digests = [hashlib.sha256(parts[0]).digest()]
     else:
         with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1)) as pool:
-            found = list(pool.map(lambda part: hashlib.sha256(part).digest(), parts))
-    return hashlib.sha256(b"".join(found)).hexdigest()
+            digests = list(pool.map(lambda part: hashlib.sha256(part).digest(), parts))
+    return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
 def _header(text, arrays):
@@ -178,7 +179,8 @@ def _read(path, text):
     description = json.loads(description)
     if description["key"] != text:
         raise ValueError
-    place, arrays = _padded(_START + length), {}
+    place = _padded(_START + length)
+    arrays = {}
     for name, kind, shape, digest in description["arrays"]:
         dtype = np.dtype(kind)
         if dtype.kind not in "biuf" or not all(isinstance(n, int) and n >= 0 for n in shape):
@@ -192,22 +194,22 @@ def _read(path, text):
     return arrays
 
 
-def holds(arrays: dict[str, np.ndarray], wanted: dict[str, tuple]) -> bool:
+def holds(arrays: dict[str, np.ndarray], expected: dict[str, tuple]) -> bool:
     """Return whether arrays have these names, types and shapes, and hold finite numbers.
 
     Parameters
     ----------
     arrays : dict of str to ndarray
         As of :meth:`DiskCache.load`.
-    wanted : dict of str to (dtype, shape)
+    expected : dict of str to (dtype, shape)
         A length of None in a shape is any.
     """
-    return arrays.keys() == wanted.keys() and all(
+    return arrays.keys() == expected.keys() and all(
         array.dtype == np.dtype(dtype)
         and len(array.shape) == len(shape)
-        and all(want in (None, got) for got, want in zip(array.shape, shape, strict=True))
+        and all(size in (None, length) for length, size in zip(array.shape, shape, strict=True))
         and bool(np.isfinite(array).all())
-        for array, (dtype, shape) in ((arrays[name], wanted[name]) for name in wanted)
+        for array, (dtype, shape) in ((arrays[name], expected[name]) for name in expected)
     )
 
 

@@ -28,10 +28,10 @@ def flat(kind: type[DrArray], values: ArrayLike) -> DrArray:
     values : ndarray
         Of the dtype that ``kind`` has; raveled.
     """
-    made = dr.opaque(kind(np.ascontiguousarray(values).ravel()))
-    dr.eval(made)
+    array = dr.opaque(kind(np.ascontiguousarray(values).ravel()))
+    dr.eval(array)
     dr.sync_thread()
-    return made
+    return array
 
 
 def settled(x: DrArray, value: float) -> DrArray:

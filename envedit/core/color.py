@@ -17,6 +17,10 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Rec.709 weights of red, green and blue (Eq. 7)."""
 
 
+AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+"""Luminance, blue-amber and green-magenta, as unit vectors of log RGB."""
+
+
 def luminance(image: ArrayLike) -> np.ndarray:
     """Return Rec.709 luminance float64 ``(...)`` of radiance ``(..., 3)``: 0.2126 R + 0.7152 G + 0.0722 B."""
     image = np.asarray(image)

@@ -61,9 +61,9 @@ def check(name: str, where: str) -> None:
         return
     for folder in (*_folders(), "."):
         for file in files:
-            if os.path.lexists(found := Path(folder) / "plugins" / file):
+            if os.path.lexists(elsewhere := Path(folder) / "plugins" / file):
                 raise InputError(
-                    f"{where}: Mitsuba has no plugin {name}, and {found} is not loaded; "
+                    f"{where}: Mitsuba has no plugin {name}, and {elsewhere} is not loaded; "
                     "plugins are taken from Mitsuba's installation only"
                 )
 
@@ -72,10 +72,10 @@ def check_dict(scene: dict, where: str) -> None:
     """Check, as :func:`check`, every ``type`` in a scene given as a dict."""
     waiting = [scene]
     while waiting:
-        one = waiting.pop()
-        if isinstance(kind := one.get("type"), str):
+        table = waiting.pop()
+        if isinstance(kind := table.get("type"), str):
             check(kind, where)
-        waiting += [value for value in one.values() if isinstance(value, dict)]
+        waiting += [value for value in table.values() if isinstance(value, dict)]
 
 
 def _folders():

@@ -23,27 +23,11 @@ import numpy as np
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import ArrayLike
 
-__all__ = [
-    "check_envmap_size",
-    "directions",
-    "from_envmap_data",
-    "halo_index",
-    "lookup",
-    "lookup_solid_angles",
-    "resize",
-    "rotate",
-    "row_edges",
-    "solid_angles",
-    "texel_position",
-    "to_envmap_data",
-]
-
 MIN_HEIGHT, MIN_WIDTH = 3, 2
 """Mitsuba silently resamples anything smaller than this, so that ``envmap.data`` no longer is the image."""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Directions and positions
+# ---- Directions and positions ------------------------------------------------------------------------------
 
 
 def directions(height: int, width: int, rows: slice = slice(None)) -> np.ndarray:  # noqa: B008
@@ -124,8 +108,7 @@ def lookup(image: ArrayLike, d: ArrayLike) -> np.ndarray:
     return (1 - fr) * upper + fr * lower
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Solid angles
+# ---- Solid angles ------------------------------------------------------------------------------------------
 
 
 def row_edges(height: int) -> np.ndarray:
@@ -170,8 +153,7 @@ def _caps(v):
     return 2 * np.sin((a + b) / 2) * np.sin((b - a) / 2)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Resampling
+# ---- Resampling --------------------------------------------------------------------------------------------
 
 
 def resize(image: ArrayLike, height: int, width: int) -> np.ndarray:
@@ -281,8 +263,7 @@ def rotate(image: ArrayLike, degrees: float) -> np.ndarray:
     return ((1 - part) * near + part * far).astype(image.dtype)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Mitsuba's layout
+# ---- Mitsuba's layout --------------------------------------------------------------------------------------
 
 
 def halo_index(height: int, width: int) -> np.ndarray:

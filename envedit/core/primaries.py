@@ -78,14 +78,14 @@ def named(name: str, where: str) -> Chromaticities | None:
     InputError
         The name is not known.
     """
-    found = NAMES.get(name.strip().lower())
-    if found is None:
+    chromaticities = NAMES.get(name.strip().lower())
+    if chromaticities is None:
         shown = name[:60] if name.isprintable() else repr(name[:60])
         raise InputError(
             f"{where}: colour space '{shown}' is not known: save it as linear Rec. 709 or ACEScg, "
             "or name that of the map to edit with [input] colour_space"
         )
-    return None if found == REC709 else found
+    return None if chromaticities == REC709 else chromaticities
 
 
 def name_of(chromaticities: Chromaticities | None) -> str:

@@ -14,9 +14,7 @@ from collections.abc import Iterator
 _ALONE = threading.RLock()
 """Held while the descriptors lead elsewhere: they are the process's, so that threads take turns."""
 if hasattr(os, "register_at_fork"):  # a child that is forked has the descriptors and no holder of the lock
-    os.register_at_fork(
-        before=_ALONE.acquire, after_in_parent=_ALONE.release, after_in_child=_ALONE.release
-    )
+    os.register_at_fork(before=_ALONE.acquire, after_in_parent=_ALONE.release, after_in_child=_ALONE.release)
 
 
 @contextlib.contextmanager
@@ -26,7 +24,7 @@ def quiet_libraries() -> Iterator[list[str]]:
     OpenEXR and libjpeg write to file descriptor 2 and to ``sys.stdout``, OpenEXR's decoder of JPEG 2000 to
     file descriptor 1, and carry on. Threads take turns; what others print meanwhile is in the text too.
     """
-    said: list[str] = []
+    printed: list[str] = []
     text = io.StringIO()
     with _ALONE, contextlib.ExitStack() as stack:
         _flush_c()
@@ -40,14 +38,14 @@ def quiet_libraries() -> Iterator[list[str]]:
         for descriptor in kept:
             os.dup2(sink.fileno(), descriptor)
         try:
-            yield said
+            yield printed
         finally:
             _flush_c()
             for descriptor, copy in kept.items():
                 os.dup2(copy, descriptor)
                 os.close(copy)
             sink.seek(0)
-            said.append(text.getvalue() + sink.read().decode(errors="replace"))
+            printed.append(text.getvalue() + sink.read().decode(errors="replace"))
 
 
 def _flush_c():

@@ -55,10 +55,10 @@ class Health:
             (self.negative, "negative", self.first_negative),
             (self.saturated, "at the largest half (65504)", self.first_saturated),
         )
-        found = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if p]
+        unusual = [f"{n} {what} (first at row {p[0]}, column {p[1]})" for n, what, p in kinds if p]
         stops = math.log2(self.dynamic_range) if self.dynamic_range > 0 else 0.0
         spread = f"{self.minimum:.4g} to {self.maximum:.4g}, median {self.median:.4g}, {stops:.1f} stops"
-        return f"{self.texels} texels, {spread}; {', '.join(found) or 'nothing unusual'}"
+        return f"{self.texels} texels, {spread}; {', '.join(unusual) or 'nothing unusual'}"
 
 
 def health(image: ArrayLike) -> Health:
@@ -74,11 +74,11 @@ def health(image: ArrayLike) -> Health:
     clean = bool(finite.all())  # then nothing has to be copied
     if not clean:
         masks["negative"] &= ~any_channel(~finite)
-    found: dict[str, Any] = {}
+    counts: dict[str, Any] = {}
     for kind, mask in masks.items():
-        found[kind] = int(mask.sum())
+        counts[kind] = int(mask.sum())
         first = np.unravel_index(mask.argmax(), mask.shape)
-        found[f"first_{kind}"] = (int(first[0]), int(first[1])) if found[kind] else None
+        counts[f"first_{kind}"] = (int(first[0]), int(first[1])) if counts[kind] else None
     values = image if clean else image[finite]
     y = luminance(image if clean else image[~any_channel(~finite)])
     positive = y[y > 0]
@@ -88,7 +88,7 @@ def health(image: ArrayLike) -> Health:
         maximum=float(values.max()) if values.size else 0.0,
         median=float(np.median(y)) if y.size else 0.0,
         dynamic_range=float(positive.max() / positive.min()) if positive.size else 0.0,
-        **found,
+        **counts,
     )
 
 
@@ -169,6 +169,7 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     InputError
         If no texel is finite.
     """
+    # ---- Infinities: the brightest of the image
     with np.errstate(over="ignore"):
         image = np.array(image, np.float32)
     height, width = image.shape[:2]
@@ -179,6 +180,8 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     replaced = any_channel(np.isnan(image) | np.isneginf(image))
     overflowed = any_channel(np.isposinf(image)) & ~replaced
     image[np.isposinf(image)] = max(HALF_MAX, float(image[finite].max()))
+
+    # ---- The rest from the rim inwards: means of the neighbours that are known
     good = ~replaced
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     row, column = np.nonzero(~good)

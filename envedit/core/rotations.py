@@ -46,8 +46,8 @@ def rotated(vector: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + along
 
 
-def rotation_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,) that brings a unit vector to another by the shortest way."""
-    axis = np.cross(one, other)
+    axis = np.cross(start, end)
     sine = float(np.linalg.norm(axis))
-    return axis * (np.arctan2(sine, one @ other) / max(sine, 1e-30))
+    return axis * (np.arctan2(sine, start @ end) / max(sine, 1e-30))

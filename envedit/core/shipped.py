@@ -14,8 +14,8 @@ def folder() -> Path | None:
     """Return the folder of the shipped files; None where the installation lacks them."""
     package = Path(envedit.__file__).parent
     # In a source checkout it lies beside the package, in an installed wheel inside it.
-    found = (parent / "scenes" for parent in (package, package.parent))
-    return next((path for path in found if (path / "sphere.xml").is_file()), None)
+    candidates = (parent / "scenes" for parent in (package, package.parent))
+    return next((path for path in candidates if (path / "sphere.xml").is_file()), None)
 
 
 def scenes() -> tuple[str, ...]:

@@ -13,17 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = [
-    "ArrayLike",
-    "DrArray",
-    "FilePath",
-    "Info",
-    "Params",
-    "Progress",
-    "Shape",
-    "Tensor",
-    "Views",
-]
+__all__ = ["ArrayLike", "DrArray", "FilePath", "Info", "Params", "Progress", "Shape", "Tensor", "Views"]
 
 DrArray = Any
 """A flat Dr.Jit array: ``mi.Float``, ``mi.UInt32``, of any precision."""

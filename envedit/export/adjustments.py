@@ -68,7 +68,10 @@ def adjust(
     """
     if not any_asked(lights, output):
         return envmap, []
-    gain, notes = np.ones(3), []
+
+    # ---- One factor for each channel
+    gain = np.ones(3)
+    notes = []
     if output.exposure:
         gain *= 2.0**output.exposure
         notes.append(f"exposure of the map changed by {output.exposure:+g} stops")
@@ -78,6 +81,8 @@ def adjust(
     if output.temperature:
         gain *= gains(output.temperature)
         notes.append(f"temperature: light of {output.temperature:g} K in place of 6500 K")
+
+    # ---- The map times it, in double precision, some rows at a time
     result = np.empty(envmap.shape, np.float32)
     with np.errstate(over="ignore"):
         for first in range(0, len(envmap), _ROWS):
@@ -116,7 +121,7 @@ def spread(core: np.ndarray, degrees: float) -> np.ndarray:
         result = latlong.resize(_spread(coarse, degrees), height, width)
     else:
         result = _spread(core, degrees)
-    result *= _flux_ratio(core, result)
+    result *= flux_ratio(core, result)
     return result
 
 
@@ -153,10 +158,10 @@ def _spread(core, degrees):
     return result
 
 
-def _flux_ratio(before, after):
-    """Return the flux (3,) of one map over that of another; 1 where either has none."""
+def flux_ratio(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the flux (3,) of one map (H, W, 3) over that of another; 1 where the second has none."""
     omega = latlong.lookup_solid_angles(*before.shape[:2])
-    fluxes = [np.einsum("h,hwc->c", omega, one, dtype=np.float64) for one in (before, after)]
+    fluxes = [np.einsum("h,hwc->c", omega, envmap, dtype=np.float64) for envmap in (before, after)]
     return np.where(fluxes[1] > 0, fluxes[0] / np.where(fluxes[1] > 0, fluxes[1], 1), 1)
 
 
@@ -200,7 +205,7 @@ def _bounded(core, others, most):
     small, behind = core, others
     if core.shape[1] > SEARCH_WIDTH:
         size = SEARCH_WIDTH // 2, SEARCH_WIDTH
-        small, behind = (latlong.resize(one, *size) for one in (core, others))
+        small, behind = (latlong.resize(image, *size) for image in (core, others))
     low, high = np.log(180 / len(core)), np.log(WIDEST)
     for _ in range(_SEARCH):
         middle = (low + high) / 2

@@ -43,17 +43,21 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
     """
     if result.given.size[0] <= settings.input.width:
         return None
-    found, own = result.found, result.given.at_file_size(settings.input)
-    adjusted = settings.lights, settings.output, own.scale
-    if found is None:
+    own = result.given.at_file_size(settings.input)
+    how = settings.lights, settings.output, own.scale
+    if result.found is None:
         full = _by_hand(settings.input, result.given, own)
-        return full.as_stored(adjustments.adjust(full.radiance, *adjusted)[0])
-    full, made = carried(settings.input, result.given, own, found, result.maps["initial"])
-    return full.as_stored(adjustments.adjust(made, *adjusted)[0], found.turn_degrees)
+        return full.as_stored(adjustments.adjust(full.radiance, *how)[0])
+    full, edited = carried(settings.input, result.given, own, result.found, result.maps["initial"])
+    return full.as_stored(adjustments.adjust(edited, *how)[0], result.found.turn_degrees)
 
 
 def carried(
-    settings: config.Input, given: inputs.InputMap, own: inputs.InputMap, found: Found, initial: np.ndarray
+    settings: config.Input,
+    input_map: inputs.InputMap,
+    own: inputs.InputMap,
+    solution: Found,
+    initial: np.ndarray,
 ) -> tuple[inputs.InputMap, np.ndarray]:
     """Carry an edit to the map as its file has it.
 
@@ -61,9 +65,9 @@ def carried(
     ----------
     settings : config.Input
         With the lights that were placed by hand.
-    given, own : InputMap
+    input_map, own : InputMap
         The map at working size, and as the file has it.
-    found : Found
+    solution : Found
         The edit.
     initial : ndarray (h, w, 3)
         The working map that was edited.
@@ -73,29 +77,33 @@ def carried(
     InputMap, ndarray (H, W, 3)
         The map with its lights placed, and its edit, radiance before adjustments.
     """
-    full = _by_hand(settings, given, own)
-    before = latlong.rotate(initial, found.turn_degrees)
-    source = latlong.rotate(full.radiance, found.turn_degrees)
+    full = _by_hand(settings, input_map, own)
+    before = latlong.rotate(initial, solution.turn_degrees)
+    source = latlong.rotate(full.radiance, solution.turn_degrees)
     rows = inputs.active_rows(settings.rows, before.shape[0])
-    others = placed_lights.without_locked(settings.lights)
+
+    # ---- Locked lights, which stay as they are
     locked = None
-    if others is not None and isinstance(found.representation, Layers):
-        dark = _by_hand(replace(settings, lights=others), given, own).radiance
+    others = placed_lights.without_locked(settings.lights)
+    if others is not None and isinstance(solution.representation, Layers):
+        dark = _by_hand(replace(settings, lights=others), input_map, own).radiance
         locked = np.clip(source - dark, 0, source)
         source = source - locked
-    edited = found.edited
-    made = full_resolution.carry(
-        found.representation, found.params, before, edited, source, rows, found.free
+
+    # ---- The rest, edited
+    edited = full_resolution.carry(
+        solution.representation, solution.params, before, solution.edited, source, rows, solution.free
     )
-    return full, made if locked is None else made + locked
+    return full, edited if locked is None else edited + locked
 
 
-def _by_hand(settings: config.Input, given: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
+def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
     """Place and turn the lights of the map as the file has it as it was done at working size."""
     full = own
-    if given.placed is not None:
-        placed = given.placed
-        before, rows = placed.envmap, Rows.of(len(placed.envmap))
+    if input_map.placed is not None:
+        placed = input_map.placed
+        before = placed.envmap
+        rows = Rows.of(len(placed.envmap))
         moved = full.radiance
         if any("light" in light for light in settings.lights):
             moved = full_resolution.carry(

@@ -84,6 +84,7 @@ def carry(
     NumericalError
         If a texel comes out non-finite; names its row and column.
     """
+    # ---- Refuse arrays that do not belong together
     source = np.asarray(source)
     if source.ndim != 3 or source.shape[2] != 3 or source.dtype != np.float32:
         raise ValueError(f"carry: a source is (H, W, 3) float32, got {source.shape} {source.dtype}")
@@ -92,6 +93,8 @@ def carry(
         raise ValueError(
             f"carry: the working maps have shapes {np.shape(original_working)} and {np.shape(edited_working)}"
         )
+
+    # ---- The edit, as layers or as a ratio of the working maps
     grid = Places(source.shape[:2], rows_working, width)
     work: _LayersAt | Ratio
     if isinstance(representation, Layers):
@@ -100,25 +103,26 @@ def carry(
     else:
         work = Ratio(original_working, edited_working, free, grid)
         work.correct(source)
+
+    # ---- Apply it to bands of rows
     result = source.copy()
     for start, fresh, size in grid.bands():
         band = slice(start, start + size)
-        made = work.band(source[band], start)
+        composed = work.band(source[band], start)
         if representation.models_edit:
-            made = unseen_kept(source[band], made)
+            composed = unseen_kept(source[band], composed)
         if free is not None:
-            made = np.where(free[grid.row[band]][:, grid.column][..., None], made, source[band])
-        if (bad := ~np.isfinite(made)).any():
+            composed = np.where(free[grid.row[band]][:, grid.column][..., None], composed, source[band])
+        if (bad := ~np.isfinite(composed)).any():
             raise NumericalError(
                 f"the edit at full resolution is not finite at {place_of(bad, start)}; lower "
                 "[optimizer] lr if you have raised it, else scale the map down"
             )
-        result[fresh : start + size] = made[fresh - start :]
+        result[fresh : start + size] = composed[fresh - start :]
     return result
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Layers
+# ---- Layers ------------------------------------------------------------------------------------------------
 
 
 class _LayersAt:
@@ -203,7 +207,8 @@ class _LayersAt:
         directions = self.cores.directions(start, row, column)
 
         # ---- The source without its cores, and those of lights that stay
-        base, core = image, None
+        base = image
+        core = None
         if self.cores.any(start, size):
             light, _, own_core = self.cores.of(image, row, column, directions, start, size)
             base = image - own_core

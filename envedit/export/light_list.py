@@ -14,6 +14,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.inputs import InputMap
+from envedit.representations.layers.placed_lights import direction
 from envedit.representations.layers.separation import Light, Separation, separate
 
 FARTHEST = math.pi + 1
@@ -53,13 +54,13 @@ def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def of_edit(
-    given: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: float, degrees: float = 0.0
+    input_map: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: float, degrees: float = 0.0
 ) -> tuple[dict[str, list[dict]], np.ndarray]:
     """Match the lights of a map as its file has it and as edited.
 
     Parameters
     ----------
-    given : inputs.InputMap
+    input_map : inputs.InputMap
         The map.
     edited : ndarray (H, W, 3)
         The edited map, linear radiance that reaches the scene.
@@ -75,11 +76,11 @@ def of_edit(
     core : ndarray (H, W, 3) float32
         The lights of the edited map alone.
     """
-    first = last = separate(given.radiance if given.unmoved is None else given.unmoved)
-    if given.unmoved is not None:
-        last = kept(first, separate(given.radiance), given.unmoved, given.radiance, by_hand)
-    last = kept(last, separate(edited), given.radiance, edited, degrees)
-    before, after = (listed(one.lights, edited.shape[:2], to_world) for one in (first, last))
+    first = last = separate(input_map.radiance if input_map.unmoved is None else input_map.unmoved)
+    if input_map.unmoved is not None:
+        last = kept(first, separate(input_map.radiance), input_map.unmoved, input_map.radiance, by_hand)
+    last = kept(last, separate(edited), input_map.radiance, edited, degrees)
+    before, after = (listed(separation.lights, edited.shape[:2], to_world) for separation in (first, last))
     return matched(before, after, by_hand + degrees), np.minimum(last.core, edited).astype(np.float32)
 
 
@@ -173,19 +174,22 @@ def kept(
         ``after`` with other lights, and the core of these.
     """
     same = np.asarray((latlong.rotate(start, degrees) == end).all(axis=2)).ravel()
-    lights, others, touched = [], list(after.lights), np.zeros(len(same), bool)
+    lights = []
+    others = list(after.lights)
+    touched = np.zeros(len(same), bool)
     for light in before.lights:
         core = np.zeros_like(after.core)
         core.reshape(-1, 3)[light.texels] = light.radiance
         core = latlong.rotate(core, degrees).reshape(-1, 3)
-        lit = np.asarray(core.any(axis=1))
-        touched |= lit
-        here = [other for other in others if lit[other.texels].any()]
-        if same[lit].all() and all(same[other.texels].all() for other in here):
-            toward, texels = _turned(light.direction, degrees), np.flatnonzero(lit)
-            lights.append(replace(light, direction=toward, texels=texels, radiance=core[lit]))
-            others = [other for other in others if all(other is not one for one in here)]
-    lights += [one for one in others if touched[one.texels].any() or not same[one.texels].all()]
+        occupied = np.asarray(core.any(axis=1))
+        touched |= occupied
+        overlapping = [other for other in others if occupied[other.texels].any()]
+        if same[occupied].all() and all(same[other.texels].all() for other in overlapping):
+            toward = _turned(light.direction, degrees)
+            texels = np.flatnonzero(occupied)
+            lights.append(replace(light, direction=toward, texels=texels, radiance=core[occupied]))
+            others = [other for other in others if not occupied[other.texels].any()]
+    lights += [other for other in others if touched[other.texels].any() or not same[other.texels].all()]
     core = np.zeros_like(after.core)
     for light in lights:
         core.reshape(-1, 3)[light.texels] += light.radiance
@@ -214,11 +218,17 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
         ``removed``, whether it is gone, and ``after`` has ``added``, whether it is new, and ``moved_degrees``
         from where it was before any turn, None if it is new.
     """
-    start, end = (np.array([_toward(light) for light in lights]).reshape(-1, 3) for lights in (before, after))
+    # ---- Pair lights that are near to each other and of similar flux
+    start, end = (
+        np.array([direction(light["azimuth"], light["elevation"]) for light in lights]).reshape(-1, 3)
+        for lights in (before, after)
+    )
     flux = [np.log([max(np.mean(light["flux"]), 1e-30) for light in lights]) for lights in (before, after)]
     apart = np.arccos(np.clip(_turned(start, degrees) @ end.T, -1, 1))
     partner = _paired(apart + np.abs(flux[0][:, None] - flux[1]))
     moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))
+
+    # ---- Number them: those before, then those added
     removed = [j is None for j in partner]
     numbered = [{"id": i + 1, "removed": removed[i], **light} for i, light in enumerate(before)]
     owner = {j: i for i, j in enumerate(partner) if j is not None}
@@ -272,13 +282,6 @@ def _place(light):
     return f"azimuth {round(light['azimuth']) % 360}, elevation {round(light['elevation'])}"
 
 
-def _toward(light):
-    """Return the unit vector towards a light in the map's frame."""
-    azimuth, elevation = math.radians(light["azimuth"]), math.radians(light["elevation"])
-    flat = math.cos(elevation)
-    return flat * math.sin(azimuth), math.sin(elevation), -flat * math.cos(azimuth)
-
-
 def _turned(directions, degrees):
     """Turn directions (..., 3) as :func:`.latlong.rotate` turns a map."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
@@ -296,8 +299,10 @@ def _paired(cost):
     u, v = np.zeros(rows + 1), np.zeros(columns + rows + 1)
     row_of = np.zeros(columns + rows + 1, int)  # 0: none; column 0 is where a search begins
     for i in range(1, rows + 1):
-        row_of[0], column = i, 0
-        least, back = np.full(len(v), np.inf), np.zeros(len(v), int)
+        row_of[0] = i
+        column = 0
+        least = np.full(len(v), np.inf)
+        back = np.zeros(len(v), int)
         done = np.zeros(len(v), bool)
         while row_of[column]:
             done[column] = True

@@ -139,8 +139,8 @@ class MovedLights:
                 for k, image in enumerate((total, total / density)):
                     rows = image.numpy()[fresh - start :].sum(axis=1, dtype=np.float64)
                     flux[light][k] += omega[fresh : start + size] @ rows
-        for light, (wanted, got) in flux.items():
-            self._level[light] = np.where(got > 0, wanted / np.maximum(got, 1e-300), 1).astype(np.float32)
+        for light, (target, got) in flux.items():
+            self._level[light] = np.where(got > 0, target / np.maximum(got, 1e-300), 1).astype(np.float32)
 
     def radiance(self, start: int, size: int) -> Iterator[mi.TensorXf]:
         """Yield the radiance (size, W, 3) of each light that reaches the band of rows from ``start``."""
@@ -158,7 +158,9 @@ class MovedLights:
         total, density = 0, 0
         for p in self.points:
             if p.light == light and p.first < start + size and p.last >= start:
-                (row, column, half), shape, rows = p.places, (size, self.width), (start, self.height)
+                row, column, half = p.places
+                shape = (size, self.width)
+                rows = (start, self.height)
                 total += lights.shared_out(row, column, half, p.flux, p.half_row, shape, rows)
                 density += lights.shared_out(row, column, half, p.omega, p.half_row, shape, rows)
         return total, dr.clip(density, 0.5, 2)

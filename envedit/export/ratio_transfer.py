@@ -27,7 +27,8 @@ class Ratio:
     """What was done to a working map, applied to its source; see :func:`.full_resolution.carry`."""
 
     def __init__(self, original: np.ndarray, edited: np.ndarray, free: np.ndarray | None, grid: Places):
-        self.grid, rows = grid, grid.rows.slice
+        self.grid = grid
+        rows = grid.rows.slice
         self.old, self.want = (np.asarray(e, np.float64)[rows] for e in (original, edited))
         self.changed = (np.asarray(original)[rows] != np.asarray(edited)[rows]).any(axis=2)
         if free is not None:
@@ -46,11 +47,11 @@ class Ratio:
             )
         ratio = np.where(self.changed[..., None], ratio, 1.0)
         self.m = np.minimum(ratio, MODERATE)
-        taken = _most_around(-np.log2(np.maximum(ratio.min(axis=2), 1e-30)))
-        given = _most_around(np.log2(np.maximum(ratio.max(axis=2), 1e-30)))
-        replaced, added = _step(taken - 1), _step(given - 1)
+        darker = _most_around(-np.log2(np.maximum(ratio.min(axis=2), 1e-30)))
+        brighter = _most_around(np.log2(np.maximum(ratio.max(axis=2), 1e-30)))
+        replaced, added = _step(darker - 1), _step(brighter - 1)
         self.parts = np.stack([replaced, added * (1 - replaced)], axis=2)
-        self.wanted = _Linear(np.where(self.changed[..., None], self.want, self.old))
+        self.replacement = _Linear(np.where(self.changed[..., None], self.want, self.old))
         self.more = _Linear(np.where(self.changed[..., None], self.want - self.old, 0))
         self.fix = np.ones(self.m.shape), np.zeros(self.m.shape)
         self.fixed = False
@@ -96,15 +97,16 @@ class Ratio:
             if step < ROUNDS[0]:
                 self.m = self.m * m
             else:
-                self.fix, self.fixed = (self.fix[0] * m, self.fix[1] * m + a), True
+                self.fix = (self.fix[0] * m, self.fix[1] * m + a)
+                self.fixed = True
 
     def _means(self, source):
         """Mean of the result over each active working texel, as :func:`.latlong.resize` makes it."""
         height, width = self.grid.shape
         sums = np.zeros((*self.changed.shape, 3))
         for start, fresh, size in self.grid.bands():
-            made = self.band(source[start : start + size], start)[fresh - start :]
-            sums += self._mean_of(made, fresh)
+            composed = self.band(source[start : start + size], start)[fresh - start :]
+            sums += self._mean_of(composed, fresh)
         # Rows that reach out of the active ones: what lies there is the source's.
         for part in (range(max(self.grid.start - 1, 0), self.grid.start), range(self.grid.stop, height)):
             for row in part:
@@ -113,17 +115,18 @@ class Ratio:
                 sums += self._mean_of(source[row : row + 1], row)
         return sums
 
-    def _mean_of(self, made, start):
-        weights = self.down[:, start : start + len(made)]
+    def _mean_of(self, composed, start):
+        weights = self.down[:, start : start + len(composed)]
         used = np.flatnonzero(weights.any(axis=1))
         result = np.zeros((*self.changed.shape, 3))
         if len(used):
-            part = (weights[used] @ made.reshape(len(made), -1)).reshape(len(used), -1, 3)
+            part = (weights[used] @ composed.reshape(len(composed), -1)).reshape(len(used), -1, 3)
             result[used] = np.einsum("rwc,wk->rkc", part.astype(np.float64), self.over, optimize=True)
         return result
 
     def band(self, source: np.ndarray, start: int) -> np.ndarray:
         """Compose the rows of a source that begin at ``start``."""
+        # ---- Texels of the band whose working texel changes
         size = len(source)
         low, high = (r[start : start + size] for r in self.rows)
         inside = (low >= 0) & (high < len(self.changed))
@@ -134,6 +137,8 @@ class Ratio:
             return source
         if self.same_size:
             return np.where(changed[..., None], self.target[start : start + size], source)
+
+        # ---- The fields of working size at these texels
         row, column = self.grid.texels(size)
         near = self.grid.row[start : start + size]
 
@@ -145,8 +150,9 @@ class Ratio:
             table = flat(mi.Float, values[near].astype(np.float32))
             return self.grid.nearest(mi.Color3f, table, row, column)
 
+        # ---- Texels times m; where that is no moderate factor, replaced or added to
         image = dr.unravel(mi.Color3f, flat(mi.Float, source))
-        made = image * smooth(self.m)
+        composed = image * smooth(self.m)
         if self.parts[max(near[0] - 1, 0) : near[-1] + 2].any():  # rows between which is interpolated
             table = flat(mi.Float, self.grid.along_rows(self.parts, start, size))
             replaced, added = self.grid.across(mi.Vector2f, table, row, column)
@@ -159,12 +165,13 @@ class Ratio:
 
             last = len(self.changed) - 1
             places = [np.clip(r, 0, last) for r in (low, high)], self.grid.place[start : start + size]
-            made += (image + linear(self.more) - made) * added + (linear(self.wanted) - made) * replaced
-            made = dr.maximum(made, 0)
+            additions = (image + linear(self.more) - composed) * added
+            replacements = (linear(self.replacement) - composed) * replaced
+            composed = dr.maximum(composed + (additions + replacements), 0)
         if self.fixed:
-            made = made * nearest(self.fix[0]) + nearest(self.fix[1])
-        made = dr.select(flat(mi.Bool, changed), made, image)
-        return as_image(made, size, self.grid.shape[1]).numpy()
+            composed = composed * nearest(self.fix[0]) + nearest(self.fix[1])
+        composed = dr.select(flat(mi.Bool, changed), composed, image)
+        return as_image(composed, size, self.grid.shape[1]).numpy()
 
 
 def _most_around(values):

@@ -68,7 +68,8 @@ class SourceCores:
         self, image: mi.Color3f, row: mi.UInt32, column: mi.UInt32, d: mi.Vector3f, start: int, size: int
     ) -> tuple[mi.Int32, mi.Float, mi.Color3f]:
         """Return of texels at directions ``d``: light, or -1; how far inside it, 0 to 1; core in them."""
-        at, survey = self.surveyed, self.survey
+        at = self.surveyed
+        survey = self.survey
         label = self.label[at.row[start : start + size]].astype(np.int32)
         light = at.nearest(mi.Int32, flat(mi.Int32, label), row, column)
         share = [

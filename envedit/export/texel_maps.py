@@ -45,7 +45,10 @@ class Places:
     """
 
     def __init__(self, shape: tuple[int, int], rows: Rows, columns: int):
-        self.shape, self.rows, self.count, self.columns = shape, rows, rows.count, columns
+        self.shape = shape
+        self.rows = rows
+        self.count = rows.count
+        self.columns = columns
         height, width = shape
         place = np.arange(height) * ((rows.total - 1) / max(height - 1, 1)) - rows.first
         nearest = np.rint(place)
@@ -115,7 +118,7 @@ class Places:
         """Interpolate a table of :meth:`smooth_rows` by cubic convolution at texels of a band."""
         first = row * dr.opaque(mi.UInt32, self.columns)
         around = [dr.gather(mi.UInt32, index, column) for index in self._index[:4]]
-        a, b, before, after = (dr.gather(kind, table, first + one) for one in around)
+        a, b, before, after = (dr.gather(kind, table, first + offset) for offset in around)
         return _keys(a, b, before, after, dr.gather(mi.Float, self._part[0], column))
 
     def nearest(self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32) -> DrArray:

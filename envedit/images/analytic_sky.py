@@ -58,6 +58,7 @@ def sunsky(
     ConfigError
         If a parameter is out of its range.
     """
+    # ---- Refuse what is out of range
     if width < 6 or width % 2 or width > MAX_WIDTH:
         raise ConfigError(f"sunsky: width must be even, from 6 to {MAX_WIDTH}, got {width}")
     for key, value, low, high in (
@@ -70,6 +71,8 @@ def sunsky(
     ):
         if not low <= value <= high:  # a NaN is not in any range either
             raise ConfigError(f"sunsky: {key} must be from {low:g} to {high:g}, got {value}")
+
+    # ---- Sky and sun, each an emitter of its own
     height = width // 2
     # The plugin is black for a sun in the horizon itself, to float32: one hundredth of a degree is above it.
     sun_direction = latlong.on_sphere(math.radians(90 - max(elevation, 0.01)), math.radians(azimuth % 360.0))
@@ -77,6 +80,7 @@ def sunsky(
     sky = _sunsky_emitter(sun_scale=0.0, sky_scale=sky_scale, **common)
     sun = _sunsky_emitter(sun_scale=sun_scale, sky_scale=0.0, **common)
 
+    # ---- The sky averaged over texels, over ground that both light; the sun added as points
     points = disc(sun_direction, math.radians(SUN_APERTURE / 2), width)
     flux = sun(points) * (2 * math.pi * (1 - math.cos(math.radians(SUN_APERTURE / 2))) / len(points))
     irradiance = (flux * points[:, 1:2]).sum(0) + _sky_irradiance(sky)

@@ -80,7 +80,8 @@ def _require_chunks(name, part):
         return
     # Only the header and the table are read into memory.
     with open(name, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        begin, size = 8, len(data)
+        begin = 8
+        size = len(data)
         while data[begin : begin + 1] not in (b"", b"\0"):  # an attribute: name, type, size, value
             end = data.find(b"\0", data.find(b"\0", begin) + 1) + 1
             if end <= begin:
@@ -144,7 +145,7 @@ def _decoded(name, count):
     import OpenEXR
 
     try:
-        with quiet_libraries() as said, on_cores():
+        with quiet_libraries() as printed, on_cores():
             # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
             parts = OpenEXR.File(name, separate_channels=True).parts
     except MemoryError:
@@ -153,8 +154,8 @@ def _decoded(name, count):
         raise damaged(name, e) from None
     # A part that cannot be decoded is dropped with a printed warning, and the others move up.
     # The decoder of JPEG 2000 says that a stream ended early, and fills up with what it likes.
-    if len(parts) != count or "terminated early" in (said[0] if said else ""):
-        raise damaged(name, said and said[0] or "not all of its parts could be decoded")
+    if len(parts) != count or "terminated early" in (printed[0] if printed else ""):
+        raise damaged(name, printed and printed[0] or "not all of its parts could be decoded")
     return parts
 
 
@@ -166,14 +167,14 @@ def _window(box):
 
 def _choose_channels(name, headers, info):
     """Return the part of the picture and its channel names, three or (luminance) one."""
-    seen, colour, grey = [], [], []  # of the latter: part, name of the layer, channels
+    channel_names, colour, grey = [], [], []  # of the latter: part, name of the layer, channels
     for index, header in enumerate(headers):
         if "deep" in str(header.get("type", "")).lower():
-            seen.append("deep data")
+            channel_names.append("deep data")
             continue
         layers: dict[str, dict[str, str]] = {}
         for channel in header["channels"]:
-            seen.append(channel.name)
+            channel_names.append(channel.name)
             layer, _, short = channel.name.rpartition(".")
             layers.setdefault(layer, {})[short.upper()] = channel.name
         # Unnamed channels of a part go first; the part's own name is that of all of them.
@@ -185,8 +186,8 @@ def _choose_channels(name, headers, info):
             elif "Y" in channels and not {"RY", "BY", "X", "Z"} & channels.keys():
                 grey.append((index, channels["Y"], [channels["Y"]]))
     if not colour + grey:
-        found = ", ".join(shown(channel, 30) for channel in seen[:12])
-        raise InputError(f"{name}: no R, G, B channels (found: {found}); save it as RGB")
+        listed = ", ".join(shown(channel, 30) for channel in channel_names[:12])
+        raise InputError(f"{name}: no R, G, B channels (found: {listed}); save it as RGB")
 
     # ---- unnamed channels, then a layer or part that calls itself the picture, then the order of the file
     index, label, names = min(colour, key=lambda c: _rank(c[1])) if colour else grey[0]
@@ -207,8 +208,8 @@ def _rank(label):
     """Order layers: unnamed channels, names that end in a word for the picture, or hold one, others."""
     if not label:
         return 0
-    found = re.search("(combined|beauty|rgba)(.?)", label.lower())
-    return 3 if found is None else 2 if found[2] else 1
+    match = re.search("(combined|beauty|rgba)(.?)", label.lower())
+    return 3 if match is None else 2 if match[2] else 1
 
 
 def _describe(header, info):

@@ -30,11 +30,8 @@ FORMATS = (
 ARRAY = "array"
 """What a map that came as an array is called, where others have the name of their file."""
 
-__all__ = ["load_envmap", "read", "read_stored", "write_exr", "write_hdr", "write_png"]
 
-
-# ----------------------------------------------------------------------------------------------------------
-# Reading
+# ---- Reading -----------------------------------------------------------------------------------------------
 
 
 def read(path: FilePath) -> tuple[np.ndarray, dict]:
@@ -72,7 +69,7 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
 
 
 def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
-    """Read an image file as it was painted: with alpha, and without undoing any display curve.
+    """Read an image file as it was painted: with alpha, with its display curve; errors as of :func:`read`.
 
     Parameters
     ----------
@@ -88,11 +85,6 @@ def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     info : dict
         As of :func:`read`; ``metadata`` holds a PNG's texts. A JPEG also has ``quality``, as libjpeg
         counts it, estimated from its first table.
-
-    Raises
-    ------
-    InputError
-        As :func:`read`.
     """
     pixels, info = _decode(path, stored=True)
     return marks.in_rec709(pixels, info), info
@@ -293,8 +285,7 @@ def _of_array(values: np.ndarray, name: str, space: str) -> tuple[np.ndarray, di
     return marks.honour(image, info, space), info
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Writing
+# ---- Writing -----------------------------------------------------------------------------------------------
 
 
 def write_exr(
@@ -339,6 +330,8 @@ def write_exr(
 
     name = os.fsdecode(path)
     pixels = _checked(name, image)
+
+    # ---- Header
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -353,6 +346,8 @@ def write_exr(
             raise ConfigError(f"{name}: '{key}' cannot be used as the name of a metadata attribute")
         plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
         header[str(key)] = value if plain else str(value)
+
+    # ---- Channels
     if half:
         with np.errstate(over="ignore"):  # refused as an infinity
             pixels = _checked(name, pixels.astype(np.float16)).astype(np.float16)
@@ -365,7 +360,7 @@ def write_exr(
 def write_hdr(
     path: FilePath, image: ArrayLike, chromaticities: primaries.Chromaticities | None = None
 ) -> None:
-    """Write an image as a Radiance file (:func:`.rgbe.encode`), whole or not at all.
+    """Write an image as a Radiance file (:func:`.rgbe.encode`); errors as of :func:`write_exr`.
 
     Parameters
     ----------
@@ -375,18 +370,13 @@ def write_hdr(
         Linear radiance, finite and not negative.
     chromaticities : tuple, optional
         Of the image's colours, which few programs read from such a file; None: Rec. 709.
-
-    Raises
-    ------
-    NumericalError, InputError
-        As :func:`write_exr`.
     """
     name = os.fsdecode(path)
     write_atomically(name, rgbe.encode(_checked(name, image), chromaticities))
 
 
 def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:
-    """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel, whole or not at all.
+    """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel; errors as of :func:`write_exr`.
 
     Parameters
     ----------
@@ -398,11 +388,6 @@ def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | 
         8 or 16.
     metadata : dict, optional
         Texts to add, as ``tEXt`` chunks.
-
-    Raises
-    ------
-    NumericalError, InputError
-        As :func:`write_exr`.
     """
     name = os.fsdecode(path)
     image = np.asarray(image)

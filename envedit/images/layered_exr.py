@@ -62,8 +62,11 @@ def write(
         raise ConfigError(f"{name}: compression '{compression}' is not one of {', '.join(COMPRESSIONS)}")
     if not layers:
         raise ConfigError(f"{name}: a layered file needs at least one layer")
+
+    # ---- Channels of each layer
     default = DEFAULT if DEFAULT in layers else next(iter(layers))
-    planes, size = {}, np.shape(layers[default])[:2]
+    planes = {}
+    size = np.shape(layers[default])[:2]
     for layer, values in layers.items():
         values = np.asarray(values)
         colour = values.ndim == 3 and values.shape[2] == 3
@@ -77,6 +80,8 @@ def write(
         prefix = "" if layer == default else f"{layer}."
         for i, channel in enumerate("RGB" if colour else "Y"):
             planes[prefix + channel] = np.ascontiguousarray(values[..., i] if colour else values)
+
+    # ---- Header, and the file
     header = {
         "compression": getattr(OpenEXR, COMPRESSIONS[compression] + "_COMPRESSION"),
         "type": OpenEXR.scanlineimage,

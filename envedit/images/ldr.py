@@ -35,7 +35,8 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
 def _jpeg_header(name, info):
     """Return (width, height), and note the quality and the marks of a JPEG file."""
     marks = info["marks"]
-    size, mean = None, 0.0
+    size = None
+    mean = 0.0
     with open(name, "rb") as file:
         file.seek(2)
         while True:
@@ -81,7 +82,8 @@ def _png_marks(name, info):
     with open(name, "rb") as file:
         file.seek(8)
         while len(start := file.read(8)) == 8 and start[4:] != b"IEND":
-            length, kind = int.from_bytes(start[:4], "big"), start[4:]
+            length = int.from_bytes(start[:4], "big")
+            kind = start[4:]
             if kind not in (b"eXIf", b"iCCP", b"sRGB", b"cICP", b"gAMA", b"tEXt", b"iTXt", b"zTXt"):
                 file.seek(length + 4, os.SEEK_CUR)
                 continue
@@ -131,11 +133,11 @@ def _bitmap(name):
     import mitsuba as mi
 
     try:
-        with quiet_libraries() as said:
+        with quiet_libraries() as texts:
             pixels = np.array(mi.Bitmap(name))
     except Exception as e:
         raise damaged(name, re.sub(r'^(\[\w+\] )?("[^"]*": )?', "", str(e))) from None
-    printed = said[0] if said else ""  # all that libjpeg does
+    printed = texts[0] if texts else ""  # all that libjpeg does
     if re.search("corrupt|premature|invalid|inconsistent", printed, re.I):
         raise damaged(name, printed)
     return pixels if pixels.ndim == 3 else pixels[..., None]

@@ -114,10 +114,10 @@ def _recoded(codes, gamma):
     """Return codes of light to a power as 16-bit sRGB codes; alpha has no curve."""
     top = np.iinfo(codes.dtype).max
     values = linear_to_srgb((np.arange(top + 1) / top) ** (1 / gamma))
-    found = np.rint(65535 * values).astype(np.uint16)[codes]
+    recoded = np.rint(65535 * values).astype(np.uint16)[codes]
     if codes.shape[2] in (2, 4):
-        found[..., -1] = codes[..., -1] * np.uint16(65535 // top)
-    return found
+        recoded[..., -1] = codes[..., -1] * np.uint16(65535 // top)
+    return recoded
 
 
 def _chromaticities(marks, info, space):

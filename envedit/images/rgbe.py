@@ -85,7 +85,8 @@ def _radiance_runs(name, data, height, width):
     Mitsuba's reader is quicker and overruns its buffer on damaged files, which kills the process.
     """
     rows = bytearray()
-    start, at = data[:4], 0
+    start = data[:4]
+    at = 0
     for y in range(height):
         if data[at : at + 4] != start:
             raise damaged(name, f"scanline {y} of {height} does not begin")
@@ -124,8 +125,7 @@ def _radiance_pixels(name, data, height, width):
     return pixels[np.repeat(source[:stop], count[:stop])].reshape(height, width, 4)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Writing
+# ---- Writing -----------------------------------------------------------------------------------------------
 
 
 def encode(image: np.ndarray, chromaticities: tuple[float, ...] | None = None) -> bytes:
@@ -138,7 +138,8 @@ def encode(image: np.ndarray, chromaticities: tuple[float, ...] | None = None) -
     height, width, _ = image.shape
     space = "" if chromaticities is None else f"PRIMARIES={' '.join(f'{v:g}' for v in chromaticities)}\n"
     head = f"#?RADIANCE\n{space}FORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
-    start, rows = bytes((2, 2, width >> 8 & 255, width & 255)), [head]
+    start = bytes((2, 2, width >> 8 & 255, width & 255))
+    rows = [head]
     for first in range(0, height, _ROWS):
         texels = _texels(image[first : first + _ROWS])
         if not 8 <= width < 32768:  # too short or long for scanlines by channel

@@ -23,9 +23,7 @@ CHANGE_SOFT = 0.05
 CHANGE_FLOOR = 0.01
 """Share of a map's mean below which radiance is as good as black."""
 
-# --------------------------------------------------------------------------------------------------------
-# Differences, light and smoothness
-# --------------------------------------------------------------------------------------------------------
+# ---- Differences, light and smoothness ---------------------------------------------------------------------
 
 
 def image_l1(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
@@ -106,7 +104,8 @@ def tv(x: Tensor, reference: Tensor | None = None, weight: Tensor | None = None)
     """
     check_image(x, "image")
     height, width, channels = x.shape
-    row, values = width * channels, x.array
+    row = width * channels
+    values = x.array
     index = dr.arange(dr.uint32_array_t(type(values)), height * row)
     column = index % row
     right = dr.select(column < row - channels, index + channels, index + channels - row)

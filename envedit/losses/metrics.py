@@ -1,7 +1,8 @@
 """Numbers that judge an image: PSNR, SSIM and MSE on a stated tonemap, and what they do not see.
 
 Images are numpy arrays ``(H, W, 3)`` of linear radiance unless said otherwise; sums run in double precision.
-Every function refuses images that are not finite or differ in shape, and returns a finite number or None.
+Every function raises InputError for images that are not finite or differ in shape, and returns a finite
+number or None.
 """
 
 from __future__ import annotations
@@ -58,19 +59,11 @@ def _pair(a, b):
     return a, b
 
 
-# --------------------------------------------------------------------------------------------------------
-# Two images: how far apart
-# --------------------------------------------------------------------------------------------------------
+# ---- Two images: how far apart -----------------------------------------------------------------------------
 
 
 def mse(a: np.ndarray, b: np.ndarray) -> float:
-    """Compute the mean squared error over texels and channels.
-
-    Raises
-    ------
-    InputError
-        If the images differ in shape or hold values that are not finite.
-    """
+    """Compute the mean squared error over texels and channels."""
     a, b = _pair(a, b)
     return float(np.mean(np.square(a - b)))
 
@@ -80,8 +73,6 @@ def psnr(a: np.ndarray, b: np.ndarray, data_range: float = 1.0) -> float:
 
     Raises
     ------
-    InputError
-        As `mse`.
     ConfigError
         If ``data_range`` is not a positive number.
     """
@@ -98,8 +89,6 @@ def ssim(a: np.ndarray, b: np.ndarray, data_range: float = 1.0) -> float:
 
     Raises
     ------
-    InputError
-        As `mse`.
     ConfigError
         If ``data_range`` is not a positive number.
     """
@@ -144,8 +133,6 @@ def compare(
 
     Raises
     ------
-    InputError
-        As `mse`.
     ConfigError
         If there is no such tonemap.
     """
@@ -154,47 +141,50 @@ def compare(
     views = views or (slice(0, len(a)),)
     shares = [len(a[rows]) / len(a) for rows in views]
     alike = sum(share * ssim(a[rows], b[rows]) for share, rows in zip(shares, views, strict=True))
-    apart, pairs = None, [(a[rows].astype(np.float32), b[rows].astype(np.float32)) for rows in views]
+    apart = None
+    pairs = [(a[rows].astype(np.float32), b[rows].astype(np.float32)) for rows in views]
     if lpips is not None and min(min(x.shape[:2]) for x, _ in pairs) >= lpips.backbone.least_size("max"):
         apart = sum(share * float(lpips(*pair)) for share, pair in zip(shares, pairs, strict=True))
     here = np.ones(a.shape[:2], bool) if seen is None or not np.any(seen) else seen
-    some, radiance = (a[here][None], b[here][None]), [image[here][None] for image in radiance]
-    shown = {"psnr": psnr(*some), "ssim": alike, "mse": mse(*some), "lpips": apart}
-    return shown | {"log_rmse": log_rmse(*radiance), "beyond_display": _beyond_display(*some, *radiance)}
+    a, b, radiance_a, radiance_b = (image[here][None] for image in (a, b, *radiance))
+    shown = {"psnr": psnr(a, b), "ssim": alike, "mse": mse(a, b), "lpips": apart}
+    beyond = _beyond_display(a, b, radiance_a, radiance_b)
+    return shown | {"log_rmse": log_rmse(radiance_a, radiance_b), "beyond_display": beyond}
 
 
 def saturated(compared: Iterable[dict]) -> bool:
     """Say whether PSNR is no score in one of some results of `compare`, and `log_rmse` is one in all."""
-    beyond = any((one.get("beyond_display") or 0) > SATURATED for one in compared)
-    return beyond and all(one.get("log_rmse") is not None for one in compared)
+    beyond = any((result.get("beyond_display") or 0) > SATURATED for result in compared)
+    return beyond and all(result.get("log_rmse") is not None for result in compared)
 
 
-def worse(one: dict, other: dict) -> bool:
+def worse(result: dict, other: dict) -> bool:
     """Say whether of two results of `compare` with the same image the first is farther from it."""
-    return gained(one, other) < 0
+    return gained(result, other) < 0
 
 
-def gained(one: dict, other: dict) -> float:
+def gained(result: dict, other: dict) -> float:
     """Return by which share the first of two results of `compare` with an image is nearer; below 0: farther.
 
     In RMS of display values, or `log_rmse` where PSNR is no score; 0 where both are the image.
     """
     after, before = (
-        e["log_rmse"] if saturated([one, other]) else 10 ** (-e["psnr"] / 20) for e in (one, other)
+        entry["log_rmse"] if saturated([result, other]) else 10 ** (-entry["psnr"] / 20)
+        for entry in (result, other)
     )
     return 1 - after / before if before else float(-after)
 
 
-def off(one: dict, among: Iterable[dict]) -> bool:
+def off(result: dict, among: Iterable[dict]) -> bool:
     """Say whether a result of `compare` among others is farther from its image than noise explains."""
-    return one["log_rmse"] > OFF_STOPS if saturated([one, *among]) else one["psnr"] < OFF_DECIBELS
+    return result["log_rmse"] > OFF_STOPS if saturated([result, *among]) else result["psnr"] < OFF_DECIBELS
 
 
-def score(one: dict, among: Iterable[dict], digits: int = 1) -> str:
+def score(result: dict, among: Iterable[dict], digits: int = 1) -> str:
     """Return the score of a result of `compare` among others: PSNR in dB, or `log_rmse` in stops."""
-    if saturated([one, *among]):
-        return f"{one['log_rmse']:.{max(digits, 2)}f} stops"
-    return f"{one['psnr']:.{digits}f} dB"
+    if saturated([result, *among]):
+        return f"{result['log_rmse']:.{max(digits, 2)}f} stops"
+    return f"{result['psnr']:.{digits}f} dB"
 
 
 def _beyond_display(shown_a, shown_b, a, b):
@@ -212,11 +202,6 @@ def log_rmse(a: np.ndarray, b: np.ndarray) -> float | None:
     e is `RELATIVE_EPS` of the median of the reference ``b`` where it is above 0: the same at every exposure,
     and blind only far below what is there. Negative radiance counts as 0. None if the reference is black and
     the images differ.
-
-    Raises
-    ------
-    InputError
-        As `mse`.
     """
     a, b = (np.maximum(image, 0) for image in _pair(a, b))
     if np.array_equal(a, b):
@@ -261,11 +246,6 @@ def painted(
         less than noise leaves of it where it is followed exactly: the mean of |x - y| is 2 / sqrt(pi) times
         the noise of each;
         ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
-
-    Raises
-    ------
-    InputError
-        As `mse`.
     """
     edited, target = _pair(edited, target)
     _, initial = _pair(edited, initial)
@@ -273,14 +253,15 @@ def painted(
     counts = 1.0 if seen is None else np.asarray(seen, np.float64)[..., None]
     cover = counts * np.broadcast_to(coverage, d.shape).astype(np.float64)
     left = np.broadcast_to(counts - cover, d.shape)
-    asked, rest = float((cover * np.abs(before - t)).sum()), float(left.sum())
-    measured = asked > 0
+    requested = float((cover * np.abs(before - t)).sum())
+    rest = float(left.sum())
+    measured = requested > 0
     if noise is not None:
         change = np.abs(apply_tonemap(initial, "gamma") - apply_tonemap(target, "gamma"))
         by_noise = 2 / np.sqrt(np.pi) * float((cover * noise[..., None]).sum())
         measured &= float((cover * change).sum()) > by_noise
     return {
-        "towards": 1 - float((cover * np.abs(d - t)).sum()) / asked if measured else None,
+        "towards": 1 - float((cover * np.abs(d - t)).sum()) / requested if measured else None,
         "elsewhere": float((left * np.abs(d - before)).sum()) / rest if rest > 0 else None,
     }
 
@@ -293,11 +274,6 @@ def log_psnr(a: np.ndarray, b: np.ndarray) -> float | None:
     """Compute the PSNR of log radiance, normalised as in Eq. 1 by the range of the reference ``b``.
 
     The logarithm is that of ``max(E, 0) + LOG_EPS``. None if the reference is constant and the images differ.
-
-    Raises
-    ------
-    InputError
-        As `mse`.
     """
     a, b = (_log(image) for image in _pair(a, b))
     span = float(np.ptp(b))
@@ -306,32 +282,18 @@ def log_psnr(a: np.ndarray, b: np.ndarray) -> float | None:
     return psnr(a, b, data_range=span)
 
 
-# --------------------------------------------------------------------------------------------------------
-# Lights, and texture
-# --------------------------------------------------------------------------------------------------------
+# ---- Lights, and texture -----------------------------------------------------------------------------------
 
 
 def peak_position(image: np.ndarray) -> tuple[int, int]:
-    """Find the row and column of the greatest luminance, the first of several.
-
-    Raises
-    ------
-    InputError
-        If the image holds values that are not finite.
-    """
+    """Find the row and column of the greatest luminance, the first of several."""
     values = luminance(_checked(image, "image"))
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)
     return int(row), int(column)
 
 
 def sun_offset(a: np.ndarray, b: np.ndarray) -> float:
-    """Measure the distance between the brightest texels of two lat-long maps, in texels, columns periodic.
-
-    Raises
-    ------
-    InputError
-        As `mse`.
-    """
+    """Measure the distance between the brightest texels of two lat-long maps, in texels, columns periodic."""
     a, b = _pair(a, b)
     (row_a, column_a), (row_b, column_b) = peak_position(a), peak_position(b)
     across = abs(column_a - column_b)
@@ -345,13 +307,7 @@ def _ratio(a, b):
 
 
 def peak_ratio(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Divide the greatest luminance of ``a`` by that of the reference ``b``; None where that is 0.
-
-    Raises
-    ------
-    InputError
-        As `mse`.
-    """
+    """Divide the greatest luminance of ``a`` by that of the reference ``b``; None where that is 0."""
     a, b = _pair(a, b)
     return _ratio(luminance(a).max(), luminance(b).max())
 
@@ -360,11 +316,6 @@ def mean_luminance_ratio(a: np.ndarray, b: np.ndarray) -> float | None:
     """Divide the mean luminance of ``a`` by that of the reference ``b``; None where that is 0.
 
     Texels count alike, not by their solid angle, as in Eq. 7.
-
-    Raises
-    ------
-    InputError
-        As `mse`.
     """
     a, b = _pair(a, b)
     return _ratio(luminance(a).mean(), luminance(b).mean())
@@ -376,11 +327,6 @@ def high_frequency_energy(image: np.ndarray) -> float:
     The high pass is ``log(max(L, 0) + LOG_EPS)`` of the luminance L minus its 5 x 5 binomial blur
     (1, 4, 6, 4, 1) / 16 on either axis; columns are periodic, the outermost rows repeat. Independent noise of
     variance s^2 gives 0.794 s^2 (squared taps: 1 - 2 (6/16)^2 + (70/256)^2), a smooth gradient about 0.
-
-    Raises
-    ------
-    InputError
-        If the image holds values that are not finite.
     """
     values = _log(luminance(_checked(image, "image")))
     height, width = values.shape

@@ -45,7 +45,7 @@ def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = 
         those between two photographed skies. None where the denominator is 0.
     """
     known = [original] if true is None else [original, true]
-    sharp = max(high_frequency_energy(one) for one in known)
+    sharp = max(high_frequency_energy(envmap) for envmap in known)
     step = _step(original)
     return {
         "colours_outside": colours_outside(edited, known),
@@ -58,14 +58,16 @@ def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = 
 
 def warning(measured: dict) -> str:
     """Return a sentence on what is unnatural in a painted edit's :func:`natural`; "" where nothing is."""
-    found = []
+    reasons = []
     if measured["white"] > MOST_WHITE:
-        found.append(f"{100 * measured['white']:.0f} % more of it is white")
+        reasons.append(f"{100 * measured['white']:.0f} % more of it is white")
     if measured["patches"] > MOST_PATCHES:
-        found.append(f"its patches are {measured['patches']:.1f} times those between two photographed skies")
-    if not found:
+        reasons.append(
+            f"its patches are {measured['patches']:.1f} times those between two photographed skies"
+        )
+    if not reasons:
         return ""
-    return f"the sky has changed much: {' and '.join(found)}; lower solve.freedom, or paint less"
+    return f"the sky has changed much: {' and '.join(reasons)}; lower solve.freedom, or paint less"
 
 
 def white(envmap: np.ndarray) -> float:
@@ -83,7 +85,8 @@ def patches(edited: np.ndarray, original: np.ndarray) -> float:
     Gaussian mean of :data:`COARSE_DEGREES`: one factor for the sky leaves nothing, a gradient over all of it
     some 60 % of its own RMS.
     """
-    (before, directions, omega), (after, _, _) = cells(original), cells(edited)
+    (before, directions, omega) = cells(original)
+    (after, _, _) = cells(edited)
     gain = after - before
     angle = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
     kernel = np.exp(-0.5 * (angle / COARSE_DEGREES) ** 2) * omega
@@ -114,7 +117,7 @@ def colours_outside(edited: np.ndarray, known: list[np.ndarray]) -> float:
     """Return the share of the upper half's solid angle in colours that none of the known maps has."""
     half = max(1, edited.shape[0] // 2)
     omega = np.repeat(latlong.solid_angles(*edited.shape[:2])[:half], edited.shape[1])
-    both = np.concatenate([_chroma(one[:half]) for one in known])
+    both = np.concatenate([_chroma(envmap[:half]) for envmap in known])
     low, high = np.percentile(both, PERCENTILES, axis=0)
     chroma = _chroma(edited[:half])
     outside = ((chroma < low - MARGIN) | (chroma > high + MARGIN)).any(axis=1)

@@ -21,9 +21,7 @@ import numpy as np
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import Arrays, Params, Tensor
 
-# --------------------------------------------------------------------------------------------------------
-# Adam
-# --------------------------------------------------------------------------------------------------------
+# ---- Adam --------------------------------------------------------------------------------------------------
 
 
 class Adam:
@@ -71,7 +69,10 @@ class Adam:
             raise ConfigError(f"Adam: both betas must lie in [0, 1), got {tuple(betas)}.")
         if not (math.isfinite(eps) and eps >= 1e-30):
             raise ConfigError(f"Adam: eps must be a number >= 1e-30, got {eps}.")
-        self.lr, self.betas, self.eps, self.t = lr, tuple(betas), eps, 0
+        self.lr = lr
+        self.betas = tuple(betas)
+        self.eps = eps
+        self.t = 0
         # Copies in memory of Dr.Jit's own: a literal would be part of the first step's kernel, and an array
         # wrapped around numpy's memory is not aligned, which is part of a kernel too and costs a compilation.
         self.params = {name: dr.opaque(dr.detach(value)) for name, value in params.items()}
@@ -111,6 +112,7 @@ class Adam:
         InputError
             If a gradient is missing, unknown or of the wrong shape.
         """
+        # ---- Refuse what does not fit
         lr = self.lr if lr is None else lr
         if not (math.isfinite(lr) and lr >= 0):
             raise ConfigError(f"Adam: the learning rate must be a number >= 0, got {lr}.")
@@ -118,13 +120,16 @@ class Adam:
             odd = sorted(grads.keys() ^ self.params.keys())
             raise InputError(f"Adam: gradients and parameters differ in {', '.join(odd)}.")
 
-        (b1, b2), t = self.betas, self.t + 1
+        (b1, b2) = self.betas
+        t = self.t + 1
         scalars = {}  # one pair per precision, in memory: kernels do not depend on the step then
-        new, refused = {}, []
+        new = {}
+        refused = []
         for name, p in self.params.items():
             if grads[name].shape != p.shape:
                 raise InputError(f"Adam: gradient of {name} has shape {grads[name].shape}, not {p.shape}.")
-            flat, g = dr.array_t(type(p)), _flat(dr.detach(grads[name]))
+            flat = dr.array_t(type(p))
+            g = _flat(dr.detach(grads[name]))
             if flat not in scalars:
                 scalars[flat] = (dr.opaque(flat, lr / (1 - b1**t)), dr.opaque(flat, math.sqrt(1 - b2**t)))
             rate, root = scalars[flat]
@@ -140,6 +145,8 @@ class Adam:
                 flag = dr.opaque(index, 0)
                 dr.scatter(flag, index(1), index(0), ~good)
                 refused.append(flag)
+
+        # ---- All in one evaluation; a step that is not finite is refused as a whole
         dr.eval(new, refused)
         if any(flag[0] for flag in refused):
             return False
@@ -175,20 +182,21 @@ class Adam:
         InputError
             If the state does not belong to these parameters; nothing has changed then.
         """
-        found, expected = dict(state), self.state_dict()
-        if found.keys() != expected.keys():
-            odd = sorted(found.keys() ^ expected.keys())
+        entries = dict(state)
+        expected = self.state_dict()
+        if entries.keys() != expected.keys():
+            odd = sorted(entries.keys() ^ expected.keys())
             raise InputError(f"optimiser state: its entries and the parameters differ in {', '.join(odd)}.")
         for key, value in expected.items():
-            got, shape = np.shape(found[key]), np.shape(value)
+            got, shape = np.shape(entries[key]), np.shape(value)
             if got != shape:
                 raise InputError(f"optimiser state: {key} has shape {got}, expected {shape}.")
         for name, value in self.params.items():
             kind, shape = type(value), value.shape
             for part, target in self._parts():
-                flat = dr.array_t(kind)(np.ascontiguousarray(found[f"{part}/{name}"]).ravel())
+                flat = dr.array_t(kind)(np.ascontiguousarray(entries[f"{part}/{name}"]).ravel())
                 target[name] = dr.opaque(_shaped(kind, flat, shape))
-        self.t = int(found["step"])
+        self.t = int(entries["step"])
 
 
 def _flat(value):
@@ -199,9 +207,7 @@ def _shaped(kind, flat, shape):
     return kind(flat, shape) if dr.is_tensor_v(kind) else kind(flat)
 
 
-# --------------------------------------------------------------------------------------------------------
-# Schedules: functions of the step, counted from 0
-# --------------------------------------------------------------------------------------------------------
+# ---- Schedules: functions of the step, counted from 0 ------------------------------------------------------
 
 
 def constant(lr: float, step: int = 0) -> float:

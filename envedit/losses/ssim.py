@@ -13,9 +13,7 @@ import drjit as dr
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import DrArray, Shape, Tensor, Views
 
-# --------------------------------------------------------------------------------------------------------
-# Shapes and sums, shared with the other losses
-# --------------------------------------------------------------------------------------------------------
+# ---- Shapes and sums, shared with the other losses ---------------------------------------------------------
 
 
 def check_image(x: Tensor, name: str) -> None:
@@ -48,9 +46,7 @@ def total(values: DrArray) -> DrArray:
     return dr.sum(dr.float64_array_t(type(values))(values))
 
 
-# --------------------------------------------------------------------------------------------------------
-# Structural similarity
-# --------------------------------------------------------------------------------------------------------
+# ---- Structural similarity ---------------------------------------------------------------------------------
 
 WINDOW = 11
 """Texels along a side of the Gaussian window."""
@@ -144,7 +140,8 @@ class Ssim:
 
     def _moments(self, *operands):
         """Filter along columns: mean and variance of the first operand and, if there are two, of x - y."""
-        row, F = self.shape[1] * self.shape[2], type(self._y)
+        row = self.shape[1] * self.shape[2]
+        F = type(self._y)
         index = dr.arange(dr.uint32_array_t(F), self.map_shape[0] * row)
         taps = [[dr.gather(F, o, index + j * row) for j in range(len(self._rows))] for o in operands]
         moments = list(_mean_and_variance(self._rows, taps[0]))
@@ -155,7 +152,9 @@ class Ssim:
 
     def _window(self, moments):
         """Merge the moments of the columns of a window into its means and variances."""
-        start, step, F = self._row_start(), self.shape[2], type(self._y)
+        start = self._row_start()
+        step = self.shape[2]
+        F = type(self._y)
         merged = []
         for mean, variance in zip(moments[::2], moments[1::2], strict=True):
             means = [dr.gather(F, mean, start + j * step) for j in range(len(self._columns))]
@@ -220,8 +219,10 @@ class StackedSsim:
     def __init__(self, reference: Tensor, weight: Tensor | None, rows: Views):
         check_image(reference, "reference")
         width, channels = reference.shape[1:]
-        self.shape, F = tuple(reference.shape), type(reference.array)
-        self._parts, shares = [], []
+        self.shape = tuple(reference.shape)
+        F = type(reference.array)
+        self._parts = []
+        shares = []
         for some in rows:
             cut = slice(some.start * width * channels, some.stop * width * channels)
             height = some.stop - some.start
@@ -243,7 +244,8 @@ class StackedSsim:
 
     def _evaluate(self, x, with_gradient):
         """As of :class:`Ssim`."""
-        loss, gradients = type(x)(0), []
+        loss = type(x)(0)
+        gradients = []
         for share, (cut, part) in zip(self._shares, self._parts, strict=True):
             value, gradient = part._evaluate(_cut(x, cut), with_gradient)
             loss += share * value
@@ -297,7 +299,8 @@ def _mean_and_variance(taps, values):
 
 def _scatter_filter(taps, fields, position, base, step, length):
     """Gather each field against the reversed window, taking nothing from outside ``[0, length)``."""
-    F, sums = type(fields[0]), [0] * len(fields)
+    F = type(fields[0])
+    sums = [0] * len(fields)
     for j, tap in enumerate(taps):
         source = position - j * step
         inside = (source >= 0) & (source < length)

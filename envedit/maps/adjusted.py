@@ -49,7 +49,7 @@ class Adjustments:
 
 
 def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[str]]:
-    """Adjust a map.
+    """Adjust a map; returns one that is not negative, and what was done, with the errors of :func:`.adjust`.
 
     Parameters
     ----------
@@ -57,19 +57,8 @@ def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[s
         Linear radiance in Rec. 709.
     how : Adjustments
         What is changed.
-
-    Returns
-    -------
-    adjusted : ndarray (H, W, 3) float32
-        Not negative.
-    notes : list of str
-        What was done.
-
-    Raises
-    ------
-    NumericalError
-        The adjusted map leaves single precision.
     """
+    # ---- Orientation
     notes = []
     if how.tilt or how.horizon:
         radiance = sphere.rotate(radiance, sphere.rotation(how.turn, how.tilt, how.horizon))
@@ -77,12 +66,16 @@ def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[s
     elif how.turn:
         radiance = latlong.rotate(radiance, how.turn)
         notes.append(f"turned by {how.turn:g} degrees")
+
+    # ---- Exposure, white balance and saturation
     colour = config.Output(exposure=how.exposure, white_balance=how.white_balance)
     radiance, done = adjustments.adjust(radiance, config.Lights(), colour)
     notes += done
     if how.saturation != 1:
         radiance = saturated(radiance, how.saturation)
         notes.append(f"saturation x {how.saturation:g}")
+
+    # ---- Lights, and blur
     lights = config.Lights(soften_degrees=how.soften, max_radiance=how.max_radiance)
     radiance, done = adjustments.adjust(radiance, lights, config.Output())
     notes += done

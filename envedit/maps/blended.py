@@ -55,11 +55,11 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
 
     # ---- Lights, matched, and the skies without them
     maps = first, second
-    lights = [file_lights.lights_of(one).lights for one in maps]
+    lights = [file_lights.lights_of(envmap).lights for envmap in maps]
     moves = _moves(lights, first.shape[:2], amount)
-    for one, own in zip(maps, lights, strict=True):
-        file_lights.take_out(one, own)
-    offset = [max(BLACK * float(one.mean(dtype=np.float64)), 1e-30) for one in maps]
+    for envmap, own_lights in zip(maps, lights, strict=True):
+        file_lights.take_out(envmap, own_lights)
+    offset = [max(BLACK * float(envmap.mean(dtype=np.float64)), 1e-30) for envmap in maps]
     share = np.array([1 - amount, amount])
     least = np.float32(np.exp(share @ np.log(offset)))
 
@@ -69,11 +69,11 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
         rows = slice(top, top + _ROWS)
         directions = latlong.directions(height, width, rows).astype(np.float32)
         log_sky = np.zeros_like(first[rows])
-        for one, own, e, weight in zip(maps, lights, offset, share, strict=True):
-            for light in own:
+        for envmap, own_lights, e, weight in zip(maps, lights, offset, share, strict=True):
+            for light in own_lights:
                 if light.glow is not None:
-                    one[rows] /= 1 + glow_at(light.glow, directions @ np.float32(light.direction))
-            log_sky += np.float32(weight) * np.log(one[rows] + np.float32(e))
+                    envmap[rows] /= 1 + glow_at(light.glow, directions @ np.float32(light.direction))
+            log_sky += np.float32(weight) * np.log(envmap[rows] + np.float32(e))
         first[rows] = np.maximum(np.exp(log_sky) - least, 0)
         for move in moves:
             if move.log_glow.any():
@@ -108,12 +108,12 @@ def _moves(lights, shape, amount):
             (light, flux), weight = (start, 1 - amount) if end is None else (end, amount)
             moves.append(_Move(light.direction, [(light, weight * flux)], weight * _log_glow(light)))
             continue
-        (one, before), (other, after) = start, end
+        (light_before, before), (light_after, after) = start, end
         flux = before ** (1 - amount) * after**amount
-        turn = amount * rotation_between(one.direction, other.direction)
-        parts = [(one, (1 - amount) * flux), (other, amount * flux)]
-        glow = (1 - amount) * _log_glow(one) + amount * _log_glow(other)
-        moves.append(_Move(rotated(one.direction, turn), parts, glow))
+        turn = amount * rotation_between(light_before.direction, light_after.direction)
+        parts = [(light_before, (1 - amount) * flux), (light_after, amount * flux)]
+        glow = (1 - amount) * _log_glow(light_before) + amount * _log_glow(light_after)
+        moves.append(_Move(rotated(light_before.direction, turn), parts, glow))
     return moves
 
 

@@ -41,7 +41,8 @@ ADDED_DEGREES = 0.1
 """Standard deviation of an added light that may be a sun. Derived: 97 % of its flux are within 0.27 degrees,
 the sun's radius."""
 _GAUSSIAN_97 = math.sqrt(-2 * math.log(0.03))  # radius within which 97 % of a Gaussian's flux lie
-_ROUNDS, _ENOUGH = 16, 1e-3  # of fitting fluxes to the sky that they light, and of their relative change
+_ROUNDS = 16  # of fitting fluxes to the sky that they light
+_ENOUGH = 1e-3  # relative change of that sky at which it ends
 
 
 @dataclass(frozen=True)
@@ -143,9 +144,9 @@ def of_edit(initial: np.ndarray, edited: np.ndarray, turn: float = 0.0) -> Look:
     relit = replace(no_change(before), lights=_lights(before, look, irradiance))
     sky, core = (part.numpy() for part in before.parts(parameters(before, relit)))
     rows = min(before.shape[0], after.shape[0])
-    lit = core[:rows].any(axis=2) | after.separation.core[:rows].any(axis=2)
+    in_core = core[:rows].any(axis=2) | after.separation.core[:rows].any(axis=2)
     total = before.rows[1]
-    weight = np.where(lit, 0.0, latlong.solid_angles(total, sky.shape[1])[:rows, None])
+    weight = np.where(in_core, 0.0, latlong.solid_angles(total, sky.shape[1])[:rows, None])
     gain, saturation, white_balance = looks.sky_change(sky[:rows], after.base[:rows], weight, total)
     return replace(look, gain=gain, saturation=saturation, white_balance=white_balance)
 
@@ -194,8 +195,7 @@ def _between(start, end, amount):
     return start + amount * ((end - start + 180) % 360 - 180)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From a look to a change of one map
+# ---- From a look to a change of one map --------------------------------------------------------------------
 
 
 def no_change(layers: Layers) -> Change:
@@ -256,15 +256,15 @@ def blended(start: Change, end: Change, amount: float) -> Change:
     """Return the change between two of the same map; a light that only one has fades."""
     lights = {}
     for i in start.lights.keys() | end.lights.keys():
-        one = start.lights.get(i) or _dark(i, start.lights, end.lights)
-        other = end.lights.get(i) or _dark(i, end.lights, start.lights)
-        way = rotation_between(one.direction, other.direction)
-        toward = rotated(one.direction, amount * way) if way.any() else other.direction
-        both = (one.flux > 0) & (other.flux > 0)
-        log_one, log_other = np.log(np.where(both, [one.flux, other.flux], 1))
-        geometric = np.exp(_mix(log_one, log_other, amount))
-        flux = np.where(both, geometric, _mix(one.flux, other.flux, amount))
-        lights[i] = Placed(toward, flux, _mix(one.log_size, other.log_size, amount))
+        first = start.lights.get(i) or _dark(i, start.lights, end.lights)
+        second = end.lights.get(i) or _dark(i, end.lights, start.lights)
+        way = rotation_between(first.direction, second.direction)
+        toward = rotated(first.direction, amount * way) if way.any() else second.direction
+        both = (first.flux > 0) & (second.flux > 0)
+        log_first, log_second = np.log(np.where(both, [first.flux, second.flux], 1))
+        geometric = np.exp(_mix(log_first, log_second, amount))
+        flux = np.where(both, geometric, _mix(first.flux, second.flux, amount))
+        lights[i] = Placed(toward, flux, _mix(first.log_size, second.log_size, amount))
     return Change(
         lights,
         _mix(start.gain, end.gain, amount),
@@ -273,19 +273,18 @@ def blended(start: Change, end: Change, amount: float) -> Change:
     )
 
 
-def _dark(i, here, there):
-    """Return a light that is only ``there``, without flux: where the light is ``here`` that it adds to."""
-    light = there[i]
-    same = [j for j in here if j in there and there[j].direction is light.direction]
-    return replace(light, direction=here[same[0]].direction if same else light.direction, flux=np.zeros(3))
+def _dark(i, own, others):
+    """Return a light that only ``others`` have, without flux: where the one of ``own`` is that it adds to."""
+    light = others[i]
+    same = [j for j in own if j in others and others[j].direction is light.direction]
+    return replace(light, direction=own[same[0]].direction if same else light.direction, flux=np.zeros(3))
 
 
 def _mix(start, end, amount):
     return (1 - amount) * start + amount * end
 
 
-# ------------------------------------------------------------------------------------------------------------
-# From a change to the parameters of layers
+# ---- From a change to the parameters of layers -------------------------------------------------------------
 
 
 def parameters(layers: Layers, change: Change) -> dict:

@@ -100,8 +100,7 @@ class Look:
         return direction(key.azimuth + light.azimuth, elevation)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Measuring
+# ---- Measuring ---------------------------------------------------------------------------------------------
 
 
 def harmonics(d: np.ndarray) -> np.ndarray:
@@ -151,14 +150,14 @@ def roles(layers: Layers) -> dict[str, int]:
     if not own or not flux.max() > 0:
         return {}
     key = int(np.argmax(flux))
-    found = {"key": key}
+    indices = {"key": key}
     for i in np.argsort(-flux, kind="stable"):
         if i == key or flux[i] < LEAST_SHARE * flux[key]:
             continue
         apart = angles(layers.lights.centres[i])[0] - angles(layers.lights.centres[key])[0]
         behind = abs((apart + 180) % 360 - 180) > RIM_DEGREES
-        found.setdefault("rim" if behind else "fill", int(i))
-    return found
+        indices.setdefault("rim" if behind else "fill", int(i))
+    return indices
 
 
 def radius(layers: Layers, i: int) -> float:
@@ -227,10 +226,10 @@ def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total:
 
     # ---- Saturation and white balance: log chroma after = balance + saturation * log chroma before
     chroma = [
-        np.log2(np.maximum(sky / np.maximum(one, 1e-30)[:, None], _CHANNEL))
-        for sky, one in zip(skies, light, strict=True)
+        np.log2(np.maximum(sky / np.maximum(luminances, 1e-30)[:, None], _CHANNEL))
+        for sky, luminances in zip(skies, light, strict=True)
     ]
-    mean_before, mean_after = (weight @ one for one in chroma)
+    mean_before, mean_after = (weight @ log_chroma for log_chroma in chroma)
     apart = chroma[0] - mean_before
     variance = float(weight @ np.square(apart).sum(axis=1))
     saturation = 1.0
@@ -241,8 +240,7 @@ def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total:
     return gain, saturation, tuple(balance.tolist())
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Files
+# ---- Files -------------------------------------------------------------------------------------------------
 
 _NUMBERS = {
     "turn": (1, -360.0, 360.0),
@@ -332,7 +330,7 @@ def _numbers(path, prefix, table, expected):
         value = table[name]
         numbers = value if isinstance(value, list) else [value]
         right = len(numbers) == count and isinstance(value, list) == (count > 1)
-        right = right and all(type(one) in (int, float) and low <= one <= high for one in numbers)
+        right = right and all(type(number) in (int, float) and low <= number <= high for number in numbers)
         if not right:
             what = "a number" if count == 1 else f"{count} numbers"
             wrong = f"{path}: {prefix}{name}: got {value!r}"

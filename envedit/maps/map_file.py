@@ -22,7 +22,7 @@ _ROWS = 256  # that are converted at a time
 
 
 def read(path: FilePath, repair: bool = False) -> InputMap:
-    """Read a map at the resolution of its file.
+    """Read a map at the resolution of its file; errors as of :func:`.images.load_envmap`.
 
     Parameters
     ----------
@@ -36,11 +36,6 @@ def read(path: FilePath, repair: bool = False) -> InputMap:
     InputMap
         Its ``radiance`` is (H, W, 3) float32 in Rec. 709; ``as_stored`` turns edited radiance into the file's
         colours.
-
-    Raises
-    ------
-    InputError
-        As of :func:`.images.load_envmap`.
     """
     return inputs.read_file(os.fsdecode(path), None, config.Input(repair=repair), 1.0)
 
@@ -94,7 +89,8 @@ def output_path(
     if requested is None:
         stem = f"{Path(names[0]).stem}_{word}" if names else word
         ending = HDR if names and names[0].lower().endswith(HDR) else EXR
-        path, number = Path(stem + ending), 1
+        path = Path(stem + ending)
+        number = 1
         while path.exists():
             number += 1
             path = Path(f"{stem}_{number}{ending}")

@@ -16,7 +16,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat
 from envedit.core.rotations import rotated
-from envedit.export import file_lights
+from envedit.export import adjustments, file_lights
 from envedit.representations.layers.separation import Light
 
 SKY_SAMPLES = 2
@@ -32,8 +32,7 @@ BAND_TEXELS = 1 << 20
 """Texels that are rotated at a time."""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Rotation
+# ---- Rotation ----------------------------------------------------------------------------------------------
 
 
 def rotation(turn: float = 0.0, tilt: float = 0.0, horizon: float = 0.0) -> np.ndarray:
@@ -145,6 +144,7 @@ def resampled(
     -------
     ndarray (target rows, W, 3) float32
     """
+    # ---- The source on the device, and places of samples within a texel
     width = image.shape[1]
     first, height = rows
     source = flat(mi.Float, image)
@@ -153,6 +153,8 @@ def resampled(
     parts = (np.arange(samples) + 0.5) / samples
     begin = dr.opaque(mi.Int32, first)
     phi = 2 * np.pi * (np.arange(width)[:, None] + parts) / width
+
+    # ---- Bands of rows
     result = np.empty((target[1] - target[0], width, 3), np.float32)
     step = max(BAND_TEXELS // width, 1)
     for top in range(target[0], target[1], step):
@@ -169,13 +171,13 @@ def resampled(
         weight = weight / (samples * weight.sum(axis=1, keepdims=True))
         for i in range(samples):
             sine, cosine, share = (
-                dr.gather(mi.Float, flat(mi.Float, np.float32(one[:, i])), row)
-                for one in (np.sin(theta), np.cos(theta), weight)
+                dr.gather(mi.Float, flat(mi.Float, np.float32(table[:, i])), row)
+                for table in (np.sin(theta), np.cos(theta), weight)
             )
             for j in range(samples):
                 x, z = (
-                    sine * dr.gather(mi.Float, flat(mi.Float, np.float32(one[:, j])), column)
-                    for one in (np.sin(phi), -np.cos(phi))
+                    sine * dr.gather(mi.Float, flat(mi.Float, np.float32(table[:, j])), column)
+                    for table in (np.sin(phi), -np.cos(phi))
                 )
                 direction = mi.Vector3f(*(a * x + b * cosine + c * z for a, b, c in back))
                 total += share * _lookup(source, direction, (begin, len(image)), height, width)
@@ -206,8 +208,7 @@ def _lookup(source, d, rows, height, width):
     return value
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Blur
+# ---- Blur --------------------------------------------------------------------------------------------------
 
 
 def blur(radiance: np.ndarray, degrees: float) -> np.ndarray:
@@ -235,9 +236,7 @@ def blur(radiance: np.ndarray, degrees: float) -> np.ndarray:
     flux = latlong.lookup_solid_angles(*coarse.shape[:2])
     blurred = _blurred(coarse, flux, math.radians(degrees))
     result = latlong.resize(blurred, height, width)
-    omega = latlong.lookup_solid_angles(height, width)
-    before, after = (np.einsum("h,hwc->c", omega, one, dtype=np.float64) for one in (radiance, result))
-    result *= np.where(after > 0, before / np.where(after > 0, after, 1), 1).astype(np.float32)
+    result *= adjustments.flux_ratio(radiance, result).astype(np.float32)
     return result
 
 

@@ -43,6 +43,7 @@ def text(
         USD file of the scene, relative to the stage, which becomes a layer above it, and its ``stage`` as of
         :class:`.conversion.Converted`: its domes are switched off. None: lights alone.
     """
+    # ---- Layer metadata
     rotation = np.eye(3) if to_world is None else np.asarray(to_world, np.float64)
     up = "Z" if abs(rotation[2, 1]) > abs(rotation[1, 1]) else "Y"
     head = ['defaultPrim = "Environment"', "metersPerUnit = 1", f'upAxis = "{up}"']
@@ -54,6 +55,8 @@ def text(
         head.append(f'upAxis = "{stage["upAxis"]}"')
         off = "".join(_switched_off(path) for path in stage["domes"])
     metadata = "\n".join(f"    {line}" for line in head)
+
+    # ---- Domes and lamps
     dome, sky = (_dome(file, rotation, scale) for file in (map_file, sky_file))
     lamps = [_distant(number, light) for number, light in enumerate(lights, 1)]
     return f"""#usda 1.0

@@ -67,6 +67,7 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
         _section("", _separation(result.separation, tonemap)),
         _section("What this view determines", _determined(result)),
         _section("What was painted", _painted(result)),
+        _section("Photograph", _photograph(result)),
         _section("Other explanations", _variants(result, tonemap)),
         f"<h2>Losses</h2>{_losses(result.history, settings)}",
         tables.quality(metrics),
@@ -179,6 +180,20 @@ def _painted(result):
     caption = f"what is not feasible; {100 * result.reach.share:.0f} % of the painted change is feasible"
     words = parts.scale(("marked red: stays darker than painted", "marked blue: brighter"))
     return [parts.figure(codes[rows], caption, words) for rows in views]
+
+
+def _photograph(result):
+    """Draw the photograph, the edited rendering as its camera shows it, and what light does not explain."""
+    if result.photo is None:
+        return []
+    captions = (
+        f"the photograph on the film of the rendering: {result.photo.summary}",
+        "the edited rendering as that camera shows it",
+        f"red: not explained by light, {100 * result.metrics['camera']['outliers']:.3g} % of the pixels",
+    )
+    pictures = preview.photograph(result.photo, result.render, result.outliers)
+    codes = [np.rint(255 * one).astype(np.uint8) for one in pictures]
+    return [parts.figure(*one) for one in zip(codes, captions, strict=True)]
 
 
 def _variants(result, tonemap):

@@ -19,7 +19,7 @@ RESULTS = (
     "metrics.json", "edited.exr", "edited.hdr", "edited_full.exr", "edited_full.hdr", "edited_layers.exr",
     "edited_sky.exr", "edited_lights.exr", "lights.json", "look.toml", "edited.xml", "edited.usda",
     "render_initial.exr", "render_target.exr", "render_edited.exr", "influence.exr", "influence.png",
-    "unreachable.png",
+    "unreachable.png", "photograph.png",
     "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "given_envmap.exr",
     "given_target_map.exr", "given_target.exr", "given_mask.exr", "variants", "checkpoint.npz",
 )  # fmt: skip

@@ -13,11 +13,12 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from envedit.core.atomic_files import write_atomically
-from envedit.core.color import luminance
+from envedit.core.color import linear_to_srgb, luminance
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.resampling import fit
 from envedit.core.types import FilePath, Views
 from envedit.images.images import png
+from envedit.targets.photo import Photo
 from envedit.transport.influence import per_solid_angle
 
 UNKNOWN = 216
@@ -257,6 +258,18 @@ def influence_caption(frozen: np.ndarray | None) -> str:
 def share_image(share: np.ndarray) -> np.ndarray:
     """Draw shares from 0 to 1, (H, W), in colours from violet to yellow: (H, W, 3) uint8."""
     return _colours(RISING, np.asarray(share, np.float64))
+
+
+def photograph(photo: Photo, rendering: np.ndarray, outliers: np.ndarray) -> list[np.ndarray]:
+    """Return a photograph, a rendering (h, w, 3) under its camera, and its outliers (h, w) in red.
+
+    Each is (h, w, 3) display values in [0, 1].
+    """
+    values = [np.clip(one, 0, 1) for one in (photo.values, photo.camera.shown(rendering))]
+    if photo.camera.curve == "linear":
+        values = [linear_to_srgb(one) for one in values]
+    grey = 0.5 * values[0].mean(axis=2, keepdims=True) + 0.25
+    return [*values, np.where(outliers[..., None], (0.9, 0.1, 0.1), grey)]
 
 
 def influence(path: FilePath, values: np.ndarray, frozen: np.ndarray | None = None) -> None:

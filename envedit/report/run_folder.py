@@ -146,6 +146,9 @@ def _write_maps(settings, folder, result):
         layers["deviation"] = result.posterior.deviation
     layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=input_map.chromaticities)
     result.warnings += variants.write(folder / variants.FOLDER, result.variants, settings.output, input_map)
+    if result.photo is not None:
+        pictures = preview.photograph(result.photo, result.render, result.outliers)
+        images.write_png(folder / "photograph.png", np.concatenate(pictures, axis=1))
     if result.reach is not None:
         images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
 

@@ -42,7 +42,7 @@ _ANY_DEPTH = 2**32 - 1  # as Mitsuba prints a depth of -1
 
 
 def load(
-    given: object,
+    scene: object,
     width: int = 0,
     height: int = 0,
     parameters: Mapping[str, Any] | None = None,
@@ -55,7 +55,7 @@ def load(
 
     Parameters
     ----------
-    given : path, str, dict, mitsuba.Scene or Scene
+    scene : path, str, dict, mitsuba.Scene or Scene
         A file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, or a built scene, for which
         all but ``sensors`` and ``scale`` is fixed.
     width, height, parameters, base, sensors, up, scale
@@ -66,21 +66,21 @@ def load(
     ConfigError, InputError
         As of :func:`.scene.load` and :func:`wrapped`, or if it is none of these.
     """
-    if isinstance(given, Scene):
-        return given
-    if isinstance(given, str | os.PathLike | dict):
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, str | os.PathLike | dict):
         filled = dict(parameters or {})
-        return scenes.load(given, width, height, filled, base, sensors=sensors, up=up, scale=scale)
-    found = wrapped(given, sensors)
-    return found if isinstance(scale, str) else replace(found, own=OwnMap(None, scale))
+        return scenes.load(scene, width, height, filled, base, sensors=sensors, up=up, scale=scale)
+    wrapped_scene = wrapped(scene, sensors)
+    return wrapped_scene if isinstance(scale, str) else replace(wrapped_scene, own=OwnMap(None, scale))
 
 
-def is_built(given: object) -> bool:
+def is_built(scene: object) -> bool:
     """Return whether this is a ``mitsuba.Scene``, of any variant."""
-    return type(given).__name__ == "Scene" and hasattr(given, "environment")
+    return type(scene).__name__ == "Scene" and hasattr(scene, "environment")
 
 
-def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
+def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     """Make the environment of a built scene replaceable.
 
     The ``scale`` of its ``envmap`` becomes 1, as that of every :class:`.Scene`; the former one is in ``own``.
@@ -89,7 +89,7 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
 
     Parameters
     ----------
-    given : mitsuba.Scene
+    scene : mitsuba.Scene
         Of the present variant.
     sensors : "all" or sequence of int and str
         "all", or [0] where the scene has one sensor.
@@ -102,15 +102,16 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
         Its environment is no ``envmap``, or stands askew, a sensor is of a kind that makes no picture, or
         there is a medium that its integrator would render.
     """
-    if not is_built(given):
-        what = type(given).__name__
+    # ---- Refuse what makes no picture of a map
+    if not is_built(scene):
+        what = type(scene).__name__
         raise ConfigError(f"scene: got {what}, expected a file, a dict, or a mitsuba.Scene")
-    if given.variant_name() != mi.variant():
+    if scene.variant_name() != mi.variant():
         raise ConfigError(
-            f"scene: got one of variant {given.variant_name()}, expected {mi.variant()}: build it after "
+            f"scene: got one of variant {scene.variant_name()}, expected {mi.variant()}: build it after "
             f'mi.set_variant("{mi.variant()}"), or set variant in the configuration'
         )
-    cameras = given.sensors()
+    cameras = scene.sensors()
     if sensors != "all" and len(cameras) > 1:
         raise ConfigError(
             f"scene.sensors: got {list(sensors)} for a built scene with {len(cameras)} sensors, expected "
@@ -122,30 +123,38 @@ def wrapped(given: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
             raise InputError(f"scene: sensor {kind} makes no picture; expected {', '.join(_CAMERAS)}")
     if not cameras:
         raise InputError("scene: got no sensor, expected at least one")
-    params, key = mi.traverse(given), _texels(given)
+
+    # ---- The environment map; its scale is taken out
+    params = mi.traverse(scene)
+    key = _texels(scene)
     stem = key.removesuffix("data")
-    to_world, scale = _rotation(params[f"{stem}to_world"]), float(np.array(params[f"{stem}scale"]).item())
+    to_world = _rotation(params[f"{stem}to_world"])
+    scale = float(np.array(params[f"{stem}scale"]).item())
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"scene: scale of the environment map is {scale}, expected a number above 0")
     params[f"{stem}scale"] = 1.0
     params.update()
-    width, views = scenes.views_of(given, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
-    asked = _integrator(given)
+
+    # ---- Sensors and integrator
+    width, views = scenes.views_of(scene, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
+    max_depth, rr_depth, hide, notes = _integrator(scene)
     unique = UNKNOWN + uuid.uuid4().hex
     own = OwnMap(None, scale)
     rows = views[-1].rows.stop
-    return Scene(given, None, width, rows, key, to_world, unique, params, views, own, *asked)
+    return Scene(
+        scene, None, width, rows, key, to_world, unique, params, views, own, max_depth, rr_depth, hide, notes
+    )
 
 
-def own_map(given: Any) -> np.ndarray:
+def own_map(scene: Any) -> np.ndarray:
     """Return the texels of a built scene's ``envmap``, (H, W, 3) float32, without its scale."""
-    return latlong.from_envmap_data(mi.traverse(given)[_texels(given)])
+    return latlong.from_envmap_data(mi.traverse(scene)[_texels(scene)])
 
 
 @contextlib.contextmanager
-def kept(given: Any) -> Iterator[None]:
+def kept(scene: Any) -> Iterator[None]:
     """Put the texels and the scale of a built scene's ``envmap`` back in the end."""
-    params, key = mi.traverse(given), _texels(given)
+    params, key = mi.traverse(scene), _texels(scene)
     scale = f"{key.removesuffix('data')}scale"
     before = type(params[key])(params[key]), type(params[scale])(params[scale])
     try:
@@ -155,31 +164,35 @@ def kept(given: Any) -> Iterator[None]:
         params.update()
 
 
-def _texels(given: Any) -> str:
+def _texels(scene: Any) -> str:
     """Return the name of the texels among the parameters of a scene."""
-    light = given.environment()
+    light = scene.environment()
     if light is None or light.class_name() != "EnvironmentMapEmitter":
         kind = "none" if light is None else light.class_name()
         raise InputError(f"scene: got environment {kind}, expected an emitter of type envmap")
     ending = f"{light.id()}.data"
-    return next(k for k, _ in mi.traverse(given) if k == ending or k.endswith(f".{ending}"))
+    return next(k for k, _ in mi.traverse(scene) if k == ending or k.endswith(f".{ending}"))
 
 
 def _rotation(transform: Any) -> np.ndarray:
     """Return the rotation (3, 3) of a transformation."""
-    found = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
-    if not np.isfinite(found).all() or np.abs(found @ found.T - np.eye(3)).max() > 1e-4:
+    rotation = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
+    if not np.isfinite(rotation).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
         raise InputError("scene: to_world of the environment map is no rotation; scale the scene instead")
-    if np.linalg.det(found) < 0:
+    if np.linalg.det(rotation) < 0:
         raise InputError("scene: to_world of the environment map mirrors; expected a rotation")
-    return found
+    return rotation
 
 
 def _integrator(scene: Any) -> tuple[int, int, bool, tuple[str, ...]]:
     """Return max_depth, rr_depth, hide_emitters and notes, as :func:`.supported.take_integrator`."""
-    given, media = scene.integrator(), any(shape.is_medium_transition() for shape in scene.shapes())
-    names = {given.class_name(), type(given).__name__} if given is not None else {"PathIntegrator"}
-    hide, notes = bool(getattr(given, "hide_emitters", False)), []
+    integrator = scene.integrator()
+    media = any(shape.is_medium_transition() for shape in scene.shapes())
+    names = {"PathIntegrator"}
+    if integrator is not None:
+        names = {integrator.class_name(), type(integrator).__name__}
+    hide = bool(getattr(integrator, "hide_emitters", False))
+    notes = []
     if media and names & _VOLUMES:
         raise InputError("scene: participating medium: envedit renders surfaces only; remove the medium")
     if media:
@@ -187,10 +200,10 @@ def _integrator(scene: Any) -> tuple[int, int, bool, tuple[str, ...]]:
     if names & _DIRECT:
         return 2, ROULETTE, hide, tuple(notes)
     if not names & (_PATHS | _VOLUMES):
-        kind = given.class_name()
+        kind = integrator.class_name()
         notes.append(f"integrator {kind} is not used: rendered by path, with paths of any length")
         return -1, ROULETTE, hide, tuple(notes)
-    printed = dict(re.findall(r"(\w+_depth) = (\d+)", str(given)))
+    printed = dict(re.findall(r"(\w+_depth) = (\d+)", str(integrator)))
     depth = int(printed.get("max_depth", _ANY_DEPTH))
-    roulette = int(printed.get("rr_depth", getattr(given, "rr_depth", ROULETTE)))
+    roulette = int(printed.get("rr_depth", getattr(integrator, "rr_depth", ROULETTE)))
     return (-1 if depth >= _ANY_DEPTH else depth), roulette, hide, tuple(notes)

@@ -96,6 +96,7 @@ def trace(
         Escape of bounce 0, vertex of bounce 1, escape of bounce 1, ... escape of bounce ``bounces``; then,
         with ``beyond``, one escape of all further bounces.
     """
+    # ---- One lane for each path, with its own samples
     n = len(pixels) * paths
     lane = dr.arange(mi.UInt32, n)
     pixel = dr.gather(mi.UInt32, dr.opaque(mi.UInt32(pixels.astype(np.uint32))), lane // paths)
@@ -106,19 +107,22 @@ def trace(
         scramble = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, (seed * 1009 + dimension) & 0xFFFFFFFF))[0]
         return lattice(mi.permute_kensler(path, paths, scramble), scramble ^ mi.UInt32(0x5BD1E995))
 
+    # ---- Camera rays
     ray, weight = _camera_rays(scene, pixels, pixel, sample)
     throughput = mi.Color3f(mi.unpolarized_spectrum(weight))
     active = mi.Bool(dr.full(mi.Bool, True, n))
     pdf = dr.full(mi.Float, dr.inf, n)
     hidden = getattr(scene.integrator(), "hide_emitters", False)
+
+    # ---- Bounce by bounce
     for bounce in range(bounces + 1):
         hit = ray, scene.ray_intersect_preliminary(ray, active=active)
         si = hit[1].compute_surface_interaction(ray, mi.RayFlags.All, active)
         if hidden and bounce == 0:
             hit, si = _behind_lamps(scene, hit, si, active)
         dr.eval(si, throughput, pdf, active, ray, hit)
-        seen = mi.Bool(bounce > 0 or not hidden)
-        yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid() & seen)
+        visible = mi.Bool(bounce > 0 or not hidden)
+        yield Escape(bounce, ray.d, throughput, pdf, active & ~si.is_valid() & visible)
         active &= si.is_valid()
         if bounce == bounces:
             if beyond:
@@ -171,14 +175,15 @@ def _behind_lamps(scene, hit, si, active):
     ray, _ = hit
     lamp = active & si.is_valid() & (si.shape.emitter() != None)  # noqa: E711 (an array)
     onwards = si.spawn_ray(ray.d)
-    found = scene.integrator().skip_area_emitters(scene, onwards, False, lamp)
-    behind = found.compute_surface_interaction(onwards, mi.RayFlags.All, lamp)
-    return dr.select(lamp, (onwards, found), hit), dr.select(lamp, behind, si)
+    preliminary = scene.integrator().skip_area_emitters(scene, onwards, False, lamp)
+    behind = preliminary.compute_surface_interaction(onwards, mi.RayFlags.All, lamp)
+    return dr.select(lamp, (onwards, preliminary), hit), dr.select(lamp, behind, si)
 
 
 def _camera_rays(scene, pixels, pixel, sample):
     """Rays through the footprints of ``pixel``, one a lane, of the views that ``pixels`` lie in."""
-    first, found = 0, None
+    first = 0
+    chosen = None
     for sensor in scene.sensors():
         count = int(dr.prod(sensor.film().crop_size()))
         if ((pixels >= first) & (pixels < first + count)).any():
@@ -186,9 +191,9 @@ def _camera_rays(scene, pixels, pixel, sample):
             own = pixel - start if first else pixel
             rays = _rays_of_view(sensor, own, sample)
             # Views come in the order of their pixels: a lane of an earlier one keeps its ray.
-            found = rays if found is None else dr.select(pixel >= start, rays, found)
+            chosen = rays if chosen is None else dr.select(pixel >= start, rays, chosen)
         first += count
-    return found
+    return chosen
 
 
 def _rays_of_view(sensor, pixel, sample):

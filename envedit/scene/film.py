@@ -39,6 +39,7 @@ def render(
         sum f(p - s) L(s) / sum f(p - s), over the samples s near a pixel p, f the film's filter; and alpha,
         the same of samples whose path hits something that is not hidden.
     """
+    # ---- Sampler and size, with the border that the filter reaches into
     sensor = scene.sensors()[view]
     film = sensor.film()
     rfilter = film.rfilter()
@@ -53,24 +54,26 @@ def render(
     count = across * down * spp
     sampler.seed(seed, count)
 
+    # ---- Radiance of every sample
     pixel = dr.arange(mi.UInt32, count) // spp
     corner = mi.Point2f(mi.Float(pixel % across), mi.Float(pixel // across)) - border
     inside = sampler.next_2d()
     channels = _radiance(scene, sensor, integrator, sampler, corner + inside, spp, medium)
     dr.eval(channels, inside)  # the sums below must not trace again
 
+    # ---- Sums over the samples of each pixel, in a fixed order
     if box:
         sums = [
             dr.block_sum(mi.Float64(channel), spp) for channel in (*channels, dr.full(mi.Float, 1, count))
         ]
-        total = np.stack([one.numpy() for one in sums], axis=-1).reshape(down, across, 5)
+        total = np.stack([plane.numpy() for plane in sums], axis=-1).reshape(down, across, 5)
         total = total[border : border + height, border : border + width]
     else:
         reach = int(np.ceil(rfilter.radius() - 0.5))
         places = [dr.opaque(mi.Int32, n) for n in (width, across, down, border, reach, spp)]
         pixels = dr.arange(mi.Int32, width * height)
         sums = _filtered(pixels, rfilter, channels, inside.x - 0.5, inside.y - 0.5, *places)
-        total = np.stack([one.numpy() for one in sums], axis=-1).reshape(height, width, 5)
+        total = np.stack([plane.numpy() for plane in sums], axis=-1).reshape(height, width, 5)
     return total[..., :4] / np.where(total[..., 4:] == 0, 1, total[..., 4:])
 
 

@@ -93,8 +93,10 @@ def _followed(scene, view, x, y):
         active &= si.is_valid()
 
         # ---- A glossy, specular or null sample there; some BSDFs sample other lobes although not asked to
-        one, two = (camera_paths.lattice(path, dr.opaque(mi.UInt32, 2 * bounce + k)) for k in range(2))
-        bs, weight = si.bsdf().sample(context, si, one.x, two, active)
+        lobe_sample, direction_sample = (
+            camera_paths.lattice(path, dr.opaque(mi.UInt32, 2 * bounce + k)) for k in range(2)
+        )
+        bs, weight = si.bsdf().sample(context, si, lobe_sample.x, direction_sample, active)
         weight = dr.mean(mi.Color3f(mi.unpolarized_spectrum(weight)))
         active &= ((bs.sampled_type & context.type_mask) != 0) & (weight > 0)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | mi.has_flag(bs.sampled_type, passed)

@@ -81,17 +81,18 @@ class OwnLight:
 
         def radiance(y, azimuth):
             """Return radiance (..., 3) at heights of unit vectors and azimuths of the map, of one shape."""
-            found = np.empty((y.size, 3), np.float32)
+            values = np.empty((y.size, 3), np.float32)
             for first in range(0, y.size, _MOST_SAMPLES):
                 some = slice(first, first + _MOST_SAMPLES)
                 d = latlong.on_sphere(np.arccos(y.ravel()[some]), azimuth.ravel()[some]) @ to_world.T
                 si = dr.zeros(mi.SurfaceInteraction3f, len(d))
                 si.wi = -mi.Vector3f(*d.T.astype(np.float32))
-                found[some] = np.array(parser.called(self.where, emitter.eval, si)).T
-            return found.reshape(*y.shape, 3)
+                values[some] = np.array(parser.called(self.where, emitter.eval, si)).T
+            return values.reshape(*y.shape, 3)
 
         # ---- A grid of samples, several a texel
-        height, n = width // 2, math.ceil(360 / width / SPACING_DEGREES)
+        height = width // 2
+        n = math.ceil(360 / width / SPACING_DEGREES)
         rows = latlong.row_edges(height)
         inside = (rows[:-1, None] + np.diff(rows)[:, None] * np.arange(n) / n).ravel()
         edges = np.cos(np.pi * np.append(inside, 1.0))
@@ -135,22 +136,23 @@ def _of_three(of, values, axis):
 
 def _alone(state, index):
     """Return a parsed scene of one node and those that it refers to."""
-    found = mi.parser.ParserState()
+    scene = mi.parser.ParserState()
     root = mi.parser.SceneNode()
     root.type, root.props = mi.ObjectType.Scene, mi.Properties("scene")
-    found.nodes.append(root)
+    scene.nodes.append(root)
 
     def taken(i):
-        node, place = mi.parser.SceneNode(), len(found.nodes)
+        node = mi.parser.SceneNode()
+        place = len(scene.nodes)
         node.type, node.props = state.nodes[i].type, mi.Properties(state.nodes[i].props)
-        found.nodes.append(node)
+        scene.nodes.append(node)
         for name, value in list(state.nodes[i].props.items()):
             if isinstance(value, mi.Properties.ResolvedReference):
                 # The append of the inner node moves this one in memory.
                 inner = mi.Properties.ResolvedReference(taken(value.index()))
-                found.nodes[place].props[name] = inner
+                scene.nodes[place].props[name] = inner
         return place
 
     light = mi.Properties.ResolvedReference(taken(index))
-    found.nodes[0].props["light"] = light
-    return found
+    scene.nodes[0].props["light"] = light
+    return scene

@@ -33,8 +33,7 @@ _MESHES = {".ply": "ply", ".obj": "obj", ".serialized": "serialized"}
 _MOST_WIDTH_PER_HEIGHT = 1.5
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Words for errors
+# ---- Words for errors --------------------------------------------------------------------------------------
 
 
 def called(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any:
@@ -59,8 +58,7 @@ def place_of(state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str
     return mi.parser.file_location(state, node) if state.files else f"{where}, {node.props.id()}"
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Changes
+# ---- Changes -----------------------------------------------------------------------------------------------
 
 
 def lower_names(state: mi.parser.ParserState) -> None:
@@ -83,19 +81,19 @@ def check_required(state: mi.parser.ParserState, node: mi.parser.SceneNode, wher
 def environment(state: mi.parser.ParserState, where: str) -> int | None:
     """Return the index of the environment emitter's node; None if there is none, InputError if several."""
     emitters = [i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Emitter]
-    found = [i for i in emitters if state.nodes[i].props.plugin_name() in _ENVIRONMENTS]
-    if len(found) > 1:
-        kinds = ", ".join(state.nodes[i].props.plugin_name() for i in found)
-        raise InputError(f"{where}: {len(found)} environment emitters ({kinds}); expected one: remove others")
-    return found[0] if found else None
+    environments = [i for i in emitters if state.nodes[i].props.plugin_name() in _ENVIRONMENTS]
+    if len(environments) > 1:
+        kinds = ", ".join(state.nodes[i].props.plugin_name() for i in environments)
+        raise InputError(
+            f"{where}: {len(environments)} environment emitters ({kinds}); expected one: remove others"
+        )
+    return environments[0] if environments else None
 
 
 def replace_environment(
     state: mi.parser.ParserState, where: str, up: str = "auto"
 ) -> tuple[mi.Properties, np.ndarray, tuple[str, ...]]:
-    """Put an ``envmap`` in place of the environment emitter, or add one.
-
-    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
+    """Put an ``envmap`` in place of the environment emitter, or add one; may move nodes, as :func:`append`.
 
     Parameters
     ----------
@@ -112,7 +110,9 @@ def replace_environment(
     notes : tuple of str
         Where its zenith is, unless that is +y or the emitter's own.
     """
-    index, note = environment(state, where), ""
+    # ---- Where the map's zenith and its first azimuth are
+    index = environment(state, where)
+    note = ""
     plugin = "constant" if index is None else state.nodes[index].props.plugin_name()
     matrix = np.eye(4)
     if (zenith := _ENVIRONMENTS[plugin]) is None:
@@ -122,12 +122,14 @@ def replace_environment(
             note = f"map: its zenith is the scene's {zenith if zenith[0] == '-' else f'+{zenith}'}, {why}"
             note += "; scene.up sets another" if up == "auto" else ""
     else:
-        place, props = place_of(state, state.nodes[index], where), state.nodes[index].props
+        place = place_of(state, state.nodes[index], where)
+        props = state.nodes[index].props
         matrix = _matrix(props["to_world"], place) if "to_world" in props else matrix
         if up != "auto":
             note = f"scene.up has no effect: the scene's {plugin} has an orientation of its own"
+
+    # ---- Only the rotation counts: a uniform scale has no meaning at infinity
     rotation = matrix[:3, :3]
-    # A uniform scale has no meaning at infinity.
     size = np.cbrt(np.linalg.det(rotation)) if np.isfinite(rotation).all() else 0.0
     rotation = rotation / size if size > 0 else rotation
     if not size > 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
@@ -138,6 +140,8 @@ def replace_environment(
     rotation = rotation @ _upright(zenith).T
     matrix = np.eye(4)  # where an environment stands has no meaning: a translation is dropped
     matrix[:3, :3] = rotation
+
+    # ---- The envmap, under a name of its own
     if index is None:
         index = append(state, mi.ObjectType.Emitter, "envmap")
     taken = {n.props.id() for i, n in enumerate(state.nodes) if i != index}
@@ -186,7 +190,8 @@ def set_film(state: mi.parser.ParserState, where: str, sensor: int, width: int, 
     films = [i for i in inside if state.nodes[i].type == mi.ObjectType.Film]
     if not films:
         films = [append(state, mi.ObjectType.Film, "hdrfilm", sensor)]  # what Mitsuba takes
-    place, film = place_of(state, state.nodes[films[0]], where), state.nodes[films[0]].props
+    place = place_of(state, state.nodes[films[0]], where)
+    film = state.nodes[films[0]].props
     if film.plugin_name() != "hdrfilm":
         raise InputError(f'{place}: the sensor needs a <film type="hdrfilm">, got {film.plugin_name()}')
     film["pixel_format"], film["component_format"] = "rgb", "float32"
@@ -202,7 +207,8 @@ def set_film(state: mi.parser.ParserState, where: str, sensor: int, width: int, 
         )
     cropped = any(str(name).startswith("crop_") for name, _ in film.items())
     for k, size in enumerate(_of_aspect(width, height, *crop)):
-        side, scale = ("width", "height")[k], size / crop[k]
+        side = ("width", "height")[k]
+        scale = size / crop[k]
         film[side] = max(size, round(scale * own[k]))
         if cropped:
             film[f"crop_{side}"] = size
@@ -332,15 +338,15 @@ def _upright(up: str) -> np.ndarray:
     """Return the rotation ``(3, 3)`` about a coordinate axis that brings an axis to +y."""
     a = np.array(_AXES[up.removeprefix("-")], float) * (-1 if up.startswith("-") else 1)
     y = np.array([0.0, 1, 0])
-    v, c = np.cross(a, y), a @ y
+    v = np.cross(a, y)
+    c = a @ y
     if c < -0.5:
         return np.diag([1.0, -1, -1])
     skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     return np.eye(3) + skew + skew @ skew / (1 + c)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Digest
+# ---- Digest ------------------------------------------------------------------------------------------------
 
 
 def hash_node(digest: hashlib._Hash, node: mi.parser.SceneNode) -> None:

@@ -71,8 +71,8 @@ class PathTracer:
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
         installed_plugins.come_first()
-        asked = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": scene.hide_emitters}
-        self._integrators = [mi.load_dict({"type": kind, **asked}) for kind in ("path", "prb")]
+        options = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": scene.hide_emitters}
+        self._integrators = [mi.load_dict({"type": kind, **options}) for kind in ("path", "prb")]
         self._index: mi.UInt32 | None = None
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
@@ -87,8 +87,8 @@ class PathTracer:
     def picture(self, data: mi.TensorXf, seed: int) -> mi.TensorXf:
         """Render the map as Mitsuba holds it, (H, W + 2, 3), without derivatives."""
         self._set(data)
-        found = film.render(self.scene.mi, self._integrators[0], self.spp, seed)[..., :3]
-        return mi.TensorXf(found.astype(np.float32))
+        rendering = film.render(self.scene.mi, self._integrators[0], self.spp, seed)[..., :3]
+        return mi.TensorXf(rendering.astype(np.float32))
 
     def gradient(self, data: mi.TensorXf, seed: int, picture: mi.TensorXf) -> mi.TensorXf:
         """Pull a picture back to the map as Mitsuba holds it: the adjoint of rendering."""
@@ -99,10 +99,10 @@ class PathTracer:
             self._integrators[1].render_backward(
                 self.scene.mi, self.scene.params, picture, seed=seed, spp=self.spp
             )
-            found = dr.grad(data)
-            dr.eval(found)
+            adjoint = dr.grad(data)
+            dr.eval(adjoint)
             dr.sync_thread()
-        return found
+        return adjoint
 
     def _set(self, data):
         self.scene.params[self.scene.envmap_key] = data
@@ -124,8 +124,8 @@ class _Rendering(dr.CustomOp):
         return tracer.picture(data, self.seeds[0])
 
     def backward(self):
-        found = self.tracer.gradient(self.data, self.seeds[1], self.grad_out())
-        self.set_grad_in("data", found)
+        adjoint = self.tracer.gradient(self.data, self.seeds[1], self.grad_out())
+        self.set_grad_in("data", adjoint)
 
     def name(self):
         return "path tracing"

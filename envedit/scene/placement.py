@@ -30,31 +30,19 @@ def illuminating(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     It maximises cos(angle to the normal) times the share of directions within :data:`CLEARANCE_DEGREES` in
     which no object stands: the shading normal, where nothing is in the way.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its sensors are the views.
-    view : int
-        Index of the view.
-    x, y : float
-        Place on the picture, as shares of its width and height from the upper left corner.
-
-    Returns
-    -------
-    ndarray (3,) float64
-        Unit vector in the frame of the map.
+    Parameters and return value are those of :func:`.highlight.direction`.
 
     Raises
     ------
     NoPlaceError
         No surface is seen there, it only reflects as a mirror, or no part of the map is seen from it.
     """
-    seen, normal, _ = _surface(scene, view, x, y)
+    surface, normal, _ = _surface(scene, view, x, y)
     scatters = int(mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy)
-    if not seen.bsdf().flags().numpy()[0] & scatters:
+    if not surface.bsdf().flags().numpy()[0] & scatters:
         raise NoPlaceError("the surface only mirrors: use Move highlight")
     toward = np.concatenate([[normal], _hemisphere(normal)])
-    free = ~_blocked(scene, seen, toward)
+    free = ~_blocked(scene, surface, toward)
     gain = free * (toward @ normal) * _share_within(toward, free, CLEARANCE_DEGREES)
     if not gain.any():
         raise NoPlaceError("objects stand on all sides: no light of the map reaches the place")
@@ -68,21 +56,21 @@ def rimming(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     tangent plane: what lies between the place and the silhouette faces the light. It is the direction closest
     to that behind the place with no object within :data:`CLEARANCE_DEGREES`, such as a floor.
 
-    Parameters and return value are those of :func:`illuminating`.
+    Parameters and return value are those of :func:`.highlight.direction`.
 
     Raises
     ------
     NoPlaceError
         No surface is seen there, it faces the camera, or objects are in the way.
     """
-    seen, normal, eye = _surface(scene, view, x, y)
+    surface, normal, eye = _surface(scene, view, x, y)
     grazing = np.radians(GRAZING_DEGREES)
     away = (eye @ normal) * normal - eye  # the tangent away from the camera
     if np.linalg.norm(away) <= np.sin(grazing):
         raise NoPlaceError("the surface faces the camera there: pick a place nearer to the object's outline")
     best = np.cos(grazing) * away / np.linalg.norm(away) + np.sin(grazing) * normal
     toward = np.concatenate([[best], _hemisphere(normal)])
-    free = _share_within(toward, ~_blocked(scene, seen, toward), CLEARANCE_DEGREES) == 1
+    free = _share_within(toward, ~_blocked(scene, surface, toward), CLEARANCE_DEGREES) == 1
     behind = free & (toward @ eye < 0)
     if not behind.any():
         raise NoPlaceError("objects are in the way of a light behind it: pick another side of its outline")
@@ -96,17 +84,17 @@ def shading(scene: Scene, view: int, x: float, y: float, light: np.ndarray | Non
     where nothing fills all, it is the one closest to ``light`` (3,), where the light stands in the frame of
     the map; without it the one closest to the normal.
 
-    Other parameters and the return value are those of :func:`illuminating`.
+    Other parameters and the return value are those of :func:`.highlight.direction`.
 
     Raises
     ------
     NoPlaceError
         No surface is seen there, or no object stands above it.
     """
-    seen, normal, _ = _surface(scene, view, x, y, smooth=False)  # facets do not shade one another
+    surface, normal, _ = _surface(scene, view, x, y, smooth=False)  # facets do not shade one another
     toward = _hemisphere(normal)
     above = (toward @ scene.to_world[:, 1] > 0) & (toward @ normal > np.sin(np.radians(COVER_DEGREES)))
-    covered = above * _share_within(toward, above & _blocked(scene, seen, toward), COVER_DEGREES)
+    covered = above * _share_within(toward, above & _blocked(scene, surface, toward), COVER_DEGREES)
     if not covered.any():
         raise NoPlaceError("no object stands above the place: none can cast a shadow there")
     closeness = toward @ (normal if light is None else scene.to_world @ np.float64(light))
@@ -115,12 +103,12 @@ def shading(scene: Scene, view: int, x: float, y: float, light: np.ndarray | Non
 
 def _surface(scene, view, x, y, smooth=True):
     """Return the surface at a place, its normal on the camera's side, and the direction of the camera."""
-    seen = shadow.surfaces_seen(scene, view, np.array([[x, y]]))
-    if not seen.is_valid().numpy()[0]:
+    surface = shadow.surfaces_seen(scene, view, np.array([[x, y]]))
+    if not surface.is_valid().numpy()[0]:
         raise NoPlaceError("no surface is seen there")
-    vectors = seen.sh_frame.n if smooth else seen.n, seen.to_world(seen.wi)
+    vectors = surface.sh_frame.n if smooth else surface.n, surface.to_world(surface.wi)
     normal, eye = (vector.numpy()[:, 0].astype(np.float64) for vector in vectors)
-    return seen, normal * (1.0 if normal @ eye >= 0 else -1.0), eye
+    return surface, normal * (1.0 if normal @ eye >= 0 else -1.0), eye
 
 
 def _hemisphere(normal):
@@ -134,9 +122,9 @@ def _hemisphere(normal):
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1) @ tangents
 
 
-def _blocked(scene, seen, toward):
+def _blocked(scene, surface, toward):
     """Return in which directions (n, 3) from a surface an object stands, (n,)."""
-    ray = seen.spawn_ray(mi.Vector3f(toward.T.astype(np.float32)))
+    ray = surface.spawn_ray(mi.Vector3f(toward.T.astype(np.float32)))
     return shadow.first_surfaces(scene, ray, dr.full(mi.Bool, True, len(toward))).is_valid().numpy()
 
 

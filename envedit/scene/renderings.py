@@ -34,6 +34,7 @@ def rendered(
     picture, spp, noise
         As of :meth:`.Scene.sampled`.
     """
+    # ---- What a rendering depends on
     cache = DiskCache(cache_folder("renderings") if keep else None, MOST_BYTES)
     image = np.ascontiguousarray(envmap, np.float32)
     key = {
@@ -49,9 +50,10 @@ def rendered(
         kept = {"picture": ("f4", (*size, 3)), "spp": ("i8", ()), "noise": ("f8", of_noise)}
         return holds(arrays, kept) and arrays["spp"] > 0
 
-    if (found := cache.load(key, whole)) is not None:
-        noise = np.array(found["noise"]) if found["noise"].size else None
-        return np.array(found["picture"]), int(found["spp"]), noise
+    # ---- From disk, or rendered and stored
+    if (stored_arrays := cache.load(key, whole)) is not None:
+        noise = np.array(stored_arrays["noise"]) if stored_arrays["noise"].size else None
+        return np.array(stored_arrays["picture"]), int(stored_arrays["spp"]), noise
     picture, taken, noise = scene.sampled(envmap, spp, seed, exactly)
     stored = np.zeros(0) if noise is None else noise
     cache.store(key, {"picture": picture, "spp": np.array(taken, np.int64), "noise": stored})

@@ -44,8 +44,6 @@ from envedit.scene import film, parser, scene_files, scene_text, supported
 from envedit.scene.scene_files import SceneFile
 from envedit.scene.usd import conversion as usd
 
-__all__ = ["Scene", "load"]
-
 QUIET_DECIBELS = 48.0
 """PSNR of a rendering that is quiet, against one without noise: beyond what an edit reaches under a sun."""
 QUIET_LEAST, QUIET_MOST = 256, 768
@@ -56,8 +54,7 @@ _SAMPLED = 3e-4  # of the radiance of a pole's row, in the next row, which adds 
 _PASS_SAMPLES = 2**22  # bounds the memory of a wavefront, whatever the film and spp
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The scene
+# ---- The scene ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,7 @@ class Scene:
         """Rows of each view."""
         return tuple(view.rows for view in self.views)
 
-    def view(self, asked: int | str, key: str) -> int:
+    def view(self, identifier: int | str, key: str) -> int:
         """Return the index of a view by index or name.
 
         Raises
@@ -151,7 +148,7 @@ class Scene:
             There is none; ``key`` is what asked for it.
         """
         names = [view.name for view in self.views]
-        return supported.index_of(asked, names, names, f"{key}: got view", "; see [scene] sensors")
+        return supported.index_of(identifier, names, names, f"{key}: got view", "; see [scene] sensors")
 
     def set_envmap(self, image: ArrayLike) -> None:
         """Light the scene by a map.
@@ -234,7 +231,7 @@ class Scene:
     def sampled(
         self, image: ArrayLike, spp: int | str = "auto", seed: int = 0, exactly: int | None = None
     ) -> tuple[np.ndarray, int, np.ndarray | None]:
-        """Render as :meth:`render`, with "auto" by as many samples as it takes to be quiet.
+        """Render as :meth:`render`, its errors included, with "auto" by as many samples as quiet takes.
 
         Passes of 64 samples a pixel are added until the error of their mean, estimated from how much their
         display values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at
@@ -242,12 +239,8 @@ class Scene:
 
         Parameters
         ----------
-        image : array (H, W, 3)
-            The map, linear radiance.
-        spp : int or "auto"
-            Samples a pixel.
-        seed : int
-            Of every random choice.
+        image, spp, seed
+            As of :meth:`render`; ``spp`` also "auto".
         exactly : int, optional
             With "auto": as many samples as another rendering took, to be judged beside it: with the same seed
             they are the same samples.
@@ -260,11 +253,6 @@ class Scene:
             Samples a pixel that were taken.
         noise : array (height, width) float64 or None
             Standard error of display values, RMS over channels; None where samples were given.
-
-        Raises
-        ------
-        ConfigError, InputError, NumericalError
-            As :meth:`render`.
         """
         if not isinstance(spp, str):
             return self.render(image, spp, seed), spp, None
@@ -296,8 +284,8 @@ class Scene:
     def _traced(self, count, seed, i, max_depth):
         """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
-        asked = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
-        integrator = mi.load_dict({"type": "path", **asked})
+        options = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+        integrator = mi.load_dict({"type": "path", **options})
         pictures = []
         for k in range(len(self.views)):
             pass_seed = int(np.random.SeedSequence([seed, i, k]).generate_state(1)[0])
@@ -380,47 +368,57 @@ def load(
     """
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")
+
+    # ---- Parse
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
     config, state, path, where, folders = _parsed(file, parameters, base)
+
+    # ---- What is read of emitter, integrator and sensors; all refusals are raised at once
     refused = _Refusals()
-    nodes: list[int] = []
+    sensor_indices: list[int] = []
     with refused.collected():
         own = supported.own_map(state, where, folders, scale)
     with refused.collected():
-        asked = supported.take_integrator(state, where)
+        integrator = supported.take_integrator(state, where)
     if usd.is_usd(file) and sensors != "all" and tuple(sensors) == (0,):
         supported.require_one_sensor(state, where)
     with refused.collected():
-        nodes, names, said = supported.take_sensors(state, where, sensors)
-    for node in nodes:
+        sensor_indices, names, sensor_notes = supported.take_sensors(state, where, sensors)
+
+    # ---- What is changed of film, emitter, BSDFs, files and shapes
+    for sensor in sensor_indices:
         with refused.collected():
-            parser.set_film(state, where, node, width, height)
+            parser.set_film(state, where, sensor, width, height)
     with refused.collected():
         emitter, to_world, turned = parser.replace_environment(state, where, up)
-    for one in state.nodes:
+    for node in state.nodes:
         with refused.collected():
-            parser.smooth_limit(state, one)
+            parser.smooth_limit(state, node)
     _find_files(state, where, folders, refused)
-    for one in state.nodes:
+    for node in state.nodes:
         with refused.collected():
-            parser.fit_to_stage(state, one)
+            parser.fit_to_stage(state, node)
     refused.raise_all()
+
+    # ---- Notes, files and digest
     first = usd.kept(path).notes if path is not None and usd.is_usd(path) else ()
-    notes = (*first, *own.notes, *turned, *asked.notes, *supported.polarised(state), *said)
-    read = [one.props["filename"] for one in state.nodes if "filename" in one.props]
+    notes = (*first, *own.notes, *turned, *integrator.notes, *supported.polarised(state), *sensor_notes)
+    read = [node.props["filename"] for node in state.nodes if "filename" in node.props]
     read += [] if own.file is None else [str(own.file)]
     digest = hashlib.sha256(b"envedit scene 1")
-    for one in state.nodes:
-        parser.hash_node(digest, one)
+    for node in state.nodes:
+        parser.hash_node(digest, node)
     emitter["bitmap"] = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
     name = str(emitter.id())
-    for node in nodes:  # after the digest: light transport has its own samples
-        parser.set_sampler(state, node, sampler)
-    # Mitsuba refuses properties that nobody has asked for, which finds typing errors; we asked for all.
-    for one in state.nodes:
-        for key in one.props.keys():  # noqa: SIM118 (no dict)
-            one.props.mark_queried(key, False)
+    for sensor in sensor_indices:  # after the digest: light transport has its own samples
+        parser.set_sampler(state, sensor, sampler)
 
+    # ---- All properties count as unread: Mitsuba refuses those that no plugin reads, such as typing errors
+    for node in state.nodes:
+        for key in node.props.keys():  # noqa: SIM118 (no dict)
+            node.props.mark_queried(key, False)
+
+    # ---- Build
     with _two_threads(), quiet_libraries():  # libjpeg prints about odd textures
         built = parser.called(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
@@ -430,7 +428,7 @@ def load(
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
     rows = views[-1].rows.stop
-    given: dict[str, Any] = dict(parameters or {})
+    filled: dict[str, Any] = dict(parameters or {})
 
     def again(width: int, height: int) -> Scene:
         return load(file, width, height, parameters, base, sampler, sensors, up, scale)
@@ -446,11 +444,11 @@ def load(
         params,
         views,
         own=own,
-        max_depth=asked.max_depth,
-        rr_depth=asked.rr_depth,
-        hide_emitters=asked.hide_emitters,
+        max_depth=integrator.max_depth,
+        rr_depth=integrator.rr_depth,
+        hide_emitters=integrator.hide_emitters,
         notes=notes,
-        parameters=given,
+        parameters=filled,
         again=again,
         files=tuple(read),
     )
@@ -495,7 +493,9 @@ def _find_files(state, where, folders, refused):
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
     """Return the width that all views have, and name and rows of each; ConfigError if widths differ."""
-    views, sizes, first = [], [[int(n) for n in s.film().crop_size()] for s in scene.sensors()], 0
+    views = []
+    sizes = [[int(n) for n in s.film().crop_size()] for s in scene.sensors()]
+    first = 0
     for name, (width, height) in zip(names, sizes, strict=True):
         if width != sizes[0][0]:
             raise ConfigError(
@@ -516,7 +516,9 @@ def _parsed(file, parameters, base):
     if isinstance(file, dict):
         if parameters:
             raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
-        path, where, folders = None, "scene dict", (base,)
+        path = None
+        where = "scene dict"
+        folders = (base,)
         installed_plugins.come_first()
         installed_plugins.check_dict(file, where)
         state = parser.called(where, mi.parser.parse_dict, config, file)
@@ -550,7 +552,7 @@ def relit(
     up: str = "auto",
     scale: float | str = "auto",
 ) -> str:
-    """Return the XML of a scene that is lit by another map and otherwise as its author has it.
+    """Return the XML of a scene under another map, otherwise as its author has it; errors as of :func:`load`.
 
     Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
     and what plain Mitsuba does not know (``fit_height``, names in capitals) is written out. The environment
@@ -563,11 +565,6 @@ def relit(
         As of :func:`load`.
     envmap : str
         Name of the map's file, as it shall stand in the XML.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As of :func:`load`.
     """
     _, state, _, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders, scale)
@@ -582,8 +579,7 @@ def relit(
     return mi.parser.write_string(state)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Files and parameters
+# ---- Files and parameters ----------------------------------------------------------------------------------
 
 
 def find(file: FilePath) -> Path:
@@ -592,15 +588,16 @@ def find(file: FilePath) -> Path:
     if os.path.isfile(path):  # False, and no error, in a folder that may not be entered
         return path.absolute()
     name = path.name.removesuffix(".xml")
-    bare, names = path.name == str(file), shipped.scenes()
+    bare = path.name == str(file)
+    names = shipped.scenes()
     if bare and name in names and (folder := shipped.folder()):
         return folder / f"{name}.xml"
     if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML or USD file")
     close = difflib.get_close_matches(name, names, 1) if bare else []
     known = ", ".join(names) or "none: install envedit again"
-    wanted = f"expected a Mitsuba XML or USD file or one of {known}"
-    hint = f"did you mean {close[0]}?" if close else wanted
+    expected = f"expected a Mitsuba XML or USD file or one of {known}"
+    hint = f"did you mean {close[0]}?" if close else expected
     raise InputError(f"scene {file}: no such file; {hint}")
 
 
@@ -614,8 +611,8 @@ def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | Non
     try:
         text = path = find(file)
         if usd.is_usd(path):
-            made = usd.kept(path)
-            text, sources = made.xml, made.sources
+            converted = usd.kept(path)
+            text, sources = converted.xml, converted.sources
         outline = scene_text.read(text, {name: str(value) for name, value in parameters.items()})
     except EnveditError:
         return [path]

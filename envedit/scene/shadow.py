@@ -24,12 +24,8 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
 
     Parameters
     ----------
-    scene : Scene
-        Its sensors are the views.
-    view : int
-        Index of the view.
-    x, y : float
-        Place on the picture, as shares of its width and height from the upper left corner.
+    scene, view, x, y
+        As of :func:`.highlight.direction`.
     toward : ndarray (3,)
         Direction of the light in the frame of the map.
 
@@ -47,14 +43,16 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
     offset = NEAR / [scene.width, rows.stop - rows.start]
     offset = offset[np.argsort(np.abs(NEAR).sum(axis=1), kind="stable")]
     places = np.clip(np.array([x, y]) + offset, 0, 1)
-    seen = surfaces_seen(scene, view, places)
+    surfaces = surfaces_seen(scene, view, places)
     ahead = mi.Vector3f(scene.to_world @ np.float64(toward))
-    facing = seen.is_valid() & (dr.dot(seen.n, ahead) * dr.dot(seen.n, seen.to_world(seen.wi)) > 0)
-    hit = first_surfaces(scene, seen.spawn_ray(ahead), facing)
+    facing = surfaces.is_valid() & (
+        dr.dot(surfaces.n, ahead) * dr.dot(surfaces.n, surfaces.to_world(surfaces.wi)) > 0
+    )
+    hit = first_surfaces(scene, surfaces.spawn_ray(ahead), facing)
     blocked = hit.is_valid().numpy()
     if blocked.any():
         return hit.p.numpy().T[int(np.argmax(blocked))].astype(np.float64)
-    if not seen.is_valid().numpy()[0]:
+    if not surfaces.is_valid().numpy()[0]:
         raise NoShadowError("no surface is seen there")
     if not facing.numpy()[0]:
         raise NoShadowError("the surface faces away from the light there: pick a shadow that is cast")
@@ -81,15 +79,15 @@ def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) ->
     NoShadowError
         No surface is seen there, or it faces away from the point.
     """
-    seen = surfaces_seen(scene, view, np.array([[x, y]]))
-    if not seen.is_valid().numpy()[0]:
+    surface = surfaces_seen(scene, view, np.array([[x, y]]))
+    if not surface.is_valid().numpy()[0]:
         raise NoShadowError("no surface is seen there")
-    toward = np.float64(point) - seen.p.numpy()[:, 0]
-    normal, eye = (v.numpy()[:, 0] for v in (seen.n, seen.to_world(seen.wi)))
+    toward = np.float64(point) - surface.p.numpy()[:, 0]
+    normal, eye = (v.numpy()[:, 0] for v in (surface.n, surface.to_world(surface.wi)))
     if (toward @ normal) * (eye @ normal) <= 0:
         raise NoShadowError("the surface faces away from what casts the shadow")
-    found = scene.to_world.T @ toward
-    return found / np.linalg.norm(found)
+    light = scene.to_world.T @ toward
+    return light / np.linalg.norm(light)
 
 
 def surfaces_seen(scene: Scene, view: int, places: np.ndarray) -> mi.SurfaceInteraction3f:
@@ -100,13 +98,13 @@ def surfaces_seen(scene: Scene, view: int, places: np.ndarray) -> mi.SurfaceInte
 
 def first_surfaces(scene: Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
     """Return the first surfaces on rays that do more than let light through."""
-    found = scene.mi.ray_intersect(ray, active)
+    surfaces = scene.mi.ray_intersect(ray, active)
     for _ in range(PASSED):
-        bsdf = found.bsdf()
-        alone = dr.mean(mi.Color3f(mi.unpolarized_spectrum(bsdf.eval_null_transmission(found, active))))
-        through = active & found.is_valid() & (alone > 0.5)
+        bsdf = surfaces.bsdf()
+        alone = dr.mean(mi.Color3f(mi.unpolarized_spectrum(bsdf.eval_null_transmission(surfaces, active))))
+        through = active & surfaces.is_valid() & (alone > 0.5)
         if not dr.any(through):
             break
-        ray = dr.select(through, found.spawn_ray(ray.d), ray)
-        found = dr.select(through, scene.mi.ray_intersect(ray, through), found)
-    return found
+        ray = dr.select(through, surfaces.spawn_ray(ray.d), ray)
+        surfaces = dr.select(through, scene.mi.ray_intersect(ray, through), surfaces)
+    return surfaces

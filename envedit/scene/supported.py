@@ -87,6 +87,7 @@ def own_map(
     InputError
         There are several, or ``scale`` is not a finite number above 0.
     """
+    # ---- No emitter, or one that is no map
     factor = 1.0 if isinstance(scale, str) else scale
     index = environment(state, where)
     if index is None:
@@ -96,12 +97,16 @@ def own_map(
         missing = f"{where}: no environment emitter: add {emitter}, {_GIVE_MAP}"
         note = "no environment emitter: the map lights the scene beside its own lamps"
         return OwnMap(None, factor, (note,), missing=missing, added=True)
-    node, place = state.nodes[index], place_of(state, state.nodes[index], where)
-    props, plugin = node.props, node.props.plugin_name()
+    node = state.nodes[index]
+    place = place_of(state, state.nodes[index], where)
+    props = node.props
+    plugin = node.props.plugin_name()
     if plugin != "envmap":
         if plugin == "constant" and props.id() == PLACEHOLDER:
             return OwnMap(None, factor)
         return OwnMap(None, factor, light=OwnLight.of(state, index, where))
+
+    # ---- Scale and rotation
     own: Any = props.get("scale", 1.0)
     number = isinstance(own, int | float) and not isinstance(own, bool)
     if not number or not math.isfinite(own) or not 0 < float(np.float32(own)) < math.inf:
@@ -120,31 +125,21 @@ def own_map(
         factor = float(own)
     elif scale != own:
         notes.append(f"scale {scale:g} (scene.scale) takes the place of the emitter's, {own:g}")
+
+    # ---- Texels, or a file in the first folder that has it
     if "bitmap" in props:
         return OwnMap(None, factor, tuple(notes), OwnLight.of(state, index, where))
     name = props.get("filename", None)
     if not isinstance(name, str) or not name:
         missing = f"{place}: the environment map names no file; name one, {_GIVE_MAP}"
         return OwnMap(None, factor, tuple(notes), missing=missing)
-    found = [folder / name for folder in folders if os.path.isfile(folder / name)]
-    return OwnMap(Path(found[0] if found else next(iter(folders)) / name), factor, tuple(notes))
+    paths = [folder / name for folder in folders if os.path.isfile(folder / name)]
+    return OwnMap(Path(paths[0] if paths else next(iter(folders)) / name), factor, tuple(notes))
 
 
 @dataclass(frozen=True)
 class Integrator:
-    """What the scene's integrator asks of a rendering.
-
-    Attributes
-    ----------
-    max_depth : int
-        Longest path in segments, as Mitsuba counts; -1: any.
-    rr_depth : int
-        Path length in segments from which on Russian roulette ends paths.
-    hide_emitters : bool
-        The camera does not see the environment, nor shapes that are lamps.
-    notes : tuple of str
-        What the user should know.
-    """
+    """What the scene's integrator asks of a rendering; attributes as of :class:`.scene.Scene`."""
 
     max_depth: int
     rr_depth: int
@@ -161,11 +156,13 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
         The scene has a participating medium and an integrator that would render it, or ``max_depth`` or
         ``rr_depth`` is out of range.
     """
+    # ---- The integrator inside all wrappers
     for n in state.nodes:  # of a dict, the parser does not know the type of a plugin written in Python
         if n.type == mi.ObjectType.Unknown and n.props.plugin_name() in PATHS + DIRECT + VOLUMES:
             n.type = mi.ObjectType.Integrator
     nodes = [n for n in state.nodes if n.type == mi.ObjectType.Integrator]
-    node, notes = next(iter(nodes), None), []
+    node = next(iter(nodes), None)
+    notes = []
     while node is not None and node.props.plugin_name() in WRAPPERS:
         if node.props.plugin_name() == "stokes":
             notes.append("integrator stokes: rendered without polarisation")
@@ -173,7 +170,12 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
         if not inside:
             break
         node = inside[0]
-    name, depth, roulette, hide = "path", -1, ROULETTE, False
+
+    # ---- Its path depth, Russian roulette and hidden emitters
+    name = "path"
+    depth = -1
+    roulette = ROULETTE
+    hide = False
     if node is not None:
         props, name = node.props, node.props.plugin_name()
         hide = props.get("hide_emitters", False) is True
@@ -188,6 +190,8 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
             if not whole or not (value > 0 or expected and value == -1):
                 expected += "a whole number above 0"
                 raise InputError(f"{place_of(state, node, where)}: {key} is {value}, expected {expected}")
+
+    # ---- All give way to path
     _check_media(state, where, name, notes)
     for n in nodes:
         identity = n.props.id()
@@ -206,10 +210,7 @@ def polarised(state: mi.parser.ParserState) -> tuple[str, ...]:
 
 
 def ensure_integrator(state: mi.parser.ParserState) -> None:
-    """Give a scene without an integrator ``path``.
-
-    May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
-    """
+    """Give a scene without an integrator ``path``; may move its nodes, as :func:`.append`."""
     if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
         return
     append(state, mi.ObjectType.Integrator, "path")
@@ -230,13 +231,13 @@ def _check_media(state, where, integrator, notes):
 
 
 def take_sensors(
-    state: mi.parser.ParserState, where: str, asked: str | Sequence[int | str] = "all"
+    state: mi.parser.ParserState, where: str, selection: str | Sequence[int | str] = "all"
 ) -> tuple[list[int], list[str], tuple[str, ...]]:
     """Choose the sensors whose pictures are edited, in the order asked for; the scene has no others then.
 
     Parameters
     ----------
-    asked : "all" or sequence of int and str
+    selection : "all" or sequence of int and str
         Indices and ids.
 
     Returns
@@ -255,17 +256,18 @@ def take_sensors(
     InputError
         One is of a kind that makes no picture.
     """
-    found = [i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Sensor]
-    if not found:
+    # ---- Choose
+    sensors = [i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Sensor]
+    if not sensors:
         raise InputError(f'{where}: the scene has no sensor; add <sensor type="perspective">')
-    ids = [state.nodes[i].props.id() for i in found]
-    chosen = list(range(len(found)))
-    if asked != "all":
-        shown = [_name(state.nodes[i]) for i in found]
-        chosen = [index_of(one, ids, shown, "scene.sensors: got") for one in asked]
+    ids = [state.nodes[i].props.id() for i in sensors]
+    chosen = list(range(len(sensors)))
+    if selection != "all":
+        shown = [_name(state.nodes[i]) for i in sensors]
+        chosen = [index_of(name, ids, shown, "scene.sensors: got") for name in selection]
     if len({*chosen}) != len(chosen):
-        raise ConfigError(f"scene.sensors: got {list(asked)}, expected each sensor once")
-    nodes = [found[k] for k in chosen]
+        raise ConfigError(f"scene.sensors: got {list(selection)}, expected each sensor once")
+    nodes = [sensors[k] for k in chosen]
     for i in nodes:
         kind = state.nodes[i].props.plugin_name()
         if kind not in SENSORS:
@@ -274,18 +276,20 @@ def take_sensors(
                 f"expected {', '.join(SENSORS)}"
             )
     names = [ids[k] or f"sensor {k}" for k in chosen]
-    if len(found) == 1:
+    if len(sensors) == 1:
         return nodes, names, ()
+
+    # ---- Leave out the others, and say so
     _keep_only(state, nodes)
     used = ", ".join(_name(state.nodes[i]) for i in nodes[:4]) + (", ..." if len(nodes) > 4 else "")
-    others = [_name(state.nodes[i]) for i in found if i not in nodes]
+    others = [_name(state.nodes[i]) for i in sensors if i not in nodes]
     more = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
     if len(nodes) > 1:
-        count = f"{len(nodes)} of {len(found)}" if more else f"{len(nodes)}"
-        said = f"{count} sensors are views: {used}" + (f"; not {more}" if more else "")
-        return nodes, names, (said,)
+        count = f"{len(nodes)} of {len(sensors)}" if more else f"{len(nodes)}"
+        note = f"{count} sensors are views: {used}" + (f"; not {more}" if more else "")
+        return nodes, names, (note,)
     which = "the first" if chosen == [0] else "one"
-    return nodes, names, (f"{len(found)} sensors: {which} is used ({used}), not {more}",)
+    return nodes, names, (f"{len(sensors)} sensors: {which} is used ({used}), not {more}",)
 
 
 def require_one_sensor(state: mi.parser.ParserState, where: str) -> None:
@@ -303,20 +307,20 @@ def require_one_sensor(state: mi.parser.ParserState, where: str) -> None:
         raise ConfigError(f"{where}: {len(names)} cameras ({known}): choose one, such as {how}")
 
 
-def index_of(asked: int | str, names: list[str], shown: list[str], said: str, more: str = "") -> int:
+def index_of(identifier: int | str, names: list[str], shown: list[str], prefix: str, more: str = "") -> int:
     """Return the index of what is asked for by index or name; ``shown`` is what an error lists.
 
     Raises
     ------
     ConfigError
-        There is none; its text begins with ``said`` and ends with ``more``.
+        There is none; its text begins with ``prefix`` and ends with ``more``.
     """
-    if asked in names:
-        return names.index(asked)
-    if isinstance(asked, int) and 0 <= asked < len(names):
-        return asked
+    if identifier in names:
+        return names.index(identifier)
+    if isinstance(identifier, int) and 0 <= identifier < len(names):
+        return identifier
     known = ", ".join(f"{k} ({name})" for k, name in enumerate(shown))
-    raise ConfigError(f"{said} {asked!r}, expected one of {known}{more}")
+    raise ConfigError(f"{prefix} {identifier!r}, expected one of {known}{more}")
 
 
 def _keep_only(state, nodes):

@@ -32,7 +32,7 @@ class Linearisation:
     Attributes
     ----------
     pictures : ndarray (k, h, w, 3)
-        By the unknowns of lights, and by the saturation.
+        By the unknowns of lights, by a camera's factors, and by the saturation.
     named : list of (str, int, int or ndarray)
         Which these are: name, light, and channel or axis.
     profile : ndarray (h, w, 3)
@@ -136,8 +136,11 @@ class Derivatives:
             if change is not None:
                 pictures[:3] += self.blocks.pictures(change) * profile.reshape(-1, 3)
 
-        # ---- The saturation, through the blocks
+        # ---- A camera's factor of every channel, and the saturation, through the blocks
         of_sky = []
+        if self.unknowns.photographed:
+            names += [("camera", 0, c) for c in range(3)]
+            of_sky += [point.rendering * np.eye(3, dtype=np.float32)[c] for c in range(3)]
         if self.unknowns.saturates:
             names.append(("saturation", 0, 0))
             of_sky.append(self._by_saturation(point, profile))

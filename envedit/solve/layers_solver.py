@@ -21,7 +21,7 @@ from envedit.losses import display_curve
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, search, task, transport_error
 from envedit.solve.edit_state import EditState, Interrupted
-from envedit.solve.map_problem import Posterior
+from envedit.solve.map_problem import SIGMA, Posterior
 from envedit.transport.light_transport import LightTransport
 
 CHECKED_SPP = 64
@@ -52,6 +52,7 @@ class LayersSolver:
     posterior: Posterior | None = None
     note: str = ""
     _likelier: list[str] = field(default_factory=list)
+    _curves: dict[str, float] = field(default_factory=dict)
 
     # ---- Before the steps ----------------------------------------------------------------------------------
 
@@ -92,14 +93,18 @@ class LayersSolver:
         """
         problem, rendered = self.edit.problem(transport), self.edit.rendered
         problem.evaluate(begun.state)  # another explanation may have taken its columns of T
-        return gauss_newton.solve(
+        photographed = self.edit.target.photo is not None
+        solution = gauss_newton.solve(
             problem,
             params,
             self._sigma,
             run=begun,
             sparing=rendered,
-            judge=self._display_error if rendered else None,
-        ).params
+            judge=self._display_error if rendered and not photographed else None,
+        )
+        if photographed:
+            self._take_off_camera(solution)
+        return solution.params
 
     def settle(self, params: Params) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
@@ -111,7 +116,11 @@ class LayersSolver:
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
         if point.residual is not None:  # what T errs by may have been fitted
-            point = replace(point, residual=self._missed(point.edited).astype(np.float64))
+            if problem.photographed:
+                residual = problem.residual(point.state, self._path_traced(point.edited))
+            else:
+                residual = self._missed(point.edited).astype(np.float64)
+            point = replace(point, residual=residual)
         return search.score(problem, solution.run, point, self._sigma)
 
     def go_on_from(self, file: str, params: Params) -> None:
@@ -137,6 +146,8 @@ class LayersSolver:
         if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
             state, arrays, traced, picture = stored
             edit.renderer.restore(traced)
+            if edit.target.photo is not None:
+                edit.target = edit.target.developed(edit.target.photo.of_array(arrays.pop("photo")))
             edit.target = replace(edit.target, picture=picture, compared=arrays.pop("aim"))
             run = gauss_newton.Run.of_arrays(arrays, state.history)
         elif run is not None:
@@ -147,6 +158,7 @@ class LayersSolver:
         with ctrl_c() as interrupt:
             keep = _Checkpoints(edit, digest, interrupt)
             while True:
+                photographed = edit.target.photo is not None
                 compared = edit.rendered and not (run and run.corrected)
                 solution = gauss_newton.solve(
                     edit.problem(),
@@ -156,9 +168,13 @@ class LayersSolver:
                     keep.after_step,
                     run,
                     sparing=compared,  # paint is no noisy picture, and asks for what it shows
-                    judge=self._display_error if compared else None,
+                    judge=self._display_error if compared and not photographed else None,
                 )
-                if edit.rendered:
+                if photographed:
+                    self._take_off_camera(solution)
+                    following = self._settled(solution) or self._another(solution, interrupt)
+                    following = following or self._corrected(solution)
+                elif edit.rendered:
                     following = self._another(solution, interrupt) or self._corrected(solution)
                 else:
                     following = self._held_more(solution.run)
@@ -177,6 +193,9 @@ class LayersSolver:
         if "saturation" in solution.params and not solution.note:
             kept = 100 * float(np.exp(solution.params["saturation"].numpy()[0, 0]))
             notes.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
+        if len(self._curves) > 1:
+            values = ", ".join(f"{name} {value:.0f}" for name, value in self._curves.items())
+            notes.append(f"-2 log likelihood of the photograph by tone curve: {values}")
         if run.corrected:
             missed = f"the stored transport's error at the solution ({transport_error.SPP} samples a pixel)"
             notes.append(f"{missed} was taken off the target for the last steps")
@@ -215,6 +234,49 @@ class LayersSolver:
         )
         most = len(run.history) + transport_error.STEPS
         return gauss_newton.Run(run.state, run.start, history=run.history, most=most, corrected=True)
+
+    def _take_off_camera(self, solution):
+        """Divide the target by what the solution has of the camera's factor, which is then 1."""
+        photo, state = self.edit.target.photo, solution.run.state
+        if not solution.note:
+            self.edit.target = self.edit.target.developed(photo.exposed_by(state["camera"][0]))
+        solution.run.state = state | {"camera": np.zeros((1, 3))}
+
+    def _settled(self, solution):
+        """Return a run that goes on with the photograph as it is seen best; None where it was settled before.
+
+        It is aligned again, with the rendering of the solution, and tone curves are compared: by values of
+        the photograph, each after a few steps.
+        """
+        edit, run, photo = self.edit, solution.run, self.edit.target.photo
+        if photo.settled or not self._goes_on(solution):
+            return None
+
+        # ---- Where it lies
+        rendering = edit.problem().evaluate(run.state, resolve=False).rendering
+        aligned = photo.aligned(rendering)
+        if np.abs(aligned.placed.shares).max() <= 1:
+            photo = aligned
+        before = edit.target.developed(replace(photo, settled=True))
+
+        # ---- Its curve
+        tried = []
+        for curve in photo.curves:
+            edit.target = before.developed(before.photo.under(curve, rendering, before.weight))
+            problem = edit.problem()
+            one = gauss_newton.Run(run.state, run.start, history=list(run.history))
+            point = problem.evaluate(one.state)
+            if point.residual is None:
+                continue
+            point = gauss_newton.descended(problem, one, point, self._sigma, search.EXPLANATION_STEPS)
+            seen = edit.target.photo.exposed_by(one.state["camera"][0])
+            unlikeliness = problem.likelihood.at_best(seen.missed(point.rendering), SIGMA)
+            tried.append((unlikeliness + problem.penalty(one.state, one.start), seen, one))
+        _, seen, one = min(tried, key=lambda three: three[0])
+        self._curves = {other.camera.curve: float(value) for value, other, _ in tried}
+        edit.target = before.developed(seen)
+        one.state = one.state | {"camera": np.zeros((1, 3))}
+        return replace(one, finished=False, most=len(one.history) + gauss_newton.MOST_STEPS)
 
     def _goes_on(self, solution):
         """Whether steps were made and kept, more are allowed, and T's error is not yet off the target."""
@@ -258,9 +320,13 @@ class LayersSolver:
 
     def _missed(self, envmap):
         """Return display values of Mitsuba's rendering of a map less the target's."""
-        edit, seed = self.edit, Seeds.of(self.edit.settings.seed).step_check
-        shown = display_curve.to_display(tensor(edit.scene.render(envmap, CHECKED_SPP, seed)))
-        return shown.numpy() - display_curve.to_display(tensor(edit.target.picture)).numpy()
+        shown = display_curve.to_display(tensor(self._path_traced(envmap)))
+        return shown.numpy() - display_curve.to_display(tensor(self.edit.target.picture)).numpy()
+
+    def _path_traced(self, envmap):
+        """Return Mitsuba's rendering of a map, (h, w, 3)."""
+        seed = Seeds.of(self.edit.settings.seed).step_check
+        return self.edit.scene.render(envmap, CHECKED_SPP, seed)
 
 
 class _Checkpoints:
@@ -280,6 +346,8 @@ class _Checkpoints:
         if edit.folder and (due or self.interrupt.is_set()):
             state = adam_loop.State(step=done, history=run.history)
             arrays = run.arrays() | {"aim": edit.target.aim}
+            if edit.target.photo is not None:
+                arrays["photo"] = edit.target.photo.array
             traced = edit.renderer.state()
             checkpoint.save(edit.folder, self.digest, state, arrays, traced, edit.target.picture)
             self.saved = time.perf_counter()

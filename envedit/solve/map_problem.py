@@ -10,6 +10,10 @@ E(x) the map that the layers compose, minimised is
 * K is the inverse covariance of a sky's change (:class:`Prior`): of the gain along luminance, blue-amber and
   green-magenta; of lights flux, size and direction.
 
+Of a photograph, what is compared with the target is d(exp(c) T E(x)): the log factor c of a channel, exposure
+and white balance, is an unknown too, whose deviation from none the penalty holds. Where the photograph is
+white, only a rendering that is darker differs from it.
+
 The residual is exact, through T; so is the gradient by gain and saturation. Other derivatives are those of
 ``derivatives.py``.
 """
@@ -38,8 +42,35 @@ from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured."""
-LARGEST_STEP = {"gain": 2.0, "flux": 1.5, "turn": np.radians(4.0), "size": 0.7, "saturation": 1.0}
+LARGEST_STEP = {
+    "gain": 2.0,
+    "flux": 1.5,
+    "turn": np.radians(4.0),
+    "size": 0.7,
+    "saturation": 1.0,
+    "camera": 1.0,
+}
 """Largest step of an unknown: beyond it the linear model does not hold."""
+
+
+@dataclass(frozen=True)
+class Photographed:
+    """What a photograph adds to a problem.
+
+    Attributes
+    ----------
+    log_factor : ndarray (3,)
+        Of exposure and white balance, by which the target has been divided, less what they are drawn to: the
+        unknown is the rest.
+    precision : ndarray (3, 3)
+        Inverse covariance of their sum, about 0.
+    clipped : ndarray of bool (h, w, 3)
+        Where the target is a lower bound.
+    """
+
+    log_factor: np.ndarray
+    precision: np.ndarray
+    clipped: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -87,6 +118,8 @@ class Problem(Unknowns):
         The saturation of its colours is an unknown.
     blocks : BlockJacobian, optional
         Of another problem of these layers and this transport; made where None.
+    photo : Photographed, optional
+        Of a photograph as the target.
     """
 
     def __init__(
@@ -99,8 +132,10 @@ class Problem(Unknowns):
         prior: Prior | None = None,
         saturates: bool = False,
         blocks: BlockJacobian | None = None,
+        photo: Photographed | None = None,
     ):
-        super().__init__(layers, saturates)
+        super().__init__(layers, saturates, photo is not None)
+        self.photo = photo
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks)
@@ -120,8 +155,7 @@ class Problem(Unknowns):
     def aimed_at(self, picture: np.ndarray, likelihood: Likelihood | None, point: Point) -> Point:
         """Take another target, with its likelihood; returns a point with its residual from that target."""
         self._aim(picture, likelihood)
-        shown = display_curve.to_display(tensor(point.rendering)).numpy()
-        return replace(point, residual=np.float64(shown) - self.target)
+        return replace(point, residual=self.residual(point.state, point.rendering))
 
     # ---- F -------------------------------------------------------------------------------------------------
 
@@ -135,11 +169,31 @@ class Problem(Unknowns):
             return Point(state, edited, sky, None, None)
         if resolve:
             self.transport.resolve(edited, limit=COLUMNS_A_LOOK)
-        rendering = self.transport.apply(tensor(edited))
-        shown = display_curve.to_display(rendering).numpy()
-        if not np.isfinite(shown).all():
+        rendering = self.transport.apply(tensor(edited)).numpy()
+        residual = self.residual(state, rendering)
+        if not np.isfinite(residual).all():
             return Point(state, edited, sky, None, None)
-        return Point(state, edited, sky, rendering.numpy(), np.float64(shown) - self.target)
+        return Point(state, edited, sky, rendering, residual)
+
+    def residual(self, state: dict, rendering: np.ndarray) -> np.ndarray:
+        """Return display values of a rendering (h, w, 3), under a camera's factor, less the target's."""
+        shown = display_curve.to_display(tensor(rendering * self._exposure(state))).numpy()
+        residual = np.float64(shown) - self.target
+        if self.photo is None:
+            return residual
+        return np.where(self.photo.clipped, np.minimum(residual, 0), residual)
+
+    def _exposure(self, state):
+        """Return the factor of every channel between a rendering and the picture, (3,) or 1."""
+        return np.exp(state["camera"][0]).astype(np.float32) if self.photographed else np.float32(1)
+
+    def _slope(self, point):
+        """Return the derivative of the residual by radiance, (h, w, 3)."""
+        exposure = self._exposure(point.state)
+        slope = display_curve.slope(point.rendering * exposure) * exposure
+        if self.photo is None:
+            return slope
+        return np.where(self.photo.clipped & (point.residual >= 0), 0, slope).astype(np.float32)
 
     def noise(self, residual: np.ndarray, least: float) -> float:
         """Return the most likely standard error (:meth:`.Likelihood.noise`)."""
@@ -153,6 +207,9 @@ class Problem(Unknowns):
         """Return x' K x; ``start`` is where the search has put the lights."""
         total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
+        if self.photo is not None:
+            factor = self.photo.log_factor + state["camera"][0]
+            total += factor @ self.photo.precision @ factor
         for i in self.shining(state):
             change = self._flux_change(state, start, i)
             total += change @ self.prior.flux_precision @ change
@@ -191,7 +248,7 @@ class Problem(Unknowns):
         # ---- Weights of pixels, and of the mean of what was not painted
         robust = self.likelihood.weights(point.residual, sigma)
         share, mean = self.likelihood.linear_mean(point.residual)
-        slope = display_curve.slope(point.rendering)
+        slope = self._slope(point)
 
         # ---- Gain: the Hessian by blocks, the gradient through T
         squared = blocks.summed((slope * profile) ** 2 * robust)
@@ -274,6 +331,8 @@ class Problem(Unknowns):
         for k, (name, i, axis) in enumerate(unknowns, 3 * n):
             if name == "flux":
                 precision[k, k - axis : k - axis + 3] = self.prior.flux_precision[axis]
+            elif name == "camera":
+                precision[k, k - axis : k - axis + 3] = self.photo.precision[axis]
             else:
                 precision[k, k] = self._deviation(name, i) ** -2.0
         return precision
@@ -290,6 +349,8 @@ class Problem(Unknowns):
         for name, i, axis in unknowns:
             if name == "flux":
                 found.append([self._flux_change(state, start, i)[axis]])
+            elif name == "camera":
+                found.append([self.photo.log_factor[axis] + state[name][i, axis]])
             elif name == "saturation":
                 found.append(state[name][i])
             elif name == "turn":
@@ -344,7 +405,8 @@ class Problem(Unknowns):
             half = np.linalg.solve(lower, mean)
             if np.isfinite(half).all():
                 covariance = half.T @ half
-                unknowns = Unknowns(self.layers, self.saturates)  # not this problem, which keeps T in memory
+                # Not this problem, which keeps T in memory.
+                unknowns = Unknowns(self.layers, self.saturates, self.photographed)
                 sample = functools.partial(_sample, unknowns, state, lower, normal.unknowns)
         spread = [self.blocks.spread(one) for one in (covariance, prior)]
         whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envedit.core.color import AXES
 from envedit.representations.layers.gain import GridGain
-
-AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-"""Luminance, blue-amber and green-magenta, as unit vectors of log RGB."""
 
 
 @dataclass(frozen=True)

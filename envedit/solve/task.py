@@ -9,7 +9,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.solve import prior
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.likelihood import Likelihood, on_average_one
-from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.map_problem import SIGMA, Photographed, Problem
 from envedit.targets.target import Target
 from envedit.transport.light_transport import LightTransport
 
@@ -40,7 +40,10 @@ def problem(
     layers, transport, envmap, blocks
         As for :class:`.Problem`.
     """
-    painted = target.coverage is not None
+    painted, photograph = target.coverage is not None, None
+    if target.photo is not None:
+        photo = target.photo
+        photograph = Photographed(photo.camera.log_factor - photo.centre, photo.precision, photo.clipped)
     expected = prior.of_paint(settings.solve.freedom, target.coverage) if painted else prior.Prior()
     return Problem(
         layers,
@@ -51,6 +54,7 @@ def problem(
         expected,
         saturates=not painted,
         blocks=blocks,
+        photo=photograph,
     )
 
 

@@ -1,7 +1,8 @@
 """The unknowns of an edit with layers, as they are solved for: logarithms and radians.
 
 A state is a dict of float64 arrays: ``gain`` (nodes, 3), ``turn`` and ``flux`` (lights, 3), ``size``
-(lights, 1) and ``saturation`` (1, 1).
+(lights, 1) and ``saturation`` (1, 1); of a photograph also ``camera`` (1, 3), the log factor of each channel
+between a rendering and the picture.
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ class Unknowns:
         After ``encode``.
     saturates : bool
         The saturation of the sky's colours is an unknown.
+    photographed : bool
+        The factor of a camera is an unknown.
 
     Attributes
     ----------
@@ -56,8 +59,8 @@ class Unknowns:
         Of all grids, and one more where ground goes by the light that falls on it.
     """
 
-    def __init__(self, layers: Layers, saturates: bool = False):
-        self.layers, self.saturates = layers, saturates
+    def __init__(self, layers: Layers, saturates: bool = False, photographed: bool = False):
+        self.layers, self.saturates, self.photographed = layers, saturates, photographed
         self.sizes = layers.gain.sizes
         self.ground = layers.ground_light is not None
         self.nodes = sum(rows * columns for rows, columns in self.sizes) + self.ground
@@ -74,7 +77,8 @@ class Unknowns:
         """
         real = {k: np.float64(v.numpy()) * in_numpy(self.layers.scales[k]) for k, v in params.items()}
         grids = [real.pop(name).reshape(-1, 3) for name in self.grids]
-        return {"saturation": np.zeros((1, 1))} | real | {"gain": np.concatenate(grids)}
+        camera = {"camera": np.zeros((1, 3))} if self.photographed else {}
+        return {"saturation": np.zeros((1, 1))} | camera | real | {"gain": np.concatenate(grids)}
 
     def params(self, state: dict) -> dict:
         """Return the layers' parameters of a state; where it is an unknown, with the saturation."""
@@ -116,8 +120,8 @@ class Unknowns:
         largest : dict, optional
             Largest step of each; None: any.
         """
-        bound = {"gain": np.inf, "turn": np.inf, "flux": np.inf, "size": np.inf, "saturation": np.inf}
-        bound |= largest or {}
+        kinds = "gain", "turn", "flux", "size", "saturation", "camera"
+        bound = dict.fromkeys(kinds, np.inf) | (largest or {})
         n = self.nodes
         changed = {name: value.copy() for name, value in state.items()}
         changed["gain"] += np.clip(step[: 3 * n], -bound["gain"], bound["gain"]).reshape(3, n).T

@@ -266,19 +266,20 @@ def _duration(seconds):
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """Return a line for each job, and one that counts them."""
-    width = max((len(one.job.name) for one in outcomes), default=0)
-    lines = [
-        f"{one.job.name:{width}}  {one.state:7}  {one.seconds:8.1f} s  {one.job.key}  {one.error}".rstrip()
-        for one in outcomes
-    ]
-    states = [one.state for one in outcomes]
+    width = max((len(outcome.job.name) for outcome in outcomes), default=0)
+    lines = []
+    for outcome in outcomes:
+        job = outcome.job
+        line = f"{job.name:{width}}  {outcome.state:7}  {outcome.seconds:8.1f} s  {job.key}  {outcome.error}"
+        lines.append(line.rstrip())
+    states = [outcome.state for outcome in outcomes]
     counts = [f"{states.count(state)} {state}" for state in dict.fromkeys(states)]
     return "\n".join([*lines, f"{len(outcomes)} jobs: {', '.join(counts)}"])
 
 
 def _tsv(outcomes):
     rows = [("name", "state", "seconds", "folder", "error")]
-    for one in outcomes:
-        error = " ".join(one.error.split())
-        rows.append((one.job.name, one.state, f"{one.seconds:.1f}", one.job.key, error))
+    for outcome in outcomes:
+        error = " ".join(outcome.error.split())
+        rows.append((outcome.job.name, outcome.state, f"{outcome.seconds:.1f}", outcome.job.key, error))
     return "".join("\t".join(row) + "\n" for row in rows)

@@ -63,11 +63,7 @@ def program() -> str:
 
 
 def job(
-    name: str,
-    toml: str | dict,
-    base: FilePath = ".",
-    version: str = "",
-    command: Sequence[str] = (),
+    name: str, toml: str | dict, base: FilePath = ".", version: str = "", command: Sequence[str] = ()
 ) -> Job:
     """Make a job of a configuration.
 
@@ -209,7 +205,7 @@ def _scene_digests(name):
             pending.append(conversion.kept(path).xml)
         if path.suffix.lower() == ".xml":
             names = re.findall(r"""(?:value|filename)\s*=\s*["']([^"'$]+)["']""", _text(path))
-            pending += filter(None, (_file_in(path.parent, one) for one in names))
+            pending += filter(None, (_file_in(path.parent, file_name) for file_name in names))
     return sorted(digests.values())
 
 

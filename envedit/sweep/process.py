@@ -119,6 +119,7 @@ def run_job(
     InputError
         If the folder cannot be made or written to.
     """
+    # ---- Nothing to do, or not by this installation
     folder = job.folder(out)
     stop = stop or threading.Event()
     if stop.is_set():
@@ -128,6 +129,8 @@ def run_job(
     if job.program != program():
         here = f"{socket.gethostname()} has envedit {program()}, expected {job.program}"
         return Outcome(job, "failed", error=f"{here}; install the same on every machine")
+
+    # ---- Carry it out in its folder, which no other process works in meanwhile
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

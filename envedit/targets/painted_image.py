@@ -102,10 +102,10 @@ def read(
     said = initial_rendering.stated_origin(file, info, exported)
     warnings = [f"{file}: {line}" for line in info["warnings"]]
     spread = _spread_of_resampling(file, pixels.shape, shape, warnings)
-    _check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
+    check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
 
     # ---- Values, alpha and clipped pixels, at the size of the rendering
-    values, alpha, top = _planes(file, pixels, warnings)
+    values, alpha, top = planes(file, pixels, warnings)
     clipped = np.zeros(alpha.shape, bool)
     if not info["hdr"]:
         clipped = (values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)).any(axis=2) & (alpha > 0)
@@ -187,7 +187,7 @@ def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarr
     picture = np.asarray(picture, np.float64)
     if picture.shape != (*shape, 3):
         raise InputError(f"target: the picture has shape {picture.shape}, the rendering {(*shape, 3)}")
-    _check_finite("target", picture, "repair it where it comes from")
+    check_finite("target", picture, "repair it where it comes from")
     picture = np.maximum(picture, 0)
     if mask is None:
         coverage = differs(picture, np.asarray(initial, np.float64), {"hdr": True, "format": "exr"}, 1)
@@ -196,7 +196,7 @@ def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarr
         if coverage.size != shape[0] * shape[1] or coverage.shape[:2] != tuple(shape):
             raise InputError(f"mask: has shape {coverage.shape}, the rendering {tuple(shape)}")
         coverage = coverage.reshape(shape)
-        _check_finite("mask", coverage[..., None], "it is how much each pixel was painted, from 0 to 1")
+        check_finite("mask", coverage[..., None], "it is how much each pixel was painted, from 0 to 1")
         coverage = np.clip(coverage, 0, 1)
     if not coverage.any():
         raise InputError("target: nothing of the picture is painted")
@@ -224,7 +224,7 @@ def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
             f"{file}: is {columns}x{rows} pixels, the target is {shape[1]}x{shape[0]}: "
             "the mask must have the target's size"
         )
-    _check_finite(file, pixels, "paint the mask in black and white")
+    check_finite(file, pixels, "paint the mask in black and white")
     values = pixels if info["hdr"] else pixels / np.iinfo(pixels.dtype).max
     if values.shape[2] in (2, 4):
         alpha = 1 if info["hdr"] else values[..., -1:]  # OpenEXR is premultiplied
@@ -265,7 +265,8 @@ def _resampled(values, alpha, clipped, shape, premultiplied):
     return new, new_alpha[..., 0], fit(clipped[..., None], *shape[:2])[..., 0] > 0
 
 
-def _check_finite(file, pixels, advice):
+def check_finite(file: FilePath, pixels: np.ndarray, advice: str) -> None:
+    """Refuse a picture (H, W, C) with values that are not finite: InputError with the place and an advice."""
     if (bad := ~np.isfinite(pixels)).any():
         raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
 
@@ -289,7 +290,9 @@ def _tonemap_of(file, info, said, declared, exported, warnings):
     return name
 
 
-def _planes(file, pixels, warnings):
+def planes(
+    file: FilePath, pixels: np.ndarray, warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Return values (h, w, 3) and alpha (h, w), float64, and the largest code; codes become [0, 1]."""
     top = 1 if pixels.dtype == np.float32 else int(np.iinfo(pixels.dtype).max)
     values = pixels.astype(np.float64) / top
@@ -301,7 +304,7 @@ def _planes(file, pixels, warnings):
     if values.shape[2] == 1:
         values = values.repeat(3, axis=2)
         warnings.append(f"{file}: read as grey")
-    if (negative := (values < 0).any(axis=2)).any():
+    if (negative := np.any(values < 0, axis=2)).any():
         where = f"the first at {place_of(negative)}"
         warnings.append(f"{file}: {negative.sum()} pixels are negative, {where}: set to 0")
     return np.maximum(values, 0), alpha, top

@@ -25,6 +25,7 @@ from envedit.images import images
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
+from envedit.targets import photo as photographs
 from envedit.targets.pixel_weights import first_hold, pixel_weight
 
 FOUND_ANEW = (
@@ -66,6 +67,8 @@ class Target:
     compared : ndarray (h, w, 3) or None
         What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
         (:meth:`seen_as`).
+    photo : Photo or None
+        The photograph that the picture is, as far as its camera is known.
     """
 
     picture: np.ndarray
@@ -79,6 +82,7 @@ class Target:
     noise: np.ndarray | None = None
     spp: int | None = None
     compared: np.ndarray | None = None
+    photo: photographs.Photo | None = None
 
     @property
     def aim(self) -> np.ndarray:
@@ -95,6 +99,17 @@ class Target:
         T of this map matches its own rendering exactly then, and nothing is spent on the noise of both.
         """
         return replace(self, compared=np.maximum(self.picture + (seen - rendering), 0).astype(np.float32))
+
+    def developed(self, photograph: photographs.Photo) -> Target:
+        """Return the target with its photograph, whose camera and place are known better."""
+        picture = np.minimum(photograph.picture, np.float32(BRIGHTEST))
+        weight = self.weight
+        if self.photo is not None and photograph.placed != self.photo.placed:
+            before = self.photo.counts
+            weight = np.ones_like(before) if weight is None else weight
+            share = np.divide(weight, before, out=np.zeros_like(before), where=before > 0)
+            weight = share * photograph.counts
+        return replace(self, photo=photograph, picture=picture, weight=weight, compared=None)
 
     def held(self, paint: float, hold: float) -> Target:
         """Return the target with other weights of paint and rest, among the pixels that count."""
@@ -145,6 +160,8 @@ def make(
         return _seen(made, hidden, settings.output.tonemap)
     if picture is None and chosen.kind == "envmap":
         return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
+    if chosen.kind == "photo":
+        return _seen(_of_photo(settings, scene, envmap, picture, mask), hidden, settings.output.tonemap)
     if chosen.kind not in config.TARGET_KINDS and picture is None:
         picture = extensions.load(extensions.TARGETS, chosen.kind)(settings, scene, envmap)
         chosen = replace(chosen, kind="rendering")
@@ -233,6 +250,37 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
     return Target(picture, counts, None, source, tuple(found.warnings), asked=asked, noise=noise, spp=spp)
+
+
+def _of_photo(settings, scene, envmap, picture, mask):
+    """Take a photograph, on the film of the scene, under the camera that fits the map as it is."""
+    # ---- The photograph, laid on the rendering under light from everywhere
+    chosen = settings.target
+    if picture is not None or mask is not None or len(chosen.files) != 1 or len(scene.views) > 1:
+        raise ConfigError('target.kind = "photo": expected one file in target.file, and a scene of one view')
+    everywhere = np.ones_like(envmap, np.float32)
+    spp, cache = chosen.spp, settings.renderer.cache
+    outlines, _, _ = rendered(scene, everywhere, spp, Seeds.of(settings.seed).target_again, cache)
+    file = chosen.files[0]
+    found, warnings = photographs.read(file, "".join(chosen.masks), outlines, chosen.align)
+
+    # ---- Its camera
+    initial, spp, _ = with_noise(settings, scene, envmap)
+    curves = found.curves if chosen.curve == "auto" or found.curves == ("linear",) else (chosen.curve,)
+    known = [None if value == "auto" else value for value in (chosen.exposure, chosen.white_balance)]
+    found = replace(found, curves=curves, stops=known[0], kelvin=known[1])
+    found = found.under(curves[0], initial, found.counts)
+    asked = tuple(np.fromfile(one, np.uint8) for one in (*chosen.files, *chosen.masks) if one)
+    placed = f", {found.placed.summary}" if found.placed.summary else ""
+    source = f"a photograph of the scene: {file}{placed}"
+    counts = None if (found.counts == 1).all() else found.counts
+    target = Target(found.picture, counts, None, source, tuple(warnings), asked=asked, photo=found)
+    target = target.developed(found)
+
+    # ---- Its noise
+    noise = rendered_anew.noise(target.picture, scene.rows)
+    spp = rendered_anew.samples(target.picture, noise, initial, spp, scene.rows)
+    return replace(target, noise=noise, spp=spp)
 
 
 def _by_view(scene, views, given):

@@ -82,7 +82,10 @@ def worked_on(
     hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0
     if target.coverage is None or target.initial is None or target.weight is None:
         weight = None
-        if target.envmap is None:  # a picture of the scene
+        if target.photo is not None:
+            target = target.developed(target.photo.laid((small.height, small.width)))
+            picture, noise, spp = target.picture, rendered_anew.noise(target.picture, small.rows), target.spp
+        elif target.envmap is None:  # a picture of the scene
             picture = at_size(target.picture, scene, small)
             noise = rendered_anew.noise(picture, small.rows)
             spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)

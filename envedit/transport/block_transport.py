@@ -89,21 +89,23 @@ def whole(
     """Return whether arrays from disk are an overview of such a picture and map: no index leaves it."""
     block_of, blocks = _blocks(shape, views)
     cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))
-    wanted = {
+    expected = {
         "matrix": ("f4", (3, blocks, cells)),
         "block_of": ("i8", block_of.shape),
         "cell_of": ("i8", cell_of.shape),
         "directions": ("f8", (cells, 3)),
         "omega": ("f8", (cells,)),
     }
-    same = holds(arrays, wanted) and (arrays["block_of"] == block_of).all()
+    same = holds(arrays, expected) and (arrays["block_of"] == block_of).all()
     return bool(same and (arrays["cell_of"] == cell_of).all())
 
 
 def _blocks(shape, views):
     """Return the block of every pixel, and their number; the longest side of a view has BLOCKS of them."""
     heights = [rows.stop - rows.start for rows in views] or [shape[0]]
-    size, parts, count = max(1, -(-max(*heights, shape[1]) // BLOCKS)), [], 0
+    size = max(1, -(-max(*heights, shape[1]) // BLOCKS))
+    parts = []
+    count = 0
     for height in heights:
         block_of, blocks = tiles(height, shape[1], size)
         parts.append(block_of + count)

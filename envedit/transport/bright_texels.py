@@ -26,7 +26,9 @@ def error(radiance: np.ndarray, omega: np.ndarray, samples: float, rest: np.ndar
     float
         Error relative to the light of all texels; 0 where there is none.
     """
-    total, e, w = (radiance * omega).sum(), radiance[rest], omega[rest]
+    total = (radiance * omega).sum()
+    e = radiance[rest]
+    w = omega[rest]
     if not (total > 0 and w.sum() > 0):
         return 0.0
     variance = max((e * e * w).sum() - (e * w).sum() ** 2 / w.sum(), 0) * omega.sum()
@@ -35,13 +37,16 @@ def error(radiance: np.ndarray, omega: np.ndarray, samples: float, rest: np.ndar
 
 def brightest(radiance: np.ndarray, omega: np.ndarray, samples: float, tolerance: float) -> np.ndarray:
     """List the fewest texels without which the :func:`error` is at most ``tolerance``, brightest first."""
-    total, span = (radiance * omega).sum(), omega.sum()
+    total = (radiance * omega).sum()
+    span = omega.sum()
     if not total > 0:
         return np.zeros(0, np.int64)
     order = np.argsort(-radiance, kind="stable")
     # Variance of what is left when the first k are taken out, k = 0 ... n.
     e, w = radiance[order], omega[order]
-    square, linear, weight = _total_from(e * e * w), _total_from(e * w), _total_from(w)
+    square = _total_from(e * e * w)
+    linear = _total_from(e * w)
+    weight = _total_from(w)
     variance = np.maximum(square - linear**2 / np.maximum(weight, 1e-30), 0) * span
     enough = np.flatnonzero(np.sqrt(variance / samples) / total <= tolerance)
     return order[: enough[0] if len(enough) else len(order)]

@@ -55,7 +55,10 @@ class ExactColumns:
     """
 
     def __init__(self, scene: Scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
-        self.scene, self.grid, self.bounces, self.capacity = scene, grid, bounces, capacity
+        self.scene = scene
+        self.grid = grid
+        self.bounces = bounces
+        self.capacity = capacity
         self.pixels = scene.width * scene.height
         self.texels = np.zeros(0, np.int64)
         self.slot_of = np.full(grid.texels, -1, np.int64)
@@ -89,7 +92,7 @@ class ExactColumns:
         """Columns that can still be added."""
         return self.capacity - len(self.texels)
 
-    # ------------------------------------------------------------------ tracing
+    # ---- tracing -------------------------------------------------------------------------------------------
 
     def trace(
         self,
@@ -130,29 +133,35 @@ class ExactColumns:
             yield from self._kept[count, seed]
             return
         self._kept = {key: kept for key, kept in self._kept.items() if key[1] == seed}
-        made, room = [], self.paths_bytes - self.kept_bytes
+        traced = []
+        room = self.paths_bytes - self.kept_bytes
         own = seeds.columns(seed)
         for block in path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, own):
-            made.append(block)
+            traced.append(block)
             room -= block.bytes
             yield block
             if room < 0:
-                made.clear()
+                traced.clear()
         if room >= 0:
-            self._kept[count, seed] = made
+            self._kept[count, seed] = traced
 
     def _add_vertices(self, block, texels, count, seed):
         """Add what a block of paths contributes to columns by way of its vertices."""
         value, lost = path_vertices.contributions(self.scene.mi, self.grid, block, texels, count, seed)
         self._lost += lost
-        slots = path_vertices.on_device(mi.UInt32, (self.slot_of[texels] * SLICE).astype(np.uint32))
-        lane, pixels = dr.arange(mi.UInt32, len(texels) * block.pixels), dr.opaque(mi.UInt32, block.pixels)
-        texel = lane // pixels
-        pixel = lane - texel * pixels + dr.opaque(mi.UInt32, block.first)
-        place = (_first_place(pixel, self.capacity) + dr.gather(mi.UInt32, slots, texel)) * 4
+        place = self._places(texels, block.pixels, dr.opaque(mi.UInt32, block.first)) * 4
         for c in range(3):  # whatever the column held before is overwritten
             dr.scatter(self._store, value[c], place + c)
         dr.eval(self._store, self._lost)
+
+    def _places(self, texels, count, first):
+        """Return the packets of so many pixels of texels' columns, texel by texel."""
+        slots = path_vertices.on_device(mi.UInt32, (self.slot_of[texels] * SLICE).astype(np.uint32))
+        lane = dr.arange(mi.UInt32, len(texels) * count)
+        pixels = dr.opaque(mi.UInt32, count)
+        texel = lane // pixels
+        pixel = lane - texel * pixels + first
+        return _first_place(pixel, self.capacity) + dr.gather(mi.UInt32, slots, texel)
 
     def _take_slots(self, fresh, texels, keep):
         """Give slots to texels without one: new ones first, then those of columns that nobody keeps."""
@@ -166,9 +175,11 @@ class ExactColumns:
             older = np.arange(len(self.texels) - new)
             given_up = older[~kept[self.texels[older]]][: len(fresh) - new]
             gone = self.texels[given_up]
-            self.slot_of[gone], self.paths_of[gone] = -1, 0
+            self.slot_of[gone] = -1
+            self.paths_of[gone] = 0
             slots = np.concatenate([slots, given_up])
-        self.texels[slots], self.slot_of[fresh] = fresh, slots
+        self.texels[slots] = fresh
+        self.slot_of[fresh] = slots
 
     def retrace(self, seed: int) -> None:
         """Trace every column again with other samples, each with as many paths as before."""
@@ -193,10 +204,10 @@ class ExactColumns:
         """
         traced = np.zeros(self.grid.texels, bool)
         traced[texels] = True
-        wanted = dr.opaque(mi.Bool(traced))
+        is_traced = dr.opaque(mi.Bool(traced))
         hit = mi.Bool(False)
         for texel in block.texels:
-            hit |= dr.gather(mi.Bool, wanted, texel)
+            hit |= dr.gather(mi.Bool, is_traced, texel)
         index = dr.compress(hit)
         if not len(index):
             return
@@ -206,7 +217,8 @@ class ExactColumns:
         )
         tap, escape = np.nonzero(traced[around] & (shares > 0))
         value = light[:, escape].T * shares[tap, escape, None]
-        texel, pixel = around[tap, escape], pixel[0, escape].astype(np.int64)
+        texel = around[tap, escape]
+        pixel = pixel[0, escape].astype(np.int64)
         slot = self.slot_of[texel]
         target = (pixel // SLICE * self.capacity + slot) * SLICE + pixel % SLICE
         finite = np.isfinite(value).all(axis=1)
@@ -221,7 +233,7 @@ class ExactColumns:
             dr.scatter_add(self._store, path_vertices.on_device(mi.Float, value[:, c]), place + c, real)
         dr.eval(self._store)
 
-    # ------------------------------------------------------------------ using
+    # ---- using ---------------------------------------------------------------------------------------------
 
     def product(self, packets: mi.Float, count: int = 1) -> list[mi.Color3f]:
         """Multiply with maps: sum over columns of column * E[texel], of each map one colour a pixel.
@@ -233,18 +245,13 @@ class ExactColumns:
         count : int
             How many there are.
         """
-        args = self._store, packets, self._texel_of, self._count, self.pixels, self.capacity
-        return _product(*args, count)
+        return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity, count)
 
     def read(self, texels: np.ndarray) -> np.ndarray:
         """Return the columns of texels that have one, (n, pixels, 3); in memory channel by channel."""
         if not len(texels):
             return np.zeros((0, self.pixels, 3), np.float32)
-        slots = path_vertices.on_device(mi.UInt32, (self.slot_of[texels] * SLICE).astype(np.uint32))
-        lane, pixels = dr.arange(mi.UInt32, len(texels) * self.pixels), dr.opaque(mi.UInt32, self.pixels)
-        texel = lane // pixels
-        place = _first_place(lane - texel * pixels, self.capacity) + dr.gather(mi.UInt32, slots, texel)
-        columns = dr.gather(mi.Vector4f, self._store, place)
+        columns = dr.gather(mi.Vector4f, self._store, self._places(texels, self.pixels, 0))
         dr.eval(columns)
         planes = np.stack([columns[c].numpy() for c in range(3)])
         return planes.reshape(3, len(texels), self.pixels).transpose(1, 2, 0)
@@ -276,14 +283,15 @@ class ExactColumns:
     def restore(self, state: dict, seed: int) -> None:
         """Trace the columns of an earlier :meth:`state` again."""
         # The same slots as before: the order of a sum is part of its result.
-        self.slot_of[:], self.paths_of[:] = -1, 0
+        self.slot_of[:] = -1
+        self.paths_of[:] = 0
         self.texels = state["columns"].astype(np.int64)
         self.slot_of[self.texels] = np.arange(len(self.texels))
         self.paths_of[self.texels] = state["paths"]
         self.retrace(seed)
 
 
-# ---------------------------------------------------------------------- kernels
+# ---- kernels -----------------------------------------------------------------------------------------------
 
 
 def _split(values, most):

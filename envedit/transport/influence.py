@@ -52,7 +52,7 @@ def determined(influence: np.ndarray, samples: np.ndarray, rows: slice, threshol
         return np.ones((height, width), bool)
     sphere, density = latlong.solid_angles(height, width), per_solid_angle(influence)
     mean = influence[rows].sum(dtype=np.float64) / (sphere[rows].sum() * width)
-    found = np.empty((height, width), bool)
+    is_determined = np.empty((height, width), bool)
     for row in range(height):
         # At the threshold, threshold * samples / sphere samples fall on a steradian: on this many steradians,
         # WANTED_SAMPLES.
@@ -62,8 +62,8 @@ def determined(influence: np.ndarray, samples: np.ndarray, rows: slice, threshol
         band = density[max(row - radius, 0) : row + radius + 1].max(axis=0)
         sine = math.sin(math.pi * row / max(height - 1, 1))
         across = math.ceil(radius / max(sine, 1e-6))  # as far in angle as up and down
-        found[row] = _largest_around(band, across) > threshold * mean
-    return found
+        is_determined[row] = _largest_around(band, across) > threshold * mean
+    return is_determined
 
 
 def _largest_around(values, radius):

@@ -87,18 +87,29 @@ class LightTransport:
     """
 
     def __init__(self, scene: Scene, grid: Grid, plan: SamplingPlan, seed: int, refresh: int):
-        self.scene, self.grid, self.shape = scene, grid, (scene.height, scene.width)
-        self.spp, self.bounces, self.capacity, self.refresh = plan.spp, plan.bounces, plan.capacity, refresh
-        self.epoch, self._base_seed, self._choices, self._lost = 0, seed, plan.choices, 0
-        self.cached, self.depth_error, self.warnings = False, plan.depth_error, plan.warnings
-        self.paths, self.tolerance = plan.paths, plan.tolerance
+        self.scene = scene
+        self.grid = grid
+        self.shape = (scene.height, scene.width)
+        self.spp = plan.spp
+        self.bounces = plan.bounces
+        self.capacity = plan.capacity
+        self.refresh = refresh
+        self.epoch = 0
+        self._base_seed = seed
+        self._choices = plan.choices
+        self._lost = 0
+        self.cached = False
+        self.depth_error = plan.depth_error
+        self.warnings = plan.warnings
+        self.paths = plan.paths
+        self.tolerance = plan.tolerance
         self._looks = np.zeros(grid.texels, np.uint8)
         self._bright: np.ndarray = np.zeros(0, np.int64)
         self._overview: overviews.Overview | None = None
         self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
         self._exact = ExactColumns(scene, grid, plan.bounces, plan.capacity, plan.paths_bytes)
 
-    # ------------------------------------------------------------------ building
+    # ---- building ------------------------------------------------------------------------------------------
 
     @classmethod
     def build(
@@ -157,6 +168,7 @@ class LightTransport:
         >>> transport = LightTransport.build("sphere")  # doctest: +SKIP
         >>> picture = transport.apply(envedit.sunsky(256)).numpy()  # doctest: +SKIP
         """
+        # ---- Scene and options, checked
         if mi.variant() is None:
             mi.set_variant("llvm_ad_rgb")
         scene = built_scene.load(scene, 0 if isinstance(scene, Scene) else 128)
@@ -168,6 +180,8 @@ class LightTransport:
                 raise ConfigError(
                     f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
                 )
+
+        # ---- How T is sampled, by a few paths under a white sky
         cache = DiskCache(folder)
         origin = {
             "version": [_RECORDING, mi.__version__, mi.variant()],
@@ -178,14 +192,16 @@ class LightTransport:
         light = white_sky(cache, origin | {"part": "pilot"}, scene, (height, width), seed)
         plan = choose(scene, (height, width), light, spp, max_depth, memory_gb, few)
         transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed, refresh)
+
+        # ---- The recording, from disk or traced
         key = origin | {"part": "recording"} | plan.key()
         transport._stored = cache, key | {"part": "overview"}
-        found = cache.load(key, transport._whole)
-        if found is None:
+        recording = cache.load(key, transport._whole)
+        if recording is None:
             transport._trace(plan.lamps, progress)
             cache.store(key, transport._recording())
         else:
-            transport._take(found)
+            transport._take(recording)
         return transport
 
     def _trace(self, lamps, progress=None):
@@ -196,7 +212,8 @@ class LightTransport:
 
     def _record(self, progress=None):
         """Trace the coarse tier with the seed of the present epoch."""
-        texels, pixels = self.grid.texels, self.shape[0] * self.shape[1]
+        texels = self.grid.texels
+        pixels = self.shape[0] * self.shape[1]
         rows, columns, weights, lost = record_all(
             self.scene, self.grid, self.spp, self.bounces, self.seed, progress
         )
@@ -218,7 +235,8 @@ class LightTransport:
 
     def _whole(self, arrays):
         """Return whether :meth:`_take` can take arrays from disk."""
-        grid, pixels = (self.grid.height, self.grid.width), self.shape[0] * self.shape[1]
+        grid = (self.grid.height, self.grid.width)
+        pixels = self.shape[0] * self.shape[1]
         own = {k: a for k, a in arrays.items() if "/" not in k}
         kept = {"influence": ("f4", grid), "lost": ("i8", ()), "offset": ("f4", (None,))}
         shapes = {"forward": (pixels, self.grid.texels), "reverse": (self.grid.texels, pixels)}
@@ -231,13 +249,14 @@ class LightTransport:
 
     def _take(self, arrays):
         """Take the first recording from arrays."""
-        self.cached, self._lost = True, int(arrays["lost"])
+        self.cached = True
+        self._lost = int(arrays["lost"])
         self.influence = np.array(arrays["influence"])
         self._offset = dr.opaque(mi.Float(arrays["offset"]))
         for part in ("forward", "reverse"):
             setattr(self, part, ColourMatrix.from_arrays(_under(arrays, part)))
 
-    # ------------------------------------------------------------------ what it is
+    # ---- what it is ----------------------------------------------------------------------------------------
 
     @property
     def seed(self) -> int:
@@ -288,17 +307,16 @@ class LightTransport:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
         if self._overview is None:
             cache, key = self._stored
-            shapes = self.shape, (self.grid.height, self.grid.width)
+            grid = (self.grid.height, self.grid.width)
             views = self.scene.rows
-            stored = cache.load(key, lambda found: overviews.whole(found, *shapes, views))
+            stored = cache.load(key, lambda arrays: overviews.whole(arrays, self.shape, grid, views))
             if stored is None:
-                made = overviews.make(self.forward, *shapes, views)
-                cache.store(key, vars(made))
-                stored = vars(made)
+                stored = vars(overviews.make(self.forward, self.shape, grid, views))
+                cache.store(key, stored)
             self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
         return self._overview
 
-    # ------------------------------------------------------------------ using
+    # ---- using ---------------------------------------------------------------------------------------------
 
     @property
     def transport(self) -> LightTransport:
@@ -372,7 +390,8 @@ class LightTransport:
         """
         flat = maps.reshape(len(maps), -1, 3)
         some = np.flatnonzero(flat.any(axis=(0, 2)))
-        texels, values = some + rows.start * self.grid.width, flat[:, some]
+        texels = some + rows.start * self.grid.width
+        values = flat[:, some]
         self._trace_main(texels, values, most)
         exact = self._exact.slot_of[texels] >= 0
         total = self.reverse.transposed(texels[~exact], values[:, ~exact])
@@ -469,7 +488,8 @@ class LightTransport:
         if int(state["epoch"]) != self.epoch:
             self.epoch = int(state["epoch"])
             self._record()
-        self._looks, self._bright = np.array(state["looks"], np.uint8), bright.astype(np.int64)
+        self._looks = np.array(state["looks"], np.uint8)
+        self._bright = bright.astype(np.int64)
         self._exact.restore(state, self.seed)
 
     def _apply(self, envmap, offset=True):
@@ -481,8 +501,8 @@ class LightTransport:
         packets = to_packets(maps.array, self.grid.texels, count)
         masked = scale_packets(packets, self._exact.mask, self.grid.texels, count)
         both = zip(self.forward.apply(masked, count), self._exact.product(packets, count), strict=True)
-        found = [dr.ravel(coarse + exact) for coarse, exact in both]
-        return found[0] if count == 1 else dr.concat(found)
+        pictures = [dr.ravel(coarse + exact) for coarse, exact in both]
+        return pictures[0] if count == 1 else dr.concat(pictures)
 
     def _adjoint(self, image):
         packets = to_packets(image.array, self.shape[0] * self.shape[1])
@@ -492,7 +512,7 @@ class LightTransport:
         self._exact.add_adjoint(flat, packets)
         return mi.TensorXf(flat, (self.grid.height, self.grid.width, 3))
 
-    # ------------------------------------------------------------------ which texels are exact
+    # ---- which texels are exact ----------------------------------------------------------------------------
 
     def probe(self, texels: np.ndarray) -> np.ndarray:
         """Trace columns with the fewest paths, where there are none, and return them: (n, pixels, 3)."""
@@ -533,19 +553,20 @@ class LightTransport:
             any more make room for those that are.
         """
         require_unmasked(envmap, "light transport")
-        envmap, exact = np.asarray(envmap), self._exact
-        wanted = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
-        tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[wanted], side="left") - 1
+        envmap = np.asarray(envmap)
+        exact = self._exact
+        bright = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
+        tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[bright], side="left") - 1
         tier = np.maximum(tier, 0)
         if lasting is not None:
             # The last tier is for lights that have lasted; others stop one below.
-            tier = np.minimum(tier, np.where(lasting[wanted], len(self.paths), len(self.paths) - 2))
+            tier = np.minimum(tier, np.where(lasting[bright], len(self.paths), len(self.paths) - 2))
         traced = 0
         for i in reversed(range(len(self.paths))):
-            todo = wanted[(tier == i) & (exact.paths_of[wanted] < self.paths[i])]
+            todo = bright[(tier == i) & (exact.paths_of[bright] < self.paths[i])]
             todo = todo[: None if limit is None else limit - traced]
             if len(todo):
-                exact.trace(todo, self.paths[i], self.seed, wanted)
+                exact.trace(todo, self.paths[i], self.seed, bright)
                 traced += len(todo)
         return traced
 
@@ -577,8 +598,8 @@ class LightTransport:
         """List every texel's radiance, its largest channel, and solid angle; 0 where no light comes from."""
         omega = np.repeat(latlong.solid_angles(self.grid.height, self.grid.width), self.grid.width)
         # A texel that no sample has met may matter as much as its row: rows are known from many samples.
-        seen = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
-        return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * seen, omega * seen
+        reached = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
+        return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * reached, omega * reached
 
     def bright_texels(self, envmap: np.ndarray, tolerance: float | None = None) -> np.ndarray:
         """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""

@@ -77,23 +77,19 @@ def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, s
 
     Parameters
     ----------
-    scene : mi.Scene
-        Its sensors are the views.
+    scene, bounces, seed
+        As of :func:`.camera_paths.trace`.
     grid : Grid
         Texels that escaping rays are recorded by.
-    pixels : int
-        Pixels of the picture.
-    count : int
-        Camera paths a pixel.
-    bounces : int
-        Surface points along a path.
-    seed : int
-        Seed of every random choice.
+    pixels, count : int
+        Pixels of the picture, and camera paths a pixel.
     """
     size = max(SLICE, LANES // count // SLICE * SLICE)
     for first in range(0, pixels, size):
         some = np.arange(first, min(first + size, pixels), dtype=np.uint32)
-        block, vertices, escapes = Block(first, len(some)), [], []
+        block = Block(first, len(some))
+        vertices = []
+        escapes = []
         for event in camera_paths.trace(scene, some, count, bounces, seed):
             if isinstance(event, camera_paths.Escape):
                 escapes.append(_escapes(event, grid, count, first))
@@ -119,8 +115,8 @@ def _of_first(value, count):
 def _vertices(event, count, first):
     """Take the vertices that a light can reach; None if there are none."""
     # A filter with negative lobes makes negative throughputs; NaN is kept: what uses it counts what it loses.
-    lit = event.active & mi.has_flag(event.si.bsdf().flags(), _SHADING) & dr.any(event.throughput != 0)
-    index, some = _where(lit)
+    smooth = mi.has_flag(event.si.bsdf().flags(), _SHADING)
+    index, some = _where(event.active & smooth & dr.any(event.throughput != 0))
     if not some:
         return None
     ray, hit = event.hit
@@ -128,10 +124,11 @@ def _vertices(event, count, first):
     kept = tuple(dr.gather(type(v), v, index) for v in (ray.o, ray.d, ray.time, *at))
     throughput = _of_first(dr.gather(mi.Color3f, event.throughput, index), some)
     pixel = index // dr.opaque(mi.UInt32, count)
-    path, bounce = index - pixel * dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, event.bounce)
-    found = kept, throughput, bounce + 0 * index, path, pixel + dr.opaque(mi.UInt32, first)
-    dr.make_opaque(found)  # literals would make other kernels
-    return found
+    path = index - pixel * dr.opaque(mi.UInt32, count)
+    bounce = dr.opaque(mi.UInt32, event.bounce)
+    vertices = kept, throughput, bounce + 0 * index, path, pixel + dr.opaque(mi.UInt32, first)
+    dr.make_opaque(vertices)  # literals would make other kernels
+    return vertices
 
 
 def _sort(block, parts):
@@ -173,9 +170,9 @@ def _escapes(event, grid, count, first):
     light = dr.gather(mi.Color3f, throughput, index) * (weight / dr.opaque(mi.Float, count))
     texels, shares = zip(*taps, strict=True)
     pixel = dr.opaque(mi.UInt32, first) + index // dr.opaque(mi.UInt32, count)
-    found = texels, shares, tuple(_of_first(light, some)), pixel
-    dr.eval(found)
-    return found
+    escapes = texels, shares, tuple(_of_first(light, some)), pixel
+    dr.eval(escapes)
+    return escapes
 
 
 def _join(block, parts):
@@ -199,8 +196,8 @@ def _joined(parts, places):
     leaves = [list(_leaves(part)) for part in parts]
     total = sum(len(place) for place in places)
     joined = [dr.empty(type(leaf), total) for leaf in leaves[0]]
-    for place, one in zip(places, leaves, strict=True):
-        for target, leaf in zip(joined, one, strict=True):
+    for place, members in zip(places, leaves, strict=True):
+        for target, leaf in zip(joined, members, strict=True):
             dr.scatter(target, leaf, place)
     dr.eval(joined)
     return _of_leaves(parts[0], iter(joined))
@@ -228,10 +225,10 @@ def _of_leaves(like, leaves):
     if kind is tuple:
         return tuple(_of_leaves(member, leaves) for member in like)
     if members := getattr(kind, "DRJIT_STRUCT", None):
-        made = kind()
+        structure = kind()
         for name in members:
-            setattr(made, name, _of_leaves(getattr(like, name), leaves))
-        return made
+            setattr(structure, name, _of_leaves(getattr(like, name), leaves))
+        return structure
     if dr.depth_v(kind) > 1:
         members = [_of_leaves(member, leaves) for member in like]
         return kind(*members) if members else like
@@ -297,8 +294,13 @@ def _interaction(hits, lane):
     """Return the surface interactions of kept vertices, as :mod:`.camera_paths` had them."""
     o, d, time, t, uv, prim, index, shape, instance = (dr.gather(type(v), v, lane) for v in hits)
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(lane))
-    hit.valid, hit.t, hit.prim_uv, hit.prim_index = mi.Bool(True), t, uv, prim
-    hit.shape_index, hit.shape, hit.instance = index, shape, instance
+    hit.valid = mi.Bool(True)
+    hit.t = t
+    hit.prim_uv = uv
+    hit.prim_index = prim
+    hit.shape_index = index
+    hit.shape = shape
+    hit.instance = instance
     ray = mi.Ray3f(o, d, time, [])
     return hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(True))
 
@@ -307,9 +309,11 @@ def _interaction(hits, lane):
 def _connect(scene, grid, block, texels, each, count, values, lost):
     """Write what a vertex adds for every texel: value t * vertices + v."""
     v = dr.arange(mi.UInt32, block.vertices)
-    si, throughput = _interaction(block.hits, v), dr.gather(mi.Color3f, block.throughput, v)
+    si = _interaction(block.hits, v)
+    throughput = dr.gather(mi.Color3f, block.throughput, v)
     bounce, path, pixel = (dr.gather(mi.UInt32, a, v) for a in (block.bounce, block.path, block.pixel))
-    vertices, per_pixel = dr.opaque(mi.UInt32, block.vertices), dr.opaque(mi.Float, count)
+    vertices = dr.opaque(mi.UInt32, block.vertices)
+    per_pixel = dr.opaque(mi.Float, count)
     uniform = dr.opaque(mi.Float, grid.width * max(grid.height - 1, 1))  # over (u, v), one sample a texel
     t = dr.zeros(mi.UInt32, block.vertices)
     while t < texels:

@@ -33,7 +33,8 @@ PATHS = 1 << 22
 """Paths of a recording, all pixels together: more pixels need fewer each, as neighbours see the same map."""
 FEWEST_SPP, MOST_SPP = 16, 256
 """Paths a pixel between which "auto" chooses."""
-AUTO_GB, COARSE_SHARE = 2.0, 0.7
+AUTO_GB = 2.0
+COARSE_SHARE = 0.7
 """GB of memory that "auto" allows; share of it that samples of "auto" may fill: the rest is for columns."""
 PILOT_SPP = 16
 """Paths a pixel of the pilot, whose sums over rows and bounces are of the whole picture."""
@@ -76,7 +77,8 @@ def connect(
     sampled : Float
         Solid-angle density of the texel sample there.
     """
-    si, bsdf = vertex.si, vertex.si.bsdf()
+    si = vertex.si
+    bsdf = vertex.si.bsdf()
     active = vertex.active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (jacobian > 0)
     wo = si.to_local(direction)
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
@@ -93,13 +95,7 @@ def bsdf_weight(pdf: mi.Float, sampled: mi.Float) -> mi.Float:
 
 
 def contributions(
-    scene: mi.Scene,
-    grid: Grid,
-    pixels: np.ndarray,
-    spp: int,
-    bounces: int,
-    seed: int,
-    beyond: bool = False,
+    scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: int, seed: int, beyond: bool = False
 ) -> Iterator[tuple[int | mi.UInt32, mi.UInt32, mi.UInt32, mi.Color3f]]:
     """Yield (bounce, pixel of each lane, texel, RGB weight) of one block of pixels, as batches on the device.
 
@@ -112,20 +108,12 @@ def contributions(
 
     Parameters
     ----------
-    scene : mi.Scene
-        Its sensors are the views.
+    scene, pixels, bounces, seed, beyond
+        As of :func:`.camera_paths.trace`; with ``beyond`` the last batch has an array of bounces.
     grid : Grid
         Where the rays go.
-    pixels : ndarray of uint32
-        Indices row * width + column of the pixels.
     spp : int
         Camera paths a pixel.
-    bounces : int
-        Surface points along a path.
-    seed : int
-        Seed of every random choice.
-    beyond : bool
-        As of :func:`.camera_paths.trace`: the last batch has an array of bounces then.
     """
     lane = dr.arange(mi.UInt32, len(pixels) * spp)
     pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), lane // spp)
@@ -151,7 +139,10 @@ def record(scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: i
     A contribution that is not finite (a BSDF that overflows) would make its pixel non-finite under any map:
     it is left out and counted.
     """
-    rows, columns, weights, lost = [], [], [], 0
+    rows = []
+    columns = []
+    weights = []
+    lost = 0
     for _, pixel, texel, value in contributions(scene, grid, pixels, spp, bounces, seed):
         dr.eval(pixel, texel, value)  # once: each read-back below would trace the rays again
         finite = dr.all(dr.isfinite(value))
@@ -182,7 +173,8 @@ def record_all(
     progress : callable, optional
         Called with (done, total) blocks.
     """
-    pixels, block = scene.width * scene.height, max(1, LANES // spp)
+    pixels = scene.width * scene.height
+    block = max(1, LANES // spp)
     starts = range(0, pixels, block)
     parts = []
     for i, start in enumerate(starts):

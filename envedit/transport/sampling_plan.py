@@ -36,24 +36,18 @@ FEW_PATHS, FEW_TOLERANCE = (8, 16, 48), 0.08
 class SamplingPlan:
     """How T is sampled; made by :func:`choose`.
 
+    Other attributes are those of :class:`.LightTransport`.
+
     Attributes
     ----------
-    spp, bounces, capacity : int
-        Paths a pixel of the coarse tier, surface points along a path, most exact columns.
     mass : ndarray (H,)
         Share of the samples by row of the map, up to a factor.
     lamps : int
         Path depth of the light of other lamps; 0: there are none; -1: any.
-    depth_error : float
-        Share of the picture under a white sky that comes from deeper paths.
-    paths, tolerance : (int, int, int), float
-        Paths a pixel of exact columns, and the error of the coarse tier from which on there are any.
     paths_bytes : int
         Memory for camera paths that are kept for further columns.
     choices : tuple of str
         What was chosen automatically, with the measurement that decided.
-    warnings : tuple of str
-        What the user should know: how much light comes by longer paths.
     """
 
     spp: int
@@ -82,10 +76,8 @@ def white_sky(
     known = {"by_row": ("f8", (height,)), "by_bounce": ("f8", (None,))}
     light = cache.load(
         key,
-        lambda found: (
-            holds(found, known)
-            and len(found["by_bounce"]) > MAX_BOUNCES
-            and found["by_bounce"].sum() > 0
+        lambda arrays: (
+            holds(arrays, known) and len(arrays["by_bounce"]) > MAX_BOUNCES and arrays["by_bounce"].sum() > 0
         ),
     )
     if light is None:
@@ -125,18 +117,22 @@ def choose(
     InputError
         As of :func:`.recording.choose_bounces` and :func:`.recording.choose_samples`.
     """
+    # ---- Path depth and samples
     by_row, by_bounce = light[0], light[1].copy()
     if scene.max_depth > 0:
         by_bounce[scene.max_depth :] = 0
     bounces, choices = choose_bounces(scene, max_depth, by_bounce)
     samples, capacity, choice = choose_samples(scene, spp, shape[0] * shape[1], memory_gb)
-    depth_error, warnings = left_out(by_bounce, bounces), []
+    depth_error = left_out(by_bounce, bounces)
+    warnings = []
     if depth_error > DEPTH_TOLERANCE:
         warnings.append(
             f"light transport: paths of more than {bounces + 1} segments are left out, which add "
             f"{100 * depth_error:.2g} % of the picture under a white sky: set [renderer] max_depth = "
             f"{enough_bounces(by_bounce) + 1}"
         )
+
+    # ---- What memory is left holds the camera paths of exact columns
     left = memory_gb - gigabytes(scene.width * scene.height, samples, capacity)
     # The light of other lamps is constant: it need not be cut where no path depth is asked for.
     most = scene.max_depth if max_depth == "auto" else bounces + 1

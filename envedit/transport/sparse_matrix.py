@@ -112,14 +112,16 @@ class ColourMatrix:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ColourMatrix:
         """Make a matrix of what :meth:`arrays` returned; its products have the same bits."""
         matrix = cls.__new__(cls)
-        matrix.shape, matrix.entries = tuple(arrays["shape"].tolist()), int(arrays["entries"])
+        matrix.shape = tuple(arrays["shape"].tolist())
+        matrix.entries = int(arrays["entries"])
         matrix._upload(*(arrays[name] for name in ("packed", "start", "stop", "lane")))
         return matrix
 
     def coordinates(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows (n,), columns (n,) and weights (n, 3) of the entries that are not zero."""
         stored = self.arrays()
-        packed, first = stored["packed"].reshape(-1, 4), stored["start"][::SLICE].astype(np.int64)
+        packed = stored["packed"].reshape(-1, 4)
+        first = stored["start"][::SLICE].astype(np.int64)
         row_of = np.full(len(stored["start"]), -1, np.int64)
         row_of[stored["lane"]] = np.arange(len(stored["lane"]))
         place = np.arange(len(packed))
@@ -154,9 +156,9 @@ class ColourMatrix:
         within = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
         entries = packed[start[row] + within * SLICE]
         column = entries[:, 3].copy().view(np.uint32)
-        for one, colours in zip(total, values, strict=True):
+        for product, colours in zip(total, values, strict=True):
             for c in range(3):
-                one[:, c] = np.bincount(column, entries[:, c] * colours[row, c], self.shape[1])
+                product[:, c] = np.bincount(column, entries[:, c] * colours[row, c], self.shape[1])
         return total
 
     def apply(self, x: mi.Float, count: int = 1) -> list[mi.Color3f]:
@@ -174,17 +176,17 @@ class ColourMatrix:
         list of Color3f
             Of each vector one colour per row.
         """
-        y = _product(self._packed, x, self._start, self._stop, count)
-        dr.eval(y)
-        return [dr.gather(mi.Color3f, one, self._lane) for one in y]
+        products = _product(self._packed, x, self._start, self._stop, count)
+        dr.eval(products)
+        return [dr.gather(mi.Color3f, product, self._lane) for product in products]
 
 
 def _largest(values):
     """Return the largest of every fourth value, (4,): rows of 1024 go at the speed of memory."""
     whole = len(values) // 1024 * 1024
     parts = values[:whole].reshape(-1, 1024), values[whole:].reshape(-1, 4)
-    found = [part.max(axis=0).reshape(-1, 4).max(axis=0) for part in parts if len(part)]
-    return np.max(found, axis=0)
+    maxima = [part.max(axis=0).reshape(-1, 4).max(axis=0) for part in parts if len(part)]
+    return np.max(maxima, axis=0)
 
 
 @dr.syntax
@@ -202,11 +204,11 @@ def add_products(
     total: list[mi.Color3f], weight: mi.Vector4f, packets: mi.Float, column: mi.UInt32
 ) -> list[mi.Color3f]:
     """Add to the total of each vector a weight times its colour in a column."""
-    found = []
-    for k, one in enumerate(total):
+    sums = []
+    for k, before in enumerate(total):
         value = dr.gather(mi.Vector4f, packets, column * len(total) + k if len(total) > 1 else column)
-        found.append(one + mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z))
-    return found
+        sums.append(before + mi.Color3f(weight.x * value.x, weight.y * value.y, weight.z * value.z))
+    return sums
 
 
 def to_packets(flat: mi.Float, size: int, count: int = 1) -> mi.Float:

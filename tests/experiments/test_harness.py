@@ -177,6 +177,7 @@ COUNTS = {
     "painted_edits": 18,
     "painted_edits.artists": 296,
     "paper": 540,
+    "photograph": 396,
     "pictures": 30,
     "scenes": 6,
     "solver.edits": 14,

@@ -306,3 +306,33 @@ def test_importing_envedit_limits_the_threads_of_numpy_but_not_against_the_user(
 def test_importing_envedit_imports_no_mitsuba():
     code = "import sys, envedit; dir(envedit); assert 'mitsuba' not in sys.modules; envedit.Config()"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.slow
+def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatch):
+    """The example: the sun of the photograph is found, its curve too, and the box casts a shadow."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    found = runpy.run_path(str(ROOT / "docs" / "insert_in_python.py"))
+    result = found["result"]
+
+    # ---- Light and camera
+    (sun,) = result.lights["after"]
+    assert abs(sun["azimuth"] - 150) < 4 and abs(sun["elevation"] - 30) < 4
+    camera = result.metrics["camera"]
+    assert camera["curve"] == "filmic" and camera["outliers"] < 0.1
+    assert abs(camera["exposure"] - found["phone"].stops) < 0.6
+    assert result.metrics["render"]["psnr"] > 30 and not result.warnings
+
+    # ---- What is written
+    saved = images.read_stored(tmp_path / "matched" / "photograph.png")[0]
+    assert saved.shape == (40, 3 * 40, 3)
+    assert f"curve {camera['curve']}" in (tmp_path / "matched" / "report.html").read_text()
+    assert 'kind = "photo"' in (tmp_path / "matched" / "config.toml").read_text()
+
+    # ---- The object: its own pixels, a shadow beside it, and nothing far from it
+    outline = found["outline"][..., 0]
+    ratio = (found["composed"] / found["photo"].picture)[..., 1]
+    assert 0.01 < (outline == 1).mean() < 0.1
+    assert ratio[outline == 0].min() < 0.7
+    assert abs(np.median(ratio[outline == 0]) - 1) < 0.05

@@ -192,7 +192,7 @@ def test_it_is_a_json_schema_to_another_program_as_well():
 def test_checks_can_be_inspected():
     assert FIELDS["input"]["width"].metadata["check"] == Integer(6, 16384, even=True)
     assert FIELDS["target"]["kind"].metadata["check"].names == (
-        "envmap", "rendering", "image", "strokes", "none",
+        "envmap", "rendering", "photo", "image", "strokes", "none",
     )  # fmt: skip
     for check in CHECKS.values():
         assert isinstance(check, Check) and check.kind and str(check) and "object at" not in repr(check)

@@ -54,7 +54,7 @@ def test_a_turn_goes_the_way_of_the_map():
     turned = latlong.rotate(envmap, 45.0)
     lists = [light_list.listed(separate(one).lights, one.shape[:2], np.eye(3)) for one in (envmap, turned)]
     assert [len(one) for one in lists] == [2, 2]
-    start, end = (np.array([light_list._toward(one) for one in lights]) for lights in lists)
+    start, end = (np.array([one["direction"] for one in lights]) for lights in lists)
     np.testing.assert_allclose(light_list._turned(start, 45.0), end, atol=1e-4)
     np.testing.assert_allclose(start[0], latlong.directions(HEIGHT, WIDTH)[9, 50], atol=1e-4)
     assert [row[0] for row in numbers(light_list.matched(*lists, 45.0))] == [1, 2]

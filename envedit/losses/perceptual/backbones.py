@@ -15,9 +15,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import DrArray, FilePath
 from envedit.losses.perceptual import convolution, weights
 
-# --------------------------------------------------------------------------------------------------------
-# The stacks, as torchvision has them
-# --------------------------------------------------------------------------------------------------------
+# ---- The stacks, as torchvision has them -------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -39,11 +37,11 @@ class Conv:
     def parts(self) -> dict[str, tuple[int, ...]]:
         """Name the tensors of the layer, with their shapes in torchvision's layout (O, I, kh, kw)."""
         outputs = self.outputs // len(self.names)
-        found: dict[str, tuple[int, ...]] = {}
+        shapes: dict[str, tuple[int, ...]] = {}
         for name, k in zip(self.names, self.kernels or (self.kernel,), strict=True):
-            found[name + ".weight"] = outputs, self.inputs, k, k
-            found[name + ".bias"] = (outputs,)
-        return found
+            shapes[name + ".weight"] = outputs, self.inputs, k, k
+            shapes[name + ".bias"] = (outputs,)
+        return shapes
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,8 @@ def _vgg16():
             index += 1
         for i in range(count):
             layers.append(Conv((f"features.{index}",), channels, width, 3, padding=1, tap=i == count - 1))
-            channels, index = width, index + 2
+            channels = width
+            index = index + 2
     return layers
 
 
@@ -132,7 +131,8 @@ class Backbone:
     """
 
     def __init__(self, kind: str, tensors: dict[str, np.ndarray]):
-        self.title, self.kind = title(kind), kind
+        self.title = title(kind)
+        self.kind = kind
         self.layers = KINDS[kind][1]()
         self.channels = [layer.outputs for layer in self.layers if isinstance(layer, Conv) and layer.tap]
         self._weights = [
@@ -154,11 +154,11 @@ class Backbone:
         """
         title(kind)
         words, layers, model, original = KINDS[kind]
-        wanted: dict[str, tuple[int, ...]] = {}
+        shapes: dict[str, tuple[int, ...]] = {}
         for layer in layers():
-            wanted |= layer.parts() if isinstance(layer, Conv) else {}
+            shapes |= layer.parts() if isinstance(layer, Conv) else {}
         source = f"torchvision.models.{model}, https://download.pytorch.org/models/{original}"
-        return cls(kind, weights.read(file, wanted, words, source))
+        return cls(kind, weights.read(file, shapes, words, source))
 
     def least_size(self, pooling: str = "max") -> int:
         """Return how many pixels an image must have along each side to leave one after the last layer."""
@@ -218,9 +218,7 @@ def _as_matrix(layer, tensors):
     return tensor(matrix), dr.opaque(mi.Float(bias))
 
 
-# --------------------------------------------------------------------------------------------------------
-# A network laid out for one size of image
-# --------------------------------------------------------------------------------------------------------
+# ---- A network laid out for one size of image --------------------------------------------------------------
 
 
 class Stack:
@@ -244,8 +242,9 @@ class Stack:
             if isinstance(layer, Conv):
                 channels = layer.outputs
                 matrix, bias = matrices[i]
-                sizes = layer.kernel, layer.stride, layer.padding
-                step = convolution.Convolution(matrix, bias, before, (*after, channels), *sizes)
+                step = convolution.Convolution(
+                    matrix, bias, before, (*after, channels), layer.kernel, layer.stride, layer.padding
+                )
                 if layer.tap:
                     self._tapped.append((i + 1, after[0] * after[1], channels))
                     self.channels.append(channels)

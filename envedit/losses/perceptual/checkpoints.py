@@ -47,14 +47,14 @@ def read(data: bytes, name: str) -> dict[str, Any]:
             for _ in range(3):  # magic number, version, sizes of types
                 _Arrays(stream).load()
             reader = _Arrays(stream)
-            found = reader.load()
+            table = reader.load()
             for key in _Arrays(stream).load():
                 reader.fill(key, stream)
         else:
-            found = _Arrays(stream).load()
-        if not isinstance(found, Mapping):
-            raise pickle.UnpicklingError(f"it holds {type(found).__name__}, no table of arrays")
-        return _plain(found)
+            table = _Arrays(stream).load()
+        if not isinstance(table, Mapping):
+            raise pickle.UnpicklingError(f"it holds {type(table).__name__}, no table of arrays")
+        return _plain(table)
     except Exception as error:  # what a damaged pickle raises has many names
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise InputError(f"{name}: no checkpoint of float32 arrays ({reason})") from None
@@ -83,7 +83,8 @@ class _Arrays(pickle.Unpickler):
     def fill(self, key: str, stream: io.BytesIO) -> None:
         """Read the numbers of a storage: their count in 8 bytes, then float32."""
         storage = self._storages[key]
-        count, data = int.from_bytes(stream.read(8), "little"), stream.read(storage.nbytes)
+        count = int.from_bytes(stream.read(8), "little")
+        data = stream.read(storage.nbytes)
         if count != len(storage) or len(data) != storage.nbytes:
             raise pickle.UnpicklingError("a storage has another size than its tensor")
         storage[:] = np.frombuffer(data, "<f4")
@@ -122,9 +123,9 @@ def _torch_tensor(storage: np.ndarray, offset: int, shape: tuple, stride: tuple,
     expected = tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
     if tuple(stride) != expected:
         raise pickle.UnpicklingError(f"a tensor with the strides {stride}")
-    found = _Array()
-    found.values = storage[offset : offset + math.prod(shape)].reshape(shape)
-    return found
+    tensor = _Array()
+    tensor.values = storage[offset : offset + math.prod(shape)].reshape(shape)
+    return tensor
 
 
 _KNOWN: dict[tuple[str, str], Any] = {
@@ -137,10 +138,10 @@ _KNOWN: dict[tuple[str, str], Any] = {
 }
 
 
-def _plain(found: Mapping) -> dict[str, Any]:
+def _plain(table: Mapping) -> dict[str, Any]:
     """Put arrays in the place of their placeholders, and refuse anything else."""
     plain: dict[str, Any] = {}
-    for key, value in found.items():
+    for key, value in table.items():
         if isinstance(value, Mapping):
             plain[str(key)] = _plain(value)
         elif isinstance(value, _Array):

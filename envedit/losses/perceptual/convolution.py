@@ -51,7 +51,10 @@ class _Windows:
     """
 
     def __init__(self, before, after, kernel, stride, padding, together=None):
-        self.before, self.after, self.kernel, self.stride = before, after[:2], kernel, stride
+        self.before = before
+        self.after = after[:2]
+        self.kernel = kernel
+        self.stride = stride
         self.together = together or (4 if before[2] % 4 == 0 else 1)
         self.packets = before[2] // self.together
         sizes = *before[:2], *after[:2], stride, padding
@@ -150,8 +153,11 @@ class Convolution:
         stride: int,
         padding: int,
     ):
-        self._matrix, self._bias = matrix, bias
-        self._before, self._after, self._outputs = before, after, after[2]
+        self._matrix = matrix
+        self._bias = bias
+        self._before = before
+        self._after = after
+        self._outputs = after[2]
         self._kernel, self._stride, self._padding = kernel, stride, padding
         self._columns = kernel * kernel * before[2]
         self._windows = _Windows(before, after, kernel, stride, padding)
@@ -161,7 +167,8 @@ class Convolution:
 
     def forward(self, x: DrArray) -> tuple[DrArray, None]:
         """Return max(W patches + bias, 0), and nothing to keep."""
-        height, parts = self._after[0], []
+        height = self._after[0]
+        parts = []
         for first in range(0, height, self._rows):
             rows = min(self._rows, height - first)
             patches = x if self._pointwise else self._patches(x, first, rows)
@@ -176,12 +183,13 @@ class Convolution:
         """Pull a gradient back; where the ReLU gave 0, its slope is 0."""
         gradient = dr.select(y <= 0, 0, gradient)
         dr.eval(gradient)
-        height, stride, padding, parts = self._before[0], self._stride, self._padding, []
-        rows = self._rows * stride
+        height = self._before[0]
+        rows = self._rows * self._stride
+        parts = []
         for first in range(0, height, rows):
             stop = min(first + rows, height)
-            low = max(-(-(first + padding - self._kernel + 1) // stride), 0)
-            high = min((stop - 1 + padding) // stride + 1, self._after[0])
+            low = max(-(-(first + self._padding - self._kernel + 1) // self._stride), 0)
+            high = min((stop - 1 + self._padding) // self._stride + 1, self._after[0])
             parts.append(self._pull(gradient, first, stop, low, high))
             dr.eval(parts[-1])
         return _joined(parts)
@@ -198,7 +206,8 @@ class Convolution:
 
     def _pull(self, gradient, first, stop, low, high):
         """Gradient of input rows first ... stop - 1, which the output rows low ... high - 1 depend on."""
-        F, windows = type(gradient), self._windows
+        F = type(gradient)
+        windows = self._windows
         i, row, column, c = windows.inputs(first, stop - first)
         if low >= high:  # rows at the end that no window reaches
             return dr.zeros(F, len(i) * windows.together)
@@ -209,7 +218,8 @@ class Convolution:
         patches = dr.matmul(_rows_of(gradient, self._outputs), self._weights(F)).array
         if self._pointwise:
             return patches
-        total, low = 0, dr.opaque(mi.Int32, low)
+        total = 0
+        low = dr.opaque(mi.Int32, low)
         for y, x, tap_y, tap_x, inside in windows.over(row, column):
             total += windows.read(patches, windows.patch(y - low, x, tap_y, tap_x, c), inside)
         return windows.write(F, total, i)
@@ -224,7 +234,8 @@ class MaxPool:
 
     def forward(self, x: DrArray) -> tuple[DrArray, DrArray]:
         """Return the largest of every window, and under which tap it is."""
-        windows, best, winner = self._windows, None, None
+        windows = self._windows
+        best = winner = None
         _, row, column, c = windows.outputs()
         for tap in range(self._kernel**2):
             index, inside = windows.under(row, column, *divmod(tap, self._kernel), c)
@@ -239,7 +250,8 @@ class MaxPool:
 
     def backward(self, x: DrArray, y: DrArray, winner: DrArray, gradient: DrArray) -> DrArray:
         """Give the gradient of a window to its largest."""
-        windows, total = self._windows, 0
+        windows = self._windows
+        total = 0
         dr.eval(gradient)
         _, row, column, c = windows.inputs(0, windows.before[0])
         for y_, x_, tap_y, tap_x, inside in windows.over(row, column):
@@ -258,7 +270,8 @@ class HanningPool:
 
     def forward(self, x: DrArray) -> tuple[DrArray, None]:
         """Return the root of every window, and nothing to keep."""
-        windows, total = self._windows, 0
+        windows = self._windows
+        total = 0
         i, row, column, c = windows.outputs()
         for tap in range(9):
             tap_y, tap_x = divmod(tap, 3)
@@ -270,7 +283,8 @@ class HanningPool:
 
     def backward(self, x: DrArray, y: DrArray, _: None, gradient: DrArray) -> DrArray:
         """Pull a gradient back: w x / root, summed over the windows."""
-        windows, total = self._windows, 0
+        windows = self._windows
+        total = 0
         quotient = gradient / y
         dr.eval(quotient)
         i, row, column, c = windows.inputs(0, windows.before[0])

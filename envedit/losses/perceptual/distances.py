@@ -36,9 +36,7 @@ NORM_EPS = 1e-10
 """What LPIPS adds to the length of a feature before it divides by it."""
 
 
-# --------------------------------------------------------------------------------------------------------
-# DISTS
-# --------------------------------------------------------------------------------------------------------
+# ---- DISTS -------------------------------------------------------------------------------------------------
 
 
 class Dists:
@@ -135,7 +133,8 @@ class _DistsTo(Measure):
 
     def _evaluate(self, x, with_gradient):
         features, tape = self._features(x)
-        score, gradients = 0, []
+        score = 0
+        gradients = []
         for (value, pixels, channels), (y, mean_y, variance_y), (alpha, beta) in zip(
             features, self._reference, self._weights, strict=True
         ):
@@ -215,9 +214,7 @@ def _sums_of_stretches(x, y, mean_x, mean_d, lane, channels, pixels, rows):
     return sum_x, sum_d, square_x, square_d
 
 
-# --------------------------------------------------------------------------------------------------------
-# LPIPS
-# --------------------------------------------------------------------------------------------------------
+# ---- LPIPS -------------------------------------------------------------------------------------------------
 
 
 class Lpips:
@@ -253,25 +250,20 @@ class Lpips:
 
     def __init__(self, kind: str, backbone_file: FilePath | Backbone, heads_file: FilePath):
         words = title(kind)
-        self.kind, self.backbone = kind, _backbone(kind, backbone_file)
+        self.kind = kind
+        self.backbone = _backbone(kind, backbone_file)
         if self.backbone.kind != kind:
             raise ConfigError(
                 f"LPIPS '{kind}' needs the features of {words}, not those of {self.backbone.title}"
             )
-        wanted: dict[str, Shape] = {
+        shapes: dict[str, Shape] = {
             f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)
         }
-        read = weights.read(heads_file, wanted, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
-        self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in wanted]
+        read = weights.read(heads_file, shapes, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
+        self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in shapes]
 
     def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
-        """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``.
-
-        Raises
-        ------
-        InputError
-            If it is no image, is too small for the network, or gradients are expected of it.
-        """
+        """Return the distance to an image as :meth:`.Dists.against`; InputError also of one too small."""
         return _LpipsTo(self, reference)
 
     def __call__(self, a: Any, b: Any) -> float:
@@ -284,14 +276,14 @@ class Lpips:
             large that their features are not.
         """
         a, b = (single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
-        found = float(self.against(b)(a)[0])
-        if not np.isfinite(found):
+        distance = float(self.against(b)(a)[0])
+        if not np.isfinite(distance):
             raise InputError("LPIPS: the images hold values too large to compare; give display values.")
-        return found
+        return distance
 
 
-def _backbone(kind: str, given: FilePath | Backbone) -> Backbone:
-    return given if isinstance(given, Backbone) else Backbone.load(kind, given)
+def _backbone(kind: str, backbone: FilePath | Backbone) -> Backbone:
+    return backbone if isinstance(backbone, Backbone) else Backbone.load(kind, backbone)
 
 
 class _LpipsTo(Measure):
@@ -303,13 +295,16 @@ class _LpipsTo(Measure):
         dr.eval(self._reference)
 
     def _evaluate(self, x, with_gradient):
-        F, score, gradients = type(x), 0, []
+        F = type(x)
+        score = 0
+        gradients = []
         tape = self._stack.forward(normalised(x))
         for (value, pixels, channels), y, head in zip(
             self._stack.taps(tape), self._reference, self._heads, strict=True
         ):
             unit, norm, pixel, channel = _unit(value, pixels, channels)
-            difference, head = unit - y, F(head)
+            difference = unit - y
+            head = F(head)
             score += dr.sum(mi.Float64(_rowwise(dr.square(difference), head, channels))) / pixels
             if with_gradient:
                 slope = 2 / pixels * dr.gather(F, head, channel) * difference

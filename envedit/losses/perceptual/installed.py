@@ -37,7 +37,7 @@ def files(settings: config.Config) -> dict[str, str]:
     pairs = {("backbone", "heads"): (BACKBONES[named.network], HEADS.format(named.network))}
     if settings.loss.dists:
         pairs["vgg", "dists"] = VGG, DISTS
-    found: dict[str, str] = {}
+    chosen_files: dict[str, str] = {}
     for keys, names in pairs.items():
         paths = [getattr(named, key) for key in keys]
         if not paths[0] and chosen:
@@ -45,8 +45,8 @@ def files(settings: config.Config) -> dict[str, str]:
             if not named.weights and not all(map(os.path.isfile, paths)):
                 continue
         if paths[0]:
-            found |= zip(keys, paths, strict=True)
-    return found
+            chosen_files |= zip(keys, paths, strict=True)
+    return chosen_files
 
 
 def settled(settings: config.Config) -> config.Config:
@@ -64,9 +64,9 @@ def settled(settings: config.Config) -> config.Config:
 
 def missing(settings: config.Config) -> str:
     """Say that DISTS is off without weights, and how to get them; "" where it is on, or not asked for."""
-    asked = settings.loss.dists
-    if asked == "auto":
-        asked = settings.representation.kind == "siren"
-    if settings.target.kind == "none" or not asked or "vgg" in files(settings):
+    dists = settings.loss.dists
+    if dists == "auto":
+        dists = settings.representation.kind == "siren"
+    if settings.target.kind == "none" or not dists or "vgg" in files(settings):
         return ""
     return "DISTS is off: no trained weights; to fetch them once, 64 MB: `envedit weights`"

@@ -27,7 +27,8 @@ class Measure:
             raise InputError(
                 f"{name}: gradients of the reference are not available: swap the two, or detach it."
             )
-        self.name, self.shape = name, tuple(reference.shape)
+        self.name = name
+        self.shape = tuple(reference.shape)
         self._stack = backbone.stack(self.shape[0], self.shape[1], pooling)
 
     def __call__(self, x: Tensor) -> DrArray:

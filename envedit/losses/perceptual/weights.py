@@ -31,14 +31,14 @@ _SAFETENSORS: dict[str, np.dtype] = {
 }
 
 
-def read(file: FilePath, wanted: dict[str, tuple[int, ...]], what: str, source: str) -> dict[str, np.ndarray]:
+def read(file: FilePath, shapes: dict[str, tuple[int, ...]], what: str, source: str) -> dict[str, np.ndarray]:
     """Read named tensors, and nothing else, from a ``safetensors`` or ``npz`` file.
 
     Parameters
     ----------
     file : path-like
         The file. Its first bytes decide which format it has, not by its name.
-    wanted : dict
+    shapes : dict
         Name -> shape. Further tensors in the file are not looked at.
     what : str
         What the tensors are, for messages: "VGG16".
@@ -56,6 +56,7 @@ def read(file: FilePath, wanted: dict[str, tuple[int, ...]], what: str, source: 
         If the file cannot be read, is damaged or of another format, or a tensor is missing, has another
         shape or type, or holds values that are not finite.
     """
+    # ---- Read, by the format that the first bytes show
     name = os.fsdecode(file)
     try:
         if not os.path.isfile(name):  # opening a pipe would wait for ever
@@ -63,9 +64,9 @@ def read(file: FilePath, wanted: dict[str, tuple[int, ...]], what: str, source: 
         with open(name, "rb") as stream:
             head = stream.read(16)
             if head[:4] == b"PK\x03\x04":
-                found = _read_npz(name, stream, wanted, what, source)
+                tensors = _read_npz(name, stream, shapes, what, source)
             elif head[8:9] == b"{":
-                found = _read_safetensors(name, stream, wanted, what, source)
+                tensors = _read_safetensors(name, stream, shapes, what, source)
             elif head[:1] == b"\x80":
                 raise _pickled(name)
             else:
@@ -76,14 +77,16 @@ def read(file: FilePath, wanted: dict[str, tuple[int, ...]], what: str, source: 
         raise InputError(f"{name}: not enough memory to read the weights of {what}.") from None
     except Exception as e:  # what parsers make of damaged files has many names
         raise _damaged(name, getattr(e, "strerror", None) or e) from None
-    for tensor, values in found.items():
+
+    # ---- Refuse numbers that are not finite
+    for tensor, values in tensors.items():
         if not np.isfinite(values).all():
             place = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
             raise InputError(f"{name}: '{tensor}' holds {values[place]} at {place}; download it again.")
-    return found
+    return tensors
 
 
-def _read_safetensors(name, stream, wanted, what, source):
+def _read_safetensors(name, stream, shapes, what, source):
     """Read the format: header length (8 bytes, little-endian), header (JSON), data."""
     size = os.fstat(stream.fileno()).st_size
     stream.seek(0)
@@ -91,9 +94,10 @@ def _read_safetensors(name, stream, wanted, what, source):
     if length > min(MOST_HEADER, size - 8):
         raise _damaged(name, f"its header should have {length} bytes")
     header = json.loads(stream.read(length).decode("utf-8"), object_pairs_hook=_without_repetition)
-    start, found = 8 + length, {}
-    _check_names(name, header, wanted, what, source)
-    for tensor, shape in wanted.items():
+    start = 8 + length
+    tensors = {}
+    _check_names(name, header, shapes, what, source)
+    for tensor, shape in shapes.items():
         entry = header[tensor] if isinstance(header[tensor], dict) else {}
         kind, declared = entry.get("dtype"), entry.get("shape")
         place: Any = entry.get("data_offsets")
@@ -102,27 +106,28 @@ def _read_safetensors(name, stream, wanted, what, source):
         if not isinstance(kind, str) or kind not in _SAFETENSORS:
             raise _wrong_type(name, tensor, kind)
         _check_shape(name, tensor, declared, shape, what)
-        count, dtype = math.prod(shape), _SAFETENSORS[kind]
+        count = math.prod(shape)
+        dtype = _SAFETENSORS[kind]
         if place[1] - place[0] != count * dtype.itemsize:
             raise _damaged(name, f"'{tensor}' lies at bytes {place[0]} to {place[1]} of the data")
         stream.seek(start + place[0])
         values = np.frombuffer(_exactly(stream, count * dtype.itemsize), dtype)
         if kind == "BF16":  # the upper half of a float32
             values = (values.astype(np.uint32) << 16).view(np.float32)
-        found[tensor] = _single(values, shape)
-    return found
+        tensors[tensor] = _single(values, shape)
+    return tensors
 
 
-def _read_npz(name, stream, wanted, what, source):
+def _read_npz(name, stream, shapes, what, source):
     """Read the members ``TENSOR.npy`` of a zip archive, headers first."""
     stream.seek(0)
     with zipfile.ZipFile(stream) as archive:
         members = archive.namelist()
         if any(member.endswith("/data.pkl") for member in members):
             raise _pickled(name)
-        _check_names(name, [member.removesuffix(".npy") for member in members], wanted, what, source)
-        found = {}
-        for tensor, shape in wanted.items():
+        _check_names(name, [member.removesuffix(".npy") for member in members], shapes, what, source)
+        tensors = {}
+        for tensor, shape in shapes.items():
             # LZMA, which numpy does not write, takes the memory that its header asks for.
             if archive.getinfo(tensor + ".npy").compress_type not in (
                 zipfile.ZIP_STORED,
@@ -140,8 +145,8 @@ def _read_npz(name, stream, wanted, what, source):
                     raise _wrong_type(name, tensor, dtype)
                 _check_shape(name, tensor, declared, shape, what)
                 values = np.frombuffer(_exactly(member, math.prod(shape) * dtype.itemsize), dtype)
-                found[tensor] = _single(values, shape, "F" if columns_first else "C")
-    return found
+                tensors[tensor] = _single(values, shape, "F" if columns_first else "C")
+    return tensors
 
 
 def _single(values, shape, order="C"):
@@ -163,19 +168,19 @@ def _are_sizes(value):
 
 
 def _without_repetition(pairs):
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    table = dict(pairs)
+    if len(table) != len(pairs):
         raise ValueError("a name occurs twice in its header")
-    return found
+    return table
 
 
-def _check_names(name, present, wanted, what, source):
+def _check_names(name, present, shapes, what, source):
     if not isinstance(present, (dict, list)):
         raise _damaged(name, "its header is no table")
     present = set(present)
-    missing = [tensor for tensor in wanted if tensor not in present]
+    missing = [tensor for tensor in shapes if tensor not in present]
     if missing:
-        count = "" if len(missing) == 1 else f" and {len(missing) - 1} more of {len(wanted)} tensors"
+        count = "" if len(missing) == 1 else f" and {len(missing) - 1} more of {len(shapes)} tensors"
         raise InputError(
             f"{name}: does not hold the weights of {what}: no '{missing[0]}'{count}.\n"
             f"Names must be as in {source}"

@@ -59,14 +59,15 @@ def degrees_to_cores(lights: list[Light], shape: tuple[int, int], rows: tuple[in
 
     A core is taken to be a disc of the solid angle of its texels. ``rows`` is as of :func:`behind_glow`.
     """
-    (first, total), width = rows, shape[1]
+    (first, total) = rows
+    width = shape[1]
     toward = latlong.directions(total, width)[first : first + shape[0]]
     omega = latlong.lookup_solid_angles(total, width)
     glowing = [light for light in lights if light.glow is not None]
-    radii = [np.sqrt(omega[first + one.texels // width].sum() / np.pi) for one in glowing]
+    radii = [np.sqrt(omega[first + light.texels // width].sum() / np.pi) for light in glowing]
     if not glowing:
         return np.full(shape, 180.0)
-    angles = np.arccos(np.clip(toward @ np.transpose([one.direction for one in glowing]), -1, 1))
+    angles = np.arccos(np.clip(toward @ np.transpose([light.direction for light in glowing]), -1, 1))
     return np.degrees(np.maximum(angles - radii, 0).min(axis=2))
 
 

@@ -215,8 +215,8 @@ class Below:
             Share of the light that is gone where every glow is, and :func:`.near_core`.
         """
         share = 1 - near + near / np.maximum(gone, LEAST_GONE)
-        seen = 1 - (1 - self._blend[:, None, None]) * (1 - near)
-        self._behind = tensor(log_change * share * seen)
+        visible = 1 - (1 - self._blend[:, None, None]) * (1 - near)
+        self._behind = tensor(log_change * share * visible)
 
     def averaged(self, sky: mi.TensorXf) -> Averaged:
         """Return what :meth:`log_factor` compares of a sky (sky_rows, W, 3) without cores."""
@@ -241,22 +241,24 @@ class Below:
         self,
         sky: mi.TensorXf | Averaged,
         gone: mi.Float | None = None,
-        lit: mi.TensorXf | float = 0.0,
+        log_ground: mi.TensorXf | float = 0.0,
         before: mi.TensorXf | Averaged | None = None,
     ) -> mi.TensorXf:
         """Return the log factor (rows, W, 3) of the rows under a sky (sky_rows, W, 3) without cores.
 
-        ``before`` is the sky that it is compared with, the original by default, ``lit`` what else is to be
-        added (:meth:`log_lit`). With what is to be revealed, ``gone`` (sky_rows * W) is the share of a
+        ``before`` is the sky that it is compared with, the original by default, ``log_ground`` what else is
+        to be added (:meth:`log_lit`). With what is to be revealed, ``gone`` (sky_rows * W) is the share of a
         texel's light above the horizon that was a glow's and is gone.
         """
         before = self._before if before is None else before
-        old, new = (one if isinstance(one, Averaged) else self.averaged(one) for one in (before, sky))
+        old, new = (image if isinstance(image, Averaged) else self.averaged(image) for image in (before, sky))
         soft = dr.log((new.soft + self._faint) / (old.soft + self._faint))
         soft = dr.matmul(dr.matmul(self._up, soft), self._back)
         sharp = dr.log((new.sky.array + self._faint) / (old.sky.array + self._faint))
         sharp = mi.TensorXf(dr.gather(mi.Float, sharp, self._mirrored), soft.shape)
-        factor = settled(dr.reshape(sharp * self._sharp + soft * self._soft + lit, (*self.shape, 3)), 0)
+        factor = settled(
+            dr.reshape(sharp * self._sharp + soft * self._soft + log_ground, (*self.shape, 3)), 0
+        )
         if self._behind is None or gone is None:
             return factor
         gone = dr.gather(mi.Float, gone, self._mirrored // 3)
@@ -307,7 +309,7 @@ class _Blur:
         kernel = np.exp(-0.5 * (angle / width[:, None, None]) ** 2) * np.sin(theta)[:, None]
         kernel = (kernel / kernel.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
         self._kernel, self._adjoint = (
-            tensor(one.reshape(rows, rows * columns)) for one in (kernel, kernel.transpose(1, 0, 2))
+            tensor(matrix.reshape(rows, rows * columns)) for matrix in (kernel, kernel.transpose(1, 0, 2))
         )
 
     def __call__(self, sky: mi.TensorXf) -> mi.TensorXf:

@@ -110,7 +110,7 @@ class GridGain:
 
     def __init__(self, cycles: int, share: float, top: bool = True):
         self._share, self._top = share, top
-        self.poles = [row for row, there in ((0, top), (-1, top and share == 1)) if there]
+        self.poles = [row for row, at_pole in ((0, top), (-1, top and share == 1)) if at_pole]
         """Rows of nodes that lie at a pole: the first of each counts for all."""
         self.sizes = [grid_size(cycles / 2 ** (LEVELS - 1 - level), share) for level in range(LEVELS)]
         self._units: list[Any] = [0.5**level for level in range(LEVELS)]
@@ -150,8 +150,10 @@ class GridGain:
         tall, wide = min(3, rows), min(3, columns)
         y = np.round((np.arange(height) + 0.5) / height * (rows - 1)).astype(int)
         x = np.round((np.arange(width) + 0.5) / width * columns).astype(int)
-        first, left = np.clip(y - 1, 0, rows - tall), x - 1
-        poles, taps = [row % rows for row in self.poles], []
+        first = np.clip(y - 1, 0, rows - tall)
+        left = x - 1
+        poles = [row % rows for row in self.poles]
+        taps = []
         for a in range(tall):
             for b in range(wide):
                 row, column = first + a, (left + b) % columns

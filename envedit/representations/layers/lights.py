@@ -450,7 +450,8 @@ def interpolated_glow(table: mi.Float, cosine: mi.Float) -> mi.Color3f:
 
     Level within the first of GLOW_DEGREES, 0 beyond the last.
     """
-    step, last = float(GLOW_DEGREES[1]), len(GLOW_DEGREES) - 1
+    step = float(GLOW_DEGREES[1])
+    last = len(GLOW_DEGREES) - 1
     # The derivative of acos is infinite at 1: held off by less than the level part.
     angle = dr.acos(dr.clip(cosine, -1 + 1e-6, 1 - 1e-6)) * (180 / math.pi / step)
     node = dr.clip(mi.UInt32(angle), 0, last - 1)
@@ -495,10 +496,10 @@ class _Share(dr.CustomOp):
         sums = dr.zeros(mi.Int64, texels * 3)
         _scatter(sums, row, column, half, flux, scale, self.grid)
         dr.eval(sums)
-        lit = mi.Float(mi.Float64(sums) * dr.select(scale > 0, 1 / mi.Float64(scale), 0))
+        radiance = mi.Float(mi.Float64(sums) * dr.select(scale > 0, 1 / mi.Float64(scale), 0))
         # Summed in double precision: many bright points are no infinity.
         bad = ~dr.isfinite(dr.sum(mi.Float64(flux.x) + flux.y + flux.z + row + column + half))
-        return mi.TensorXf(dr.select(bad, dr.nan, lit), (*((pages,) if pages > 1 else ()), *shape, 3))
+        return mi.TensorXf(dr.select(bad, dr.nan, radiance), (*((pages,) if pages > 1 else ()), *shape, 3))
 
     def backward(self):
         row, column, half, flux = _pull(self.grad_out().array, *self.args, self.grid)

@@ -27,5 +27,5 @@ def saturated(radiance: mi.Color3f, exponent: mi.Float) -> mi.Color3f:
     # The derivative of a channel that is black at k = 1 is that by a smaller k.
     chroma = dr.replace_grad(dr.maximum(chroma, LEAST), chroma)
     chroma = dr.exp(exponent * dr.log(chroma))
-    made = chroma * (light / mi.luminance(chroma))
-    return dr.replace_grad(dr.select(exponent == 1, radiance, made), made)  # to the bit
+    result = chroma * (light / mi.luminance(chroma))
+    return dr.replace_grad(dr.select(exponent == 1, radiance, result), result)  # to the bit

@@ -230,8 +230,7 @@ def _survey(small: _Small, most: int) -> Survey | None:
     return Survey(label, filled(free, cores), small.rows, centres, glows, shares)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Finding
+# ---- Finding -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -310,7 +309,11 @@ def _reduced(image, first, total):
         whole = latlong.resize(whole, h, w).astype(np.float64)[start:stop]
         small = whole[..., :3] / np.maximum(whole[..., 3:], 1e-6)
     else:
-        small, h, w, start, stop = np.asarray(image, np.float64), total, width, first, first + height
+        small = np.asarray(image, np.float64)
+        h = total
+        w = width
+        start = first
+        stop = first + height
     toward = latlong.directions(h, w)[start:stop]
     omega = np.repeat(latlong.solid_angles(h, w)[start:stop, None], w, axis=1)
     return _Small(small, toward, omega, first, total, (start, h))
@@ -416,8 +419,7 @@ def components(mask: np.ndarray) -> np.ndarray:
         label = np.where(mask, met[least], far)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Glow and background
+# ---- Glow and background -----------------------------------------------------------------------------------
 
 
 def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarray) -> np.ndarray | None:

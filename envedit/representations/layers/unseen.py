@@ -12,5 +12,5 @@ _TINY = np.finfo(np.float32).tiny  # what is less, Dr.Jit takes as 0
 
 def unseen_kept(original: np.ndarray, edited: np.ndarray) -> np.ndarray:
     """Give texels of an edited image the original's bits where no channel changes by over :data:`UNSEEN`."""
-    seen = np.abs(edited - original) > np.maximum(UNSEEN * original, _TINY)
-    return np.where(seen.any(axis=2, keepdims=True), edited, original)
+    visible = np.abs(edited - original) > np.maximum(UNSEEN * original, _TINY)
+    return np.where(visible.any(axis=2, keepdims=True), edited, original)

@@ -34,7 +34,8 @@ MOST_REFUSED = 20
 SAVED_EVERY = 30.0
 """Seconds of training after which it is kept on disk, so that a killed fit goes on from there."""
 _RECIPE = 4  # raise when the same settings give another fit
-_NUMBERS, _ABOUT = ("log_psnr", "peak_ratio", "epochs", "seconds"), "about"
+_NUMBERS = ("log_psnr", "peak_ratio", "epochs", "seconds")
+_ABOUT = "about"
 
 
 @dataclass(frozen=True)
@@ -103,27 +104,8 @@ def fit(
 ) -> Fitted:
     """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
 
-    Parameters
-    ----------
-    image : ndarray (H, W, 3)
-        Linear radiance, finite and not negative.
-    network : config.Representation, optional
-        Width, depth and frequency; the standard preset's by default.
-    settings : config.Fit, optional
-        The recipe; the standard preset's by default.
-    seed : int
-        Seed of the initial weights.
-    rows : (int, int), optional
-        First row of the image in its map, and the rows of that map; None: the image is a whole map.
-    folder : Path, optional
-        Where fits are kept under a hash of image and settings, half-made ones too; None: nowhere.
-    progress : callable, optional
-        Called with (epoch, epochs, loss) now and then.
-
-    Returns
-    -------
-    Fitted
-        Read from ``folder`` if the same fit was made before, or continued if it was begun.
+    Parameters are those of :func:`envedit.fit`. The fit is read from ``folder`` if the same was made before,
+    and continued if it was begun.
 
     Raises
     ------
@@ -137,18 +119,25 @@ def fit(
     image = np.ascontiguousarray(image, np.float32)
     if not (good := np.isfinite(image) & (image >= 0)).all():
         raise InputError(f"fit: the texel at {place_of(~good)} is not finite or is negative: repair it")
-    cache, key = DiskCache(folder if settings.cache else None), _key(image, network, settings, seed, rows)
-    if found := cache.load(key, lambda arrays: _whole(arrays, network)):
-        return _read(found)
+
+    # ---- The same fit from disk
+    cache = DiskCache(folder if settings.cache else None)
+    key = _key(image, network, settings, seed, rows)
+    if stored := cache.load(key, lambda arrays: _whole(arrays, network)):
+        return _read(stored)
+
+    # ---- Training, continued if it was begun
     begun = _Begun(cache, key)
     normalisation = Normalisation.of(image, settings.headroom)
     x = points(network, image.shape[:2], rows)
     params = _train(image, normalisation, x, network, settings, seed, begun, progress)
     if settings.light:
-        wanted = normalisation.encode(image).reshape(-1, 3)
+        target = normalisation.encode(image).reshape(-1, 3)
         params = output_layer.last_layer(
-            params, x, network.omega, wanted, image.reshape(-1, 3), settings.light
+            params, x, network.omega, target, image.reshape(-1, 3), settings.light
         )
+
+    # ---- How well it does
     got = evaluate(params, normalisation, x, image.shape[:2], network.omega).numpy()
     if not np.isfinite(got).all():  # its last steps were refused, but too few of them to stop
         raise NumericalError("the fit ended with a network that is not finite; lower [fit] lr")
@@ -259,7 +248,8 @@ def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
 def _train(image, normalisation, x, network, settings, seed, begun, progress):
     params = siren.init(seed, network.hidden, network.depth, network.omega, inputs=x.shape[1])
     grids = _grids(image, normalisation, x, settings)
-    rng, order = np.random.default_rng(seed), list[int]()
+    rng = np.random.default_rng(seed)
+    order = list[int]()
     adam = optimizer.Adam(params, settings.lr, (0.9, settings.beta2))
     perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
     first, refused = begun.restore(adam)
@@ -308,14 +298,14 @@ class _Begun:
     def restore(self, adam: optimizer.Adam) -> tuple[int, int]:
         """Bring the optimiser to where it was; returns epochs done and steps refused."""
         expected = {k: (v.dtype, v.shape) for k, v in adam.state_dict().items()} | {_ABOUT: ("f8", (3,))}
-        found = self._cache.load(
+        state = self._cache.load(
             self._key, lambda arrays: holds(arrays, expected) and arrays[_ABOUT].min() >= 0
         )
-        if not found:
+        if not state:
             return 0, 0
-        found = dict(found)
-        epoch, refused, self._earlier = found.pop(_ABOUT).tolist()
-        adam.load_state_dict(found)
+        state = dict(state)
+        epoch, refused, self._earlier = state.pop(_ABOUT).tolist()
+        adam.load_state_dict(state)
         return int(epoch), int(refused)
 
     def keep(self, adam: optimizer.Adam, epoch: int, refused: int) -> None:
@@ -350,7 +340,7 @@ def _grids(image, normalisation, x, settings):
     return grids
 
 
-# ---------------------------------------------------------------------- fits on disk
+# ---- fits on disk ------------------------------------------------------------------------------------------
 
 
 def default_folder() -> Path:
@@ -371,15 +361,16 @@ def _key(image, network, settings, seed, rows):
 
 def _stored(fitted: Fitted) -> dict[str, np.ndarray]:
     """Put a fit into arrays; None becomes NaN."""
-    about, range_ = [getattr(fitted, name) for name in _NUMBERS], fitted.normalisation
+    about = [getattr(fitted, name) for name in _NUMBERS]
+    range_ = fitted.normalisation
     return fitted.params | {_ABOUT: np.array([range_.low, range_.span, *about], np.float64)}
 
 
 def _whole(arrays, network):
     """Return whether arrays from disk are a fit of such a network."""
     inputs = 2 if network.coordinates == "plane" else 3
-    made = siren.init(0, network.hidden, network.depth, network.omega, inputs)
-    shapes = {name: value.shape for name, value in made.items()}
+    parameters = siren.init(0, network.hidden, network.depth, network.omega, inputs)
+    shapes = {name: value.shape for name, value in parameters.items()}
     about = arrays[_ABOUT]
     params = {name: array for name, array in arrays.items() if name != _ABOUT}
     return (

@@ -185,7 +185,8 @@ def _sum_of_rows(x):
     n, width = x.shape
     parts = _sum_of_stretches(x.array, n, width)
     dr.eval(parts)
-    lane, total = dr.arange(mi.UInt32, width), dr.zeros(type(x.array), width)
+    lane = dr.arange(mi.UInt32, width)
+    total = dr.zeros(type(x.array), width)
     for stretch in range(_STRETCHES):
         total += dr.gather(type(x.array), parts, lane + stretch * width)
     return type(x)(total, (width,))

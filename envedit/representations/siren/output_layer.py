@@ -19,9 +19,9 @@ NEWTON_STEPS = 2
 
 
 def last_layer(
-    params: siren.Params, x: mi.TensorXf, omega: float, wanted: np.ndarray, light: np.ndarray, share: float
+    params: siren.Params, x: mi.TensorXf, omega: float, target: np.ndarray, light: np.ndarray, share: float
 ) -> siren.Params:
-    """Solve for the last layer that reproduces ``wanted`` best.
+    """Solve for the last layer that reproduces ``target`` best.
 
     Gauss-Newton on sum_i w_i (sigmoid(W h_i + b) - y_i)^2 + ridge |step|^2, channel by channel, in float64.
     The weight of a point is 1 + share * E_i / mean(E): points count by themselves, and by the light that they
@@ -35,7 +35,7 @@ def last_layer(
         Its points.
     omega : float
         Angular frequency.
-    wanted : ndarray (N, outputs)
+    target : ndarray (N, outputs)
         Values in [0, 1].
     light : ndarray (N, outputs)
         E, what the points hold, at least 0.
@@ -47,6 +47,7 @@ def last_layer(
     dict
         The parameters with another last layer; a channel whose solution is not finite or worse stays.
     """
+    # ---- Features, their weights, and the layer as it is
     last = siren.layers(params) - 1
     _, tape = siren.forward(params, x, omega)
     features = tape[-1][0].numpy().astype(np.float64)
@@ -57,6 +58,8 @@ def last_layer(
     light = light.astype(np.float64)
     mean = light.mean(axis=0)
     weight = 1 + share * light / np.where(mean > 0, mean, 1)
+
+    # ---- Gauss-Newton steps of each channel
     after = before.copy()
     damping = RIDGE * len(features) * np.eye(features.shape[1])
     for channel, row in enumerate(after):
@@ -64,13 +67,13 @@ def last_layer(
             y = _sigmoid(features @ row)
             root = np.sqrt(weight[:, channel] / weight[:, channel].mean())
             jacobian = features * (y * (1 - y) * root)[:, None]
-            residual = (wanted[:, channel] - y) * root
+            residual = (target[:, channel] - y) * root
             row += np.linalg.solve(jacobian.T @ jacobian + damping, jacobian.T @ residual)
 
     def errors(rows):
-        return (weight * (_sigmoid(features @ rows.T) - wanted) ** 2).sum(axis=0)
+        return (weight * (_sigmoid(features @ rows.T) - target) ** 2).sum(axis=0)
 
-    # A channel whose solution is not finite, or beyond the reach of two steps, stays as it was.
+    # ---- A channel whose solution is not finite, or beyond the reach of two steps, stays as it was
     after = np.where((errors(after) < errors(before))[:, None], after, before)
     solved = {f"{last}.weight": after[:, :-1], f"{last}.bias": after[:, -1]}
     solved = {name: tensor(v) for name, v in solved.items()}

@@ -33,7 +33,10 @@ class Siren:
         progress: Callable[[int, int, float], None] | None = None,
         rows: tuple[int, int] | None = None,
     ):
-        self.network, self.settings, self.folder, self.progress = network, settings, folder, progress
+        self.network = network
+        self.settings = settings
+        self.folder = folder
+        self.progress = progress
         self.fitted: fit.Fitted | None = None
         self._rows = rows
         self._shape: tuple[int, int] | None = None
@@ -45,7 +48,8 @@ class Siren:
         self.fitted = fit.fit(
             image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
         )
-        self._shape, self._points = image.shape[:2], {}
+        self._shape = image.shape[:2]
+        self._points = {}
         return {name: tensor(value) for name, value in self.fitted.params.items()}
 
     def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:

@@ -85,6 +85,7 @@ def convert(file: FilePath, xml: Path, camera: str = "", time: float | None = No
     MachineError
         The extra ``usd`` is not installed.
     """
+    # ---- Refuse what cannot be read or written
     file = Path(file).absolute()
     if importlib.util.find_spec("pxr") is None:
         how = "pip install 'envedit-hdr[usd]'"
@@ -95,6 +96,8 @@ def convert(file: FilePath, xml: Path, camera: str = "", time: float | None = No
     for path in (xml, folder):
         if path.exists() or path.is_symlink():
             raise InputError(f"{path}: exists already; give the scene another name")
+
+    # ---- Write beside the result, then rename
     try:
         with tempfile.TemporaryDirectory(prefix=f".{xml.name}.", dir=xml.parent) as temporary:
             draft = Path(temporary) / xml.name
@@ -120,8 +123,7 @@ def _answer(file, request):
     return answer
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Scenes that are kept
+# ---- Scenes that are kept ----------------------------------------------------------------------------------
 
 
 def kept(file: FilePath) -> Converted:
@@ -154,8 +156,8 @@ def kept(file: FilePath) -> Converted:
     except OSError as error:
         raise InputError(f"{root}: cannot be written ({error.strerror})") from None
     try:
-        made = convert(file, draft / f"{file.stem}.xml", "all")
-        known = {"notes": made.notes, "sources": _digests(made.sources), "stage": made.stage}
+        converted = convert(file, draft / f"{file.stem}.xml", "all")
+        known = {"notes": converted.notes, "sources": _digests(converted.sources), "stage": converted.stage}
         text = json.dumps(known)
         (draft / state.name).write_text(text, encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
@@ -165,7 +167,7 @@ def kept(file: FilePath) -> Converted:
         shutil.rmtree(draft, ignore_errors=True)
     for old in sorted(root.glob("*/converted.json"), key=_changed)[:-_KEPT]:
         shutil.rmtree(old.parent, ignore_errors=True)
-    return made._replace(xml=folder / f"{file.stem}.xml")
+    return converted._replace(xml=folder / f"{file.stem}.xml")
 
 
 def _changed(path):

@@ -83,8 +83,7 @@ def _rotation(scene, prim, to_world):
     return left @ last
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Lights at infinity
+# ---- Lights at infinity ------------------------------------------------------------------------------------
 
 
 def _add_dome(scene, prim, to_world, radiance):
@@ -124,7 +123,8 @@ def _add_dome(scene, prim, to_world, radiance):
         marks = {"source": str(path)}
         coloured = stored * radiance.astype(np.float32)
         images.write_exr(copy, coloured, marks, chromaticities=info["chromaticities"])
-        file, scale = name, 1.0
+        file = name
+        scale = 1.0
     if not scale > 0:
         raise scene.error(path, "the dome light is black; expected an intensity above 0")
     add(scene.root, "emitter", "envmap", filename=file, scale=scale, to_world=matrix).set("id", "dome")
@@ -144,8 +144,7 @@ def _add_distant(scene, prim, to_world, radiance):
     add(scene.root, "emitter", "directional", irradiance=irradiance, direction=-to_world[:3, 2])
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Lights with a place
+# ---- Lights with a place -----------------------------------------------------------------------------------
 
 
 def _add_flat(scene, prim, to_world, radiance):

@@ -68,7 +68,7 @@ def read(scene: Description, material: Any) -> Surface:
     surface = Surface()
     outputs = [material.GetSurfaceOutput(), material.GetSurfaceOutput("mtlx")]
     shaders = [_source(output)[0] for output in outputs if output]
-    known = [one for one in shaders if one and one.GetIdAttr().Get() in INPUTS]
+    known = [shader for shader in shaders if shader and shader.GetIdAttr().Get() in INPUTS]
     if not known:
         scene.leave_out("a material without a known surface: rendered grey", material.GetPath())
     for shader in known:
@@ -132,8 +132,7 @@ def _parameter(scene, surface, shader, key, fallback):
     return float(array) if array.ndim == 0 else array
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Textures
+# ---- Textures ----------------------------------------------------------------------------------------------
 
 
 def _texture(scene, surface, shader, output, channels):
@@ -195,8 +194,7 @@ def _uv_transform(scene, shader):
     return flip @ move @ rotation @ scale @ flip
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Into Mitsuba
+# ---- Into Mitsuba ------------------------------------------------------------------------------------------
 
 
 def of_colour(scene: Description, prim: Any) -> Surface:

@@ -132,8 +132,8 @@ def _texture_coordinates(scene, prim, name):
     if name:
         candidates = [primvars.FindPrimvarWithInheritance(name)]
     else:
-        others = [one.GetPrimvarName() for one in primvars.GetPrimvarsWithValues()]
-        candidates = [primvars.GetPrimvar(one) for one in (*FIRST_UV, *others)]
+        others = [primvar.GetPrimvarName() for primvar in primvars.GetPrimvarsWithValues()]
+        candidates = [primvars.GetPrimvar(uv_name) for uv_name in (*FIRST_UV, *others)]
     for primvar in candidates:
         if primvar and primvar.HasValue() and str(primvar.GetTypeName()).endswith("2f[]"):
             values = np.array(primvar.ComputeFlattened(scene.time), np.float32)

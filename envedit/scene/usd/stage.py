@@ -82,14 +82,8 @@ def convert(file: str, xml: str, camera: str = "", time: float | None = None) ->
 
     Parameters
     ----------
-    file : str
-        The USD file.
-    xml : str
-        The XML file; meshes go to a folder beside it, ``NAME_files``.
-    camera : str
-        As of :func:`.cameras.choose`.
-    time : float, optional
-        Time code; None: the first of the stage.
+    file, xml, camera, time
+        As of :func:`.conversion.convert`; meshes go to ``NAME_files``.
 
     Returns
     -------

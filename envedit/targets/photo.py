@@ -1,0 +1,298 @@
+"""A photograph of the scene as target: its values, and the camera between a rendering and them.
+
+With x the radiance of a rendering and c the log factor of a channel, exposure and white balance together, a
+camera shows curve(exp(c) x), where the curve is one of ``tone_curves.py``. Of one picture exposure and the
+brightness of the map are not told apart: both are drawn to what they are without the picture.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import asdict, astuple, dataclass, field, replace
+
+import numpy as np
+
+from envedit.core.color import AXES, linear_to_srgb, luminance, srgb_to_linear
+from envedit.core.errors import InputError
+from envedit.core.resampling import fit
+from envedit.core.tone_curves import TONE_CURVES
+from envedit.core.types import FilePath, Shape
+from envedit.images import images
+from envedit.targets import alignment, painted_image
+from envedit.targets.strokes import gains
+
+KELVIN = np.geomspace(2000, 25000, 400)
+"""Temperatures that a white balance is looked for among."""
+DARKEST = 0.02
+"""Display value below which a pixel says little of exposure: five steps of 8 bits."""
+LEAST_TELLING = 0.02
+"""Share of the values that must be neither clipped nor black."""
+EXPOSURE_DEVIATION = 3.0
+"""Standard deviation of the exposure, in stops: cameras make a picture of any light."""
+BALANCE_DEVIATION, TINT_DEVIATION = 0.59, 0.1
+"""Standard deviations of a white balance along the second and third of :data:`.AXES`: the root mean square of
+temperatures from 3200 to 9000 K, evenly in mired, about 6500 K; and that of a sky's tint."""
+HELD_DEVIATION = 1e-3
+"""Standard deviation of what the configuration gives."""
+MOST_ASPECT = 1.03
+"""Aspect of the photograph over that of the rendering from which on it is another picture."""
+WHITE = 1 - 2.5 / 255
+"""Display value from which on a pixel is at least so bright: a JPEG's white is not quite."""
+SUPERSAMPLED = 2
+"""Pixels of the photograph for one of the rendering, along each axis, at most, when it is aligned."""
+
+
+def _nothing():
+    return np.zeros((0, 0, 3))
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Exposure, white balance and tone curve.
+
+    Attributes
+    ----------
+    curve : str
+        One of :data:`.TONE_CURVES`; "linear" of a file that holds linear radiance.
+    log_factor : ndarray (3,)
+        Natural logarithm of the factor of red, green and blue.
+    """
+
+    curve: str
+    log_factor: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def stops(self) -> float:
+        """Exposure: the factor of grey's luminance."""
+        return float(np.log2(luminance(np.exp(self.log_factor))))
+
+    @property
+    def kelvin(self) -> float:
+        """Temperature of the light that the white balance makes neutral; 6500 changes nothing."""
+        off = [abs(self.log_factor @ (1, 0, -1) + np.log(g[0] / g[2])) for g in map(gains, KELVIN)]
+        return float(KELVIN[np.argmin(off)])
+
+    def shown(self, radiance: np.ndarray) -> np.ndarray:
+        """Return the values that the camera makes of radiance (..., 3)."""
+        exposed = np.float64(radiance) * np.exp(self.log_factor)
+        return exposed if self.curve == "linear" else TONE_CURVES[self.curve].shown(exposed)
+
+    def radiance(self, values: np.ndarray) -> np.ndarray:
+        """Return the radiance of values (..., 3)."""
+        exposed = values if self.curve == "linear" else TONE_CURVES[self.curve].exposed(values)
+        return exposed / np.exp(self.log_factor)
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph on the film of the rendering.
+
+    Attributes
+    ----------
+    file : ndarray (H, W, 7)
+        Of the file, at most :data:`SUPERSAMPLED` times as wide as the film: linear radiance, which of its
+        values are clipped, and how much a pixel counts.
+    camera : Camera
+        As far as it is known.
+    curves : tuple of str
+        Curves that the camera may have.
+    placed : alignment.Placement
+        Where the film lies in the file's picture.
+    values : ndarray (h, w, 3)
+        On the film: display values in [0, 1], or linear radiance.
+    clipped : ndarray of bool (h, w, 3)
+        Values that say "at least so bright".
+    counts : ndarray (h, w, 1) float32
+        How much each pixel counts.
+    stops, kelvin : float or None
+        Exposure and white balance, where they are known.
+    aligns, recognised : bool
+        It may lie otherwise than as it is; its outlines are those of the scene.
+    settled : bool
+        Curve and placement have been compared under the light that was found.
+    """
+
+    file: np.ndarray
+    camera: Camera
+    curves: tuple[str, ...]
+    placed: alignment.Placement = alignment.Placement()
+    values: np.ndarray = field(default_factory=_nothing)
+    clipped: np.ndarray = field(default_factory=_nothing)
+    counts: np.ndarray = field(default_factory=_nothing)
+    stops: float | None = None
+    kelvin: float | None = None
+    aligns: bool = True
+    recognised: bool = False
+    settled: bool = False
+
+    def laid(self, shape: Shape, placed: alignment.Placement | None = None) -> Photo:
+        """Return it on a film of shape (h, w, ...), or placed otherwise on it."""
+        placed = placed or self.placed
+        height, width = shape[:2]
+        factor = min(max(1, len(self.file) // height), SUPERSAMPLED)
+        stack, inside = placed.sampled(self.file, factor * height, factor * width)
+        stack[..., -1] *= inside
+        stack = fit(stack, height, width).astype(np.float64)
+        linear, clipped, counts = np.split(stack, (3, 6), axis=2)
+        values = linear if self.camera.curve == "linear" else linear_to_srgb(linear)
+        counts = counts.astype(np.float32)
+        return replace(self, placed=placed, values=values, clipped=clipped > 0, counts=counts)
+
+    def aligned(self, rendering: np.ndarray) -> Photo:
+        """Return it where its outlines are those of a rendering (h, w, 3), if they are and it may move."""
+        if not self.aligns:
+            return self
+        placed, clear = alignment.find(luminance(self.file[..., :3]), luminance(rendering))
+        moved = self.laid(rendering.shape, placed) if clear else self
+        return replace(moved, recognised=clear or self.recognised)
+
+    @property
+    def precision(self) -> np.ndarray:
+        """Inverse covariance of the camera's log factor, (3, 3)."""
+        exposure = np.sqrt(3) * np.log(2) * EXPOSURE_DEVIATION
+        deviations = np.array([exposure, BALANCE_DEVIATION, TINT_DEVIATION])
+        if self.stops is not None:
+            deviations[0] = HELD_DEVIATION
+        if self.kelvin is not None:
+            deviations[1:] = HELD_DEVIATION
+        return AXES.T @ (deviations[:, None] ** -2.0 * AXES)
+
+    @functools.cached_property
+    def centre(self) -> np.ndarray:
+        """Log factor that it is drawn to, (3,): of a known exposure and white balance, otherwise none."""
+        balance = np.zeros(3) if self.kelvin is None else np.log(_balance(self.kelvin))
+        return np.log(2) * (self.stops or 0.0) + balance
+
+    @property
+    def picture(self) -> np.ndarray:
+        """The photograph as radiance of the scene, (h, w, 3) float32."""
+        return self.camera.radiance(self.values).astype(np.float32)
+
+    def under(self, curve: str, rendering: np.ndarray, weight: np.ndarray | None) -> Photo:
+        """Return it with another curve, and the factor at which a rendering is nearest in the median."""
+        camera = Camera(curve)
+        return replace(self, camera=replace(camera, log_factor=self._factor(camera, rendering, weight)))
+
+    def _factor(self, camera, rendering, weight):
+        exposed = camera.radiance(self.values)
+        telling = ~self.clipped & (self.values > DARKEST) & (rendering > 0) & (exposed > 0)
+        if weight is not None:
+            telling &= weight > 0
+        if telling.mean() < LEAST_TELLING:
+            raise InputError(
+                f"target: {100 * telling.mean():.2g} % of the photograph's values are neither black nor "
+                f"clipped, and {100 * LEAST_TELLING:g} % are needed: take another exposure"
+            )
+        ratio = np.log(np.where(telling, exposed, 1) / np.where(telling, rendering, 1))
+        grey = np.median(ratio[telling])
+        factor = np.array([
+            np.median(ratio[..., c][telling[..., c]]) if telling[..., c].any() else grey for c in range(3)
+        ])  # fmt: skip
+        along = AXES @ (factor - self.centre)
+        along[:1] *= self.stops is None
+        along[1:] *= self.kelvin is None
+        return self.centre + along @ AXES
+
+    @property
+    def measures(self) -> dict:
+        """What metrics.json has of its camera, and of where it lies."""
+        camera = self.camera
+        factor = [float(v) for v in np.exp(camera.log_factor)]
+        found = {"exposure": camera.stops, "kelvin": camera.kelvin, "factor": factor, "curve": camera.curve}
+        return found | {"placement": asdict(self.placed), "summary": self.summary}
+
+    @property
+    def summary(self) -> str:
+        """Its camera, and where it lies, in words."""
+        camera, placed = self.camera, self.placed.summary
+        line = f"exposure {camera.stops:+.1f} stops, white balance {round(camera.kelvin, -2):.0f} K, "
+        return line + f"curve {camera.curve}" + (f", {placed}" if placed else "")
+
+    def missed(self, rendering: np.ndarray) -> np.ndarray:
+        """Return what the camera shows of a rendering (h, w, 3) less the photograph's values."""
+        return self.camera.shown(rendering) - self.values
+
+    def exposed_by(self, log_factor: np.ndarray) -> Photo:
+        """Return it with a camera whose log factor is larger by (3,)."""
+        camera = replace(self.camera, log_factor=self.camera.log_factor + log_factor)
+        return replace(self, camera=camera)
+
+    @property
+    def array(self) -> np.ndarray:
+        """What is known of it, for a checkpoint: camera, placement, and whether it is settled."""
+        curve = -1 if self.camera.curve == "linear" else list(TONE_CURVES).index(self.camera.curve)
+        known = curve, self.settled, self.recognised
+        return np.array([*known, *self.camera.log_factor, *astuple(self.placed)])
+
+    def of_array(self, array: np.ndarray) -> Photo:
+        """Return it with what :attr:`array` knew."""
+        number, settled, recognised = array[:3].astype(int)
+        curve = "linear" if number < 0 else list(TONE_CURVES)[number]
+        camera, placed = Camera(curve, array[3:6]), alignment.Placement(*array[6:].tolist())
+        photo = self.laid(self.values.shape, placed)
+        return replace(photo, camera=camera, settled=bool(settled), recognised=bool(recognised))
+
+
+def _balance(kelvin):
+    """Return the factors (3,) of a white balance, under which grey keeps its luminance."""
+    gain = 1 / gains(kelvin)
+    return gain / float(luminance(gain))
+
+
+def read(file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = True) -> tuple[Photo, list[str]]:
+    """Read a photograph and lay it on the film of a rendering.
+
+    Parameters
+    ----------
+    file, mask : path-like
+        OpenEXR, Radiance, PNG or JPEG; "" for no mask, which is white where the photograph counts, and of the
+        photograph's size.
+    outlines : ndarray (h, w, 3)
+        The scene under light from everywhere, linear radiance.
+    align : bool
+        Find how it is shifted, scaled and rotated; otherwise it lies as it is.
+
+    Returns
+    -------
+    Photo
+        With a camera that changes nothing.
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, is of another aspect, is not finite, or lies farther off than is looked for.
+    """
+    # ---- The file
+    pixels, info = images.read_stored(file)
+    warnings = [f"{file}: {line}" for line in info["warnings"]]
+    painted_image.check_finite(file, pixels, "repair it in the program it came from")
+    values, alpha, _ = painted_image.planes(file, pixels, warnings)
+    clipped = np.zeros(values.shape) if info["hdr"] else np.float64(values >= WHITE)
+    counts = alpha[..., None] * (painted_image.read_mask(mask, alpha.shape) if mask else 1)
+    (rows, columns), (height, width) = alpha.shape, outlines.shape[:2]
+    aspect = columns * height / (rows * width)
+    if not 1 / MOST_ASPECT < aspect < MOST_ASPECT:
+        raise InputError(
+            f"{file}: is {columns}x{rows} pixels, the rendering is {width}x{height}: another aspect; crop "
+            "the photograph to what the scene's camera sees, or give the film its size"
+        )
+
+    # ---- At most as many pixels as are needed, averaged as light
+    stack = np.concatenate([values if info["hdr"] else srgb_to_linear(values), clipped, counts], axis=2)
+    film = SUPERSAMPLED * height, SUPERSAMPLED * width
+    stack = fit(stack, min(rows, film[0]), min(columns, film[1])).astype(np.float64)
+    curves = ("linear",) if info["hdr"] else tuple(TONE_CURVES)
+    photo = Photo(stack, Camera(curves[0]), curves, aligns=align).laid((height, width))
+    if not photo.counts.any():
+        raise InputError(f"{file}: no pixel counts: all are masked or transparent")
+
+    # ---- Where it lies
+    photo = photo.aligned(outlines)
+    if np.abs(photo.placed.shares).max() > 1:
+        raise InputError(
+            f"{file}: fits the scene best if {photo.placed.summary}, which is more than is corrected: "
+            "give the scene the photograph's camera, or set [target] align = false"
+        )
+    return photo, warnings

@@ -1,0 +1,59 @@
+"""Mitsuba's path tracer and Adam on the texels of the map, as its tutorials write it, for a photograph."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit import config
+from envedit.core.resampling import fit
+from envedit.images import images
+from envedit.scene import scene as scenes
+
+STEPS, SPP, RATE = 150, 16, 0.05
+
+
+def edited_by_adam(settings: config.Config, envmap: np.ndarray, photo: Path) -> tuple[np.ndarray, float]:
+    """Return the map after Adam, (H, W, 3), and seconds.
+
+    The photograph is undone as sRGB and scaled to the mean of the first rendering; minimised is the mean
+    square of the difference, by log radiance.
+    """
+    # ---- Scene and target
+    chosen = settings.scene
+    images.write_exr(photo.with_name("start.exr"), envmap)
+    text = scenes.relit(chosen.file, "start.exr", dict(chosen.parameters), None, chosen.up, 1.0)
+    file = photo.with_name("start.xml")
+    file.write_text(text, encoding="utf-8")
+    threads = dr.thread_count()
+    dr.set_thread_count(max(2, threads))  # with one, Mitsuba's loader waits for ever
+    scene = mi.load_file(str(file))
+    dr.set_thread_count(threads)
+    params = mi.traverse(scene)
+    size = next(name for name, *_ in params if name.endswith("film.size"))
+    params[size] = mi.ScalarVector2u(chosen.width, chosen.width)
+    params[size.replace("film.size", "film.crop_size")] = mi.ScalarVector2u(chosen.width, chosen.width)
+    params.update()
+    target = mi.TensorXf(fit(images.read(str(photo))[0], chosen.width, chosen.width))
+    target *= dr.mean(mi.render(scene, spp=64).array) / dr.mean(target.array)
+
+    # ---- Steps
+    name = next(name for name, *_ in params if name.endswith("bitmap.data") or name.endswith(".data"))
+    began = time.perf_counter()
+    optimiser = mi.ad.Adam(lr=RATE)
+    optimiser["log"] = dr.log(dr.maximum(params[name], 1e-4))
+    for step in range(STEPS):
+        params[name] = dr.exp(optimiser["log"])
+        params.update()
+        rendering = mi.render(scene, params, spp=SPP, seed=step)
+        dr.backward(dr.mean(dr.square(rendering - target), axis=None))
+        optimiser.step()
+    seconds = time.perf_counter() - began
+    width = envmap.shape[1]
+    first = (params[name].shape[1] - width) // 2
+    found = np.exp(optimiser["log"].numpy())[:, first : first + width]
+    return np.ascontiguousarray(found, np.float32), seconds

@@ -1,0 +1,177 @@
+"""Edit towards photographs of unknown cameras, and towards the same pictures given linear.
+
+The photographs are path traced under another map than the one that is edited (:mod:`.cameras`).
+"""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+import envedit
+from envedit import config
+from envedit.core.color import tonemap
+from envedit.images import images
+from experiments import puresky
+from experiments.harness import Done, Experiment, calling
+from experiments.light_estimation import protocol
+from experiments.photograph.adam import edited_by_adam
+from experiments.photograph.cameras import CAMERAS, photograph
+from experiments.summary import Summary, values
+
+SCENES = ("sphere", "statue", "pair")
+FARTHER = 5
+"""The target's map is so many names farther on in the alphabet."""
+PREVIEW_SPP = 64
+SEED = 260_000
+"""Of the photographs; that of a case adds its number."""
+LINEAR, KNOWN, ADAM = "linear", "filmic, +1 stops, 5500 K, both given", "Adam on path, sRGB"
+"""Ways beside the cameras: the picture without one; a camera whose exposure and white balance are given;
+Mitsuba's path tracer and Adam, on the first camera's."""
+OF_WAY = {KNOWN: 2, ADAM: 0}
+"""The number of their camera."""
+
+
+def options(parser):
+    parser.add_argument("--maps", nargs="+", metavar="NAME", help="only these maps are edited")
+
+
+def cases(given):
+    maps = puresky.find()
+    names = sorted(maps)
+    made = []
+    for i, name in enumerate(names):
+        other = names[(i + FARTHER) % len(names)]
+        ways = [LINEAR, *range(len(CAMERAS)), KNOWN, ADAM]
+        names_of = {KNOWN: "known", ADAM: "adam"}
+        for k, (scene, way) in enumerate(itertools.product(SCENES, ways)):
+            if given.maps and name not in given.maps:
+                continue
+            tables = {
+                "preset": "draft",
+                "input": {"envmap": str(maps[name])},
+                "scene": {"file": scene},
+                "output": {"spp": PREVIEW_SPP},
+            }
+            camera = CAMERAS[way] if isinstance(way, int) else None
+            label = f"{camera.curve}, {camera.stops:+g} stops, {camera.kelvin:g} K" if camera else way
+            about = {"scene": scene, "map": name, "other": other, "camera": label}
+            made.append(
+                calling(
+                    f"{scene}-{name}-{other}-{names_of.get(way, way)}",
+                    "experiments.photograph.experiment:edited",
+                    tables,
+                    about,
+                    other=str(maps[other]),
+                    way=way,
+                    seed=SEED + 100 * i + k,
+                )
+            )
+    return made
+
+
+def edited(settings, folder, other, way, seed) -> dict:
+    """Edit towards a picture of the other map's light; returns what is measured."""
+    # ---- The picture
+    true, _ = images.load_envmap(other, settings.input.width, False)
+    unedited, _ = images.load_envmap(settings.input.envmap, settings.input.width, False)
+    stops, summary = None, ""
+    if way == LINEAR:
+        file = folder / "picture.exr"
+        scene = envedit.load_scene(settings.scene.file, width=settings.scene.width)
+        images.write_exr(file, scene.render(true, 256, seed), panorama=False)
+        target = config.Target(kind="rendering", file=str(file))
+    else:
+        file = folder / "photograph.jpg"
+        model = CAMERAS[OF_WAY.get(way, way)]
+        stops = photograph(model, settings.scene, true, seed, file)
+        target = config.Target(kind="photo", file=str(file))
+        if way == KNOWN:
+            target = replace(target, exposure=stops, white_balance=model.kelvin)
+
+    # ---- The edit
+    if way == ADAM:
+        found, seconds = edited_by_adam(settings, unedited, file)
+        psnr = None
+    else:
+        result = envedit.edit(replace(settings, target=target))
+        found, seconds = result.envmap, result.metrics["timing"]["total_s"]
+        psnr = result.metrics["render"]["psnr"]
+        images.write_exr(folder / "render.exr", result.render)
+        summary = (result.metrics["camera"] or {}).get("summary", "")
+    images.write_exr(folder / "edited.exr", found)
+    images.write_exr(folder / "true.exr", true)
+
+    # ---- Measures
+    about = {"psnr": psnr, "seconds": seconds, "found": summary, "stops": stops}
+    about["exposure"] = None if way in (LINEAR, ADAM) else result.metrics["camera"]["exposure"]
+    return {
+        "edited": about | measured(found, true),
+        "unedited": measured(unedited, true) if way == LINEAR else None,
+    }
+
+
+def measured(envmap, true) -> dict:
+    """Compare a map with the true one: the sun, irradiance, and the three spheres."""
+    stops = protocol.irradiance_error(envmap, true)
+    found = {
+        "sun": protocol.peak_error(envmap, true),
+        "brightness": float(stops.mean()),
+        "irradiance": float(np.abs(stops - stops.mean()).mean()),
+    }
+    lit = [protocol.tonemapped(one) for one in (envmap, true)]
+    for name, sphere in protocol.SPHERES.items():
+        errors = protocol.compared(*(protocol.render(sphere, one) for one in lit))
+        found[f"{name} si-RMSE"] = errors["si_rmse"]
+        found[f"{name} angle"] = errors["angle"]
+    return found
+
+
+def measure(done: Done) -> list[dict]:
+    rows = [values({"kind": done.case.about["camera"], "found": ""} | done.metrics["edited"])]
+    if done.metrics["unedited"]:
+        rows.append(values({"kind": "unedited", "found": ""} | done.metrics["unedited"]))
+    return rows
+
+
+SUMMARY = Summary(
+    {"": "{kind}"},
+    {
+        "runs": "{runs}",
+        "sun, degrees: mean (median)": "{sun.mean:.1f} ({sun.median:.1f})",
+        "brightness, stops": "{brightness.mean:+.2f}",
+        "irradiance, stops": "{irradiance.mean:.2f}",
+        **{
+            f"{name}: si-RMSE, angle": f"{{{name} si-RMSE.mean:.3f}}, {{{name} angle.mean:.1f}}"
+            for name in protocol.SPHERES
+        },
+        "seconds": "{seconds.mean:.0f}",
+    },
+)
+
+
+def panels(done: Done):
+    """Return the rendering where there is one, edited and true map."""
+    names = [name for name in ("render", "edited", "true") if (done.folder / f"{name}.exr").exists()]
+    return [tonemap(done.picture(name), "gamma") for name in names]
+
+
+EXPERIMENT = Experiment(
+    "photograph",
+    "Edit towards photographs of unknown cameras, and the same pictures given linear.",
+    cases,
+    measure,
+    {
+        "scene": "{scene}",
+        "map": "{map} towards {other}",
+        "camera": "{kind}",
+        "found": "{found}",
+        "sun, degrees": "{sun:.1f}",
+        "brightness, stops": "{brightness:+.2f}",
+        "irradiance, stops": "{irradiance:.2f}",
+    },
+    summary=SUMMARY,
+    panels=panels,
+    sheet=lambda case: "sheet.jpg",
+    options=options,
+)

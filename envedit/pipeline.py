@@ -436,8 +436,8 @@ class _Edit:
             self.warnings.append(line)
         line = f"camera: {photo.summary}"
         if photo.stops is None:
-            line += "; one picture does not tell exposure from the sky's brightness, which stays as it was "
-            line += "as far as it can: target.exposure fixes it"
+            line += "; one picture does not separate exposure from the sky's brightness, which stays as it "
+            line += "was as far as it can: target.exposure fixes it"
         self.notes.append(line)
         self.notes.append(f"{100 * share:.3g} % of the photograph's pixels are not explained by light")
 

@@ -22,7 +22,7 @@ CLEAR_PERCENTILE = 90
 """Percentile of an image's gradients that is g_0: the clearest tenth of its pixels has m above a half."""
 FARTHEST_COST = 0.15
 """Share of the correlation that the largest shift, scale or rotation costs, and by its square smaller ones: a
-sphere alone does not tell how it is turned."""
+sphere alone does not show how it is turned."""
 LEAST_GAIN = 1.02
 """Correlation over that of the picture as it lies, from which on it is resampled."""
 CLEAR_PEAK = 5.0

@@ -2,7 +2,7 @@
 
 With x the radiance of a rendering and c the log factor of a channel, exposure and white balance together, a
 camera shows curve(exp(c) x), where the curve is one of ``tone_curves.py``. Of one picture exposure and the
-brightness of the map are not told apart: both are drawn to what they are without the picture.
+brightness of the map are not separable: both are drawn to what they are without the picture.
 """
 
 from __future__ import annotations

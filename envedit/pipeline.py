@@ -25,6 +25,7 @@ from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances, installed
 from envedit.preparation import Preparation
 from envedit.report import variants
+from envedit.representations.layers.layers import ground_irradiance
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility, task
@@ -145,6 +146,7 @@ class _Edit:
     outliers = None
     frozen = None
     degrees = 0.0
+    level = 1.0
 
     def __init__(self, settings, folder, base, watch, memory):
         self.begun = time.perf_counter()
@@ -278,6 +280,22 @@ class _Edit:
             laid = photo.laid(photo.values.shape, found.placed)
             laid = replace(laid, camera=found.camera, recognised=found.recognised)
             self.target = self.target.developed(laid)
+        if photo is not None and photo.stops is None:
+            self.set_level()
+
+    def set_level(self):
+        """Set the factor by which the ground keeps its irradiance under the map of a photograph.
+
+        One picture does not separate the map's level from exposure, and irradiance differs less between skies
+        than their brightness. Beside other lamps, and where rows keep their radiance, it is determined.
+        """
+        if self.scene.own.added or not self.rows.all:
+            return
+        whole = 0, len(self.original)
+        before, after = (ground_irradiance(sky, whole) for sky in (self.original, self.solved_map))
+        if before > 0 and after > 0:
+            self.level = before / after
+            self.target = self.target.developed(self.target.photo.exposed_by(-np.log(np.full(3, self.level))))
 
     @contextlib.contextmanager
     def _carrying(self, envmap=None):
@@ -308,6 +326,8 @@ class _Edit:
                 self.predicted_error = self.transport.coarse_error(self.edited)
 
     def _adjusted(self, envmap):
+        if self.level != 1:
+            envmap = envmap * np.float32(self.level)
         return adjustments.adjust(envmap, self.settings.lights, self.settings.output, self.map.scale)
 
     def check_feasibility(self):
@@ -436,8 +456,8 @@ class _Edit:
             self.warnings.append(line)
         line = f"camera: {photo.summary}"
         if photo.stops is None:
-            line += "; one picture does not separate exposure from the sky's brightness, which stays as it "
-            line += "was as far as it can: target.exposure fixes it"
+            line += "; one picture does not separate exposure from the map's level: the ground keeps its "
+            line += "irradiance, or target.exposure fixes it"
         self.notes.append(line)
         self.notes.append(f"{100 * share:.3g} % of the photograph's pixels are not explained by light")
 
@@ -541,7 +561,9 @@ class _Edit:
         # ---- All that was found
         found = None
         if job:
-            found = Found(job.representation, self.params, job.free, self.degrees, self.solved_map)
+            found = Found(
+                job.representation, self.params, job.free, self.degrees, self.solved_map, self.level
+            )
         return Result(
             envmap=self.stored,
             renders=self.renders,

@@ -171,8 +171,8 @@ class Target(Table):
     exposure: float | str = key(
         "auto",
         OrAuto(Number(-30, 30)),
-        "exposure of the photograph, a factor 2^exposure of the scene's radiance; auto: found, while the map "
-        "keeps its brightness as far as it can",
+        "exposure of the photograph, a factor 2^exposure of the scene's radiance; auto: found, while the "
+        "ground keeps its irradiance",
         "stops",
         _PHOTO,
     )

@@ -23,7 +23,7 @@ class Found:
     """The active rows' representation and parameters; ``free`` as for :func:`.full_resolution.carry`.
 
     ``turn_degrees`` is by how much the map was turned before (:func:`.latlong.rotate`), ``edited`` the edited
-    map before its adjustments.
+    map before ``level``, a factor of all of it, and its adjustments.
     """
 
     representation: Representation
@@ -31,6 +31,7 @@ class Found:
     free: np.ndarray | None
     turn_degrees: float = 0.0
     edited: np.ndarray | None = None
+    level: float = 1.0
 
 
 def at_full_resolution(settings: config.Config, result: results.Result) -> np.ndarray | None:
@@ -94,7 +95,8 @@ def carried(
     edited = full_resolution.carry(
         solution.representation, solution.params, before, solution.edited, source, rows, solution.free
     )
-    return full, edited if locked is None else edited + locked
+    edited = edited if locked is None else edited + locked
+    return full, edited if solution.level == 1 else edited * np.float32(solution.level)
 
 
 def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:

@@ -15,6 +15,7 @@ from envedit import config, pipeline
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.images import images
+from envedit.representations.layers.layers import ground_irradiance
 from envedit.scene import built_scene
 from tests.oracles import ROOT
 
@@ -323,6 +324,8 @@ def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatc
     assert camera["curve"] == "filmic" and camera["outliers"] < 0.1
     assert abs(camera["exposure"] - found["phone"].stops) < 0.6
     assert result.metrics["render"]["psnr"] > 30 and not result.warnings
+    before, after = (ground_irradiance(sky, (0, len(sky))) for sky in (found["sky"], result.envmap))
+    assert after == pytest.approx(before, rel=1e-4)
 
     # ---- What is written
     saved = images.read_stored(tmp_path / "matched" / "photograph.png")[0]

@@ -50,9 +50,9 @@ def shown(transport, image):
     return transport.apply(mi.TensorXf(np.asarray(image, np.float32))).numpy()
 
 
-def problem_of(image, transport, target, likelihood=None, cycles=3, **options):
+def problem_of(image, transport, target, likelihood=None, cycles=3, aureoles=True, **options):
     """Return a problem and the parameters to start from."""
-    layers = Layers.of(image, cycles=cycles)
+    layers = Layers.of(image, cycles=cycles, aureoles=aureoles)
     params = layers.start()
     return Problem(layers, transport, image, target, likelihood, **options), params
 
@@ -111,7 +111,7 @@ def moved_case(likelihood, **options):
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
     target = shown(transport, image) * np.exp(rng.normal(0, 0.5, (*FILM, 3))).astype(np.float32)
     weight = 0.5 + rng.random((*FILM, 1))
-    problem, params = problem_of(image, transport, target, likelihood(weight), **options)
+    problem, params = problem_of(image, transport, target, likelihood(weight), aureoles=False, **options)
     assert len(problem.layers.separation.lights) == 1 and not problem.layers.lights.glowing
     start = problem.state(params)
     state, centre = copy(start), problem.layers.lights.centres[0]

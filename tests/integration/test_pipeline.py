@@ -182,7 +182,7 @@ PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "siren", "pixels"])
+@pytest.mark.parametrize("kind", ["layers", "siren"])
 def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
     picture = sky(rng, 32, 64) + 0.1
@@ -529,7 +529,6 @@ CASES = {
     "pixels, columns": (sunny, PIXELS),
     "pixels, no columns": (smooth, PIXELS | {"optimizer": {"iterations": 20, "lr": 1e-4}}),
     "siren, columns": (sunny, {"representation": {"kind": "siren", "hidden": 16, "depth": 1}}),
-    "layers, columns": (sunny, ADAM),
     "layers, transport recorded afresh": (
         sunny,
         ADAM | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}},
@@ -590,7 +589,7 @@ def stopping_at(step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sunny", "painted", "a sun of 1e6"])
+@pytest.mark.parametrize("name", ["painted", "a sun of 1e6"])
 def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path, rng, monkeypatch):
     """Interrupted in the first step, in the middle, in the last, and where nothing is left to do."""
     picture = sunny(rng)
@@ -922,10 +921,9 @@ def test_no_request_is_no_change(tables, tmp_path, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spp", [4, 256])
-def test_what_renders_alike_within_the_noise_comes_back_bit_for_bit(spp, tmp_path, rng):
+def test_what_renders_alike_within_the_noise_comes_back_bit_for_bit(tmp_path, rng):
     """By the noise of renderings with as many samples as the target had; a brighter map is told from it."""
-    asked = {"file": "other.exr", "rotate_degrees": 0.0, "spp": spp}
+    asked = {"file": "other.exr", "rotate_degrees": 0.0, "spp": 256}
     settings, picture = turned_world(tmp_path, rng, target=asked, scene={"width": 48, "height": 36})
     images.write_exr(tmp_path / "other.exr", picture * np.float32(1 + 1e-4 * rng.random((16, 32, 1))))
     found = pipeline.run(settings)
@@ -952,10 +950,8 @@ def test_light_that_makes_no_picture_comes_back_bit_for_bit(kind, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "pixels"])
-def test_noise_of_the_target_does_not_spoil_a_turn(kind, tmp_path, rng):
-    asked = {"target": {"spp": 4}, "representation": {"kind": kind}}
-    settings, picture = turned_world(tmp_path, rng, **asked)
+def test_noise_of_the_target_does_not_spoil_a_turn(tmp_path, rng):
+    settings, picture = turned_world(tmp_path, rng, target={"spp": 4})
     found = pipeline.run(settings)
     assert found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()
     assert any("the rest is noise, nothing else changed" in line for line in found.notes)

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs, renderers
+from envedit.core.color import luminance
 from envedit.core.errors import NumericalError, unwrapped
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.rows import Rows
@@ -23,9 +24,9 @@ from envedit.export import adjustments, light_list
 from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
 from envedit.losses.perceptual import backbones, distances, installed
+from envedit.maps import map_lights
 from envedit.preparation import Preparation
 from envedit.report import variants
-from envedit.representations.layers.layers import ground_irradiance
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility, task
@@ -284,17 +285,19 @@ class _Edit:
             self.set_level()
 
     def set_level(self):
-        """Set the factor by which the ground keeps its irradiance under the map of a photograph.
+        """Set the factor by which a map of a photograph keeps the mean log irradiance of six planes.
 
-        One picture does not separate the map's level from exposure, and irradiance differs less between skies
-        than their brightness. Beside other lamps, and where rows keep their radiance, it is determined.
+        One picture does not separate the map's level from exposure, and this differs least between skies.
+        Beside other lamps, and where rows keep their radiance, the level is determined.
         """
         if self.scene.own.added or not self.rows.all:
             return
-        whole = 0, len(self.original)
-        before, after = (ground_irradiance(sky, whole) for sky in (self.original, self.solved_map))
-        if before > 0 and after > 0:
-            self.level = before / after
+        before, after = (
+            luminance(map_lights.irradiance(sky, np.array(list(map_lights.AXES.values()))))
+            for sky in (self.original, self.solved_map)
+        )
+        if before.min() > 0 and after.min() > 0:
+            self.level = float(np.exp(np.log(before / after).mean()))
             self.target = self.target.developed(self.target.photo.exposed_by(-np.log(np.full(3, self.level))))
 
     @contextlib.contextmanager
@@ -456,7 +459,7 @@ class _Edit:
             self.warnings.append(line)
         line = f"camera: {photo.summary}"
         if photo.stops is None:
-            line += "; one picture does not separate exposure from the map's level: the ground keeps its "
+            line += "; one picture does not separate exposure from the map's level: surfaces keep their mean "
             line += "irradiance, or target.exposure fixes it"
         self.notes.append(line)
         self.notes.append(f"{100 * share:.3g} % of the photograph's pixels are not explained by light")

@@ -171,8 +171,8 @@ class Target(Table):
     exposure: float | str = key(
         "auto",
         OrAuto(Number(-30, 30)),
-        "exposure of the photograph, a factor 2^exposure of the scene's radiance; auto: found, while the "
-        "ground keeps its irradiance",
+        "exposure of the photograph, a factor 2^exposure of the scene's radiance; auto: found, while "
+        "surfaces keep their mean irradiance",
         "stops",
         _PHOTO,
     )

@@ -45,12 +45,15 @@ def at_full_resolution(settings: config.Config, result: results.Result) -> np.nd
     if result.given.size[0] <= settings.input.width:
         return None
     own = result.given.at_file_size(settings.input)
-    how = settings.lights, settings.output, own.scale
     if result.found is None:
         full = _by_hand(settings.input, result.given, own)
-        return full.as_stored(adjustments.adjust(full.radiance, *how)[0])
-    full, edited = carried(settings.input, result.given, own, result.found, result.maps["initial"])
-    return full.as_stored(adjustments.adjust(edited, *how)[0], result.found.turn_degrees)
+        edited = full.radiance
+        turn_degrees = 0.0
+    else:
+        full, edited = carried(settings.input, result.given, own, result.found, result.maps["initial"])
+        turn_degrees = result.found.turn_degrees
+    adjusted, _ = adjustments.adjust(edited, settings.lights, settings.output, own.scale)
+    return full.as_stored(adjusted, turn_degrees)
 
 
 def carried(

@@ -111,19 +111,19 @@ class Picking:
         return self._shadowed(asked, view, shown)
 
     def _direction(self, asked, view, shown):
-        place = self.scene, view, asked.x, asked.y
         if asked.of == "illuminate":
-            return placement.illuminating(*place)
+            return placement.illuminating(self.scene, view, asked.x, asked.y)
         if asked.of == "rim":
-            return placement.rimming(*place)
+            return placement.rimming(self.scene, view, asked.x, asked.y)
         if asked.of == "cast":
             known = 0 <= asked.light < len(shown)
-            return placement.shading(*place, shown[asked.light].direction if known else None)
+            light = shown[asked.light].direction if known else None
+            return placement.shading(self.scene, view, asked.x, asked.y, light)
         if asked.of == "highlight":
-            return highlight.direction(*place)
+            return highlight.direction(self.scene, view, asked.x, asked.y)
         if not asked.point:
             raise shadow.NoShadowError("no shadow was picked")
-        return shadow.direction(*place, np.array(asked.point))
+        return shadow.direction(self.scene, view, asked.x, asked.y, np.array(asked.point))
 
     def _shadowed(self, asked, view, listed):
         """Return the light of most flux whose shadow lies at a place, and what casts it."""

@@ -150,6 +150,7 @@ def smooth(rng):
 
 
 def sunny(rng):
-    picture = sky(rng) + 0.1
+    """Return an even sky with a sun, which few explanations need be tried for."""
+    picture = 0.05 * sky(rng) + 0.3
     picture[2, 5] = 300
     return picture

@@ -58,25 +58,25 @@ class BlockJacobian:
 
     def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
         """Return the change of a block's radiance by each node, (blocks, n), per channel."""
-        found = []
+        channels = []
         for c in range(3):
             sky = np.bincount(self._cell, self._omega * slopes[:, c], self._cells) / np.maximum(
                 self._total, 1e-30
             )
             hats = tensor(sky[self._used, None].astype(np.float32) * self._hats)
-            found.append(dr.matmul(self._tensors[c], hats).numpy())
-        return found
+            channels.append(dr.matmul(self._tensors[c], hats).numpy())
+        return channels
 
     def pictures(self, changes: np.ndarray) -> np.ndarray:
         """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
-        found = np.empty((3, len(changes), len(self.block_of)), np.float32)
+        of_pixels = np.empty((3, len(changes), len(self.block_of)), np.float32)
         for c, matrix in enumerate(self._matrix):
             sums = np.stack(
                 [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
             )
             cells = (sums / np.maximum(self._total, 1e-30))[:, self._used]
-            np.take(cells.astype(np.float32) @ matrix.T, self.block_of, axis=1, out=found[c])
-        return found.transpose(1, 2, 0)
+            np.take(cells.astype(np.float32) @ matrix.T, self.block_of, axis=1, out=of_pixels[c])
+        return of_pixels.transpose(1, 2, 0)
 
     def profile(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture (h, w, 3) over its mean in every block; 1 where that is 0."""
@@ -105,7 +105,7 @@ class BlockJacobian:
         """Return pictures in blocks of a flux (3,) in each cell of :attr:`sky`, (blocks, n) per channel."""
         return [m * mi.Float(np.float32(f)) for m, f in zip(self._lit, flux, strict=True)]
 
-    def seen(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
+    def products(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
         """Return, per channel, products of pictures (blocks, k) with those of :attr:`sky`'s cells: (k, n).
 
         The latter are of a flux of 1.
@@ -130,6 +130,6 @@ class BlockJacobian:
 
     def sums(self, pictures: np.ndarray) -> np.ndarray:
         """Sum pictures (k, pixels) over blocks: (k, blocks)."""
-        found = np.zeros((len(pictures), self.count), pictures.dtype)
-        found[:, self._present] = np.add.reduceat(pictures[:, self._order], self._starts, axis=1)
-        return found
+        in_blocks = np.zeros((len(pictures), self.count), pictures.dtype)
+        in_blocks[:, self._present] = np.add.reduceat(pictures[:, self._order], self._starts, axis=1)
+        return in_blocks

@@ -72,7 +72,7 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
             for a in (picture, *parts["optimiser"].values(), *parts["renderer"].values())
         ):
             raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
-        state, found = State(**meta["state"]), meta["digest"]
+        state, stored_digest = State(**meta["state"]), meta["digest"]
         whole = state.step, state.bad_steps, state.bad_in_a_row
         if not (
             all(type(n) is int and n >= 0 for n in whole)
@@ -90,7 +90,7 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
         raise InputError(
             f"{path}: the checkpoint cannot be read ({reason}): delete it, or run without --resume"
         ) from error
-    if found != what:
+    if stored_digest != what:
         raise InputError(
             f"{path}: belongs to another configuration or other input files, or to an older envedit: "
             "run without --resume to start afresh"

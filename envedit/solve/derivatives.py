@@ -105,9 +105,9 @@ class Derivatives:
         lights: list = []
         names: list = []
         # Columns of one light must not take the place of another's.
-        lit = self.unknowns.shining(state)
-        most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lit), 1)))
-        for i in lit:
+        lights_shining = self.unknowns.shining(state)
+        most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lights_shining), 1)))
+        for i in lights_shining:
             turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])
             axes = self._tangents(state, i)
             turns = [turn]

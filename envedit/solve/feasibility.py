@@ -172,15 +172,15 @@ def reachable(
     active = np.zeros((height, width), bool)
     active[slice(None) if rows is None else rows.slice] = True if free is None else free
     request = _Request.of(transport, original, target, likelihood, painted, rendered)
-    asked = request.distance(request.initial)
-    if asked < 1e-6:  # float32
-        asked = 0.0
+    distance = request.distance(request.initial)
+    if distance < 1e-6:  # float32
+        distance = 0.0
 
     # ---- The closest of the original's picture, the solution's, and that of the map that is known
     candidates = [(original, request.initial)]
-    if asked > 0 and (transport.influence[active] > 0).any():
+    if distance > 0 and (transport.influence[active] > 0).any():
         candidates.append(_solution(transport, original, active, request))
-    if asked > 0 and known is not None:
+    if distance > 0 and known is not None:
         transport.resolve(known)
         candidates.append((known, _rendering(transport, known)))
     envmap, picture = min(candidates, key=lambda one: request.distance(one[1]))
@@ -189,7 +189,7 @@ def reachable(
     residual = tonemap(request.target) - tonemap(picture)
     left = np.abs(residual) * request.painted[..., None]
     return Reach(
-        share=float(np.clip(1 - request.distance(picture) / asked, 0, 1)) if asked > 0 else 1.0,
+        share=float(np.clip(1 - request.distance(picture) / distance, 0, 1)) if distance > 0 else 1.0,
         picture=picture.astype(np.float32),
         residual=residual.astype(np.float32),
         envmap=envmap.astype(np.float32),
@@ -327,8 +327,8 @@ def _solution(transport, original, active, request):
         # A single texel can grow by as much light as a cell.
         y = x + METRIC_FLOOR * np.stack([ones, mean * size.max() / size])
         metric = pulled(render(y)) / y
-        seen = metric > 1e-9 * metric.max(axis=1, keepdims=True)
-        step = np.where(seen, 1 / np.maximum(metric, 1e-300), 0)
+        used = metric > 1e-9 * metric.max(axis=1, keepdims=True)
+        step = np.where(used, 1 / np.maximum(metric, 1e-300), 0)
 
         # ---- Accelerated projected gradient, each channel by itself
         z, z_light, momentum = x, light, np.ones(3)

@@ -174,7 +174,9 @@ def solve(
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
             run, normal = before, _normal(problem, before, first, sigma)
-    return Solution(problem.found(run.state), run.history, whole, problem.posterior(run.state, normal), note)
+    return Solution(
+        problem.solution_params(run.state), run.history, whole, problem.posterior(run.state, normal), note
+    )
 
 
 def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, steps: int = 1) -> Point:

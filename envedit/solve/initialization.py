@@ -17,7 +17,7 @@ from envedit.core.seeds import Seeds
 from envedit.core.types import Progress
 from envedit.representations.layers.gain import CYCLES, Octave
 from envedit.representations.layers.layers import Layers
-from envedit.scene import scene
+from envedit.scene.scene import Scene
 from envedit.solve import gain_bandwidth, pixel_confidence
 from envedit.targets.target import Target
 from envedit.transport import recording
@@ -57,7 +57,7 @@ class Recordings:
 
 def recordings(
     settings: config.Config,
-    lit: scene.Scene,
+    scene: Scene,
     shape: tuple[int, int],
     layers: Layers,
     target: Target,
@@ -74,7 +74,7 @@ def recordings(
     ----------
     settings : config.Config
         Of the run.
-    lit : scene.Scene
+    scene : Scene
         The scene.
     shape : (int, int)
         Rows and columns of the maps.
@@ -90,7 +90,10 @@ def recordings(
 
     def trace(seed, **changed):
         return renderers.trace(
-            replace(settings, seed=seed, renderer=replace(settings.renderer, **changed)), lit, shape, progress
+            replace(settings, seed=seed, renderer=replace(settings.renderer, **changed)),
+            scene,
+            shape,
+            progress,
         )
 
     # A path tracer's samples a pixel are not meant for T.
@@ -98,7 +101,7 @@ def recordings(
     fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
     if not fits or target.coverage is not None or settings.representation.cycles != "auto":
         return Recordings(transport)
-    pixels, few = lit.width * lit.height, min(SECOND_SPP, transport.spp)
+    pixels, few = scene.width * scene.height, min(SECOND_SPP, transport.spp)
     second = trace(
         Seeds.of(settings.seed).second_recording,
         spp=few,
@@ -124,7 +127,7 @@ def recordings(
             transport = trace(settings.seed, spp=most)
     # Columns of both are compared: their paths are in the ratio of the samples.
     second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
-    return Recordings(transport, second, octaves, notes, lit.rows)
+    return Recordings(transport, second, octaves, notes, scene.rows)
 
 
 def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple[Target, list[str]]:

@@ -70,16 +70,16 @@ class Places:
             return []
         flux = flux / scale  # of any strength, in single precision
         strengths, falls = self._model.of_cells(flux)
-        found: list[Place] = []
+        places_refined: list[Place] = []
         for _ in range(PLACES_REFINED):
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
             place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
             place = self._refined(place, flux)
-            found.append(replace(place, factor=place.factor / scale))
+            places_refined.append(replace(place, factor=place.factor / scale))
             falls = np.where(directions @ directions[at] > PLACES_APART_COSINE, 0, falls)
-        return found
+        return places_refined
 
     def _refined(self, place, flux):
         transport, rows = self.problem.transport, self.problem.rows
@@ -127,13 +127,13 @@ class _Model:
         """Return strength and fall of F for a flux (3,) in each cell of the sky."""
         parts, blocks = self.normal.blocks, self.problem.blocks
         columns = zip(parts.jacobian, parts.squared.T, flux, strict=True)
-        mixed = [*blocks.seen([j * (f * w)[:, None] for j, w, f in columns])]
+        mixed = [*blocks.products([j * (f * w)[:, None] for j, w, f in columns])]
         if parts.lights:
-            mixed.append(sum(blocks.seen([b * f for b, f in zip(parts.lights, flux, strict=True)])))
-        pull = sum(blocks.seen(list((parts.pulled * flux).T[..., None])))[0]
+            mixed.append(sum(blocks.products([b * f for b, f in zip(parts.lights, flux, strict=True)])))
+        pull = sum(blocks.products(list((parts.pulled * flux).T[..., None])))[0]
         power = blocks.power(parts.squared * flux**2).sum(axis=0)
         by_blocks = self.normal.mean_of_rest.by_blocks.T
-        mean = blocks.seen([b[:, None] * f for b, f in zip(by_blocks, flux, strict=True)])
+        mean = blocks.products([b[:, None] * f for b, f in zip(by_blocks, flux, strict=True)])
         return self._best(np.concatenate(mixed), pull, power, np.concatenate(mean))
 
     def of_pixels(self, pictures):
@@ -148,19 +148,19 @@ class _Model:
         half, along, power = self._reduced(*self._products(np.float32(picture * np.eye(3)[:, None])))
         rest = np.diag((1 + LEAST_UNEXPLAINED) * power) - half.T @ half
         try:
-            found = np.linalg.solve(rest, along)
+            flux = np.linalg.solve(rest, along)
         except np.linalg.LinAlgError:
-            found = np.zeros(3)
-        if not (np.isfinite(found).all() and found.max() > 0):
+            flux = np.zeros(3)
+        if not (np.isfinite(flux).all() and flux.max() > 0):
             return strengths
-        return np.maximum(found, FAINTEST * found.max())
+        return np.maximum(flux, FAINTEST * flux.max())
 
     def _products(self, pictures):
         """Return products of pictures (n, pixels, 3) with the columns of J, the residual, and themselves."""
         normal, count = self.normal, len(pictures)
         known = normal.pictures.reshape(len(normal.pictures), pictures.shape[1], 3)
         mixed: list[np.ndarray] = []
-        seen: Any = 0.0
+        by_pictures: Any = 0.0
         pull: Any = 0.0
         power: Any = 0.0
         for c, j in enumerate(normal.blocks.jacobian):
@@ -171,12 +171,12 @@ class _Model:
             )
             weighted = mine * np.float32(slope**2 * robust)
             mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)
-            seen = seen + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
+            by_pictures = by_pictures + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
             pull = pull + mine @ (slope * robust * residual)
             power = power + np.einsum("np,np->n", mine, weighted)
         by_pixels = normal.mean_of_rest.by_pixels.reshape(-1, 3)
         mean = np.stack([pictures[..., c] @ by_pixels[:, c] for c in range(3)])
-        return np.concatenate([*mixed, seen]), pull, power, mean
+        return np.concatenate([*mixed, by_pictures]), pull, power, mean
 
     def _reduced(self, mixed, pull, power, mean):
         """Return L^-1 times the mixed part, the slope beside the other unknowns, and the power.

@@ -139,11 +139,11 @@ class Likelihood:
         The most likely one: for squares exactly, with Huber's loss as an M-estimate of scale (not his
         proposal 2). At least ``least``, of paint at most :attr:`paint_noise`.
         """
-        found = self._pixels(residual, least) / (3 * self.independent)
-        if found <= 1:
+        ratio = self._pixels(residual, least) / (3 * self.independent)
+        if ratio <= 1:
             return least
         if not self.robust:
-            return float(np.sqrt(self.variance(found * least**2, least)))
+            return float(np.sqrt(self.variance(ratio * least**2, least)))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)

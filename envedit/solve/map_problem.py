@@ -317,9 +317,11 @@ class Problem(Unknowns):
             sky, _ = self.layers.parts(params)
             dr.backward(dr.sum(sky.array * tensor(light).array))
             units = [in_numpy(self.layers.scales[name]) for name in names]
-            found = [dr.grad(params[name]).numpy() / unit for name, unit in zip(names, units, strict=True)]
-        colour = float(found.pop()[0, 0]) if self.saturates else 0.0
-        return np.concatenate([np.float64(one).reshape(-1, 3) for one in found]), colour
+            derivatives = [
+                dr.grad(params[name]).numpy() / unit for name, unit in zip(names, units, strict=True)
+            ]
+        colour = float(derivatives.pop()[0, 0]) if self.saturates else 0.0
+        return np.concatenate([np.float64(one).reshape(-1, 3) for one in derivatives]), colour
 
     def _precision(self, unknowns):
         """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
@@ -345,19 +347,19 @@ class Problem(Unknowns):
 
     def _from_prior(self, state, start, unknowns):
         """How far the unknowns are from where the prior draws them."""
-        found = [state["gain"].T.ravel()]
+        parts = [state["gain"].T.ravel()]
         for name, i, axis in unknowns:
             if name == "flux":
-                found.append([self._flux_change(state, start, i)[axis]])
+                parts.append([self._flux_change(state, start, i)[axis]])
             elif name == "camera":
-                found.append([self.photo.log_factor[axis] + state[name][i, axis]])
+                parts.append([self.photo.log_factor[axis] + state[name][i, axis]])
             elif name == "saturation":
-                found.append(state[name][i])
+                parts.append(state[name][i])
             elif name == "turn":
-                found.append([rotation_between(self.direction(start, i), self.direction(state, i)) @ axis])
+                parts.append([rotation_between(self.direction(start, i), self.direction(state, i)) @ axis])
             else:
-                found.append([(state[name] - start[name])[i, axis]])
-        return np.concatenate(found)
+                parts.append([(state[name] - start[name])[i, axis]])
+        return np.concatenate(parts)
 
     def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
         """Return the state after a damped step; None if the step is not finite."""

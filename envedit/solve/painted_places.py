@@ -42,7 +42,7 @@ def best(
         return []
     own, flux = k < lights.own, lights.flux[k]
     pixels = np.maximum(np.bincount(blocks.block_of, minlength=blocks.count), 1)[:, None]
-    seen = _Seen(
+    compared = _Comparison(
         likelihood=likelihood,
         sigma=sigma,
         before=blocks.summed(point.rendering) / pixels,
@@ -50,17 +50,17 @@ def best(
         weight=blocks.summed(likelihood.weight)[:, 0],
         share=blocks.summed(likelihood.share)[:, 0],
     )
-    factors, unlikeliness = seen.best(blocks.of_cells(flux), own)
+    factors, unlikeliness = compared.best(blocks.of_cells(flux), own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
-    found = []
+    lights_refined = []
     for _ in range(PLACES_REFINED):
         at = int(np.argmin(unlikeliness))
         if not np.isfinite(unlikeliness[at]):
             break
         unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
-        found.append(_refined(problem, point, flux, own, directions[at], sigma))
-    return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in found]
+        lights_refined.append(_refined(problem, point, flux, own, directions[at], sigma))
+    return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in lights_refined]
 
 
 def _refined(problem, point, flux, own, direction, sigma):
@@ -68,7 +68,7 @@ def _refined(problem, point, flux, own, direction, sigma):
     transport, likelihood = problem.transport, problem.likelihood
     height, width = problem.envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
-    seen = _Seen(
+    compared = _Comparison(
         likelihood=likelihood,
         sigma=sigma,
         before=point.rendering.reshape(-1, 3),
@@ -84,14 +84,14 @@ def _refined(problem, point, flux, own, direction, sigma):
         texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
         unit = (flux / omega[texels // width][:, None]).astype(np.float32)
         pictures = transport.probe(texels) * unit[:, None, :]
-        factors, unlikeliness = seen.best([tensor(one) for one in pictures.T], own)
+        factors, unlikeliness = compared.best([tensor(one) for one in pictures.T], own)
         at = int(np.argmin(unlikeliness))
         row, column = divmod(int(texels[at]), width)
     return latlong.directions(height, width)[row, column], factors[at], float(unlikeliness[at])
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Comparison:
     """Pixels or blocks of them, by which pictures of a light are compared.
 
     ``before`` and ``target`` are linear radiance (n, 3); ``weight`` (n,) and ``share`` (n,) those of the
@@ -110,12 +110,12 @@ class _Seen:
 
         ``pictures`` are (n, k), per channel.
         """
-        found = np.ones(pictures[0].shape[1])
+        strengths = np.ones(pictures[0].shape[1])
         if not own:  # of any flux; on black, as much as was painted
             light = self.before.mean() or max(float(self.target.mean()), 1e-30)
             mean = np.mean([dr.mean(one, axis=0).numpy() for one in pictures], axis=0)
-            found = light / np.maximum(mean, 1e-30)
-        factors = np.float32(np.outer(OWN_FLUX_FACTORS if own else ADDED_FLUX_SHARES, found))
+            strengths = light / np.maximum(mean, 1e-30)
+        factors = np.float32(np.outer(OWN_FLUX_FACTORS if own else ADDED_FLUX_SHARES, strengths))
         squares, means = self._sums(pictures, factors)
         count = 3 * self.likelihood.independent
         squares = squares / self.likelihood.area

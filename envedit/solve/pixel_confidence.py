@@ -64,17 +64,17 @@ def weights(
     views = views or (slice(None),)
     around = np.concatenate([_windows(variance[rows], AVERAGED_PIXELS).mean(axis=(2, 3)) for rows in views])
     brightness = picture.max(axis=2)
-    lit = brightness > LEAST_BRIGHTNESS * brightness.mean(dtype=np.float64)
-    if not lit.any():
+    bright = brightness > LEAST_BRIGHTNESS * brightness.mean(dtype=np.float64)
+    if not bright.any():
         return None
-    beyond = np.maximum(around - NOISE_FLOOR_VARIANCES * np.median(around[lit]), 0)
+    beyond = np.maximum(around - NOISE_FLOOR_VARIANCES * np.median(around[bright]), 0)
     trust = HALF_TRUSTED_ERROR**2 / (HALF_TRUSTED_ERROR**2 + beyond)
     if trust.min() >= 0.5:
         return None
     brightest = np.concatenate([_windows(brightness[rows], 1).max(axis=(2, 3)) for rows in views])
-    shows_light = (brightest >= LIGHT_BRIGHTNESS * np.median(brightness[lit])) & (beyond > 0)
+    shows_light = (brightest >= LIGHT_BRIGHTNESS * np.median(brightness[bright])) & (beyond > 0)
     trust = np.where(shows_light, 0, trust)
-    return trust[..., None].astype(np.float32) if trust[lit].any() else None
+    return trust[..., None].astype(np.float32) if trust[bright].any() else None
 
 
 def _windows(values, reach):

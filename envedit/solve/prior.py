@@ -118,14 +118,14 @@ class Prior:
         directions = gain.directions(len(gain.sizes) - 1)
         cosine = np.clip(directions @ directions.T, -1, 1)
         first, last = sum(coarse[:-1]), sum(coarse)
-        found = np.zeros((3, last + ground, last + ground))
-        for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
+        precisions = np.zeros((3, last + ground, last + ground))
+        for precision, skies in zip(precisions, PHOTOGRAPHED, strict=True):
             covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM), self.factor)
             covariance[np.diag_indices_from(covariance)] *= 1 + OWN_VARIANCE_SHARE
             precision[first:last, first:last] = np.linalg.inv(covariance)
             precision[np.arange(first), np.arange(first)] = FIXED_PRECISION
             precision[last:, last:] = (self.factor * skies.whole) ** -2.0
-        return found
+        return precisions
 
     @property
     def flux_precision(self) -> np.ndarray:

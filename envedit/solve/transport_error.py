@@ -27,7 +27,7 @@ STEPS = 6
 
 
 def corrected(
-    target: Target, scene: Scene, envmap: np.ndarray, seen: np.ndarray, seed: int, keep: bool = True
+    target: Target, scene: Scene, envmap: np.ndarray, rendering: np.ndarray, seed: int, keep: bool = True
 ) -> Target:
     """Return a target whose aim is the picture as T would show it near a map.
 
@@ -39,7 +39,7 @@ def corrected(
         The scene.
     envmap : ndarray (H, W, 3)
         E^.
-    seen : ndarray (h, w, 3)
+    rendering : ndarray (h, w, 3)
         R(E^).
     seed : int
         That of the configuration.
@@ -47,4 +47,4 @@ def corrected(
         Keep I on disk: a run that is killed and resumed has the same.
     """
     shown, _, _ = rendered(scene, envmap, SPP, Seeds.of(seed).solution_check, keep)
-    return target.seen_as(seen, shown)
+    return target.seen_as(rendering, shown)

@@ -82,22 +82,22 @@ class Unknowns:
 
     def params(self, state: dict) -> dict:
         """Return the layers' parameters of a state; where it is an unknown, with the saturation."""
-        found, start = {}, 0
+        params, start = {}, 0
         shapes = [(*size, 3) for size in self.sizes] + [(1, 3)] * self.ground
         for name, shape in zip(self.grids, shapes, strict=True):
             stop = start + int(np.prod(shape[:-1]))
             grid = state["gain"][start:stop].reshape(shape)
             unit = in_numpy(self.layers.scales[name])
-            found[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
+            params[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
             start = stop
         names = ["turn", "flux", "size"]
         if self.saturates or state["saturation"].any():
             names.append("saturation")
         for name in names:
-            found[name] = tensor(state[name] / self.layers.scales[name])
-        return found
+            params[name] = tensor(state[name] / self.layers.scales[name])
+        return params
 
-    def found(self, state: dict) -> dict:
+    def solution_params(self, state: dict) -> dict:
         """Return the layers' parameters of a state that is a solution: colours that stay keep their bits."""
         params = self.params(state)
         if not state["saturation"].any():

@@ -658,7 +658,8 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
 @pytest.mark.slow
 def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path, rng, monkeypatch):
     """Mitsuba adds the gradients of a texel in any order: its runs agree but for the last bits."""
-    settings = settings_of(tmp_path, smooth(rng), renderer={"kind": "path", "spp": 4, "max_depth": 3}, optimizer={"iterations": 10})
+    renderer = {"kind": "path", "spp": 4, "max_depth": 3}
+    settings = settings_of(tmp_path, smooth(rng), renderer=renderer, optimizer={"iterations": 10})
     whole = pipeline.run(settings)
     monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
     monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
@@ -885,7 +886,9 @@ def test_a_turn_is_as_exact_where_the_transport_is_not(degrees, tmp_path, rng):
     """T with few samples; texels of 11.25 degrees each."""
     target, film = {"rotate_degrees": degrees, "spp": 256}, {"width": 48, "height": 36}
     renderer = {"spp": 4, "max_depth": 3}
-    settings, picture = turned_world(tmp_path, rng, target=target, scene=film, renderer=renderer, optimizer={"iterations": 4})
+    settings, picture = turned_world(
+        tmp_path, rng, target=target, scene=film, renderer=renderer, optimizer={"iterations": 4}
+    )
     found = pipeline.run(settings)
     assert found.metrics["turn_degrees"] == pytest.approx(degrees, abs=0.6 if degrees == 60 else 1e-9)
     assert degrees == 60 or found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()

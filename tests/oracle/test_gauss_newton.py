@@ -1209,7 +1209,7 @@ def test_a_sky_gets_no_more_saturated_and_the_rest_of_a_step_makes_up_for_it(rng
 def test_saturation_comes_back_from_a_checkpoint_of_its_state(rng):
     problem, params = saturating(rng, 0.3)
     state = problem.state(params)
-    assert state["saturation"].tolist() == [[0.0]] and "saturation" not in problem.found(state)
+    assert state["saturation"].tolist() == [[0.0]] and "saturation" not in problem.solution_params(state)
     state["saturation"][:] = -0.7
     again = problem.state(problem.params(state))
     np.testing.assert_allclose(again["saturation"], -0.7, rtol=1e-6)

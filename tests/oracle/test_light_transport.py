@@ -99,7 +99,7 @@ def test_pictures_are_those_of_mitsuba(recorded):
     # Both tiers. What the pole and the seam do to a texel does not depend on the surface that it lights.
     suns = SUNS | (SUNS_BELOW if name == "in the air" else {})
     if name not in EVERY_SUN:
-        suns = {what: SUNS[what] for what in ("the horizon", "the seam, last column")}
+        suns = {what: SUNS[what] for what in ("the seam, last column",)}
     for what, (row, column) in suns.items():
         image = sun(row, column)
         assert all(t.resolve(image) >= 1 for t in transports)

@@ -374,7 +374,7 @@ def edited(m, folder):
     if not same:
         problem = Problem(made, traced, m, wanted)
         lights = search.search(problem, problem.state(params))
-        assert np.isfinite(made.decode(problem.found(lights.run.state)).numpy()).all()
+        assert np.isfinite(made.decode(problem.solution_params(lights.run.state)).numpy()).all()
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
     objective = adam_loop.Objective(weights, wanted, None, m, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.01)

@@ -569,7 +569,7 @@ class Session:
             self._wide = self.given.at_file_size(settings, SKY_WIDTH)
         by_hand = replace(settings, lights=document.lights, rotate_degrees=document.rotate_degrees)
         given = replace(self.given, placed=self.placed if document.lights else None)
-        params = self.problem.found(self.run.state)
+        params = self.problem.solution_params(self.run.state)
         edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
         _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)
         self.tell.frame("sky-before", "transport", self._wide.radiance)

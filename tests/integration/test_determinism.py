@@ -16,7 +16,7 @@ from tests.oracles.runs import call, changed, differing, pixels, world
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_core")
 
-KINDS = ("layers", "siren", "pixels", "log-pixels")
+KINDS = ("layers", "siren", "log-pixels")
 
 
 @pytest.fixture

@@ -261,6 +261,17 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path):
         page.shot("shaped")
         page.page.get_by_test_id("undo").click()
         until(lambda: lights()[0]["aspect"] == 0.1)
+        # ---- Its size and flux, by drags of its handle with a key: it stays where it is
+        stays = {key: lights()[0][key] for key in ("azimuth", "elevation")}
+        handle = page.page.get_by_test_id("handle-2").bounding_box()
+        x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
+        for key, name, factor in (("Shift", "size", 2), ("Control", "flux", 0.5)):
+            before = np.array(lights()[0][name])
+            page.page.keyboard.down(key)
+            page.drag((x, y), (x, y + (50 if factor < 1 else -50)))
+            page.page.keyboard.up(key)
+            until(lambda name=name, wanted=factor * before: np.allclose(lights()[0][name], wanted, rtol=0.05))
+        assert {key: lights()[0][key] for key in stays} == stays
         # ---- Without a chosen light, the sun casts the shadow
         page.page.keyboard.press("Escape")
         sync_api.expect(page.page.get_by_test_id("light-panel")).to_contain_text("No light chosen")

@@ -220,8 +220,9 @@ def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
-def test_an_interrupted_edit_of_two_views_goes_on_as_if_it_were_not(two):
+def test_an_interrupted_edit_of_two_views_goes_on_as_if_it_were_not(two, monkeypatch):
     """With Adam, whose SSIM has no window across views."""
+    monkeypatch.setattr(search, "_moves", lambda *_: [])
     settings = settings_of(
         two, input={"width": 16}, scene={"width": 24}, target={"spp": 16, "rotate_degrees": 20.0},
         output={"spp": 16},

@@ -39,7 +39,7 @@ def world(folder, rng, **changes):
     """Write a map, a scene and a configuration of a tiny run; returns the configuration's path."""
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "map.exr").exists():
-        images.write_exr(folder / "map.exr", sky(rng) + 0.1)
+        images.write_exr(folder / "map.exr", sunny(rng))
     write_scene(folder, SENSOR, BALL, SKY, name="scene.xml")
     given = {"input": {"envmap": "map.exr"}, "scene": {"file": "scene.xml"}}
     lines = []

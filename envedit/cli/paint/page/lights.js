@@ -72,6 +72,13 @@ export class Lights {
     this.preview(index, { azimuth: round(((azimuth % 360) + 360) % 360), elevation: round(Math.max(-90, Math.min(90, elevation))) });
   }
 
+  // Change flux or size of a light as it was when a drag began, by pixels upwards.
+  stretch(index, light, pixels, ofFlux) {
+    const factor = 2 ** (pixels / PIXELS_A_STOP);
+    if (ofFlux) this.preview(index, { flux: light.entry.flux.map((v) => Math.min(1e6, v * factor)) });
+    else this.preview(index, { size: Math.max(0.01, Math.min(mostSize(light), round(light.entry.size * factor))) });
+  }
+
   drag(event, index) {
     if (event.button !== 0 || this.turning) return;
     event.preventDefault();
@@ -83,7 +90,8 @@ export class Lights {
     handle.setPointerCapture(event.pointerId);
     handle.onpointermove = (e) => {
       const dx = ((e.clientX - start[0]) / box.width) * 360, dy = ((e.clientY - start[1]) / box.height) * 180;
-      if (dx || dy) this.moveTo(index, light.azimuth + dx, light.elevation - dy);
+      if (e.shiftKey || e.ctrlKey) this.stretch(index, light, start[1] - e.clientY, e.ctrlKey);
+      else if (dx || dy) this.moveTo(index, light.azimuth + dx, light.elevation - dy);
     };
     handle.onpointerup = handle.onpointercancel = () => {
       handle.onpointermove = handle.onpointerup = handle.onpointercancel = null;
@@ -147,7 +155,7 @@ export class Lights {
     const strength = 2 ** Number(flux.value) * (light.own ? 1 : this.unit);
     let next = { [what]: Number(this.panel[what].value) }; // aspect, rotation, softness
     if (what === "flux") next = { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) };
-    if (what === "size") next = { size: Math.min(light.own ? 20 : 90, round(2 ** Number(size.value))) };
+    if (what === "size") next = { size: Math.min(mostSize(light), round(2 ** Number(size.value))) };
     if (what === "shape") next = { shape: this.panel.shape.value, aspect: aspectOf(this.panel.shape.value) };
     this.preview(this.chosen, next);
   }
@@ -270,6 +278,8 @@ export class Lights {
   }
 }
 
+const PIXELS_A_STOP = 50; // of a drag with Shift or Ctrl
+const mostSize = (light) => (light.own ? 20 : 90); // a factor, or degrees
 const SHAPED = ["shape", "aspect", "rotation", "softness"]; // keys of an added light only
 const aspectOf = (shape) => (shape === "strip" ? 0.1 : 1); // where none is given
 export const off = ({ entry }) => entry.muted || entry.flux.every((v) => v === 0);

@@ -298,7 +298,7 @@ const strokes = new Strokes($("overlay"), () => ({
   preview(stroke) { history.preview({ strokes: [...history.document.strokes, stroke] }, "drawing"); },
   done(stroke) { history.push({ strokes: [...history.document.strokes, stroke] }); },
   cancel() { send(history.document, "done"); },
-  drag(phase, x, y) { pick(phase, x, y); },
+  drag(phase, x, y, event) { pick(phase, x, y, event); },
 });
 
 // Radiance of a light stroke, whose amount is of what is shown as white.
@@ -313,15 +313,21 @@ function viewed(stroke) {
 // A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
 // history: it ends with the answer to the last question, or after UNANSWERED where none comes.
 const UNANSWERED = 5000;
-let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0;
-function pick(phase, x, y) {
+let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
+function pick(phase, x, y, event) {
   const placing = PICKS[tool]?.[1];
   if (phase === "start") {
     clearTimeout(unanswered);
     picked = placing && lights.list()[lights.chosen] ? lights.chosen : -1;
     point = [];
-    place = null;
+    place = held = null;
     ended = false;
+  }
+  if (phase === "move" && (event?.shiftKey || event?.ctrlKey)) { // flux or size of the light in place of where it is
+    if (picked < 0) return;
+    held ??= { light: lights.list()[picked], y: event.clientY };
+    lights.stretch(picked, held.light, held.y - event.clientY, event.ctrlKey);
+    return;
   }
   if (phase === "end") {
     ended = true;

@@ -6,7 +6,7 @@ export class Strokes {
   constructor(overlay, options, on) {
     this.overlay = overlay;
     this.options = options; // () => {type, picks, shape, size, softness, ...}
-    this.on = on; // preview(stroke), done(stroke), drag(phase, x, y)
+    this.on = on; // preview(stroke), done(stroke), drag(phase, x, y, event)
     this.cursor = [0.5, 0.5];
     this.shown = false;
     this.reset();
@@ -55,7 +55,7 @@ export class Strokes {
   move(event) {
     const place = this.at(event);
     this.hover = place;
-    if (this.dragging) { this.on.drag("move", ...place); return; }
+    if (this.dragging) { this.on.drag("move", ...place, event); return; }
     if (this.drawing) {
       const all = event.getCoalescedEvents?.() ?? [];
       for (const one of all.length ? all : [event]) this.add(this.at(one), one);

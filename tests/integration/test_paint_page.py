@@ -10,6 +10,7 @@ import pytest
 
 from envedit import config, pipeline
 from envedit.core.color import luminance
+from envedit.core.tone_curves import TONE_CURVES
 from envedit.images import images
 from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
@@ -346,6 +347,38 @@ def states_are_compared(page, kept):
     until(lambda: "temperature" not in kept.read_text())
 
 
+TONES = """async ([canvas, colour]) => {
+  const { Display } = await import(new URL("display.js", location.href).href);
+  const shown = {};
+  for (const curve of [3, 4]) {
+    const display = new Display(document.createElement("canvas"), "radiance", canvas === "2d");
+    Object.assign(display.settings, { curve });
+    display.canvas.style = "width: 8px; height: 8px";
+    document.body.append(display.canvas);
+    display.show({ width: 1, height: 1, pixels: new Uint16Array(colour) });
+    await new Promise((done) => requestAnimationFrame(() => {
+      const copy = document.createElement("canvas").getContext("2d");
+      copy.drawImage(display.canvas, 0, 0);
+      shown[curve] = [...copy.getImageData(0, 0, 1, 1).data].slice(0, 3);
+      done();
+    }));
+    display.canvas.remove();
+  }
+  return shown;
+}"""
+
+
+def tones_are_those_of_the_package(page):
+    """AgX by both ways of drawing; false colour is grey at middle grey, and red and white far above it."""
+    for canvas in ("2d", "webgl2"):
+        for colour, band in (([0.9, 0.3, 0.02], "6cbf3b"), ([0.18] * 3, "808080"), ([40.0] * 3, "ffffff")):
+            half = np.array(colour, np.float16)
+            shown = page.page.evaluate(TONES, [canvas, half.view(np.uint16).tolist()])
+            wanted = 255 * TONE_CURVES["agx"].shown(half.astype(float))
+            np.testing.assert_allclose(shown["3"], wanted, atol=1.5)
+            np.testing.assert_allclose(shown["4"], list(bytes.fromhex(band)), atol=1)
+
+
 def map_is_large_and_rendering_zoomed(page):
     """The map beside the original; wheel and keys zoom the rendering."""
     page.settled(False)
@@ -374,6 +407,7 @@ def test_lights_listed_states_compared_the_map_large_and_zoom(browser, tmp_path)
         lights_are_listed(page, kept)
         states_are_compared(page, kept)
         map_is_large_and_rendering_zoomed(page)
+        tones_are_those_of_the_package(page)
         assert not page.faults, page.faults
 
 

@@ -1,6 +1,16 @@
 // Half floats on a canvas: WebGL2, or a 2D canvas where there is none or it would be drawn by software, which is
 // slower. Exposure and tone mapping happen here.
 
+// AgX as in core/tone_curves.py, rows of its matrices; and colours of stops from middle grey, -6 and less to 6 and more.
+const INSET = [[0.8424791, 0.0784336, 0.0792237], [0.0423282, 0.8784686, 0.0791661], [0.0423757, 0.0784336, 0.879143]];
+const OUTSET = [[1.196879, -0.0980209, -0.0990297], [-0.0528969, 1.1519031, -0.0989612], [-0.0529716, -0.0980435, 1.1510737]];
+const CONTRAST = [15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232], DARKEST = -12.47393, STOPS = 16.500003;
+const BANDS = ["000000", "2b0a52", "1d2a8f", "1560bd", "1596c9", "17b3a0", "808080", "6cbf3b", "c9d62b", "f5c518", "f28a1c", "e23b2e", "ffffff"]
+  .map((hex) => [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255));
+const GREY = 0.18, LUMINANCE = [0.2126, 0.7152, 0.0722];
+const glsl = (values) => values.map((v) => Number(v).toFixed(8)).join(", ");
+const glslRows = (rows) => `mat3(${rows.map(glsl).join(", ")})`;
+
 const VERTEX = `#version 300 es
 out vec2 at;
 void main() {
@@ -19,6 +29,15 @@ vec3 shown(vec3 e) {
   e = max(e * scale, 0.0);
   if (curve == 1) e = clip(e * (2.51 * e + 0.03) / (e * (2.43 * e + 0.59) + 0.14));
   else if (curve == 2) return log(1.0 + 100.0 * min(e, 1e4)) / log(10001.0) * 1.6;
+  else if (curve == 3) {
+    vec3 t = clamp((log2(max(e * ${glslRows(INSET)}, 1e-9)) - ${glsl([DARKEST])}) / ${glsl([STOPS])}, 0.0, 1.0);
+    vec3 s = vec3(0);
+    for (int i = 0; i < 7; i++) s = s * t + float[7](${glsl(CONTRAST)})[i];
+    return clamp(s * ${glslRows(OUTSET)}, 0.0, 1.0);
+  } else if (curve == 4) {
+    float stops = log2(max(dot(e, vec3(${glsl(LUMINANCE)})), 1e-9) / ${glsl([GREY])});
+    return vec3[13](${BANDS.map((c) => `vec3(${glsl(c)})`).join(", ")})[int(clamp(round(stops), -6.0, 6.0)) + 6];
+  }
   return pow(e, vec3(1.0 / 2.2));
 }`.replace("e = clip(", "e = (") + `
 void main() {
@@ -141,24 +160,34 @@ export class Display {
       this.image = this.flat.createImageData(width, height);
       this.image.data.fill(255); // opaque
     }
-    const bytes = this.bytes(), data = this.image.data;
-    for (let i = 0, to = 0, of = 0; i < width * height; i++, to += 4, of += 3) {
-      data[to] = bytes[pixels[of]];
-      data[to + 1] = bytes[pixels[of + 1]];
-      data[to + 2] = bytes[pixels[of + 2]];
-    }
-    if (this.before) this.drawBefore(bytes, data, width, height);
+    const paint = this.painter(), data = this.image.data;
+    for (let i = 0; i < width * height; i++) paint(data, 4 * i, pixels, 3 * i);
+    if (this.before) this.drawBefore(paint, data, width, height);
     this.flat.putImageData(this.image, 0, 0);
   }
 
+  // What writes one texel to the bytes of an image. Of the last two curves a channel depends on the others.
+  painter() {
+    const { stops, curve } = this.settings, show = [agx, band][curve - 3];
+    if (this.mode !== 0 || !show) {
+      const bytes = this.bytes();
+      return (data, to, pixels, of) => { for (let c = 0; c < 3; c++) data[to + c] = bytes[pixels[of + c]]; };
+    }
+    const scale = 2 ** stops;
+    return (data, to, pixels, of) => {
+      const shown = show([0, 1, 2].map((c) => Math.max(HALF[pixels[of + c]] * scale, 0)));
+      for (let c = 0; c < 3; c++) data[to + c] = 255 * shown[c];
+    };
+  }
+
   // The left part as it was before, whose frame may have another size.
-  drawBefore(bytes, data, width, height) {
+  drawBefore(paint, data, width, height) {
     const { before } = this, edge = Math.min(width, Math.ceil(this.settings.split * width));
     for (let y = 0; y < height; y++) {
       const row = Math.floor(((y + 0.5) * before.height) / height) * before.width;
       for (let x = 0; x < edge; x++) {
         const of = 3 * (row + Math.floor(((x + 0.5) * before.width) / width)), to = 4 * (y * width + x);
-        for (let c = 0; c < 3; c++) data[to + c] = bytes[before.pixels[of + c]];
+        paint(data, to, before.pixels, of);
       }
     }
   }
@@ -182,6 +211,17 @@ export class Display {
     return e ** (1 / 2.2);
   }
 }
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+function agx(e) {
+  const curve = (v) => {
+    const t = Math.min(1, Math.max(0, (Math.log2(Math.max(v, 1e-9)) - DARKEST) / STOPS));
+    return CONTRAST.reduce((sum, factor) => sum * t + factor, 0);
+  };
+  const display = INSET.map((row) => curve(dot(row, e)));
+  return OUTSET.map((row) => Math.min(1, Math.max(0, dot(row, display))));
+}
+const band = (e) => BANDS[Math.min(12, Math.max(0, Math.round(Math.log2(Math.max(dot(LUMINANCE, e), 1e-9) / GREY) + 6)))];
 
 const HALF = Float32Array.from({ length: 65536 }, (_, bits) => {
   const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;

@@ -41,7 +41,7 @@ def commands(step: str, variant: str, small: bool, folder: str) -> list[list[str
     python = [sys.executable, "-m"]
     variable = ["--set", f"variant={variant}"]
     run = [*python, "envedit", "run", "--json", "--quiet", "--out", folder, *variable]
-    sizes = ["--set", f"input.width={64 if small else 256}", "--set", f"scene.width={32 if small else 128}"]
+    sizes = ["--set", f"input.width={32 if small else 256}", "--set", f"scene.width={16 if small else 128}"]
     if step == "doctor":
         return [[*python, "envedit", "doctor", "--variant", variant]]
     if step == "quickstart":

@@ -95,7 +95,6 @@ def degrees_apart(a, b):
 PLACES = {
     "the other side of the sphere": ELSEWHERE,
     "across the seam": (5, 62),
-    "high": (2, 10),
     "the horizon": (15, 33),
 }
 

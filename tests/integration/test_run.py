@@ -412,6 +412,7 @@ def test_what_a_display_does_not_show_is_judged_in_stops(tmp_path, rng, capsys):
 @pytest.mark.slow
 def test_quiet_prints_nothing(tmp_path, rng, capsys):
     of_siren = {"representation__hidden": 128, "representation__depth": 3, "fit__epochs": 1200}
+    of_siren |= {"optimizer__iterations": 30}
     assert call(world(tmp_path, rng), "--quiet", *changed(**of_siren)) == 0  # the defaults: none is named
     assert capsys.readouterr() == ("", "")
 

@@ -85,11 +85,11 @@ def test_turns_of_one_run_after_another_add_up(rng, tmp_path):
         "output": {"spp": 16, "report": False},
     }
     turned = []
-    for k in range(3):
+    for k in range(2):
         file = tmp_path / f"{k}.toml"
         file.write_text(config.to_toml(config.from_dict(settings)))
         assert runs.call(file, "--out", tmp_path / f"{k}") == 0
         turned.append(runs.measured(tmp_path / f"{k}")["turn_degrees"])
         settings["scene"] = {"file": str(tmp_path / f"{k}" / "edited.xml"), "width": 32}
         settings["input"].pop("envmap", None)
-    assert sum(turned) == pytest.approx(90, abs=0.4)  # a seventh of a texel
+    assert sum(turned) == pytest.approx(60, abs=0.4)  # a seventh of a texel

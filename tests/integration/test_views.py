@@ -189,7 +189,7 @@ def test_targets_that_fit_no_views(keys, what):
 def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
     """The solver's posterior says so; the files are of each view."""
     out = two.parent / "out"
-    small = {"input": {"width": 32}}
+    small = {"input": {"width": 32}, "optimizer": {"iterations": 6}}
     (two.parent / "c.toml").write_text(config.to_toml(settings_of(two, **small)))
     # How well the sky is known hardly depends on where its light is.
     monkeypatch.setattr(search, "_moves", lambda *_: [])

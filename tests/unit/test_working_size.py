@@ -116,10 +116,10 @@ def test_paint_keeps_its_change_and_its_weight():
 def test_an_edit_on_fewer_pixels_is_judged_at_full_size():
     """Nearly as good as one on all of them; what is shown has the size of the film."""
     found = {}
-    for pixels in (32 * 32, 64 * 64):
+    for pixels in (24 * 24, 48 * 48):
         tables = {
             "input": {"width": 32},
-            "scene": {"file": "sphere", "width": 64},
+            "scene": {"file": "sphere", "width": 48},
             "target": {"rotate_degrees": 60.0, "spp": 64},
             "output": {"spp": 64},
             "renderer": {"pixels": pixels},
@@ -127,9 +127,9 @@ def test_an_edit_on_fewer_pixels_is_judged_at_full_size():
         }
         found[pixels] = envedit.edit(tables, envmap=envedit.sunsky(32))
     fewer, all_of_them = found.values()
-    assert "solved on a picture of 32x32 pixels" in fewer.notes
+    assert "solved on a picture of 24x24 pixels" in fewer.notes
     assert not any("solved on" in note for note in all_of_them.notes)
-    assert {picture.shape for picture in fewer.renders.values()} == {(64, 64, 3)}
+    assert {picture.shape for picture in fewer.renders.values()} == {(48, 48, 3)}
     psnr = [one.metrics["render"]["psnr"] for one in (fewer, all_of_them)]
     assert psnr[0] > psnr[1] - 3, psnr
     # Of the map fewer pixels tell less: where in its texel the sun is.

@@ -246,12 +246,21 @@ def transported(m, folder):
 # ---- losses ----------------------------------------------------------------------------------------------
 
 
+def ssim_loss(x, y):
+    return ssim.Ssim(y)(x)
+
+
+# Those of the edit, and those of the fit by the names of its weights.
+LOSSES = {"ssim": ssim_loss, "log_ssim": ssim_loss, **losses.LOSSES}
+LOSSES |= {"log_mse": losses.image_l2, "hdr": losses.image_l1}
+
+
 def plain(name, x, y):
     """Return value and gradient of a loss in float64; SSIM by the same code in double precision."""
     if name in ("ssim", "log_ssim"):
         leaf = mi.TensorXd(np.asarray(x, np.float64))
         dr.enable_grad(leaf)
-        value = ssim.ssim_loss(leaf, mi.TensorXd(np.asarray(y, np.float64)))
+        value = ssim.Ssim(mi.TensorXd(np.asarray(y, np.float64)))(leaf)
         dr.backward(value)
         return float(value[0]), np.array(dr.grad(leaf))
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
@@ -281,7 +290,7 @@ def loss_and_gradient(name, x, y):
     """Return value and gradient of a loss of the package in float32."""
     leaf = single(x)
     dr.enable_grad(leaf)
-    value = losses.LOSSES[name](leaf, single(y))
+    value = LOSSES[name](leaf, single(y))
     dr.backward(value)
     return float(value[0]), np.array(dr.grad(leaf))
 
@@ -308,7 +317,7 @@ def lost(m, folder):
         given = {name: (m, before) for name in ("hdr", "luminance", "l1", "tv", "change")}
         given |= {name: (display(m), display(before)) for name in ("image_l1", "image_l2", "ssim")}
         given |= {name: logs for name in ("log_mse", "log_ssim")}
-        assert given.keys() == losses.LOSSES.keys()
+        assert given.keys() == LOSSES.keys()
         seen = []
         for name, (x, y) in given.items():
             value, gradient = loss_and_gradient(name, x, y)

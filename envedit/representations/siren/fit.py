@@ -193,11 +193,12 @@ class Objective:
             else:
                 loss = dr.opaque(mi.Float, 0)
                 if self.settings.log_mse:
-                    loss += self.settings.log_mse * losses.log_mse(values, self.logs)
+                    loss += self.settings.log_mse * losses.image_l2(values, self.logs)
                 if self.settings.log_ssim:
                     loss += self.settings.log_ssim * self.ssim(values)
                 if self.settings.hdr:
-                    loss += self.settings.hdr * losses.hdr(self.normalisation.decode(values), self.radiance)
+                    radiance = self.normalisation.decode(values)
+                    loss += self.settings.hdr * losses.image_l1(radiance, self.radiance)
             dr.backward(loss)
         return dr.detach(loss), dr.grad(y)
 
@@ -242,7 +243,7 @@ def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
         return optimizer.cosine(base, epoch, settings.epochs)
     if settings.schedule == "warm-restarts":
         return optimizer.cosine_warm_restarts(base, epoch, settings.restart_period)
-    return optimizer.constant(base, epoch)
+    return base
 
 
 def _train(image, normalisation, x, network, settings, seed, begun, progress):

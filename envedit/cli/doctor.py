@@ -36,7 +36,7 @@ from envedit.cli.streams import steady
 from envedit.core.array_cache import cache_home
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
-from envedit.sweep.process import cores
+from envedit.core.processor import cores
 
 ALBEDO = 0.5
 _VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb")
@@ -368,7 +368,3 @@ def _memory_size() -> str:
     with contextlib.suppress(AttributeError, ValueError, OSError):
         return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GB"
     return "unknown"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import json
 import os
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import replace
@@ -372,7 +371,3 @@ def _change(before, after):
     first, last = (metrics.score(one, pair) for one in pair)
     saturated = " (most of the difference is outside the display's range)" if metrics.saturated(pair) else ""
     return f"{first.rpartition(' ')[0]} -> {last}{saturated}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -92,10 +92,7 @@ def _runs(process):
 def alone(folder: Path) -> Iterator[None]:
     """Make a folder for results, and let no other process of this machine work in it meanwhile.
 
-    Raises
-    ------
-    InputError
-        It cannot be made, or another process works in it.
+    InputError if it cannot be made, or another process works in it.
     """
     try:
         if folder.exists() and not folder.is_dir():
@@ -138,10 +135,7 @@ def prepare_folder(
     spare : sequence of path
         What is copied and not moved, if it is among the results: the run will be asked for by it again.
 
-    Raises
-    ------
-    InputError
-        An input lies where a result would go, or the folder cannot be used.
+    InputError if an input lies where a result would go, or the folder cannot be used.
     """
     try:
         # ---- What lies there, and whether an input is among it

@@ -106,12 +106,8 @@ def write(
 ) -> list[str]:
     """Write the map and the solution of each, numbered from 1, and a sheet; returns warnings.
 
-    ``optimizer.start`` takes a solution, ``1.npz``: an edit then goes on from it.
-
-    Raises
-    ------
-    InputError
-        A file cannot be written.
+    ``optimizer.start`` takes a solution, ``1.npz``: an edit then goes on from it. InputError if a file cannot
+    be written.
     """
     if not variants:
         return []

@@ -124,10 +124,7 @@ def job(
 def read_jobs(path: FilePath) -> list[Job]:
     """Read a TOML file of jobs, or the configurations in a folder; see the package's text.
 
-    Raises
-    ------
-    ConfigError, InputError
-        A file cannot be read, or holds no jobs, or one that is not usable.
+    ConfigError or InputError if a file cannot be read, or holds no jobs, or one that is not usable.
     """
     path = Path(path)
     if path.is_dir():

@@ -19,6 +19,7 @@ import envedit
 from envedit.core import file_locks
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import InputError
+from envedit.core.processor import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job, program
@@ -83,11 +84,6 @@ class Outcome:
     state: str
     seconds: float = 0.0
     error: str = ""
-
-
-def cores() -> int:
-    """Count the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_job(

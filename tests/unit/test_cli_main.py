@@ -44,7 +44,7 @@ def test_the_help_of_a_command_has_an_example(command, capsys):
 def test_the_help_of_run_names_what_it_takes_without_a_path(capsys):
     said = help_of(capsys, "run")
     assert all(name in said for name in (*shipped.configurations(), *shipped.scenes()))
-    assert f"{{{','.join(config.preset_names())}}}" in said
+    assert f"{{{','.join(config.presets.PRESETS)}}}" in said
 
 
 def test_the_help_of_init_names_the_shipped_scenes(capsys):

@@ -152,7 +152,7 @@ def test_shipped_configurations_and_resolved_ones_fit_the_schema():
     strokes = [{"type": "light", "polygon": [[0, 0], [1, 0], [0, 1]], "color": "#ffd9a6", "view": "left"}]
     lights = [{"light": 2, "azimuth": 3, "elevation": 4}, {"azimuth": 1, "elevation": 2, "flux": [1, 2, 3]}]
     made = {"target": {"kind": "strokes", "strokes": strokes}, "input": {"lights": lights, "rows": [2, 9]}}
-    for preset in config.preset_names():
+    for preset in config.presets.PRESETS:
         assert accepts(SCHEMA, tomllib.loads(config.to_toml(config.from_dict(made, preset=preset))))
 
 
@@ -260,7 +260,7 @@ def test_keys_that_do_not_apply_are_named_with_the_reason(tables, solver, named)
     assert config.unused(config.loads(config.to_toml(made)), solver) == said
 
 
-@pytest.mark.parametrize("preset", config.preset_names())
+@pytest.mark.parametrize("preset", config.presets.PRESETS)
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels"])
 def test_what_a_preset_gives_is_never_named(preset, kind):
     made = config.from_dict({"representation": {"kind": kind}}, preset=preset)

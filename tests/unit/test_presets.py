@@ -13,10 +13,10 @@ from envedit.core.errors import ConfigError
 
 def test_standard_is_the_defaults_and_the_presets_are_named():
     assert presets.PRESETS["standard"] == {}
-    assert cfg.preset_names() == ("draft", "standard", "paper")
+    assert tuple(cfg.presets.PRESETS) == ("draft", "standard", "paper")
 
 
-@pytest.mark.parametrize("preset", cfg.preset_names())
+@pytest.mark.parametrize("preset", tuple(cfg.presets.PRESETS))
 def test_every_preset_takes_effect_key_by_key(preset):
     config = cfg.loads("", preset=preset)
     assert config.preset == preset and (config.optimizer.lr == "auto") == (preset != "paper")

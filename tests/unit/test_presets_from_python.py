@@ -8,7 +8,7 @@ import pytest
 from envedit import config
 from envedit.config import Config, Fit, Input, Loss, Optimizer, Output, Representation, Scene, Target
 
-PRESETS = config.preset_names()
+PRESETS = config.presets.PRESETS
 KINDS = ("layers", "siren", "pixels", "log-pixels")
 STROKE = {"type": "shadow", "ellipse": [0.5, 0.5, 0.1, 0.1]}
 TARGETS = {

@@ -57,19 +57,10 @@ def on_sphere(theta: ArrayLike, phi: ArrayLike) -> np.ndarray:
 
 
 def texel_position(d: ArrayLike, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fractional (row, column) at which Mitsuba looks up directions.
+    """Return the fractional (row, column) at which Mitsuba looks up directions, arrays (...).
 
-    Parameters
-    ----------
-    d : array (..., 3)
-        Directions in the emitter's frame, of any positive length.
-    height, width : int
-        Size of the map in texels.
-
-    Returns
-    -------
-    row, column : arrays (...)
-        Rows in [0, H - 1], columns in [-1/2, W - 1/2); whole numbers are texel centres.
+    ``d`` (..., 3) are directions in the emitter's frame, of any positive length. Rows are in [0, H - 1],
+    columns in [-1/2, W - 1/2); whole numbers are texel centres.
     """
     _check_size(height, width)
     d = np.asarray(d, np.float64)
@@ -238,16 +229,7 @@ def rotate(image: ArrayLike, degrees: float) -> np.ndarray:
     360 degrees are one width: new(u) = old(u + degrees / 360). A shift by whole texels (to 1e-6) is exactly
     ``np.roll``; any other is interpolated linearly between the two columns, which keeps the sum of every row.
 
-    Parameters
-    ----------
-    image : array (H, W, ...)
-        The map.
-    degrees : float
-        Any finite angle.
-
-    Returns
-    -------
-    array (H, W, ...), of the dtype of ``image``
+    The result has the dtype of ``image`` (H, W, ...).
     """
     image = np.asarray(image)
     if not math.isfinite(degrees):
@@ -282,12 +264,8 @@ def to_envmap_data(image: ArrayLike) -> np.ndarray:
     """Return ``envmap.data`` of Mitsuba >= 3.9, ``(H, W + 2, 3)`` float32, for a map ``(H, W, 3)``.
 
     The first column repeats the last texel of each row and the last column the first. Mitsuba does not
-    validate the width: an (H, W, 3) tensor would silently be read as W - 2 columns.
-
-    Raises
-    ------
-    InputError
-        If the map has fewer than 3 rows or 2 columns.
+    validate the width: an (H, W, 3) tensor would silently be read as W - 2 columns. InputError if the map has
+    fewer than 3 rows or 2 columns.
     """
     image = np.asarray(image, np.float32)
     if image.ndim != 3 or image.shape[2] != 3:

@@ -45,7 +45,7 @@ def _lights(arguments: argparse.Namespace, console: Console) -> None:
     # ---- The lights, in Rec. 709 and in the colours of the file
     input_map = map_command.read(arguments.map, arguments, console)
     shape = input_map.stored.shape[:2]
-    separated = file_lights.lights_of(input_map.radiance).lights
+    separated = file_lights.lights_of(input_map.radiance)
     listed = map_lights.listed(separated, shape, file_lights.without(input_map.radiance, separated))
     texels = [input_map.stored.reshape(-1, 3)[light.texels][None] for light in separated]
     cores = [

@@ -32,12 +32,6 @@ _ROWS = 256  # of a map that are worked on at a time
 _SEARCH, _NOTHING = 20, 1e-9  # halvings of a radius; share of a peak that is rounding of a transform
 
 
-def any_asked(lights: config.Lights, output: config.Output) -> bool:
-    """Return whether anything is to be adjusted."""
-    colour = output.white_balance or output.temperature
-    return bool(lights.max_radiance or lights.soften_degrees or output.exposure or colour)
-
-
 def adjust(
     envmap: np.ndarray, lights: config.Lights, output: config.Output, scale: float = 1.0
 ) -> tuple[np.ndarray, list[str]]:
@@ -60,15 +54,10 @@ def adjust(
         The map itself where nothing is asked.
     notes : list of str
         What was done.
-
-    Raises
-    ------
-    NumericalError
-        The adjusted map leaves single precision.
     """
-    if not any_asked(lights, output):
+    colour = output.white_balance or output.temperature
+    if not (lights.max_radiance or lights.soften_degrees or output.exposure or colour):
         return envmap, []
-
     # ---- One factor for each channel
     gain = np.ones(3)
     notes = []
@@ -174,7 +163,7 @@ def _core(light: Light, shape: tuple[int, ...], degrees: float) -> np.ndarray:
 
 def _soften(envmap, degrees, most):
     """Soften the lights of a map in place and bound what it shows; ``most`` 0: no bound. Returns notes."""
-    lights = file_lights.lights_of(envmap).lights
+    lights = file_lights.lights_of(envmap)
     notes = [f"{len(lights)} lights softened by {degrees:g} degrees"] if degrees else []
     if degrees and not lights:
         notes = ["no light was found: lights.soften_degrees changes nothing"]

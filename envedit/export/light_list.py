@@ -27,18 +27,8 @@ _POINTS = 100_000  # of a light, by which its radii are measured
 def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split radiance (..., 3) into the sky, without lights but with their glow, and its lights.
 
-    Parameters
-    ----------
-    envmap : ndarray (..., 3) float32
-        Of the map.
-    core : ndarray (..., 3)
-        :attr:`.Separation.core` of the map, in its units.
-
-    Returns
-    -------
-    sky, lights : ndarray (..., 3) float32
-        Not negative; their sum in float32 is the map, bit for bit. Where there is no light the sky has the
-        map's bits.
+    ``core`` is :attr:`.Separation.core` of the map, in its units. Sky and lights are float32 and not
+    negative; their sum in float32 is the map, bit for bit. Without a light the sky has the map's bits.
     """
     envmap = np.asarray(envmap, np.float32)
     lights = np.minimum(core, envmap).astype(np.float32)
@@ -159,19 +149,9 @@ def kept(
 ) -> Separation:
     """Let texels that an edit did not change be the same lights as before, whatever has been separated.
 
-    Parameters
-    ----------
-    before, after : separation.Separation
-        Of the map before and after the edit.
-    start, end : ndarray (H, W, 3)
-        These maps.
-    degrees : float
-        By how much the whole map was turned (:func:`.latlong.rotate`) before it was edited.
-
-    Returns
-    -------
-    separation.Separation
-        ``after`` with other lights, and the core of these.
+    ``start`` and ``end`` (H, W, 3) are the map before and after the edit, of which ``before`` and ``after``
+    are separations; the whole map was turned by ``degrees`` (:func:`.latlong.rotate`) before it was edited.
+    Returns ``after`` with other lights, and the core of these.
     """
     same = np.asarray((latlong.rotate(start, degrees) == end).all(axis=2)).ravel()
     lights = []
@@ -251,12 +231,7 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
 def summary(lights: dict[str, list[dict]], height: int) -> str | None:
     """Say which lights moved, stayed, came and went, those with most flux first; None without any.
 
-    Parameters
-    ----------
-    lights : dict
-        Of :func:`matched`.
-    height : int
-        Rows of the map: what has moved by less than one has stayed.
+    ``lights`` are of :func:`matched`; what has moved by less than one of ``height`` rows has stayed.
     """
     after = {light["id"]: light for light in lights["after"]}
     parts = []

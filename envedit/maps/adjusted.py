@@ -51,12 +51,7 @@ class Adjustments:
 def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[str]]:
     """Adjust a map; returns one that is not negative, and what was done, with the errors of :func:`.adjust`.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3) float32
-        Linear radiance in Rec. 709.
-    how : Adjustments
-        What is changed.
+    ``radiance`` (H, W, 3) float32 is linear, in Rec. 709.
     """
     # ---- Orientation
     notes = []

@@ -109,14 +109,7 @@ def harmonics(d: np.ndarray) -> np.ndarray:
     Y_0, then y, z, x, then xz, xy, yz, 3 y^2 - 1 and x^2 - z^2, orthonormal on the sphere. Below the horizon
     they have their value at the mirrored direction: ground goes with the sky above it.
 
-    Parameters
-    ----------
-    d : ndarray (..., 3)
-        Unit vectors, +y up.
-
-    Returns
-    -------
-    ndarray (..., 9)
+    ``d`` (..., 3) are unit vectors, +y up; returns (..., 9).
     """
     x, y, z = d[..., 0], np.abs(d[..., 1]), d[..., 2]
     first = 0.5 * math.sqrt(3 / math.pi)
@@ -286,12 +279,8 @@ def write(path: FilePath, look: Look) -> None:
 def read(path: FilePath) -> Look:
     """Read a look.
 
-    Raises
-    ------
-    ConfigError
-        A key is missing, unknown or out of range: names the file and the key.
-    InputError
-        The file cannot be read.
+    ConfigError names the file and the key that is missing, unknown or out of range; InputError if the file
+    cannot be read.
     """
     try:
         with open(path, "rb") as file:

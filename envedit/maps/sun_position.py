@@ -56,15 +56,7 @@ def moment(text: str) -> datetime.datetime:
 
 
 def sun_position(latitude: float, longitude: float, time: datetime.datetime) -> SunPosition:
-    """Compute where the sun is seen.
-
-    Parameters
-    ----------
-    latitude, longitude : float
-        Degrees; north and east are positive.
-    time : datetime
-        With its offset from UTC.
-    """
+    """Compute where the sun is seen at a latitude and longitude in degrees, north and east positive."""
     j2000 = datetime.datetime(2000, 1, 1, 12, tzinfo=datetime.UTC)
     days = (time - j2000) / datetime.timedelta(days=1)
     t = days / 36525

@@ -91,6 +91,8 @@ def columns(rows: Iterable[dict]) -> list[str]:
 def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
     """Collect what it takes to explain a run later: versions, machine, seeds, and the digests of its inputs.
 
+    ``commit`` is None unless the package runs from its own git checkout.
+
     Parameters
     ----------
     config_summary : dict
@@ -100,8 +102,6 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
     variant : str
         Mitsuba variant.
         Mitsuba variant.
-
-    ``commit`` is None unless the package runs from its own git checkout.
     """
     versions: dict[str, str | None] = {"envedit": envedit.__version__, "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy", "OpenEXR"):

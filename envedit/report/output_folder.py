@@ -121,6 +121,8 @@ def prepare_folder(
 ) -> None:
     """Move what an earlier run left in a folder to ``earlier-N`` in it.
 
+    InputError if an input lies where a result would go, or the folder cannot be used.
+
     Parameters
     ----------
     folder : Path
@@ -134,8 +136,6 @@ def prepare_folder(
         Leave what is there, if it is complete or there is a checkpoint: it is to be continued.
     spare : sequence of path
         What is copied and not moved, if it is among the results: the run will be asked for by it again.
-
-    InputError if an input lies where a result would go, or the folder cannot be used.
     """
     try:
         # ---- What lies there, and whether an input is among it

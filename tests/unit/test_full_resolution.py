@@ -475,13 +475,6 @@ def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
     np.testing.assert_array_equal(result[inside], latlong.resize(edited, *shape)[inside])
 
 
-def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"float32, got \(64, 128, 3\) float64"):
-        full_resolution.carry(Pixels(), {}, grey(1), grey(1), np.ones((64, 128, 3)), Rows.of(32))
-    with pytest.raises(ValueError, match="working maps have shapes"):
-        full_resolution.carry(Pixels(), {}, grey(1), grey(1, 4, 8), grey(1, 32, 64), Rows.of(32))
-
-
 # ---- real maps ---------------------------------------------------------------------------------------------
 
 

@@ -105,14 +105,8 @@ def fit(
     """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
 
     Parameters are those of :func:`envedit.fit`. The fit is read from ``folder`` if the same was made before,
-    and continued if it was begun.
-
-    Raises
-    ------
-    InputError
-        If a texel is not finite or is negative.
-    NumericalError
-        If too many steps were not finite.
+    and continued if it was begun. InputError if a texel is not finite or is negative, NumericalError if too
+    many steps were not finite.
     """
     network, settings = network or config.Representation(), settings or config.Fit()
     settings = unpolished(settings) if settings.polish == "never" else settings

@@ -129,10 +129,7 @@ def _answer(file, request):
 def kept(file: FilePath) -> Converted:
     """Return the scene of a USD file in the folder of caches, made anew where one of its sources has changed.
 
-    Raises
-    ------
-    ConfigError, InputError, MachineError
-        As of :func:`convert`, which is asked for all cameras.
+    Errors are those of :func:`convert`, which is asked for all cameras.
     """
     file = Path(file).absolute()
     root = cache_folder("usd")

@@ -133,10 +133,7 @@ def is_scene(name: str) -> bool:
 def quick(arguments: argparse.Namespace) -> list[str]:
     """Return the overrides that --envmap, --camera, --paint, --target and --rotate stand for.
 
-    Raises
-    ------
-    ConfigError
-        They are given beside a configuration, which says the same.
+    ConfigError where they are given beside a configuration, which says the same.
     """
     from envedit import config
     from envedit.core.errors import ConfigError

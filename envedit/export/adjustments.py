@@ -41,10 +41,8 @@ def adjust(
     ----------
     envmap : ndarray (H, W, 3) float32
         Linear radiance that reaches the scene.
-    lights : config.Lights
-        How its lights are changed.
-    output : config.Output
-        Exposure, white balance and temperature.
+    lights, output
+        How its lights are changed; its exposure, white balance and temperature.
     scale : float
         What the scene multiplies the map's file by; ``max_radiance`` is in the units of the file.
 
@@ -94,14 +92,7 @@ def spread(core: np.ndarray, degrees: float) -> np.ndarray:
 
     The disc's radiance falls as 1 - (1 - cos g) / (1 - cos r) with the angle g to its centre. Flux is
     radiance times :func:`.latlong.lookup_solid_angles`; it is kept exactly. A radius of less than a texel
-    changes nothing.
-
-    Parameters
-    ----------
-    core : ndarray (H, W, 3)
-        Radiance of a light, black elsewhere.
-    degrees : float
-        Radius r of the disc.
+    changes nothing. ``core`` (H, W, 3) is radiance of a light, black elsewhere; ``degrees`` the radius r.
     """
     height, width, _ = core.shape
     across = min(width, 2 * math.ceil(SPREAD_TEXELS * 180 / max(degrees, 1e-3)))

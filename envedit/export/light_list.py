@@ -48,23 +48,9 @@ def of_edit(
 ) -> tuple[dict[str, list[dict]], np.ndarray]:
     """Match the lights of a map as its file has it and as edited.
 
-    Parameters
-    ----------
-    input_map : inputs.InputMap
-        The map.
-    edited : ndarray (H, W, 3)
-        The edited map, linear radiance that reaches the scene.
-    to_world : ndarray (3, 3)
-        As of :func:`listed`.
-    by_hand, degrees : float
-        By how much the map was turned when it was read, and by the edit.
-
-    Returns
-    -------
-    lights : dict
-        Of :func:`matched`.
-    core : ndarray (H, W, 3) float32
-        The lights of the edited map alone.
+    ``edited`` (H, W, 3) is linear radiance that reaches the scene, ``to_world`` as of :func:`listed`;
+    ``by_hand`` and ``degrees`` are by how much the map was turned when it was read, and by the edit. Returns
+    what :func:`matched` does, and the lights of the edited map alone, (H, W, 3) float32.
     """
     first = last = separate(input_map.radiance if input_map.unmoved is None else input_map.unmoved)
     if input_map.unmoved is not None:
@@ -75,16 +61,10 @@ def of_edit(
 
 
 def listed(separated: list[Light], shape: tuple[int, int], to_world: np.ndarray) -> list[dict]:
-    """List the lights of a map, those with most flux first.
+    """List the lights of a map of a shape, those with most flux first.
 
-    Parameters
-    ----------
-    separated : list of separation.Light
-        Of the map, linear radiance that reaches the scene.
-    shape : (int, int)
-        Rows and columns of the map.
-    to_world : ndarray (3, 3)
-        Rotation from the map's frame (+y up) to the scene's.
+    They are ``separated`` from linear radiance that reaches the scene; ``to_world`` (3, 3) is the rotation
+    from the map's frame (+y up) to the scene's.
 
     Returns
     -------

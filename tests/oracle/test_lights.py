@@ -52,7 +52,7 @@ def patch(rng, top, left, rows=3, columns=4, *, shape=(H, W), peak=100.0, glow=N
     radiance = peak * rng.uniform(0.2, 1.0, (len(r), 3))
     flux = radiance.sum(axis=1) * latlong.lookup_solid_angles(*shape)[r]
     centre = (latlong.directions(*shape)[r, c] * flux[:, None]).sum(axis=0)
-    return Light(centre / np.linalg.norm(centre), r * width + c, radiance, glow, 0.5)
+    return Light(centre / np.linalg.norm(centre), r * width + c, radiance, glow)
 
 
 def image_of(light, shape=(H, W)):
@@ -337,7 +337,7 @@ def test_rows_that_are_not_wanted_lose_their_flux_and_nothing_else(rng):
 
 def test_light_of_rows_of_a_map_is_that_of_the_map(rng):
     light = patch(rng, 8, 10)
-    part = Light(light.direction, light.texels - 5 * W, light.radiance, None, 0.5)
+    part = Light(light.direction, light.texels - 5 * W, light.radiance, None)
     turn = random_turn(rng)
     whole, of_rows = (core(Lights([x], (f, H), W), turn=turn) for x, f in ((light, 0), (part, 5)))
     np.testing.assert_array_equal(whole, of_rows)
@@ -689,7 +689,7 @@ def test_core_has_the_same_bits_every_time(rng):
         np.testing.assert_array_equal(core(made, turn=turn), first)
     # In another order as well.
     order = rng.permutation(len(light.texels))
-    other = Light(light.direction, light.texels[order], light.radiance[order], None, 0.5)
+    other = Light(light.direction, light.texels[order], light.radiance[order], None)
     np.testing.assert_array_equal(core(Lights([other], (0, H), W), turn=turn), first)
 
 

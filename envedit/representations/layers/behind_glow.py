@@ -86,14 +86,9 @@ def behind_glow(
 ) -> BehindGlow:
     """Predict the sky where the glow has gone.
 
-    Parameters
-    ----------
-    background, glow : ndarray (rows, W, 3)
-        Linear radiance without lights; the factor by which they brightened it, at least 1.
-    away : ndarray (rows, W)
-        Degrees to the core of the nearest light that has a glow.
-    rows : (int, int)
-        First row in the map, and the rows of the map.
+    ``background`` (rows, W, 3) is linear radiance without lights, ``glow`` the factor by which they
+    brightened it, at least 1, ``away`` (rows, W) degrees to the core of the nearest light that has a glow.
+    ``rows`` are the first row in the map, and the rows of the map.
     """
     faint = float(max(1e-6 * background.mean(), 1e-30))
     shape = background.shape[:2]

@@ -127,17 +127,10 @@ class ClippedLight:
 
 
 def find(radiance: np.ndarray) -> ClippedLight | None:
-    """Find the clipped region of a map that is most like a sun, and say what it is.
+    """Find the clipped region of a map (H, W, 3) that is most like a sun, and say what it is.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3)
-        Linear radiance, finite and not negative.
-
-    Returns
-    -------
-    ClippedLight or None
-        None where less than :data:`LEAST_TEXELS` above the horizon are on the plateau, or all is black.
+    None where less than :data:`LEAST_TEXELS` above the horizon are on the plateau, or all is black. Radiance
+    is linear, finite and not negative.
     """
     height, width, _ = radiance.shape
     level = float(radiance.max(initial=0))

@@ -163,8 +163,8 @@ class GridGain:
                 taps.append((node.ravel(), weight.ravel()))
         return taps
 
-    def prepare(self, shape: tuple[int, int], rows: object = None) -> list:
-        """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
+    def prepare(self, shape: tuple[int, int]) -> list:
+        """Make the matrices of :meth:`evaluate` for an image (rows, W)."""
         matrices = []
         for size in self.sizes:
             down, across = splines(size, shape)

@@ -45,14 +45,9 @@ tangent: ``docs/decisions/slope_of_the_saturation.md``."""
 
 
 def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
-    """Return the luminance of the irradiance of level ground by a sky without lights.
+    """Return the luminance of the irradiance of level ground by a sky (n, W, 3) without lights.
 
-    Parameters
-    ----------
-    sky : ndarray (n, W, 3)
-        Linear radiance.
-    rows : (int, int)
-        Its first row in the map, and the rows of the map; those below the horizon light nothing.
+    ``rows`` are its first row in the map, and the rows of the map; those below the horizon light nothing.
     """
     first, total = rows
     polar = np.pi * np.arange(first, first + len(sky)) / max(total - 1, 1)
@@ -337,7 +332,7 @@ class Layers:
 
     @functools.cached_property
     def _grids(self):
-        return self.gain.prepare(self.shape, self.rows)
+        return self.gain.prepare(self.shape)
 
     # ---- fields and derivatives ----------------------------------------------------------------------------
 

@@ -189,16 +189,13 @@ class Lights:
 
         Parameters
         ----------
-        turn : TensorXf (count, 3)
-            Rotation vectors: axis times angle in radians, from where the light was.
-        log_flux : TensorXf (count, 3)
-            Logarithm of the flux over that of :attr:`flux`.
+        turn, log_flux : TensorXf (count, 3)
+            Rotation vectors, axis times angle in radians, from where the light was; logarithm of the flux
+            over that of :attr:`flux`.
         log_size : TensorXf (count, 1)
             Logarithm of the size over what it was.
-        shape : (int, int)
-            Rows and columns wanted.
-        rows : (int, int)
-            First row in the map, and the rows of the map, at that resolution.
+        shape, rows : (int, int)
+            Rows and columns wanted; first row in the map, and the rows of the map, at that resolution.
 
         Returns
         -------
@@ -218,21 +215,11 @@ class Lights:
     def cores_of(
         self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], shape: tuple[int, int]
     ) -> np.ndarray:
-        """Render the core of light ``i`` alone as it is placed in one way and another.
+        """Render the core of light ``i`` alone as it is placed in one way and another, (k, rows, W, 3).
 
-        Parameters
-        ----------
-        i : int
-            Which light.
-        placements : sequence of (ndarray (3,), ndarray (3,), float)
-            Turn, log flux and log size, as of :meth:`core`.
-        shape : (int, int)
-            Rows and columns wanted, from the first row that the lights were given for, at their resolution.
-
-        Returns
-        -------
-        ndarray (k, rows, W, 3)
-            Linear radiance; not differentiable.
+        ``placements`` are turn, log flux and log size, as of :meth:`core`; ``shape`` has the rows and columns
+        wanted, from the first row that the lights were given for, at their resolution. Linear radiance; not
+        differentiable.
         """
         # ---- Every point of the light once for each placement
         first, count = self._points_of[i]

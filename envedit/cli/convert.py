@@ -27,8 +27,7 @@ def main(argv: list[str] | None = None) -> int:
         "--time", metavar="CODE", type=float, help="time code (default: the first of the stage)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda output: _convert(arguments, output))
+    return map_command.run(parser, argv, _convert)
 
 
 def _convert(arguments, output):

@@ -6,8 +6,7 @@
    def main(argv: list[str] | None = None) -> int:
        parser = map_command.make_parser("adjust", "Adjust a map.", ["envedit adjust sky.hdr --exposure 1"])
        parser.add_argument("map", ...)
-       arguments = parser.parse_args(argv)
-       return map_command.run(arguments, lambda console: _adjust(arguments, console))
+       return map_command.run(parser, argv, _adjust)
 
 The action says what it does by ``console.say`` and puts what programs read into ``console.facts``.
 """
@@ -79,13 +78,18 @@ def number(low: float, high: float) -> Callable[[str], float]:
     return read_number
 
 
-def run(arguments: argparse.Namespace, action: Callable[[Console], None]) -> int:
+def run(
+    parser: argparse.ArgumentParser,
+    argv: list[str] | None,
+    action: Callable[[argparse.Namespace, Console], None],
+) -> int:
     """Carry out a command, report its errors, with ``--json`` in the object too, and return its exit code."""
+    arguments = parser.parse_args(argv)
     console = Console(one_object=arguments.json)
     code = 0
     try:
         with unwrapped():
-            action(console)
+            action(arguments, console)
     except EnveditError as error:
         console.error(str(error))
         code = error.exit_code

@@ -72,33 +72,6 @@ def texel_position(d: ArrayLike, height: int, width: int) -> tuple[np.ndarray, n
     return v * (height - 1), u * width - 0.5
 
 
-def lookup(image: ArrayLike, d: ArrayLike) -> np.ndarray:
-    """Interpolate a map at directions as Mitsuba's ``envmap`` does, in float64.
-
-    Parameters
-    ----------
-    image : array (H, W, C)
-        The map, without halo columns.
-    d : array (..., 3)
-        Directions in the emitter's frame; must be finite.
-
-    Returns
-    -------
-    array (..., C)
-    """
-    image = np.asarray(image)
-    height, width = image.shape[:2]
-    row, column = texel_position(d, height, width)
-    r0 = np.clip(np.floor(row).astype(np.int64), 0, max(height - 2, 0))
-    c0 = np.floor(column).astype(np.int64)
-    fr, fc = (row - r0)[..., None], (column - c0)[..., None]
-    r1 = np.minimum(r0 + 1, height - 1)
-    c0, c1 = c0 % width, (c0 + 1) % width
-    upper = (1 - fc) * image[r0, c0] + fc * image[r0, c1]
-    lower = (1 - fc) * image[r1, c0] + fc * image[r1, c1]
-    return (1 - fr) * upper + fr * lower
-
-
 # ---- Solid angles ------------------------------------------------------------------------------------------
 
 

@@ -35,7 +35,7 @@ _SEARCH, _NOTHING = 20, 1e-9  # halvings of a radius; share of a peak that is ro
 def adjust(
     envmap: np.ndarray, lights: config.Lights, output: config.Output, scale: float = 1.0
 ) -> tuple[np.ndarray, list[str]]:
-    """Adjust a map: exposure and white balance, then its lights.
+    """Adjust a map: exposure and white balance, then its lights; NumericalError where it leaves float32.
 
     Parameters
     ----------
@@ -56,6 +56,7 @@ def adjust(
     colour = output.white_balance or output.temperature
     if not (lights.max_radiance or lights.soften_degrees or output.exposure or colour):
         return envmap, []
+
     # ---- One factor for each channel
     gain = np.ones(3)
     notes = []

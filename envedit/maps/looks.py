@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from envedit.config.toml import quote
+from envedit.config.validators import Check, Number, Numbers, named
 from envedit.core import atomic_files, latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import ConfigError, InputError
@@ -235,20 +236,21 @@ def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total:
 
 # ---- Files -------------------------------------------------------------------------------------------------
 
-_NUMBERS = {
-    "turn": (1, -360.0, 360.0),
-    "saturation": (1, 0.0, 4.0),
-    "white_balance": (3, -MOST_STOPS, MOST_STOPS),
-    "gain": (9, -MOST_COEFFICIENT, MOST_COEFFICIENT),
+_STOPS = Number(-MOST_STOPS, MOST_STOPS)
+_NUMBERS: dict[str, Check] = {
+    "turn": Number(-360, 360),
+    "saturation": Number(0, 4),
+    "white_balance": Numbers(*3 * [_STOPS]),
+    "gain": Numbers(*9 * [Number(-MOST_COEFFICIENT, MOST_COEFFICIENT)]),
 }
-_LIGHT = {
-    "azimuth": (1, -360.0, 360.0),
-    "elevation": (1, -180.0, 180.0),
-    "flux": (1, -MOST_STOPS, MOST_STOPS),
-    "radius": (1, 0.0, 90.0),
-    "tint": (3, 0.0, 1000.0),
+_LIGHT: dict[str, Check] = {
+    "azimuth": Number(-360, 360),
+    "elevation": Number(-180, 180),
+    "flux": _STOPS,
+    "radius": Number(0, 90),
+    "tint": Numbers(*3 * [Number(0, 1000)]),
 }
-"""Of each key: how many numbers it has, their least and their largest."""
+"""What each key may be."""
 
 
 def to_toml(look: Look) -> str:
@@ -308,21 +310,12 @@ def read(path: FilePath) -> Look:
 
 
 def _numbers(path, prefix, table, expected):
-    """Check that a table has the expected keys, with so many numbers in range."""
+    """Check that a table has the expected keys, with such numbers."""
     for name in table:
         if name not in expected:
             raise ConfigError(f"{path}: {prefix}{name}: unknown key, expected {', '.join(expected)}")
-    values = {}
-    for name, (count, low, high) in expected.items():
+    for name in expected:
         if name not in table:
             raise ConfigError(f"{path}: {prefix}{name}: missing")
-        value = table[name]
-        numbers = value if isinstance(value, list) else [value]
-        right = len(numbers) == count and isinstance(value, list) == (count > 1)
-        right = right and all(type(number) in (int, float) and low <= number <= high for number in numbers)
-        if not right:
-            what = "a number" if count == 1 else f"{count} numbers"
-            wrong = f"{path}: {prefix}{name}: got {value!r}"
-            raise ConfigError(f"{wrong}, expected {what} from {low:g} to {high:g}")
-        values[name] = tuple(map(float, numbers)) if count > 1 else float(value)
-    return values
+    values = {name: named(f"{path}: {prefix}{name}", expected[name], table[name]) for name in expected}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

@@ -97,7 +97,7 @@ def resampled(
     """Average the rotated interpolant of a map over texels of the same grid.
 
     Each texel is divided into ``samples`` x ``samples`` parts, weighted by their solid angles, and the map is
-    interpolated at their middles as of :func:`.latlong.lookup`.
+    interpolated at their middles as Mitsuba interpolates it.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def resampled(
 
 
 def _lookup(source, d, rows, height, width):
-    """Interpolate rows of a map at directions as :func:`.latlong.lookup`; black where they are not."""
+    """Interpolate rows of a map at directions as Mitsuba does (:mod:`.latlong`); black where they are not."""
     first, count = rows
     across = dr.atan2(d.x, -d.z) * (width / (2 * math.pi)) - 0.5
     down = dr.atan2(dr.sqrt(d.x * d.x + d.z * d.z), d.y) * ((height - 1) / math.pi)

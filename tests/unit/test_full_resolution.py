@@ -17,6 +17,7 @@ from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE
 from envedit.scene import scene
 from tests.oracles.builders import grey
 from tests.oracles.devices import on_cpu
+from tests.oracles.plain import lookup
 
 WORKING, ROWS = (64, 128), (0, 32)
 
@@ -202,7 +203,7 @@ def test_a_gain_lies_where_it_lay(rng):
     for k in range(3):
         params[f"gain.{k}"] += 0.3 * rng.normal(size=params[f"gain.{k}"].shape).astype(np.float32)
     result, edited = carried(made, params, working, source)
-    expected = latlong.lookup(edited, latlong.directions(256, 512))
+    expected = lookup(edited, latlong.directions(256, 512))
     inside = active(source, (1, 30))  # not at the pole, where a row has one value in all columns
     np.testing.assert_allclose(result[inside], expected[inside], rtol=0.005)
     shifted = np.roll(expected, 6, axis=1)

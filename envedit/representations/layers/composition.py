@@ -20,6 +20,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from envedit.core.arrays import settled
 from envedit.representations.layers.behind_glow import gone_of
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.lights import Lights
@@ -110,7 +111,8 @@ def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) ->
     factor, gone = None, None
     if fields.glows is not None:
         glows = fields.glows
-        factor = glows.lights.glow_ratio(glows.turn, glows.log_flux, directions, glows.before)
+        glow = glows.lights.glow(glows.turn, glows.log_flux, directions)
+        factor = settled(glow / glows.before, 1)  # exactly 1 where nothing moved
         gone = gone_of(factor)
         hidden = glows.offset + glows.slope * dr.log(base / glows.before + glows.faint)
         factor = factor * dr.exp(gone * hidden)

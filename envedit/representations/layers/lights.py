@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import settled, tensor
+from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.types import ArrayLike
 from envedit.representations.layers.separation import GLOW_DEGREES, Light
@@ -259,12 +259,6 @@ class Lights:
         log_flux = np.zeros((self.count, 3), np.float32)
         log_flux[self.own :] = DARK
         return self.glow(tensor(np.zeros_like(log_flux)), tensor(log_flux), d)
-
-    def glow_ratio(
-        self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f, before: mi.Color3f
-    ) -> mi.Color3f:
-        """Evaluate :meth:`glow` over ``before``, of :meth:`glow_before`: exactly 1 where nothing moved."""
-        return settled(self.glow(turn, log_flux, d) / before, 1)
 
     def glow_of(self, i: int, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate 1 + s_i G_i of light ``i`` alone; 1 if it has no glow."""

@@ -164,14 +164,6 @@ def test_cosine_follows_pytorch(reference):
     np.testing.assert_allclose(rates, reference["cosine"], rtol=1e-9)
 
 
-def test_tables_of_the_docstrings():
-    np.testing.assert_allclose([cosine(1, s, 4) for s in range(6)], [1, 0.854, 0.5, 0.146, 0, 0], atol=5e-4)
-    rates = [cosine_warm_restarts(1, s, 4) for s in range(6)]
-    np.testing.assert_allclose(rates, [1, 0.854, 0.5, 0.146, 1, 0.854], atol=5e-4)
-    values = [ramp(1, 1e4, s, 5) for s in range(6)]
-    np.testing.assert_allclose(values, [1, 10, 100, 1e3, 1e4, 1e4], rtol=1e-12)
-
-
 def test_ramp_ends_exactly_and_is_geometric():
     values = np.array([ramp(1e-4, 1e-8, step, 400) for step in range(400)])
     assert values[0] == 1e-4 and values[-1] == 1e-8

@@ -1,4 +1,4 @@
-"""DISTS and LPIPS against plain numpy, the authors' recorded numbers, and finite differences.
+"""DISTS and LPIPS against the authors' recorded numbers, and finite differences.
 
 The weights are random and seeded, as the trained ones are not needed to tell whether the formulas are right;
 one test has those, where they are.
@@ -32,101 +32,6 @@ def _script():
 
 drawn = _script()
 state_of = functools.cache(drawn.tensors)
-
-# ---- the networks and measures once more, plainly ----------------------------------------------------------
-
-# torchvision's ``features``, a letter a module: convolution, ReLU, max pooling, fire; and where LPIPS taps.
-MODULES = {
-    "vgg": ("crcrmcrcrmcrcrcrmcrcrcrmcrcrcr", (3, 8, 15, 22, 29)),
-    "alex": ("crmcrmcrcrcr", (1, 4, 7, 9, 11)),
-    "squeeze": ("crmffmffmffff", (1, 4, 7, 9, 10, 11, 12)),
-}
-STEPS = {"vgg": {}, "alex": {0: (4, 2), 3: (1, 2)}, "squeeze": {0: (2, 0)}}  # stride, padding; else 1, 1
-
-
-def plain_conv(x, weight, bias, stride, pad):
-    x = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
-    k = weight.shape[2]
-    h, w = (x.shape[1] - k) // stride + 1, (x.shape[2] - k) // stride + 1
-    out = np.zeros((len(weight), h, w)) + bias[:, None, None]
-    for i in range(k):
-        for j in range(k):
-            part = x[:, i : i + stride * (h - 1) + 1 : stride, j : j + stride * (w - 1) + 1 : stride]
-            out += np.tensordot(weight[:, :, i, j].astype(np.float64), part, 1)
-    return out
-
-
-def plain_max(x, k, ceil):
-    def count(n):
-        m = -(-(n - k) // 2) + 1 if ceil else (n - k) // 2 + 1
-        return m - 1 if (m - 1) * 2 >= n else m
-
-    h, w = count(x.shape[1]), count(x.shape[2])
-    out = np.empty((len(x), h, w))
-    for i in range(h):
-        for j in range(w):
-            out[:, i, j] = x[:, 2 * i : 2 * i + k, 2 * j : 2 * j + k].max((1, 2))
-    return out
-
-
-def plain_hanning(x):
-    taps = np.hanning(5)[1:-1]
-    g = np.outer(taps, taps) / np.outer(taps, taps).sum()
-    x = np.pad(x, ((0, 0), (1, 1), (1, 1)))
-    h, w = (x.shape[1] - 3) // 2 + 1, (x.shape[2] - 3) // 2 + 1
-    out = np.zeros((len(x), h, w))
-    for i in range(3):
-        for j in range(3):
-            out += g[i, j] * x[:, i : i + 2 * h - 1 : 2, j : j + 2 * w - 1 : 2] ** 2
-    return np.sqrt(out + 1e-12)
-
-
-def plain_features(kind, x, hanning=False):
-    """Taps (C, h, w) of an image (H, W, 3) that is normalised already."""
-    t, (modules, taps) = state_of(kind), MODULES[kind]
-    h, found = x.transpose(2, 0, 1).astype(np.float64), []
-    for i, module in enumerate(modules):
-        at = f"features.{i}."
-        if module == "c":
-            h = plain_conv(h, t[at + "weight"], t[at + "bias"], *STEPS[kind].get(i, (1, 1)))
-        elif module == "r":
-            h = np.maximum(h, 0)
-        elif module == "m":
-            h = plain_hanning(h) if hanning else plain_max(h, 2 if kind == "vgg" else 3, kind == "squeeze")
-        else:
-            s = np.maximum(plain_conv(h, t[at + "squeeze.weight"], t[at + "squeeze.bias"], 1, 0), 0)
-            one = plain_conv(s, t[at + "expand1x1.weight"], t[at + "expand1x1.bias"], 1, 0)
-            three = plain_conv(s, t[at + "expand3x3.weight"], t[at + "expand3x3.bias"], 1, 1)
-            h = np.maximum(np.concatenate([one, three]), 0)
-        if i in taps:
-            found.append(h)
-    return found
-
-
-def plain_lpips(kind, x, y, heads):
-    taps = []
-    for image in (x, y):
-        image = (2 * image - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
-        taps.append([f / (np.sqrt((f**2).sum(0)) + 1e-10) for f in plain_features(kind, image)])
-    weights_ = [head.ravel() for head in heads.values()]
-    return sum(np.tensordot(w, (a - b) ** 2, 1).mean() for a, b, w in zip(*taps, weights_, strict=True))
-
-
-def plain_dists(x, y, alpha, beta):
-    taps = []
-    for image in (x, y):
-        normal = (image - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-        taps.append([image.transpose(2, 0, 1), *plain_features("vgg", normal, hanning=True)])
-    s1, s2 = [], []
-    for a, b in zip(*taps, strict=True):
-        a, b = a.reshape(len(a), -1), b.reshape(len(b), -1)
-        ma, mb = a.mean(1), b.mean(1)
-        cov = (a * b).mean(1) - ma * mb
-        s1.append((2 * ma * mb + 1e-6) / (ma**2 + mb**2 + 1e-6))
-        s2.append((2 * cov + 1e-6) / (a.var(1) + b.var(1) + 1e-6))
-    alpha, beta = (v.ravel().astype(np.float64) for v in (alpha, beta))
-    return 1 - (alpha @ np.concatenate(s1) + beta @ np.concatenate(s2)) / (alpha.sum() + beta.sum())
-
 
 # ---- what the tests share ----------------------------------------------------------------------------------
 
@@ -170,18 +75,6 @@ def pulled(backbone, pooling, x, directions):
 
 LAYOUTS = [("vgg", "max", (21, 18)), ("vgg", "hanning", (9, 14)), ("alex", "max", (47, 36))]
 LAYOUTS += [("squeeze", "max", (30, 25)), ("squeeze", "max", (17, 18))]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind, pooling, size", LAYOUTS)
-def test_features_match_plain_numpy(backbones, kind, pooling, size, rng):
-    x = rng.normal(size=(*size, 3))
-    expected = plain_features(kind, x, pooling == "hanning")
-    found, _ = pulled(backbones[kind], pooling, x, None)
-    assert len(found) == len(expected)
-    for a, b in zip(found, expected, strict=True):
-        np.testing.assert_allclose(a, b.reshape(len(b), -1).T, rtol=1e-9, atol=1e-12)
-        assert (a > 0).any()
 
 
 @pytest.mark.slow
@@ -300,48 +193,7 @@ def test_features_match_the_authors_code(recorded, backbones, measure, kind, siz
     np.testing.assert_allclose([(t**2).mean() for t in taps], recorded[case + "squares"], rtol=1e-9)
 
 
-# ---- the measures, plainly ---------------------------------------------------------------------------------
-
-
-SMALL = {"vgg": (16, 19), "alex": (36, 33), "squeeze": (20, 17)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [(13, 18), (1, 1), (2, 7)])
-def test_dists_matches_plain_numpy(dists, size):
-    x, y, _ = drawn.images(*size)
-    expected = plain_dists(x, y, *drawn.alpha_beta().values())
-    assert dists(double(x), double(y))[0] == pytest.approx(expected, rel=1e-9)
-    assert dists(single(x), single(y))[0] == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_lpips_matches_plain_numpy(lpips, kind):
-    x, y, _ = drawn.images(*SMALL[kind])
-    expected = plain_lpips(kind, x, y, drawn.heads(kind))
-    assert lpips[kind].distance(double(x), double(y))[0] == pytest.approx(expected, rel=1e-9)
-    found = lpips[kind](x, y)
-    assert isinstance(found, float) and found == pytest.approx(expected, rel=1e-5)
-    assert lpips[kind](single(x), y.astype(np.float32)) == found
-
-
-@pytest.mark.slow
-def test_lpips_with_the_published_heads(backbones, data):
-    for kind in KINDS:
-        x, y, _ = drawn.images(*SMALL[kind])
-        file = data / f"weights/lpips_v0.1_{kind}.npz"
-        with np.load(file) as published:
-            expected = plain_lpips(kind, x, y, dict(sorted(published.items())))
-        assert Lpips(kind, backbones[kind], file)(x, y) == pytest.approx(expected, rel=1e-5)
-
-
-def test_dists_with_the_published_weights(backbones, data):
-    x, y, _ = drawn.images(9, 12)
-    file = data / "weights/dists_alpha_beta.npz"
-    with np.load(file) as published:
-        expected = plain_dists(x, y, published["alpha"], published["beta"])
-    assert Dists(backbones["vgg"], file)(single(x), single(y))[0] == pytest.approx(expected, rel=1e-4)
+# ---- the measures ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -370,17 +222,6 @@ def test_measures_keep_the_digits_of_near_images(dists, lpips):
         exact = distance(double(x), double(y))[0]
         assert 0 < exact < 1e-3
         assert distance(single(x), single(y))[0] == pytest.approx(exact, rel=2e-2)
-
-
-@pytest.mark.slow
-def test_descent_along_the_gradient_approaches_the_reference(dists):
-    x, y, _ = drawn.images(9, 14)
-    to_reference, values = dists.against(single(y)), []
-    for _ in range(8):
-        value, slope = gradient(to_reference, single(x))
-        values.append(value)
-        x = x - 0.3 * slope / np.linalg.norm(slope)
-    assert values == sorted(values, reverse=True) and values[-1] < 0.8 * values[0]
 
 
 # ---- extremes ----------------------------------------------------------------------------------------------

@@ -204,49 +204,11 @@ def test_black_texels_can_be_lit(kind, below):
     assert (np.array(dr.grad(leaf)) > 0).all()
 
 
-def test_siren_gradient_is_the_finite_difference(rng):
-    representation = make("siren")
-    params, weight = representation.encode(sky(rng)), rng.normal(size=(8, 16, 3))
-    leaves = {name: mi.TensorXf(value) for name, value in params.items()}
-    dr.enable_grad(leaves)
-    dr.backward(dr.sum((representation.decode(leaves) * mi.TensorXf(weight.astype(np.float32))).array))
-    gradient = {name: np.array(dr.grad(leaf), np.float64) for name, leaf in leaves.items()}
-    x, normalisation = siren.coordinates(8, 16).numpy(), representation.fitted.normalisation
-
-    def loss(step):
-        moved = {name: params[name].numpy() + step * gradient[name] for name in params}
-        values = numpy_forward(moved, x, 30.0).reshape(8, 16, 3)
-        return np.sum(weight * np.exp(values * normalisation.span + normalisation.low))
-
-    h = 1e-7
-    slope = (loss(h) - loss(-h)) / (2 * h)
-    np.testing.assert_allclose(sum(np.sum(g * g) for g in gradient.values()), slope, rtol=1e-3)
-
-
 def test_pixels_below_zero_are_black_and_log_pixels_are_never_below():
     params = {"radiance": mi.TensorXf(np.full((1, 2, 3), -0.5, np.float32))}
     assert not representations.Pixels().decode(params).numpy().any()
     params = {"log_radiance": mi.TensorXf(np.full((1, 2, 3), -100, np.float32))}
     assert not representations.LogPixels().decode(params).numpy().any()
-
-
-def test_configuration_names_the_representation():
-    found = [make(kind) for kind in KINDS]
-    assert [type(r) for r in found] == [
-        representations.Pixels,
-        representations.LogPixels,
-        representations.Siren,
-    ]
-    assert all(r.lr > 0 for r in found)
-
-
-def test_siren_keeps_its_fits_in_the_folder(tmp_path, rng):
-    image = sky(rng)
-    a, b = make("siren", tmp_path), make("siren", tmp_path)
-    first, second = a.encode(image), b.encode(image)
-    assert not a.fitted.cached and b.fitted.cached
-    assert dataclasses.asdict(a.fitted.normalisation) == dataclasses.asdict(b.fitted.normalisation)
-    np.testing.assert_array_equal(a.decode(first).numpy(), b.decode(second).numpy())
 
 
 def test_siren_keeps_a_fit_for_each_place_in_a_map(tmp_path, rng):

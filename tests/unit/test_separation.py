@@ -88,26 +88,11 @@ def test_a_sun_of_one_texel_is_one_light(where):
     np.testing.assert_allclose((s.background * s.glow)[row, column], truth, rtol=0.05)
 
 
-def test_a_sun_between_the_columns_of_the_seam_is_in_its_middle():
-    m = sky()
-    m[20, [0, -1]] = 5e4
-    (light,) = checked(m).lights
-    assert {20 * WIDTH, 21 * WIDTH - 1} <= set(light.texels.tolist())
-    assert abs(light.direction[0]) < 1e-9 and light.direction[2] < 0
-
-
 def test_a_sun_in_the_pole_is_one_light():
     m = sky()
     m[0] = 5e4
     (light,) = checked(m).lights
     assert angle(np.array([0, 1, 0]), light.direction) < 0.1
-
-
-def test_two_lamps_are_two_lights_the_stronger_first():
-    a, b = toward(30, 50), toward(-20, 200)
-    lights = checked(discs((a, 2.5, 1000), (b, 2.5, 2000))).lights
-    assert len(lights) == 2
-    assert angle(lights[0].direction, b) < 1.5 and angle(lights[1].direction, a) < 1.5
 
 
 @pytest.mark.parametrize("azimuth", [0, 77])
@@ -239,21 +224,6 @@ def test_a_crop_has_the_light_where_the_map_has_it(rows, scale):
     )
 
 
-@pytest.mark.parametrize("rows", [(0, 350), (51, 280), (99, 350)])
-def test_the_copy_in_which_lights_are_looked_for_lies_where_the_crop_does(rows):
-    height, width = 350, 701
-    d = latlong.directions(height, width)[slice(*rows)]
-    small = separation._reduced(d - d.min() + 1, rows[0], height)
-    places = separation._Places(small.rows, small.image.shape[1], rows[0], height)
-    theta = places.upsampled(np.arccos(small.directions[..., 1:2]), *d.shape[:2])[2:-2, :, 0]
-    np.testing.assert_allclose(theta, np.arccos(d[2:-2, :, 1]), atol=1e-7)
-    upsampled = places.upsampled(small.directions, *d.shape[:2])[2:-2]
-    assert np.degrees(np.linalg.norm(upsampled - d[2:-2], axis=-1)).max() < 0.1 * 360 / small.image.shape[1]
-    nearest = places.at(small.directions, *d.shape[:2])[2:-2]
-    assert np.degrees(np.linalg.norm(nearest - d[2:-2], axis=-1)).max() < 0.75 * 360 / small.image.shape[1]
-    np.testing.assert_allclose(small.image + d.min() - 1, small.directions, atol=0.005)
-
-
 @pytest.mark.parametrize("factor", [1000, 1e-6])
 def test_lights_do_not_depend_on_the_exposure(factor):
     d = latlong.directions(HEIGHT, WIDTH)
@@ -343,15 +313,6 @@ def hole(height, width, column, radius):
 
 
 SIZES = [(3, 6), (9, 18), (33, 67), (50, 100), (63, 125), (64, 128), (65, 130)]
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("value", [1e-30, 3.7, 65504])
-def test_a_constant_stays_constant_under_a_hole(size, value):
-    mask = hole(*size, 0, max(1, size[0] // 5))
-    m = np.full((*size, 3), value)
-    m[mask] = 1e9
-    np.testing.assert_allclose(separation.filled(m, mask), value, rtol=1e-9)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -467,9 +428,3 @@ def test_an_overcast_sky_has_no_light(name, data):
 def test_lamps_of_a_studio_a_night_and_a_town(name, least, data):
     lights = checked(real(data, name)).lights
     assert least <= len(lights) <= separation.MOST_LIGHTS
-
-
-@pytest.mark.slow
-def test_a_real_map_has_the_same_sun_at_another_resolution(data):
-    (a,), (b,) = (checked(real(data, "sunflowers", w)).lights for w in (1024, 256))
-    assert angle(a.direction, b.direction) < 1

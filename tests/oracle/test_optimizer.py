@@ -69,28 +69,6 @@ def test_adam_finds_a_minimum_through_its_leaves():
     np.testing.assert_allclose(np.array(adam.params["x"]), [1.0, 0.5], atol=1e-4)
 
 
-@pytest.mark.parametrize("g", [0.0, 1e-45, 1e-30, 1e-20, 1e-6, 1.0, 65504.0, 1e6, 1.8e19])
-def test_any_gradient_that_squares_gives_a_bounded_step(g):
-    adam = Adam({"p": own([1.0])}, lr=0.01)
-    for _ in range(3):
-        assert adam.step({"p": own([g])})
-    assert abs(np.array(adam.params["p"])[0] - 1) <= 0.0301
-    assert all(np.isfinite(value).all() for value in adam.state_dict().values())
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
-def test_a_bad_gradient_is_refused_as_a_whole(bad, rng):
-    adam = Adam({"a": own(rng.random((5, 4))), "b": own(rng.random(4))}, lr=0.01)
-    good = {"a": own(rng.random((5, 4))), "b": own(rng.random(4))}
-    assert adam.step(good)
-    before = adam.state_dict()
-    g = np.ones((5, 4))
-    g[4, 3] = bad
-    assert adam.step({"a": own(g), "b": own(np.ones(4))}) is False
-    assert same(adam.state_dict(), before)
-    assert adam.step(good) and not same(adam.state_dict(), before)
-
-
 def test_kernels_are_compiled_once():
     shapes = {"a": (32, 8), "b": (32, 8), "c": (8,), "d": (8,)}
     adam = Adam({name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}, lr=0.01)

@@ -184,15 +184,6 @@ def test_trained_networks_score_as_the_authors_programs(data):
     np.testing.assert_allclose(found, expected, atol=1e-6, rtol=1e-4)
 
 
-@pytest.mark.parametrize("measure, kind, size", drawn.CASES[1:])
-def test_features_match_the_authors_code(recorded, backbones, measure, kind, size):
-    case = f"{measure}_{kind}_{size[0]}x{size[1]}/"
-    x = (drawn.images(*size)[0] - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-    taps, _ = pulled(backbones[kind], "hanning" if measure == "dists" else "max", x, None)
-    np.testing.assert_allclose([t.mean() for t in taps], recorded[case + "means"], rtol=1e-9)
-    np.testing.assert_allclose([(t**2).mean() for t in taps], recorded[case + "squares"], rtol=1e-9)
-
-
 # ---- the measures ------------------------------------------------------------------------------------------
 
 
@@ -282,12 +273,6 @@ def test_what_is_not_finite_is_not_hidden(dists, lpips, bad):
         lpips["alex"](x, y)
     with pytest.raises(InputError, match="too large to compare"):
         lpips["alex"](np.full_like(y, 1e30), y)
-
-
-def test_the_same_run_gives_the_same_bits(dists):
-    x, y, _ = drawn.images(19, 40)
-    (a, g), (b, h) = (gradient(dists.against(single(y)), single(x)) for _ in range(2))
-    assert a == b and np.array_equal(g, h)
 
 
 def test_images_that_do_not_fit_are_refused(dists, lpips):

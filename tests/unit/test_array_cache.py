@@ -221,18 +221,22 @@ def entry(text, arrays, description=None):
     return head + b"".join(a.tobytes().ljust(-(-a.nbytes // 64) * 64, b"\0") for a in arrays.values())
 
 
-def test_exchanged_parts_of_a_large_array_are_seen(tmp_path, rng, monkeypatch):
-    """Arrays of several parts, whose digests all cores work out."""
-    monkeypatch.setattr(array_cache, "_PART", 4096)
+@pytest.mark.parametrize("part", [4096, array_cache._PART])
+def test_exchanged_words_pages_and_bits_are_seen(part, tmp_path, rng, monkeypatch):
+    """Also in arrays of several parts, whose digests all cores work out."""
+    monkeypatch.setattr(array_cache, "_PART", part)
     cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(40_000), "b": np.zeros((0, 3))}
     cache.store(KEY, arrays)
     path = only_file(tmp_path)
+    good = path.read_bytes()
     assert same(cache.load(KEY), arrays)
-    data = bytearray(path.read_bytes())
-    one, other = slice(-8192, -4096), slice(-16384, -12288)
-    data[one], data[other] = data[other], data[one]
-    path.write_bytes(data)
-    assert cache.load(KEY) is None
+    start = len(good) - 320_000
+    for first, second, size in ((0, 8, 8), (0, 4096, 512), (4096, 8192, 4096), (0, 100_000, 1)):
+        data = bytearray(good)
+        one, other = (slice(start + p, start + p + size) for p in (first, second))
+        data[one], data[other] = data[other], data[one]
+        path.write_bytes(data)
+        assert cache.load(KEY) is None
 
 
 def test_a_header_is_not_believed(tmp_path, rng):

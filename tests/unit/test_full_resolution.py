@@ -9,12 +9,10 @@ from envedit.core.errors import NumericalError
 from envedit.core.rotations import rotation_vector
 from envedit.core.rows import Rows
 from envedit.export import full_resolution, moved_lights, texel_maps
-from envedit.images import images
 from envedit.representations import Pixels
 from envedit.representations.layers import layers
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
-from envedit.scene import scene
 from tests.oracles.builders import grey
 from tests.oracles.devices import on_cpu
 from tests.oracles.plain import lookup
@@ -442,44 +440,6 @@ def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
     result = ratio(working, edited, source)
     inside = active(source, (0, 31))
     np.testing.assert_array_equal(result[inside], latlong.resize(edited, *shape)[inside])
-
-
-# ---- real maps ---------------------------------------------------------------------------------------------
-
-
-def irradiance(m, normals):
-    d = latlong.directions(*m.shape[:2]).reshape(-1, 3)
-    omega = latlong.lookup_solid_angles(*m.shape[:2])[:, None, None]
-    return np.maximum(normals @ d.T, 0) @ (np.float64(m) * omega).reshape(-1, 3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["kloofendal_48d_partly_cloudy", "rustig_koppie"])
-def test_a_real_sun_lights_as_in_the_working_map(name, data, rng):
-    source, _ = images.load_envmap(data / f"puresky/{name}_puresky_1k.hdr")
-    working, rows = latlong.resize(source, 128, 256), (0, 64)
-    made, params = encoded(working, rows)
-    d = made.lights.centres[0]
-    new = toward(np.degrees(np.arcsin(d[1])) + 10, np.degrees(np.arctan2(d[0], -d[2])) + 40)
-    params = sent(made, params, new)
-    for k in range(3):
-        params[f"gain.{k}"] += 0.2 * rng.normal(size=params[f"gain.{k}"].shape).astype(np.float32)
-    result, edited = carried(made, params, working, source, rows)
-    back = latlong.resize(result, 128, 256)
-    np.testing.assert_allclose(flux(back), flux(edited), rtol=0.002)
-    there = near((128, 256), new, 6)
-    np.testing.assert_allclose(flux(back, there), flux(edited, there), rtol=0.005)
-    normals = latlong.directions(9, 18).reshape(-1, 3)
-    a, b = irradiance(back, normals), irradiance(edited, normals)
-    assert np.abs(a - b).mean() < 0.01 * b.mean() and np.abs(a - b).max() < 0.03 * b.mean()
-    assert np.abs(irradiance(working, normals) - b).mean() > 0.1 * b.mean()  # negative control
-    lit = scene.load("sphere", 16, 16)
-    fine, coarse = (lit.render(m, spp=512, seed=1).astype(np.float64) for m in (result, edited))
-    np.testing.assert_allclose(fine.mean(axis=(0, 1)), coarse.mean(axis=(0, 1)), rtol=0.02)
-    assert (
-        np.abs(fine - coarse).mean()
-        < 0.02 * coarse.mean() + 3 * np.abs(coarse - lit.render(edited, spp=512, seed=2)).mean()
-    )
 
 
 # ---- rows below the horizon that follow --------------------------------------------------------------------

@@ -77,14 +77,6 @@ def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
 
 @pytest.mark.parametrize("cycles, share", GAINS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_gain_starts_at_exactly_nothing(cycles, share, shape):
-    g = gain.GridGain(cycles, share)
-    assert {n: v.shape for n, v in g.init().items()} == {f"gain.{i}": (*s, 3) for i, s in enumerate(g.sizes)}
-    np.testing.assert_array_equal(field(g, g.init(), shape), np.zeros((*shape, 3)))
-
-
-@pytest.mark.parametrize("cycles, share", GAINS)
-@pytest.mark.parametrize("shape", SHAPES)
 def test_hats_are_a_partition_of_unity(cycles, share, shape):
     g = gain.GridGain(cycles, share)
     for level in levels(g):

@@ -120,12 +120,6 @@ def test_shrinking_is_an_area_average(rng):
     np.testing.assert_allclose(small[1, 2], expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 9), (16, 32), (33, 77)])
-def test_a_constant_stays(size):
-    image = np.full((16, 32, 3), 1e-30, np.float32)
-    np.testing.assert_allclose(latlong.resize(image, *size), 1e-30, rtol=1e-6)
-
-
 def test_a_dim_texel_survives_beside_a_bright_one():
     image = np.full((64, 128, 3), 1e-30, np.float32)
     image[20, 20] = 65504
@@ -145,11 +139,6 @@ def test_growing_samples_the_interpolated_map(rng):
         lit[row, 255] = 1
         flux = latlong.resize(lit, 256, 512).sum((1, 2)) @ latlong.lookup_solid_angles(256, 512)
         assert flux == pytest.approx(latlong.lookup_solid_angles(128, 256)[row], rel=tolerance)
-
-
-def test_same_size_is_identity(rng):
-    image = rng.random((8, 16, 3)).astype(np.float32)
-    np.testing.assert_array_equal(latlong.resize(image, 8, 16), image)
 
 
 def test_rotate(rng):

@@ -8,7 +8,7 @@ import pytest
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotation_vector
-from envedit.representations.layers import gain, layers
+from envedit.representations.layers import layers
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE
@@ -187,15 +187,6 @@ def test_rows_of_a_map(first, last, sunny):
 # ---- gain ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", range(gain.LEVELS))
-@pytest.mark.parametrize("value", [-3.0, -0.2, 0.1, 2.5])
-def test_even_gain_is_a_factor(level, value):
-    made, params = encoded(grey(0.7))
-    name = f"gain.{level}"
-    params |= {name: dr.full(mi.TensorXf, value / made.scales[name], params[name].shape)}
-    np.testing.assert_allclose(made.decode(params).numpy(), 0.7 * np.exp(value), rtol=1e-5)
-
-
 def test_log_gain_is_that_of_the_map(rng):
     made, params = encoded(grey(1.0, 24, 48))
     params = random_gain(params, rng, 0.3)
@@ -291,15 +282,6 @@ def test_moving_a_light_with_a_glow_leaves_what_is_far_from_it(sunny):
     old = np.unravel_index(np.argmax(d @ light.direction - 10 * core_of(made)), SHAPE)
     assert got[old].max() < image[old].max()
     assert got[26, 104].max() > 1.2 * image[26, 104].max()
-
-
-def test_spare_light_adds_its_flux(sunny):
-    made, params = sunny
-    changed = moved(params, light=1, flux=np.log([0.5, 1, 2]), turn=[0.7, 0.2, 0.9])
-    sky, core = (part.numpy() for part in made.parts(changed))
-    assert (sky >= made.parts(params)[0].numpy()).all()  # its glow
-    added = irradiance(np.float64(core) - made.parts(params)[1].numpy())
-    np.testing.assert_allclose(added, made.lights.flux[1] * [0.5, 1, 2], rtol=1e-4)
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit.core.errors import InputError
-from envedit.losses.losses import LOSSES, luminance, tv
+from envedit.losses.losses import LOSSES, luminance
 from envedit.losses.ssim import Ssim
 from tests.oracles.devices import on_cpu
 from tests.oracles.plain import double, gradient, plain_ssim_loss, single
@@ -133,10 +133,3 @@ def test_luminance_needs_rgb():
     x = dr.zeros(mi.TensorXf, (4, 4, 1))
     with pytest.raises(InputError, match="luminance needs RGB"):
         luminance(x, x)
-
-
-def test_tv_wraps_columns_and_not_rows():
-    x = np.zeros((4, 5, 1))
-    x[:, 0] = 1
-    assert tv(double(x))[0] * 20 == pytest.approx(8)  # both sides of the column, one of them through the seam
-    assert tv(double(np.swapaxes(x, 0, 1)))[0] * 20 == pytest.approx(4)  # the row below only

@@ -1,7 +1,6 @@
 """History, metrics and manifest: read back with other readers, with values that are not finite."""
 
 import csv
-import hashlib
 import json
 import subprocess
 from pathlib import Path
@@ -111,12 +110,6 @@ def test_commit_is_that_of_the_packages_own_checkout(tmp_path, monkeypatch):
     assert manifest._commit(tmp_path / "inside") is None, "installed inside somebody else's repository"
     monkeypatch.setenv("PATH", "")
     assert manifest._commit(tmp_path) is None, "no git"
-
-
-def test_digest_reads_files_larger_than_a_block(tmp_path):
-    content = bytes(range(256)) * 20_000
-    (tmp_path / "big").write_bytes(content)
-    assert manifest._digest(tmp_path / "big")["sha256"] == hashlib.sha256(content).hexdigest()
 
 
 def test_a_file_that_is_too_large_for_an_input_is_listed_without_its_digest(tmp_path):

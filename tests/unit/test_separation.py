@@ -419,12 +419,3 @@ def test_a_sunny_sky_has_its_sun_and_no_ghost_of_it(name, data):
 @pytest.mark.parametrize("name", OVERCAST)
 def test_an_overcast_sky_has_no_light(name, data):
     assert checked(real(data, name)).lights == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name, least", [("studio_small_03", 2), ("dikhololo_night", 1), ("venice_sunset", 1)]
-)
-def test_lamps_of_a_studio_a_night_and_a_town(name, least, data):
-    lights = checked(real(data, name)).lights
-    assert least <= len(lights) <= separation.MOST_LIGHTS

@@ -60,20 +60,11 @@ _LIBRARIES = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a probe found.
+    """What a probe found."""
 
-    Attributes
-    ----------
-    ok : bool
-        True if the probe rendered the right picture.
-    lines : tuple of str
-        If not ok: what is wrong and how to mend it, in one or two lines.
-    versions : dict
-        What the probe came to know: ``mitsuba``, ``drjit``, ``llvm``, ``llvm_path``, ``radiance``, ...
-    """
-
-    ok: bool
-    lines: tuple[str, ...] = ()
+    ok: bool  # true if the probe rendered the right picture
+    lines: tuple[str, ...] = ()  # if not ok: what is wrong and how to mend it, in one or two lines
+    # What the probe came to know: ``mitsuba``, ``drjit``, ``llvm``, ``llvm_path``, ``radiance``,
     versions: dict = field(default_factory=dict)
 
 

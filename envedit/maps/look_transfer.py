@@ -56,24 +56,12 @@ class Placed:
 
 @dataclass(frozen=True)
 class Change:
-    """What is done to one map.
+    """What is done to one map."""
 
-    Attributes
-    ----------
-    lights : dict of int to Placed
-        By the light's index in the map's layers; spare ones come last.
-    gain : ndarray (9,)
-        As of :class:`.Look`.
-    log_saturation : float
-        Logarithm of the exponent of chroma.
-    white_balance : ndarray (3,)
-        Stops.
-    """
-
-    lights: dict[int, Placed]
-    gain: np.ndarray
-    log_saturation: float
-    white_balance: np.ndarray
+    lights: dict[int, Placed]  # by the light's index in the map's layers; spare ones come last
+    gain: np.ndarray  # (9,), as of :class:`.Look`
+    log_saturation: float  # logarithm of the exponent of chroma
+    white_balance: np.ndarray  # (3,), stops
 
 
 def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | None = None) -> np.ndarray:

@@ -47,50 +47,27 @@ _VARIES = 1e-4  # least variance of log chroma from which its slope is known
 
 @dataclass(frozen=True)
 class RoleLight:
-    """A light of a look.
+    """A light of a look."""
 
-    Attributes
-    ----------
-    azimuth, elevation : float
-        Degrees in the map; of fill and rim, over the key's.
-    flux : float
-        Stops over the sky's irradiance.
-    radius : float
-        Degrees within which 97 % of its flux lie; 0: at most :func:`.smallest`, as a sun.
-    tint : (float, float, float)
-        Its colour, of luminance 1.
-    """
-
+    # azimuth, elevation: degrees in the map; of fill and rim, over the key's
     azimuth: float
     elevation: float
-    flux: float
-    radius: float
-    tint: tuple[float, float, float]
+    flux: float  # stops over the sky's irradiance
+    radius: float  # degrees within which 97 % of its flux lie; 0: at most :func:`.smallest`, as a sun
+    tint: tuple[float, float, float]  # its colour, of luminance 1
 
 
 @dataclass(frozen=True)
 class Look:
-    """What an edit did to the light.
+    """What an edit did to the light."""
 
-    Attributes
-    ----------
-    turn : float
-        Degrees by which the whole map was turned (:func:`.latlong.rotate`); 0: it stood.
-    gain : ndarray (9,)
-        Coefficients of :func:`harmonics`: stops of the sky's luminance.
-    saturation : float
-        Exponent of the sky's chroma, as of :mod:`.saturation`.
-    white_balance : (float, float, float)
-        Stops of the sky's red, green and blue beside those of its luminance.
-    lights : dict of str to RoleLight
-        By role; without a key light there is none.
-    """
-
-    turn: float = 0.0
+    turn: float = 0.0  # degrees by which the whole map was turned (:func:`.latlong.rotate`); 0: it stood
+    # (9,), coefficients of :func:`harmonics`: stops of the sky's luminance
     gain: np.ndarray = field(default_factory=lambda: np.zeros(9))
-    saturation: float = 1.0
+    saturation: float = 1.0  # exponent of the sky's chroma, as of :mod:`.saturation`
+    # stops of the sky's red, green and blue beside those of its luminance
     white_balance: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    lights: dict[str, RoleLight] = field(default_factory=dict)
+    lights: dict[str, RoleLight] = field(default_factory=dict)  # by role; without a key light there is none
 
     def toward(self, role: str) -> np.ndarray:
         """Return the direction (3,) of a light in the map."""

@@ -21,17 +21,10 @@ PARALLAX_DEGREES = 8.794 / 3600
 
 @dataclass(frozen=True)
 class SunPosition:
-    """Where the sun is seen.
+    """Where the sun is seen."""
 
-    Attributes
-    ----------
-    azimuth : float
-        Degrees from north by east, in [0, 360).
-    elevation : float
-        Degrees above the horizon, raised by refraction (10 degrees Celsius, 1010 hPa) down to -1 degree.
-    """
-
-    azimuth: float
+    azimuth: float  # degrees from north by east, in [0, 360)
+    # Degrees above the horizon, raised by refraction (10 degrees Celsius, 1010 hPa) down to -1 degree
     elevation: float
 
 

@@ -67,22 +67,14 @@ _GUARD = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
-
-    Attributes
-    ----------
-    state : str
-        "done"; "skipped": it was done before; "failed"; "held": another call carries it out; "stopped": by
-        the user; "lost": the scheduler went away.
-    seconds : float
-        What it took, this time.
-    error : str
-        Of a failed job: exit code and last line of its output. Of one that is held: who holds it.
-    """
+    """What became of a job."""
 
     job: Job
+    # "done"; "skipped": it was done before; "failed"; "held": another call carries it out; "stopped": by the
+    # user; "lost": the scheduler went away
     state: str
-    seconds: float = 0.0
+    seconds: float = 0.0  # what it took, this time
+    # Of a failed job: exit code and last line of its output. Of one that is held: who holds it.
     error: str = ""
 
 

@@ -35,19 +35,12 @@ LEAST_VARIANCE = 1e-12
 
 @dataclass(frozen=True)
 class BehindGlow:
-    """log R - b = offset + slope log(B + faint), which holds at any resolution of B.
+    """log R - b = offset + slope log(B + faint), which holds at any resolution of B."""
 
-    Attributes
-    ----------
-    offset, slope : ndarray (rows, W, 3) float32
-        Smooth; slope is c - 1.
-    faint : float
-        Added before logarithms, 1e-6 of the mean radiance.
-    """
-
+    # offset, slope: (rows, W, 3), smooth; slope is c - 1
     offset: np.ndarray
     slope: np.ndarray
-    faint: float
+    faint: float  # added before logarithms, 1e-6 of the mean radiance
 
     def log_change(self, background: np.ndarray) -> np.ndarray:
         """Return log R - b of a background (rows, W, 3)."""

@@ -58,21 +58,13 @@ def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
 
 @dataclass(frozen=True)
 class TexelFields:
-    """What parameters do to every texel of a working map, (rows, W, 3) float32 each.
+    """What parameters do to every texel of a working map, (rows, W, 3) float32 each."""
 
-    Attributes
-    ----------
-    log_gain : ndarray
-        Log gain, also of texels that :meth:`Layers.keeping` excepts from it; of rows that follow, the log
-        factor that is beside :attr:`log_followed`.
-    log_followed : ndarray
-        Log factor, by what lights do, of rows that follow; 0 of others.
-    offset, slope : ndarray
-        Of :class:`.BehindGlow`; 0 of rows that follow, and without glows.
-    """
-
+    # Log gain, also of texels that :meth:`Layers.keeping` excepts from it; of rows that follow, the log
+    # factor that is beside :attr:`log_followed`
     log_gain: np.ndarray
-    log_followed: np.ndarray
+    log_followed: np.ndarray  # log factor, by what lights do, of rows that follow; 0 of others
+    # offset, slope: of :class:`.BehindGlow`; 0 of rows that follow, and without glows
     offset: np.ndarray
     slope: np.ndarray
 

@@ -64,66 +64,37 @@ RELAXATIONS = 30
 
 @dataclass(frozen=True)
 class Light:
-    """One light of a map.
+    """One light of a map."""
 
-    Attributes
-    ----------
-    direction : ndarray (3,)
-        Unit vector to the centre of its flux, in the emitter's frame.
-    texels : ndarray of int64 (n,)
-        Its texels, row * W + column.
-    radiance : ndarray (n, 3)
-        Radiance of the core in them.
-    glow : ndarray (len(GLOW_DEGREES), 3) or None
-        Factor by which it brightens the sky, less 1, at :data:`GLOW_DEGREES` from its centre.
-    """
-
-    direction: np.ndarray
-    texels: np.ndarray
-    radiance: np.ndarray
+    direction: np.ndarray  # (3,), unit vector to the centre of its flux, in the emitter's frame
+    texels: np.ndarray  # (n,), its texels, row * W + column
+    radiance: np.ndarray  # (n, 3), radiance of the core in them
+    # (len(GLOW_DEGREES), 3), factor by which it brightens the sky, less 1, at these angles from its centre
     glow: np.ndarray | None
 
 
 @dataclass(frozen=True)
 class Separation:
-    """A separated map; ``background * glow + core`` is the map to float precision.
+    """A separated map; ``background * glow + core`` is the map to float precision."""
 
-    Attributes
-    ----------
-    background, glow, core : ndarray (rows, W, 3) float64
-        B, the product of 1 + G over all lights, and the sum of all cores.
-    lights : list of Light
-        Those with most flux first.
-    survey : Survey or None
-        Where the lights were found, to find the same lights in another resolution of the map; None without.
-    """
-
+    # background, glow, core: (rows, W, 3): B, the product of 1 + G over all lights, and the sum of all cores
     background: np.ndarray
     glow: np.ndarray
     core: np.ndarray
-    lights: list[Light] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)  # those with most flux first
+    # Where the lights were found, to find the same lights in another resolution of the map; None without
     survey: Survey | None = None
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the small copy of a map gives of its lights: all that does not depend on the map's resolution.
+    """What the small copy of a map gives of its lights: all that does not depend on the map's resolution."""
 
-    Attributes
-    ----------
-    label : ndarray of int64 (h, w)
-        Index in :attr:`Separation.lights` of the light that a texel of the copy belongs to, or -1.
-    below : ndarray (h, w, 3)
-        The background of the copy, filled in under the lights.
-    rows : (int, int)
-        First row of the copy in its map, and the rows of that map.
-    centres, glows : lists
-        Direction and :attr:`Light.glow` of each light.
-    """
-
+    # (h, w), index in :attr:`Separation.lights` of the light that a texel of the copy belongs to, or -1
     label: np.ndarray
-    below: np.ndarray
-    rows: tuple[int, int]
+    below: np.ndarray  # (h, w, 3), the background of the copy, filled in under the lights
+    rows: tuple[int, int]  # first row of the copy in its map, and the rows of that map
+    # centres, glows: direction and :attr:`Light.glow` of each light
     centres: list[np.ndarray]
     glows: list[np.ndarray | None]
 

@@ -60,18 +60,10 @@ LEAST_ELEVATION = 0.5
 
 @dataclass(frozen=True)
 class Estimate:
-    """Flux of a sun.
+    """Flux of a sun."""
 
-    Attributes
-    ----------
-    flux : ndarray (3,)
-        Irradiance on a surface that faces it, linear RGB.
-    stops : float
-        Standard deviation of log2 of it.
-    """
-
-    flux: np.ndarray
-    stops: float
+    flux: np.ndarray  # (3,), irradiance on a surface that faces it, linear RGB
+    stops: float  # standard deviation of log2 of it
 
 
 def air_mass(elevation: float) -> float:

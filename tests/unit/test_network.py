@@ -1,4 +1,4 @@
-"""The network against plain numpy in double precision, Dr.Jit's own AD, and finite differences."""
+"""The network against plain numpy in double precision, and Dr.Jit's own AD."""
 
 import drjit as dr
 import mitsuba as mi
@@ -34,11 +34,11 @@ def points(rng, count):
     return own(rng.uniform(-1, 1, (count, 2)))
 
 
-def gradient(network, params, x, seed_grad, omega=OMEGA):
+def gradient(network, params, x, seed_grad):
     """Gradient of sum(seed_grad * y) through the AD graph."""
     leaves = {name: mi.TensorXf(value) for name, value in params.items()}
     dr.enable_grad(leaves)
-    dr.backward(dr.sum((network(leaves, x, omega) * seed_grad).array))
+    dr.backward(dr.sum((network(leaves, x, OMEGA) * seed_grad).array))
     return {name: np.array(dr.grad(leaf), np.float64) for name, leaf in leaves.items()}
 
 
@@ -193,6 +193,3 @@ def test_directions_point_through_the_texels_of_their_rows(height, width, rows):
     inner = (row > 0.5) & (row < total - 1.5)  # at a pole every column is the same point
     expected = np.broadcast_to(np.arange(width), column.shape)
     np.testing.assert_allclose(column[inner], expected[inner], atol=1e-5)
-
-
-# ---- cost ------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Metrics against closed forms and scikit-image's recorded numbers."""
+"""Metrics against closed forms."""
 
 import math
 

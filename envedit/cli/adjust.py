@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import os
-from typing import TYPE_CHECKING
 
 from envedit.cli import map_command
 from envedit.cli.map_command import number
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 from envedit.maps.conventions import QUARTERS, turned_for
-
-if TYPE_CHECKING:
-    from envedit.cli.console import Console
 
 OPTIONS = {
     "turn": (number(-360, 360), "DEGREES", "turn about the vertical; positive moves the picture to the left"),
@@ -57,11 +52,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--background-blur", type=number(0, 180), metavar="DEGREES", default=0.0)
     parser.add_argument("--background-exposure", type=number(-100, 100), metavar="STOPS", default=0.0)
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _adjust(arguments, console))
+    return map_command.run(parser, argv, _adjust)
 
 
-def _adjust(arguments: argparse.Namespace, console: Console) -> None:
+def _adjust(arguments, console):
     from envedit.maps import map_file
     from envedit.maps.adjusted import Adjustments, adjusted
 

@@ -36,8 +36,7 @@ def main(argv: list[str] | None = None) -> int:
         help="0: the map, or the first of two looks; 1 (default): the look",
     )
     parser.add_argument("--frames", type=int, help="write so many maps, from amount 0 to 1")
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _apply(arguments, console))
+    return map_command.run(parser, argv, _apply)
 
 
 def _apply(arguments, console):

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING
-
 from envedit.cli import map_command
 from envedit.cli.streams import steady
-
-if TYPE_CHECKING:
-    from envedit.cli.console import Console
 
 
 @steady
@@ -34,11 +28,10 @@ def main(argv: list[str] | None = None) -> int:
         metavar="T",
         help="0: the first map; 1: the second",
     )
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _blend(arguments, console))
+    return map_command.run(parser, argv, _blend)
 
 
-def _blend(arguments: argparse.Namespace, console: Console) -> None:
+def _blend(arguments, console):
     from envedit.core import latlong
     from envedit.maps import map_file
     from envedit.maps.blended import blend

@@ -74,13 +74,9 @@ def apply(
 ) -> tuple[config.Config, str]:
     """Choose the level for a budget, of which some seconds have elapsed; returns settings and a note.
 
-    Raises
-    ------
-    ConfigError
-        The representation is not layers or the renderer not the stored transport, the target is in pixels of
-        the rendering, or even the coarsest level would take more than :data:`LATE` times the budget.
-    EnveditError
-        Scene or map cannot be read; ``base`` is as of :func:`.scene.load`.
+    ConfigError where the representation is not layers or the renderer not the stored transport, where the
+    target is in pixels of the rendering, or where even the coarsest level would take more than :data:`LATE`
+    times the budget. Errors of scene and map, and ``base``, are as of :func:`.scene.load`.
     """
     _check(settings)
     begun = time.perf_counter()
@@ -138,13 +134,7 @@ def _film_at(settings, width):
 
 
 def choose(measured: Calibration, budget: float, elapsed: float) -> tuple[Level, float]:
-    """Return the finest level that is expected to end in time, and the seconds it is expected to take.
-
-    Raises
-    ------
-    ConfigError
-        Even the coarsest takes too long.
-    """
+    """Return the finest level that is expected to end in time, and its seconds; ConfigError without any."""
     seconds = [elapsed + expect(level, measured) for level in LEVELS]
     finest = max((k for k in range(len(LEVELS)) if seconds[k] <= budget), default=0)
     if seconds[finest] <= LATE * budget:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 
+from envedit.cli import console
 from envedit.cli.streams import steady
 
 KINDS = {
@@ -19,12 +19,11 @@ KINDS = {
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Say what the cache holds, or empty it; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="envedit cache",
-        description="Show what envedit keeps on disk between runs, or delete it. A later run computes again\n"
+    parser = console.make_parser(
+        "cache",
+        "Show what envedit keeps on disk between runs, or delete it. A later run computes again\n"
         "what it needs. The cache lies in ~/.cache/envedit, or in $XDG_CACHE_HOME/envedit.",
-        epilog="examples:\n  envedit cache\n  envedit cache --empty",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        ["envedit cache", "envedit cache --empty"],
     )
     parser.add_argument("--empty", action="store_true", help="delete all entries, and nothing else")
     arguments = parser.parse_args(argv)
@@ -43,17 +42,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _visit(kind, empty):
-    """Count the entries of a kind, or delete them.
-
-    Returns
-    -------
-    folder : Path
-        Where they lie.
-    sizes : list of int
-        Bytes of each entry.
-    failed : OSError or None
-        The last thing that could not be read or deleted.
-    """
+    """Count the entries of a kind, or delete them; returns folder, bytes of each, and the last OSError."""
     from envedit.core.array_cache import DiskCache, cache_folder
 
     cache = DiskCache(cache_folder(kind))
@@ -77,7 +66,3 @@ def _visit(kind, empty):
         except OSError as error:
             failed = error
     return cache.folder, sizes, failed
-
-
-if __name__ == "__main__":
-    sys.exit(main())

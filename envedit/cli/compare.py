@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from envedit.cli import map_command
 from envedit.cli.streams import steady
-
-if TYPE_CHECKING:
-    from envedit.cli.console import Console
 
 RESULTS = ("compare.json", "difference.png")
 """What the command leaves in its folder."""
@@ -31,11 +26,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("first", metavar="A", help=f"the reference, {map_command.MAP_HELP}")
     parser.add_argument("second", metavar="B", help="another")
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _compare(arguments, console))
+    return map_command.run(parser, argv, _compare)
 
 
-def _compare(arguments: argparse.Namespace, console: Console) -> None:
+def _compare(arguments, console):
     from envedit.core import latlong
     from envedit.core.atomic_files import write_atomically
     from envedit.images.images import png
@@ -73,7 +67,7 @@ def _compare(arguments: argparse.Namespace, console: Console) -> None:
     console.say(f"difference.png: full colour is {scale:g} stops; results in {folder}")
 
 
-def _lines(measured: dict) -> list[str]:
+def _lines(measured):
     """Return what is measured as lines of text."""
     lpips = "LPIPS -" if measured["lpips"] is None else f"LPIPS {measured['lpips']:.4f}"
     score = f"PSNR {measured['psnr']:.2f} dB, SSIM {measured['ssim']:.4f}, {lpips}"
@@ -94,9 +88,9 @@ def _lines(measured: dict) -> list[str]:
     return lines
 
 
-def _place(light: dict) -> str:
+def _place(light):
     return f"azimuth {light['azimuth']:.1f}, elevation {light['elevation']:.1f}"
 
 
-def _stops(value: float | None) -> str:
+def _stops(value):
     return "-" if value is None else f"{round(value, 2) + 0.0:+.2f}"  # no minus of what rounds to 0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from envedit.core.errors import EnveditError, unwrapped
@@ -13,17 +14,23 @@ if TYPE_CHECKING:
     from envedit.cli.progress import JsonProgress, Progress
 
 
+def make_parser(
+    command: str, description: str, examples: Sequence[str], more: str = ""
+) -> argparse.ArgumentParser:
+    """Make the parser of a command; its help ends with examples, command lines, and ``more``."""
+    lines = "\n".join(f"  {example}" for example in examples)
+    return argparse.ArgumentParser(
+        prog=f"envedit {command}",
+        description=description,
+        epilog=f"examples:\n{lines}\n\n{more}".rstrip(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def exit_code(name: str, action: Callable[[], int], interrupted: str = "interrupted") -> int:
     """Return the exit code of an action, or of a user's error or of Ctrl-C, which are reported on stderr.
 
-    Parameters
-    ----------
-    name : str
-        What the lines on stderr begin with.
-    action : callable
-        Returns the exit code where nothing fails.
-    interrupted : str
-        What is said after Ctrl-C.
+    The lines there begin with ``name``; ``interrupted`` is said after Ctrl-C.
     """
     try:
         with unwrapped():

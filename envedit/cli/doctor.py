@@ -36,7 +36,7 @@ from envedit.cli.streams import steady
 from envedit.core.array_cache import cache_home
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
-from envedit.sweep.process import cores
+from envedit.core.processor import cores
 
 ALBEDO = 0.5
 _VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb")
@@ -60,20 +60,11 @@ _LIBRARIES = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a probe found.
+    """What a probe found."""
 
-    Attributes
-    ----------
-    ok : bool
-        True if the probe rendered the right picture.
-    lines : tuple of str
-        If not ok: what is wrong and how to mend it, in one or two lines.
-    versions : dict
-        What the probe came to know: ``mitsuba``, ``drjit``, ``llvm``, ``llvm_path``, ``radiance``, ...
-    """
-
-    ok: bool
-    lines: tuple[str, ...] = ()
+    ok: bool  # true if the probe rendered the right picture
+    lines: tuple[str, ...] = ()  # if not ok: what is wrong and how to mend it, in one or two lines
+    # What the probe came to know: ``mitsuba``, ``drjit``, ``llvm``, ``llvm_path``, ``radiance``,
     versions: dict = field(default_factory=dict)
 
 
@@ -368,7 +359,3 @@ def _memory_size() -> str:
     with contextlib.suppress(AttributeError, ValueError, OSError):
         return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GB"
     return "unknown"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

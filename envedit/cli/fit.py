@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -10,9 +9,10 @@ import mitsuba as mi
 
 from envedit import config, inputs
 from envedit.cli import doctor
-from envedit.cli.console import exit_code
+from envedit.cli.console import exit_code, make_parser
 from envedit.cli.progress import Progress
 from envedit.cli.streams import steady
+from envedit.config import presets
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import manifest, output_folder, preview
@@ -22,13 +22,14 @@ from envedit.representations.siren import fit
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="envedit fit",
-        description="Fit a SIREN to an HDR map, and say how well it reproduces the map.\n"
+    parser = make_parser(
+        "fit",
+        "Fit a SIREN to an HDR map, and say how well it reproduces the map.\n"
         "Leaves fitted.exr, preview.png and fit.json.",
-        epilog="examples:\n  envedit fit sky.hdr --preset draft\n"
-        "  envedit fit sunsky --set input.elevation=10 --set fit.epochs=500",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        [
+            "envedit fit sky.hdr --preset draft",
+            "envedit fit sunsky --set input.elevation=10 --set fit.epochs=500",
+        ],
     )
     parser.add_argument(
         "map", metavar="MAP", help="an EXR or Radiance HDR file, or sunsky, Mitsuba's analytic sky"
@@ -36,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", metavar="DIR", help="folder for the results (default: MAP_fit in the working folder)"
     )
-    parser.add_argument("--preset", choices=config.preset_names(), help="named set of defaults")
+    parser.add_argument("--preset", choices=tuple(presets.PRESETS), help="named set of defaults")
     parser.add_argument(
         "--set",
         metavar="table.key=value",

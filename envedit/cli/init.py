@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import os
-import sys
 from pathlib import Path
 
-from envedit.cli.console import exit_code
+from envedit.cli.console import exit_code, make_parser
 from envedit.cli.streams import steady
 from envedit.core import shipped
 
@@ -49,13 +47,11 @@ WIDEST = 48
 def main(argv: list[str] | None = None) -> int:
     """Write a configuration; returns the exit code."""
     scenes = ", ".join(shipped.scenes())
-    parser = argparse.ArgumentParser(
-        prog="envedit init",
-        description="Write a commented configuration to start from.",
-        epilog="examples:\n  envedit init\n"
-        "  envedit init my_scene.xml --envmap sky.hdr --out my_edit.toml\n\n"
+    parser = make_parser(
+        "init",
+        "Write a commented configuration to start from.",
+        ["envedit init", "envedit init my_scene.xml --envmap sky.hdr --out my_edit.toml"],
         f"shipped scenes: {scenes}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "scene",
@@ -125,7 +121,3 @@ def _aligned(text):
         f"{setting:{width}}{mark}{comment}".rstrip() + "\n" if mark else f"{setting}\n"
         for setting, mark, comment in lines
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from envedit.cli import map_command
 from envedit.cli.streams import steady
-
-if TYPE_CHECKING:
-    from envedit.cli.console import Console
 
 RESULTS = ("lights.json", "sky.exr", "lights.exr")
 """What the command leaves in its folder."""
@@ -32,11 +27,10 @@ def main(argv: list[str] | None = None) -> int:
         default="MAP_lights",
     )
     parser.add_argument("map", metavar="MAP", help=map_command.MAP_HELP)
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _lights(arguments, console))
+    return map_command.run(parser, argv, _lights)
 
 
-def _lights(arguments: argparse.Namespace, console: Console) -> None:
+def _lights(arguments, console):
     from envedit.export import file_lights
     from envedit.images import images
     from envedit.maps import map_lights
@@ -45,7 +39,7 @@ def _lights(arguments: argparse.Namespace, console: Console) -> None:
     # ---- The lights, in Rec. 709 and in the colours of the file
     input_map = map_command.read(arguments.map, arguments, console)
     shape = input_map.stored.shape[:2]
-    separated = file_lights.lights_of(input_map.radiance).lights
+    separated = file_lights.lights_of(input_map.radiance)
     listed = map_lights.listed(separated, shape, file_lights.without(input_map.radiance, separated))
     texels = [input_map.stored.reshape(-1, 3)[light.texels][None] for light in separated]
     cores = [
@@ -73,7 +67,7 @@ def _lights(arguments: argparse.Namespace, console: Console) -> None:
     console.say(f"{len(numbered)} lights; results in {folder}")
 
 
-def _table(lights: list[dict]) -> list[str]:
+def _table(lights):
     """Return the lines of the list, a light each."""
     lines = [
         "light  azimuth  elevation  solid angle, sr  flux (R, G, B)                     stops over the sky"

@@ -70,7 +70,3 @@ def _parser():
     parser.add_argument("--version", action="version", version=f"envedit {__version__}")
     parser.add_argument("command", metavar="COMMAND", help=argparse.SUPPRESS)
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,8 +6,7 @@
    def main(argv: list[str] | None = None) -> int:
        parser = map_command.make_parser("adjust", "Adjust a map.", ["envedit adjust sky.hdr --exposure 1"])
        parser.add_argument("map", ...)
-       arguments = parser.parse_args(argv)
-       return map_command.run(arguments, lambda console: _adjust(arguments, console))
+       return map_command.run(parser, argv, _adjust)
 
 The action says what it does by ``console.say`` and puts what programs read into ``console.facts``.
 """
@@ -19,6 +18,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from envedit.cli import console
 from envedit.cli.console import Console
 from envedit.core.errors import EnveditError, unwrapped
 
@@ -40,12 +40,8 @@ def make_parser(
 
     Parameters
     ----------
-    command : str
-        Its name, such as "adjust".
-    description : str
-        What it does.
-    examples : sequence of str
-        Command lines.
+    command, description, examples
+        As of :func:`.console.make_parser`.
     out : str
         "FILE" or "DIR": what ``--out`` names.
     default : str, optional
@@ -53,12 +49,7 @@ def make_parser(
     repair : bool
         Whether there is the option of :func:`.map_file.read`.
     """
-    parser = argparse.ArgumentParser(
-        prog=f"envedit {command}",
-        description=description,
-        epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = console.make_parser(command, description, examples)
     where = f" (default: {default}, in the working folder)" if default else ""
     parser.add_argument("--out", metavar=out, help=f"where the result goes{where}")
     if out == "FILE":
@@ -87,19 +78,18 @@ def number(low: float, high: float) -> Callable[[str], float]:
     return read_number
 
 
-def run(arguments: argparse.Namespace, action: Callable[[Console], None]) -> int:
-    """Carry out a command; errors are reported, with ``--json`` in the object as well.
-
-    Returns
-    -------
-    int
-        0, the exit code of the error, or 130 after Ctrl-C.
-    """
+def run(
+    parser: argparse.ArgumentParser,
+    argv: list[str] | None,
+    action: Callable[[argparse.Namespace, Console], None],
+) -> int:
+    """Carry out a command, report its errors, with ``--json`` in the object too, and return its exit code."""
+    arguments = parser.parse_args(argv)
     console = Console(one_object=arguments.json)
     code = 0
     try:
         with unwrapped():
-            action(console)
+            action(arguments, console)
     except EnveditError as error:
         console.error(str(error))
         code = error.exit_code

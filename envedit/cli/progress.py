@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import TextIO
 
 from tqdm import tqdm
 
@@ -14,19 +13,11 @@ JSON_SECONDS = 0.5  # between lines of JSON
 
 
 class Progress:
-    """Show stages and how far each has come, on stderr; a context manager.
+    """Show stages and how far each has come, on stderr unless ``quiet``: as a bar if that is a terminal."""
 
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
-    stream : file, optional
-        Where to; a bar if it is a terminal.
-    """
-
-    def __init__(self, quiet: bool = False, stream: TextIO | None = None):
+    def __init__(self, quiet: bool = False):
         self.quiet = quiet
-        self.stream = stream or sys.stderr
+        self.stream = sys.stderr
         self._terminal = self.stream.isatty()
         self._bar: tqdm | None = None
         self._stage = ""
@@ -90,8 +81,7 @@ class JsonProgress:
     when it is done, come ``{"event": "progress", "stage":, "done":, "total":, "text":}``.
     """
 
-    def __init__(self, stream: TextIO | None = None):
-        self.stream = stream or sys.stderr
+    def __init__(self) -> None:
         self._stage = ""
         self._last_line = 0.0
 
@@ -103,7 +93,7 @@ class JsonProgress:
 
     def tell(self, event: str, **facts: object) -> None:
         """Write one line."""
-        print(json.dumps({"event": event, **facts}), file=self.stream, flush=True)
+        print(json.dumps({"event": event, **facts}), file=sys.stderr, flush=True)
 
     def stage(self, text: str) -> None:
         """Begin a stage."""

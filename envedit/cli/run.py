@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import json
 import os
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import replace
@@ -55,16 +54,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[config.Config, Path | None, Path]:
-    """Read a configuration, given as a path or as the name of a shipped one.
+    """Read a configuration, given as a path or as the name of a shipped one; returns it and its file.
 
-    Returns
-    -------
-    settings : config.Config
-        Results of a shipped configuration go to ``runs/NAME`` in the working folder.
-    file : Path
-        The configuration's.
-    base : Path
-        Folder that relative paths start from: the file's; the working folder where the name was given.
+    And the folder that relative paths start from: the file's; the working folder where the name was given.
+    Results of a shipped configuration go to ``runs/NAME`` in the working folder.
     """
     from envedit import config
     from envedit.core.errors import ConfigError
@@ -372,7 +365,3 @@ def _change(before, after):
     first, last = (metrics.score(one, pair) for one in pair)
     saturated = " (most of the difference is outside the display's range)" if metrics.saturated(pair) else ""
     return f"{first.rpartition(' ')[0]} -> {last}{saturated}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

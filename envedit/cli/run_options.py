@@ -6,24 +6,27 @@ import argparse
 import os
 import re
 
+from envedit.cli import console
 from envedit.core import shipped
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog="envedit run",
-        description="Edit an HDR environment map so that a scene renders like a target.",
-        epilog="examples:\n  envedit run quickstart\n  envedit run edit.toml --set scene.width=256\n"
-        "  envedit run scene.xml --envmap sky.hdr --rotate 90\n"
-        "  envedit run scene.xml --export-initial paint_me.png\n"
-        "  envedit run scene.xml --paint paint_me.png\n"
-        "  envedit run edits/move_shadow --out shadow --preset draft\n\n"
+    parser = console.make_parser(
+        "run",
+        "Edit an HDR environment map so that a scene renders like a target.",
+        [
+            "envedit run quickstart",
+            "envedit run edit.toml --set scene.width=256",
+            "envedit run scene.xml --envmap sky.hdr --rotate 90",
+            "envedit run scene.xml --export-initial paint_me.png",
+            "envedit run scene.xml --paint paint_me.png",
+            "envedit run edits/move_shadow --out shadow --preset draft",
+        ],
         f"shipped configurations: {', '.join(shipped.configurations())}\n"
         f"shipped scenes, for [scene] file: {', '.join(shipped.scenes())}\n\n"
         "exit codes: 0 done; 2 bad configuration or usage; 3 bad image or scene file; 4 this machine cannot\n"
         "run it; 5 the optimisation could not proceed; 130 interrupted, after writing a checkpoint",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "config",
@@ -130,10 +133,7 @@ def is_scene(name: str) -> bool:
 def quick(arguments: argparse.Namespace) -> list[str]:
     """Return the overrides that --envmap, --camera, --paint, --target and --rotate stand for.
 
-    Raises
-    ------
-    ConfigError
-        They are given beside a configuration, which says the same.
+    ConfigError where they are given beside a configuration, which says the same.
     """
     from envedit import config
     from envedit.core.errors import ConfigError

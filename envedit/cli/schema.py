@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 
+from envedit.cli.console import make_parser
 from envedit.cli.streams import steady
 
 
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Print the schema; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="envedit schema",
-        description="Print every key of the configuration: as JSON Schema, by which editors complete and\n"
+    parser = make_parser(
+        "schema",
+        "Print every key of the configuration: as JSON Schema, by which editors complete and\n"
         "check TOML files, or as the page docs/configuration.md.",
-        epilog="examples:\n  envedit schema > envedit.schema.json\n"
-        "  (then, as the first line of a TOML file:  #:schema envedit.schema.json)\n"
-        "  envedit schema --markdown",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        [
+            "envedit schema > envedit.schema.json",
+            "(then, as the first line of a TOML file:  #:schema envedit.schema.json)",
+            "envedit schema --markdown",
+        ],
     )
     parser.add_argument("--markdown", action="store_true", help="print the reference")
     arguments = parser.parse_args(argv)
@@ -28,7 +28,3 @@ def main(argv: list[str] | None = None) -> int:
 
     print(markdown().rstrip() if arguments.markdown else json.dumps(json_schema(), indent=1))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

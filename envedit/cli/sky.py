@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING
-
 from envedit.cli import map_command
 from envedit.cli.map_command import number
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from envedit.cli.console import Console
 
 MIDDLE = 180.0
 """Azimuth of the middle of a map."""
@@ -48,11 +42,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--width", type=int, metavar="TEXELS", default=2048, help="even, 6 to 16384 (default: 2048)"
     )
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _sky(arguments, console))
+    return map_command.run(parser, argv, _sky)
 
 
-def _sky(arguments: argparse.Namespace, console: Console) -> None:
+def _sky(arguments, console):
     from envedit.images import analytic_sky
     from envedit.maps import map_file
 
@@ -65,7 +58,7 @@ def _sky(arguments: argparse.Namespace, console: Console) -> None:
     console.say(f"sun at azimuth {azimuth:.2f}, elevation {elevation:.2f} degrees; {path}")
 
 
-def _sun(arguments: argparse.Namespace) -> tuple[float, float]:
+def _sun(arguments):
     """Return azimuth and elevation of the sun that is asked for, degrees."""
     from envedit.maps import sun_position
 

@@ -15,17 +15,18 @@ from envedit.cli.streams import steady
 @steady
 def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
     """Carry out jobs; returns the exit code: 0, 1 if a job is not done, 2, 3 as ``envedit run``, 130."""
-    parser = argparse.ArgumentParser(
-        prog="envedit sweep",
-        description="Carry out many configurations; skip those that are done, continue interrupted ones.\n"
+    parser = console.make_parser(
+        "sweep",
+        "Carry out many configurations; skip those that are done, continue interrupted ones.\n"
         "JOBS is a TOML file with a table [jobs.NAME] for each job, laid over [common], or a folder of\n"
         "configurations NAME.toml. The folder of a job is DIR/HASH; DIR/sweep.tsv lists names and folders.",
-        epilog="examples:\n  envedit sweep jobs.toml --out runs/sweep --workers 2\n"
-        "  envedit sweep jobs.toml --out /shared/runs --scheduler tcp://HOST:8786\n\n"
+        [
+            "envedit sweep jobs.toml --out runs/sweep --workers 2",
+            "envedit sweep jobs.toml --out /shared/runs --scheduler tcp://HOST:8786",
+        ],
         "A scheduler and its workers are Dask's (pip install 'envedit-hdr[cluster]'):\n"
         "  dask scheduler                              # prints its address, tcp://HOST:8786\n"
         "  dask worker tcp://HOST:8786 --nthreads 1    # on each node; a thread is a job at a time",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("jobs", metavar="JOBS", help="TOML with tables [jobs.NAME], or a folder of NAME.toml")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder of the jobs' folders")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 
 import numpy as np
 
 from envedit.cli import map_command
-from envedit.cli.console import Console
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 
@@ -40,11 +38,10 @@ def main(argv: list[str] | None = None) -> int:
     override.add_argument(
         "--ratio", type=float, help="the sun's horizontal irradiance over the sky's, luminance"
     )
-    arguments = parser.parse_args(argv)
-    return map_command.run(arguments, lambda console: _unclip(arguments, console))
+    return map_command.run(parser, argv, _unclip)
 
 
-def _unclip(arguments: argparse.Namespace, console: Console) -> None:
+def _unclip(arguments, console):
     from envedit.maps import map_file
     from envedit.representations.layers import clipped_light, unclip
 

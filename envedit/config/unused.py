@@ -14,22 +14,11 @@ GAUSS_NEWTON, ADAM = "gauss-newton", "adam"
 
 
 def unused(config: Config, solver: str | None = None) -> list[str]:
-    """Name the keys that were given, differ from their default, and change nothing.
+    """Name the keys that were given, differ from their default, and change nothing: a sentence each reason.
 
     A key that has its default's value is not named: a resolved configuration, which has every key, is as
-    quiet as the one that it came from. Neither is what is switched off.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-    solver : str, optional
-        :data:`GAUSS_NEWTON` or :data:`ADAM`, the steps that are made; None: not known, and not looked at.
-
-    Returns
-    -------
-    list of str
-        A sentence for each reason, with all keys that it concerns.
+    quiet as the one that it came from. Neither is what is switched off. ``solver`` is :data:`GAUSS_NEWTON` or
+    :data:`ADAM`, the steps that are made; None: not known, and not looked at.
     """
     tables = {name: getattr(config, name) for name in FIELDS}
     given = {name: {key: getattr(table, key) for key in table.given} for name, table in tables.items()}

@@ -57,18 +57,9 @@ class DiskCache:
     ) -> dict[str, np.ndarray] | None:
         """Return the arrays that were stored under a key; None if there are none, or none that are whole.
 
-        Parameters
-        ----------
-        key : dict
-            What the arrays were made from, as JSON knows it.
-        is_whole : callable, optional
-            Returns whether arrays are such as :meth:`store` was given: names, types, shapes and ranges. What
-            it raises is a no.
-
-        Returns
-        -------
-        dict of str to ndarray
-            Read-only, and mapped: to be copied if they are to outlive their use.
+        ``key`` is what they were made from, as JSON knows it. ``is_whole`` returns whether arrays are such as
+        :meth:`store` was given: names, types, shapes and ranges; what it raises is a no. Arrays are read-only
+        and mapped: to be copied if they are to outlive their use.
         """
         if self.folder is None or not _private(self.folder):
             return None

@@ -34,18 +34,9 @@ def replacing(path: FilePath, suffix: str = "") -> Iterator[Path]:
     A reader sees the old file or the new one. If anything fails the old file stays and the temporary one is
     removed.
 
-    Parameters
-    ----------
-    path : path-like
-        The file; an existing one is replaced.
-    suffix : str
-        Ending of the temporary name, for libraries that read the format from it.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written: for an OSError, RuntimeError or ValueError (libraries raise any of
-        these) inside the block or while moving.
+    ``suffix`` is the ending of the temporary name, for libraries that read the format from it. InputError if
+    the file cannot be written: for an OSError, RuntimeError or ValueError (libraries raise any of these)
+    inside the block or while moving.
     """
     target = Path(os.fsdecode(path))
     temporary = target.with_name(f".{target.name}.{os.getpid()}{suffix}")
@@ -66,24 +57,15 @@ def replacing(path: FilePath, suffix: str = "") -> Iterator[Path]:
 
 
 def write_atomically(path: FilePath, data: bytes) -> None:
-    """Write bytes as a file, whole or not at all; see :func:`replacing`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write bytes as a file, whole or not at all; InputError if it cannot be written."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 def opened(path: FilePath) -> BufferedReader:
-    """Open a regular file for reading bytes; a pipe or a device would wait or never end.
+    """Open a regular file for reading bytes; OSError as of ``open``, and for what is no regular file.
 
-    Raises
-    ------
-    OSError
-        As of ``open``, and for what is no regular file.
+    A pipe or a device would wait or never end.
     """
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:
@@ -101,10 +83,7 @@ def opened(path: FilePath) -> BufferedReader:
 def digest(path: FilePath) -> bytes:
     """Return the SHA-256 of a regular file.
 
-    Raises
-    ------
-    OSError
-        As of :func:`opened`, and for a file of more than :data:`MOST_BYTES`, which is no input of a run.
+    OSError as of :func:`opened`, and for a file of more than :data:`MOST_BYTES`, which is no input of a run.
     """
     with opened(path) as file:
         size = os.fstat(file.fileno()).st_size

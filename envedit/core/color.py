@@ -80,10 +80,7 @@ def tonemap(image: ArrayLike, name: str = "gamma") -> np.ndarray:
       scaled so that W is white), so that 1 maps to 0.73
     - ``linear``: clip(E, 0, 1)
 
-    Raises
-    ------
-    ConfigError
-        If there is no such tonemap.
+    ConfigError if there is no such tonemap.
     """
     return _named(TONEMAPS, name)(np.asarray(image))
 

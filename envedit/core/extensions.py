@@ -27,10 +27,7 @@ def names(group: str) -> tuple[str, ...]:
 def load(group: str, name: str) -> Callable[..., Any]:
     """Return the function of a kind.
 
-    Raises
-    ------
-    ConfigError
-        No installed package adds it, two do, or its module cannot be imported.
+    ConfigError if no installed package adds it, two do, or its module cannot be imported.
     """
     entries = importlib.metadata.entry_points(group=group, name=name)
     values = sorted({entry.value for entry in entries})

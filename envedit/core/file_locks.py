@@ -45,12 +45,7 @@ def lock(descriptor: int) -> bool:
 def locked(path: Path) -> Iterator[TextIO]:
     """Make a lock file, hold its lock, and remove it at the end; yields the open file.
 
-    Raises
-    ------
-    Busy
-        Another process holds it: "process 1234 on HOST".
-    InputError
-        The file cannot be made.
+    Busy if another process holds it: "process 1234 on HOST"; InputError if the file cannot be made.
     """
     try:
         file = open(path, "a+", encoding="utf-8")  # noqa: SIM115

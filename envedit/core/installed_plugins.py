@@ -47,12 +47,8 @@ def restored() -> Iterator[None]:
 def check(name: str, where: str) -> None:
     """Refuse the name of a plugin that the installation lacks and a file elsewhere would provide.
 
-    A name that is neither is left to Mitsuba, which knows what a program has registered in Python.
-
-    Raises
-    ------
-    InputError
-        Naming ``where`` and the file.
+    A name that is neither is left to Mitsuba, which knows what a program has registered in Python. InputError
+    names ``where`` and the file.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{where}: type is {name[:60]!r}, expected the name of a Mitsuba plugin")

@@ -57,19 +57,10 @@ def on_sphere(theta: ArrayLike, phi: ArrayLike) -> np.ndarray:
 
 
 def texel_position(d: ArrayLike, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fractional (row, column) at which Mitsuba looks up directions.
+    """Return the fractional (row, column) at which Mitsuba looks up directions, arrays (...).
 
-    Parameters
-    ----------
-    d : array (..., 3)
-        Directions in the emitter's frame, of any positive length.
-    height, width : int
-        Size of the map in texels.
-
-    Returns
-    -------
-    row, column : arrays (...)
-        Rows in [0, H - 1], columns in [-1/2, W - 1/2); whole numbers are texel centres.
+    ``d`` (..., 3) are directions in the emitter's frame, of any positive length. Rows are in [0, H - 1],
+    columns in [-1/2, W - 1/2); whole numbers are texel centres.
     """
     _check_size(height, width)
     d = np.asarray(d, np.float64)
@@ -79,33 +70,6 @@ def texel_position(d: ArrayLike, height: int, width: int) -> tuple[np.ndarray, n
     u = np.where(u >= 1.0, 0.0, u)  # a tiny negative angle rounds up to exactly one turn
     v = np.arctan2(np.hypot(x, z), y) / np.pi  # acos(y), without its loss of digits near the poles
     return v * (height - 1), u * width - 0.5
-
-
-def lookup(image: ArrayLike, d: ArrayLike) -> np.ndarray:
-    """Interpolate a map at directions as Mitsuba's ``envmap`` does, in float64.
-
-    Parameters
-    ----------
-    image : array (H, W, C)
-        The map, without halo columns.
-    d : array (..., 3)
-        Directions in the emitter's frame; must be finite.
-
-    Returns
-    -------
-    array (..., C)
-    """
-    image = np.asarray(image)
-    height, width = image.shape[:2]
-    row, column = texel_position(d, height, width)
-    r0 = np.clip(np.floor(row).astype(np.int64), 0, max(height - 2, 0))
-    c0 = np.floor(column).astype(np.int64)
-    fr, fc = (row - r0)[..., None], (column - c0)[..., None]
-    r1 = np.minimum(r0 + 1, height - 1)
-    c0, c1 = c0 % width, (c0 + 1) % width
-    upper = (1 - fc) * image[r0, c0] + fc * image[r0, c1]
-    lower = (1 - fc) * image[r1, c0] + fc * image[r1, c1]
-    return (1 - fr) * upper + fr * lower
 
 
 # ---- Solid angles ------------------------------------------------------------------------------------------
@@ -238,16 +202,7 @@ def rotate(image: ArrayLike, degrees: float) -> np.ndarray:
     360 degrees are one width: new(u) = old(u + degrees / 360). A shift by whole texels (to 1e-6) is exactly
     ``np.roll``; any other is interpolated linearly between the two columns, which keeps the sum of every row.
 
-    Parameters
-    ----------
-    image : array (H, W, ...)
-        The map.
-    degrees : float
-        Any finite angle.
-
-    Returns
-    -------
-    array (H, W, ...), of the dtype of ``image``
+    The result has the dtype of ``image`` (H, W, ...).
     """
     image = np.asarray(image)
     if not math.isfinite(degrees):
@@ -282,12 +237,8 @@ def to_envmap_data(image: ArrayLike) -> np.ndarray:
     """Return ``envmap.data`` of Mitsuba >= 3.9, ``(H, W + 2, 3)`` float32, for a map ``(H, W, 3)``.
 
     The first column repeats the last texel of each row and the last column the first. Mitsuba does not
-    validate the width: an (H, W, 3) tensor would silently be read as W - 2 columns.
-
-    Raises
-    ------
-    InputError
-        If the map has fewer than 3 rows or 2 columns.
+    validate the width: an (H, W, 3) tensor would silently be read as W - 2 columns. InputError if the map has
+    fewer than 3 rows or 2 columns.
     """
     image = np.asarray(image, np.float32)
     if image.ndim != 3 or image.shape[2] != 3:

@@ -47,10 +47,7 @@ _BRADFORD = np.array(  # Lam 1985, as of ICC.1:2010, Annex E
 def known(chromaticities: Iterable[float], where: str) -> Chromaticities | None:
     """Check chromaticities of a file; None where they are those of Rec. 709.
 
-    Raises
-    ------
-    InputError
-        They are no primaries: not finite, or on a line.
+    InputError if they are no primaries: not finite, or on a line.
     """
     values = tuple(float(v) for v in chromaticities)
     if len(values) == 8 and np.isfinite(values).all() and abs(values[7]) > 1e-6:
@@ -71,13 +68,7 @@ def says_nothing(name: str) -> bool:
 
 
 def named(name: str, where: str) -> Chromaticities | None:
-    """Return what a colour space is that a file names; None for Rec. 709.
-
-    Raises
-    ------
-    InputError
-        The name is not known.
-    """
+    """Return what a colour space is that a file names; None for Rec. 709, InputError for an unknown name."""
     chromaticities = NAMES.get(name.strip().lower())
     if chromaticities is None:
         shown = name[:60] if name.isprintable() else repr(name[:60])

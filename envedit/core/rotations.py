@@ -51,3 +51,8 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     axis = np.cross(start, end)
     sine = float(np.linalg.norm(axis))
     return axis * (np.arctan2(sine, start @ end) / max(sine, 1e-30))
+
+
+def rotation_matrix(turn: np.ndarray) -> np.ndarray:
+    """Return the matrix (3, 3) of a rotation vector (3,)."""
+    return np.stack([rotated(axis, turn) for axis in np.eye(3)], axis=1)

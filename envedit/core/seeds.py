@@ -15,44 +15,25 @@ _WORDS = 2**32  # where a seed is a setting of its own, or goes to Mitsuba as it
 
 @dataclass(frozen=True)
 class Seeds:
-    """The seeds of a run; made by :meth:`of`.
+    """The seeds of a run; made by :meth:`of`."""
 
-    Attributes
-    ----------
-    fit : int
-        A network and its fit.
-    transport : int
-        T's recording, and the light of other lamps; further ones by :func:`recording`, :func:`pilot` and
-        :func:`columns`. Of a path tracer, ``sample_tea_32(2 step, transport)``: rendering and gradient.
-    second_recording : int
-        T once more, to see what in it is noise.
-    step_check, turn_check, solution_check : int
-        Renderings that decide about the solver's steps, and about the turn of the sky, and that show what T
-        misses of the solution.
-    target, target_again : int
-        The target, rendered under another map; and renderings that show how noisy it is.
-    exported : int
-        The rendering that is painted on.
-    painted_initial : int
-        The initial rendering where a map is only adjusted, without a target.
-    judged : int
-        The rendering of the result, and the initial one that it is compared with: the same samples.
-    page : int
-        The rendering that the painting page shows; further passes count on from it.
-    """
-
-    fit: int
+    fit: int  # a network and its fit
+    # T's recording, and the light of other lamps; further ones by :func:`recording`, :func:`pilot` and
+    # :func:`columns`. Of a path tracer, ``sample_tea_32(2 step, transport)``: rendering and gradient.
     transport: int
-    second_recording: int
+    second_recording: int  # T once more, to see what in it is noise
+    # step_check, turn_check, solution_check: renderings that decide about the solver's steps, and about the
+    # turn of the sky, and that show what T misses of the solution
     step_check: int
     turn_check: int
     solution_check: int
+    # target, target_again: the target, rendered under another map; and renderings that show how noisy it is
     target: int
     target_again: int
-    exported: int
-    painted_initial: int
-    judged: int
-    page: int
+    exported: int  # the rendering that is painted on
+    painted_initial: int  # the initial rendering where a map is only adjusted, without a target
+    judged: int  # the rendering of the result, and the initial one that it is compared with: the same samples
+    page: int  # the rendering that the painting page shows; further passes count on from it
 
     @classmethod
     def of(cls, seed: int) -> Seeds:

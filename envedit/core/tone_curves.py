@@ -22,17 +22,10 @@ _STEPS = 4096
 
 @dataclass(frozen=True)
 class ToneCurve:
-    """A tone curve.
+    """A tone curve."""
 
-    Attributes
-    ----------
-    by_channel : callable
-        Display values of exposed radiance (...), not falling.
-    mixed : tuple of tuple
-        Matrix (3, 3) that a colour is multiplied by before the curve; its inverse is applied after it.
-    """
-
-    by_channel: Callable[[np.ndarray], np.ndarray]
+    by_channel: Callable[[np.ndarray], np.ndarray]  # display values of exposed radiance (...), not falling
+    # Matrix (3, 3) that a colour is multiplied by before the curve; its inverse is applied after it
     mixed: tuple[tuple[float, ...], ...] | None = None
 
     def shown(self, radiance: np.ndarray) -> np.ndarray:

@@ -32,25 +32,17 @@ _ROWS = 256  # of a map that are worked on at a time
 _SEARCH, _NOTHING = 20, 1e-9  # halvings of a radius; share of a peak that is rounding of a transform
 
 
-def any_asked(lights: config.Lights, output: config.Output) -> bool:
-    """Return whether anything is to be adjusted."""
-    colour = output.white_balance or output.temperature
-    return bool(lights.max_radiance or lights.soften_degrees or output.exposure or colour)
-
-
 def adjust(
     envmap: np.ndarray, lights: config.Lights, output: config.Output, scale: float = 1.0
 ) -> tuple[np.ndarray, list[str]]:
-    """Adjust a map: exposure and white balance, then its lights.
+    """Adjust a map: exposure and white balance, then its lights; NumericalError where it leaves float32.
 
     Parameters
     ----------
     envmap : ndarray (H, W, 3) float32
         Linear radiance that reaches the scene.
-    lights : config.Lights
-        How its lights are changed.
-    output : config.Output
-        Exposure, white balance and temperature.
+    lights, output
+        How its lights are changed; its exposure, white balance and temperature.
     scale : float
         What the scene multiplies the map's file by; ``max_radiance`` is in the units of the file.
 
@@ -60,13 +52,9 @@ def adjust(
         The map itself where nothing is asked.
     notes : list of str
         What was done.
-
-    Raises
-    ------
-    NumericalError
-        The adjusted map leaves single precision.
     """
-    if not any_asked(lights, output):
+    colour = output.white_balance or output.temperature
+    if not (lights.max_radiance or lights.soften_degrees or output.exposure or colour):
         return envmap, []
 
     # ---- One factor for each channel
@@ -105,14 +93,7 @@ def spread(core: np.ndarray, degrees: float) -> np.ndarray:
 
     The disc's radiance falls as 1 - (1 - cos g) / (1 - cos r) with the angle g to its centre. Flux is
     radiance times :func:`.latlong.lookup_solid_angles`; it is kept exactly. A radius of less than a texel
-    changes nothing.
-
-    Parameters
-    ----------
-    core : ndarray (H, W, 3)
-        Radiance of a light, black elsewhere.
-    degrees : float
-        Radius r of the disc.
+    changes nothing. ``core`` (H, W, 3) is radiance of a light, black elsewhere; ``degrees`` the radius r.
     """
     height, width, _ = core.shape
     across = min(width, 2 * math.ceil(SPREAD_TEXELS * 180 / max(degrees, 1e-3)))
@@ -174,7 +155,7 @@ def _core(light: Light, shape: tuple[int, ...], degrees: float) -> np.ndarray:
 
 def _soften(envmap, degrees, most):
     """Soften the lights of a map in place and bound what it shows; ``most`` 0: no bound. Returns notes."""
-    lights = file_lights.lights_of(envmap).lights
+    lights = file_lights.lights_of(envmap)
     notes = [f"{len(lights)} lights softened by {degrees:g} degrees"] if degrees else []
     if degrees and not lights:
         notes = ["no light was found: lights.soften_degrees changes nothing"]

@@ -5,37 +5,24 @@ They are looked for on the small copy of :mod:`.separation` and taken out of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from envedit.representations.layers.separation import Light, Survey, separate, survey_of
+from envedit.representations.layers.separation import Light, separate, survey_of
 
 ROWS = 128
 """Rows that are worked on at a time: a band of a map 8192 texels wide is 25 MB in double precision."""
 
 
-@dataclass(frozen=True)
-class FileLights:
-    """The lights of a map.
+def lights_of(radiance: np.ndarray) -> list[Light]:
+    """Separate the lights of a map (H, W, 3), linear radiance in Rec. 709, from its sky.
 
-    Attributes
-    ----------
-    lights : list of separation.Light
-        Those with most flux first; texels and radiance at the resolution of the map.
-    survey : separation.Survey, optional
-        Of the small copy; its lights are in the same order. None: there are none.
+    Those with most flux come first; texels and radiance are at the resolution of the map.
     """
-
-    lights: list[Light]
-    survey: Survey | None
-
-
-def lights_of(radiance: np.ndarray) -> FileLights:
-    """Separate the lights of a map (H, W, 3), linear radiance in Rec. 709, from its sky."""
     survey = survey_of(radiance)
     if survey is None:
-        return FileLights([], None)
+        return []
     height, width = radiance.shape[:2]
 
     # ---- Texels of each light, of the bands that hold any
@@ -51,22 +38,15 @@ def lights_of(radiance: np.ndarray) -> FileLights:
             parts[index].append(replace(light, texels=light.texels + first * width))
 
     # ---- Those that leave anything at this resolution
-    kept = [i for i, part in enumerate(parts) if part]
-    lights = [
+    return [
         replace(
-            parts[i][0],
-            texels=np.concatenate([light.texels for light in parts[i]]),
-            radiance=np.concatenate([light.radiance for light in parts[i]]),
+            part[0],
+            texels=np.concatenate([light.texels for light in part]),
+            radiance=np.concatenate([light.radiance for light in part]),
         )
-        for i in kept
+        for part in parts
+        if part
     ]
-    survey = replace(
-        survey,
-        centres=[survey.centres[i] for i in kept],
-        glows=[survey.glows[i] for i in kept],
-        shares=[survey.shares[i] for i in kept],
-    )
-    return FileLights(lights, survey)
 
 
 def take_out(radiance: np.ndarray, lights: list[Light]) -> None:

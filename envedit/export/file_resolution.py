@@ -37,10 +37,7 @@ class Found:
 def at_full_resolution(settings: config.Config, result: results.Result) -> np.ndarray | None:
     """Carry a result to the resolution of its input's file, in its units; None where that has no more texels.
 
-    Raises
-    ------
-    InputError, NumericalError
-        If the file cannot be read any more, or the carried map is not finite.
+    InputError or NumericalError if the file cannot be read any more, or the carried map is not finite.
     """
     if result.given.size[0] <= settings.input.width:
         return None
@@ -65,21 +62,9 @@ def carried(
 ) -> tuple[inputs.InputMap, np.ndarray]:
     """Carry an edit to the map as its file has it.
 
-    Parameters
-    ----------
-    settings : config.Input
-        With the lights that were placed by hand.
-    input_map, own : InputMap
-        The map at working size, and as the file has it.
-    solution : Found
-        The edit.
-    initial : ndarray (h, w, 3)
-        The working map that was edited.
-
-    Returns
-    -------
-    InputMap, ndarray (H, W, 3)
-        The map with its lights placed, and its edit, radiance before adjustments.
+    ``settings`` have the lights that were placed by hand; ``input_map`` is the map at working size, ``own``
+    as the file has it, and ``initial`` (h, w, 3) the working map that was edited. Returns the map with its
+    lights placed, and its edit (H, W, 3), radiance before adjustments.
     """
     full = _by_hand(settings, input_map, own)
     before = latlong.rotate(initial, solution.turn_degrees)

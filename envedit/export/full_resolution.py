@@ -84,17 +84,8 @@ def carry(
     NumericalError
         If a texel comes out non-finite; names its row and column.
     """
-    # ---- Refuse arrays that do not belong together
-    source = np.asarray(source)
-    if source.ndim != 3 or source.shape[2] != 3 or source.dtype != np.float32:
-        raise ValueError(f"carry: a source is (H, W, 3) float32, got {source.shape} {source.dtype}")
-    width = np.shape(edited_working)[1]
-    if np.shape(original_working) != np.shape(edited_working):
-        raise ValueError(
-            f"carry: the working maps have shapes {np.shape(original_working)} and {np.shape(edited_working)}"
-        )
-
     # ---- The edit, as layers or as a ratio of the working maps
+    width = np.shape(edited_working)[1]
     grid = Places(source.shape[:2], rows_working, width)
     work: _LayersAt | Ratio
     if isinstance(representation, Layers):

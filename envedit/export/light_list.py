@@ -27,18 +27,8 @@ _POINTS = 100_000  # of a light, by which its radii are measured
 def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split radiance (..., 3) into the sky, without lights but with their glow, and its lights.
 
-    Parameters
-    ----------
-    envmap : ndarray (..., 3) float32
-        Of the map.
-    core : ndarray (..., 3)
-        :attr:`.Separation.core` of the map, in its units.
-
-    Returns
-    -------
-    sky, lights : ndarray (..., 3) float32
-        Not negative; their sum in float32 is the map, bit for bit. Where there is no light the sky has the
-        map's bits.
+    ``core`` is :attr:`.Separation.core` of the map, in its units. Sky and lights are float32 and not
+    negative; their sum in float32 is the map, bit for bit. Without a light the sky has the map's bits.
     """
     envmap = np.asarray(envmap, np.float32)
     lights = np.minimum(core, envmap).astype(np.float32)
@@ -58,23 +48,9 @@ def of_edit(
 ) -> tuple[dict[str, list[dict]], np.ndarray]:
     """Match the lights of a map as its file has it and as edited.
 
-    Parameters
-    ----------
-    input_map : inputs.InputMap
-        The map.
-    edited : ndarray (H, W, 3)
-        The edited map, linear radiance that reaches the scene.
-    to_world : ndarray (3, 3)
-        As of :func:`listed`.
-    by_hand, degrees : float
-        By how much the map was turned when it was read, and by the edit.
-
-    Returns
-    -------
-    lights : dict
-        Of :func:`matched`.
-    core : ndarray (H, W, 3) float32
-        The lights of the edited map alone.
+    ``edited`` (H, W, 3) is linear radiance that reaches the scene, ``to_world`` as of :func:`listed`;
+    ``by_hand`` and ``degrees`` are by how much the map was turned when it was read, and by the edit. Returns
+    what :func:`matched` does, and the lights of the edited map alone, (H, W, 3) float32.
     """
     first = last = separate(input_map.radiance if input_map.unmoved is None else input_map.unmoved)
     if input_map.unmoved is not None:
@@ -85,16 +61,10 @@ def of_edit(
 
 
 def listed(separated: list[Light], shape: tuple[int, int], to_world: np.ndarray) -> list[dict]:
-    """List the lights of a map, those with most flux first.
+    """List the lights of a map of a shape, those with most flux first.
 
-    Parameters
-    ----------
-    separated : list of separation.Light
-        Of the map, linear radiance that reaches the scene.
-    shape : (int, int)
-        Rows and columns of the map.
-    to_world : ndarray (3, 3)
-        Rotation from the map's frame (+y up) to the scene's.
+    They are ``separated`` from linear radiance that reaches the scene; ``to_world`` (3, 3) is the rotation
+    from the map's frame (+y up) to the scene's.
 
     Returns
     -------
@@ -159,19 +129,9 @@ def kept(
 ) -> Separation:
     """Let texels that an edit did not change be the same lights as before, whatever has been separated.
 
-    Parameters
-    ----------
-    before, after : separation.Separation
-        Of the map before and after the edit.
-    start, end : ndarray (H, W, 3)
-        These maps.
-    degrees : float
-        By how much the whole map was turned (:func:`.latlong.rotate`) before it was edited.
-
-    Returns
-    -------
-    separation.Separation
-        ``after`` with other lights, and the core of these.
+    ``start`` and ``end`` (H, W, 3) are the map before and after the edit, of which ``before`` and ``after``
+    are separations; the whole map was turned by ``degrees`` (:func:`.latlong.rotate`) before it was edited.
+    Returns ``after`` with other lights, and the core of these.
     """
     same = np.asarray((latlong.rotate(start, degrees) == end).all(axis=2)).ravel()
     lights = []
@@ -251,12 +211,7 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
 def summary(lights: dict[str, list[dict]], height: int) -> str | None:
     """Say which lights moved, stayed, came and went, those with most flux first; None without any.
 
-    Parameters
-    ----------
-    lights : dict
-        Of :func:`matched`.
-    height : int
-        Rows of the map: what has moved by less than one has stayed.
+    ``lights`` are of :func:`matched`; what has moved by less than one of ``height`` rows has stayed.
     """
     after = {light["id"]: light for light in lights["after"]}
     parts = []

@@ -42,16 +42,10 @@ class _Points:
 
 
 class MovedLights:
-    """The points of lights that have moved or were added.
+    """The points of lights, of the layers of a working map, that have moved or were added, in its source.
 
-    Parameters
-    ----------
-    layers : Layers
-        Of the working map.
-    shape : (int, int)
-        Rows and columns of the source.
-    turn, flux, size : ndarray (lights, 3), (lights, 3), (lights, 1)
-        Where and how large the lights are, as of :class:`.Lights`: rotation vectors, logarithms.
+    ``turn`` and ``flux`` (lights, 3) and ``size`` (lights, 1) are where and how large the lights are, as of
+    :class:`.Lights`: rotation vectors, logarithms.
     """
 
     def __init__(

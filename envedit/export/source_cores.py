@@ -15,16 +15,10 @@ from envedit.representations.layers.separation import grown
 
 
 class SourceCores:
-    """Cores in the texels of a source, band by band, by the survey of the working map.
+    """Cores in the texels of a source, band by band, by the survey of the layers of its working map.
 
-    Parameters
-    ----------
-    layers : Layers
-        Of the working map.
-    grid : Places
-        The source's texels in the working map.
-    edge : int or None
-        Working row from which rows follow those above the horizon, and have no lights.
+    ``grid`` has the source's texels in the working map; rows from ``edge`` on, if any, follow those above the
+    horizon, and have no lights.
     """
 
     def __init__(self, layers: Layers, grid: Places, edge: int | None):

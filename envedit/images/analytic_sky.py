@@ -119,16 +119,8 @@ def _sunsky_emitter(sun_direction, **parameters):
 def disc(centre: np.ndarray, radius: float, width: int) -> np.ndarray:
     """Return directions (N, 3) spread evenly over a disc of the sky, as Vogel's spiral.
 
-    Enough of them that the texels inside the disc of a wide map are evenly filled.
-
-    Parameters
-    ----------
-    centre : ndarray (3,)
-        Unit vector to its centre.
-    radius : float
-        Radians.
-    width : int
-        Columns of the map.
+    Enough of them that the texels inside the disc of a map of so many columns are evenly filled. ``centre``
+    is the unit vector to its centre, ``radius`` in radians.
     """
     count = 16384 + 512 * int(math.pi * (radius / (2 * math.pi / width)) ** 2)
     i = np.arange(count) + 0.5

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import mmap
-import os
 import re
 from collections.abc import Iterator
 
 import numpy as np
 
 from envedit.core.errors import InputError
+from envedit.core.processor import cores
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import Info
 from envedit.images.headers import MAX_TEXELS, check_declared, damaged, shown
@@ -124,16 +124,15 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def on_cores(count: int | None = None) -> Iterator[None]:
-    """Let the library use some threads, by default one a core; left alone it uses one, before 3.5 always."""
+def on_cores() -> Iterator[None]:
+    """Let the library use a thread a core; left alone it uses one, before 3.5 always."""
     import OpenEXR
 
     if not hasattr(OpenEXR, "set_global_thread_count"):
         yield
         return
     before = OpenEXR.global_thread_count()
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    OpenEXR.set_global_thread_count(available if count is None else count)
+    OpenEXR.set_global_thread_count(cores())
     try:
         yield
     finally:

@@ -40,13 +40,7 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
     The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; of layers
     and parts that with the picture; luminance-only files become grey), Radiance HDR, and PNG or JPEG, whose
     sRGB curve is undone. Marks of the file are honoured (:mod:`.marks`); what is transparent in a PNG is
-    dark. Values are as stored: they may be negative or not finite, see
-    :func:`envedit.core.radiance.health`.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
+    dark. Values are as stored: they may be negative or not finite.
 
     Returns
     -------
@@ -70,11 +64,6 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
 
 def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as it was painted: with alpha, with its display curve; errors as of :func:`read`.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
 
     Returns
     -------
@@ -153,8 +142,7 @@ def load_envmap(
     image : array (width / 2, width, 3) float32
         Linear radiance, finite and not negative.
     info : dict
-        As of :func:`read` (``size`` is the file's), with ``health`` (:class:`.radiance.Health` of the file's
-        values) and ``repaired`` and ``clipped`` (numbers of texels).
+        As of :func:`read` (``size`` is the file's), with ``repaired`` and ``clipped`` (numbers of texels).
 
     Raises
     ------
@@ -176,13 +164,10 @@ def load_envmap(
 
     # ---- Check and mend
     _check_shape(image, info)
-    info["health"] = radiance.health(image)
-    info["repaired"] = 0
-    info["clipped"] = info["health"].negative
-    if info["health"].nan or info["health"].inf:
-        image = _repaired(image, info, repair)
+    stored = image
+    image = _repaired(image, info, repair)
     image = np.maximum(image, 0)  # also turns -0.0 into 0
-    info["warnings"] += _oddities(info["health"], image)
+    _note_oddities(stored, image, info)
 
     # ---- Bring to the width asked for
     columns = info["size"][0]
@@ -212,6 +197,8 @@ def _repaired(image, info, repair):
     name = info["path"]
     bad = radiance.any_channel(~np.isfinite(image))
     info["repaired"] = int(bad.sum())
+    if not bad.any():
+        return image
     if not repair:
         where = f"{info['repaired']} texels are NaN or infinite, the first at {place_of(bad)}"
         raise InputError(f"{name}: {where}; repair the map, or ask for repair")
@@ -228,24 +215,24 @@ def _repaired(image, info, repair):
     return image
 
 
-def _oddities(health, image):
-    """List what is odd in a map: warnings."""
-    warnings = []
-    if health.first_negative:
-        row, column = health.first_negative
-        where = f"the first at row {row}, column {column}"
+def _note_oddities(stored, image, info):
+    """Note what is odd in a map, as it was ``stored`` and as it is: warnings."""
+    warnings = info["warnings"]
+    finite = np.isfinite(stored)
+    negative = radiance.any_channel(stored < 0) & ~radiance.any_channel(~finite)
+    info["clipped"] = int(negative.sum())
+    if negative.any():
+        least = stored[finite].min()
+        where = f"the first at {place_of(negative)}"
+        warnings.append(f"{negative.sum()} texels are negative (down to {least:.3g}), {where}: set to 0")
+    saturated = radiance.any_channel(stored == radiance.HALF_MAX)
+    if saturated.any():
         warnings.append(
-            f"{health.negative} texels are negative (down to {health.minimum:.3g}), {where}: set to 0"
-        )
-    if health.first_saturated:
-        row, column = health.first_saturated
-        warnings.append(
-            f"{health.saturated} texels sit at 65504, the largest half, the first at row {row}, "
-            f"column {column}: the light was cut when the file was saved"
+            f"{saturated.sum()} texels sit at 65504, the largest half, the first at {place_of(saturated)}: "
+            "the light was cut when the file was saved"
         )
     if not image.any():
         warnings.append("the map is black: it lights nothing")
-    return warnings
 
 
 _SHAPES = {
@@ -300,7 +287,6 @@ def write_exr(
     """Write an image as an OpenEXR file, of float32 unless asked for half, whole or not at all.
 
     Marked as lat-long, unless it is no ``panorama``.
-    Written under another name in the same folder and then renamed.
 
     Parameters
     ----------
@@ -328,6 +314,8 @@ def write_exr(
     """
     import OpenEXR
 
+    import envedit
+
     name = os.fsdecode(path)
     pixels = _checked(name, image)
 
@@ -337,15 +325,11 @@ def write_exr(
         "type": OpenEXR.scanlineimage,
         "chromaticities": chromaticities or primaries.REC709,
         **({"envmap": OpenEXR.ENVMAP_LATLONG} if panorama else {}),
-        "software": f"envedit {_version()}",
+        "software": f"envedit {envedit.__version__}",
     }
-    reserved = {"channels", "dataWindow", "displayWindow", "envmap", "lineOrder", "name", "tiles", "view"}
-    reserved |= header.keys() - {"software"}
     for key, value in (metadata or {}).items():
-        if key in reserved or not 0 < len(str(key)) < 256:
-            raise ConfigError(f"{name}: '{key}' cannot be used as the name of a metadata attribute")
         plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
-        header[str(key)] = value if plain else str(value)
+        header[key] = value if plain else str(value)
 
     # ---- Channels
     if half:
@@ -354,22 +338,16 @@ def write_exr(
     planes = {c: np.ascontiguousarray(pixels[..., i]) for i, c in enumerate("RGB")}
     if alpha is not None:
         planes["A"] = np.ascontiguousarray(alpha, np.float32)
-    _write_whole(name, ".exr", OpenEXR.File(header, planes).write)
+    with replacing(name, ".exr") as temporary, quiet_libraries(), exr.on_cores():
+        OpenEXR.File(header, planes).write(str(temporary))
 
 
 def write_hdr(
     path: FilePath, image: ArrayLike, chromaticities: primaries.Chromaticities | None = None
 ) -> None:
-    """Write an image as a Radiance file (:func:`.rgbe.encode`); errors as of :func:`write_exr`.
+    """Write (H, W, 3) linear radiance, finite and not negative, as a Radiance file (:func:`.rgbe.encode`).
 
-    Parameters
-    ----------
-    path : path-like
-        The file; an existing one is replaced.
-    image : array (H, W, 3)
-        Linear radiance, finite and not negative.
-    chromaticities : tuple, optional
-        Of the image's colours, which few programs read from such a file; None: Rec. 709.
+    Few programs read ``chromaticities`` from such a file; None: Rec. 709. Errors as of :func:`write_exr`.
     """
     name = os.fsdecode(path)
     write_atomically(name, rgbe.encode(_checked(name, image), chromaticities))
@@ -378,16 +356,8 @@ def write_hdr(
 def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:
     """Write a picture in [0, 1] as a PNG of 8 or 16 bits a channel; errors as of :func:`write_exr`.
 
-    Parameters
-    ----------
-    path : path-like
-        The file; an existing one is replaced.
-    image : array (H, W, 3) or (H, W)
-        Display values, already tonemapped; values outside [0, 1] are cut.
-    bits : int
-        8 or 16.
-    metadata : dict, optional
-        Texts to add, as ``tEXt`` chunks.
+    ``image`` is (H, W, 3) or (H, W), display values, already tonemapped; values outside [0, 1] are cut.
+    ``metadata`` are texts to add, as ``tEXt`` chunks.
     """
     name = os.fsdecode(path)
     image = np.asarray(image)
@@ -434,16 +404,3 @@ def _checked(name, image):
             f"{name}: not written: {bad.sum()} texels are not finite, the first at {place_of(bad)} ({values})"
         )
     return image
-
-
-def _write_whole(name, suffix, write):
-    """Call ``write(temporary name)`` and rename the result to ``name``."""
-    with replacing(name, suffix) as temporary, quiet_libraries(), exr.on_cores():
-        write(str(temporary))
-
-
-def _version():
-    """Return the package's version."""
-    import envedit
-
-    return envedit.__version__

@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from envedit.core.atomic_files import replacing
-from envedit.core.errors import ConfigError, NumericalError, place_of
+from envedit.core.errors import NumericalError, place_of
 from envedit.core.primaries import REC709, Chromaticities
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import FilePath
@@ -15,16 +15,10 @@ from envedit.images.exr import on_cores
 
 DEFAULT = "edited"
 """The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
-COMPRESSIONS = {"none": "NO", "rle": "RLE", "zips": "ZIPS", "zip": "ZIP", "piz": "PIZ"}
-"""Lossless ones that every reader of OpenEXR knows."""
 
 
 def write(
-    path: FilePath,
-    layers: dict[str, np.ndarray],
-    compression: str = "zip",
-    threads: int | None = None,
-    chromaticities: Chromaticities | None = None,
+    path: FilePath, layers: dict[str, np.ndarray], chromaticities: Chromaticities | None = None
 ) -> None:
     """Write layers as one float32 OpenEXR file, whole or not at all.
 
@@ -39,17 +33,11 @@ def write(
     layers : dict of str to ndarray (H, W, 3) or (H, W)
         Linear radiance, or anything else with a value a texel; all of one size and finite in float32.
         The first, or ``edited``, has three channels.
-    compression : str
-        One of :data:`COMPRESSIONS`.
-    threads : int, optional
-        Threads of the compression; None: one a core that this process may use.
     chromaticities : tuple, optional
         Of the colours; None: Rec. 709.
 
     Raises
     ------
-    ConfigError
-        If there is no layer, a name is no layer's name, or ``compression`` is not known.
     NumericalError
         If a value is not finite in float32; names the layer and the first texel.
     InputError
@@ -58,10 +46,6 @@ def write(
     import OpenEXR
 
     name = os.fsdecode(path)
-    if compression not in COMPRESSIONS:
-        raise ConfigError(f"{name}: compression '{compression}' is not one of {', '.join(COMPRESSIONS)}")
-    if not layers:
-        raise ConfigError(f"{name}: a layered file needs at least one layer")
 
     # ---- Channels of each layer
     default = DEFAULT if DEFAULT in layers else next(iter(layers))
@@ -74,8 +58,6 @@ def write(
             raise ValueError(
                 f"{name}: layer '{layer}' has shape {values.shape}, expected {size} with 3 channels"
             )
-        if layer != default and not (layer.isascii() and layer.isidentifier()):
-            raise ConfigError(f"{name}: '{layer}' cannot be the name of a layer: use letters, digits and _")
         values = _finite(name, layer, values)
         prefix = "" if layer == default else f"{layer}."
         for i, channel in enumerate("RGB" if colour else "Y"):
@@ -83,12 +65,12 @@ def write(
 
     # ---- Header, and the file
     header = {
-        "compression": getattr(OpenEXR, COMPRESSIONS[compression] + "_COMPRESSION"),
+        "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "chromaticities": chromaticities or REC709,
         "envmap": OpenEXR.ENVMAP_LATLONG,
     }
-    with replacing(name, ".exr") as temporary, quiet_libraries(), on_cores(threads):
+    with replacing(name, ".exr") as temporary, quiet_libraries(), on_cores():
         OpenEXR.File(header, planes).write(str(temporary))
 
 

@@ -1,22 +1,24 @@
 """Losses of the edit and of the fit, natively in Dr.Jit, behind one signature.
 
-``loss(x, reference, weight=None)`` returns a size-1 array of the tensor's own type, differentiable in ``x``.
-Images are ``(H, W, C)`` tensors (C = 3 unless said otherwise) of any Dr.Jit precision; ``weight`` is
-``(H, W, 1)`` or ``(H, W, C)``, not negative. A weighted mean divides by the sum of the weights and is 0 where
-all weights are 0. Sums run in double precision: Dr.Jit's single-precision sum is off by 5e-5 on a megapixel
-sky with a sun of 1e6. A non-finite texel makes the loss non-finite, whatever its weight; nothing is clipped.
+``loss(x, reference)`` returns a size-1 array of the tensor's own type, differentiable in ``x``; losses of
+pictures take a ``weight`` too. Images are ``(H, W, C)`` tensors (C = 3 unless said otherwise) of any Dr.Jit
+precision; a weight is ``(H, W, 1)`` or ``(H, W, C)``, not negative. A weighted mean divides by the sum of the
+weights and is 0 where all weights are 0. Sums run in double precision: Dr.Jit's single-precision sum is off
+by 5e-5 on a megapixel sky with a sun of 1e6. A non-finite texel makes the loss non-finite, whatever its
+weight; nothing is clipped.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import drjit as dr
 
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import InputError
 from envedit.core.types import DrArray, Tensor
-from envedit.losses.ssim import check_image, check_pair, expand, ssim_loss, total
+from envedit.losses.ssim import check_image, check_pair, expand, total
 
 CHANGE_SOFT = 0.05
 """Factors less than 5 % from 1 count by their square."""
@@ -27,80 +29,57 @@ CHANGE_FLOOR = 0.01
 
 
 def image_l1(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
-    """Compute the mean absolute error of two images ``(H, W, C)``.
+    """Compute the mean absolute error of two images ``(H, W, C)``: also the last term of Eq. 4, of radiance.
 
-    The subgradient where they are equal is 0.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ or the weight does not fit.
+    The subgradient where they are equal is 0. Squared, that term is 1e5 times the logarithmic ones on a map
+    with a sun. InputError if the shapes differ or the weight does not fit.
     """
     check_pair(x, reference)
     return _mean(dr.abs(x.array - reference.array), x.shape, weight)
 
 
 def image_l2(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
-    """Compute the mean squared error of two images ``(H, W, C)``; arguments and errors as `image_l1`."""
+    """Compute the mean squared error of two images ``(H, W, C)``: also the first term of Eq. 4."""
     check_pair(x, reference)
     return _mean(dr.square(x.array - reference.array), x.shape, weight)
 
 
-def log_mse(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
-    """Compare normalised log radiance: the first term of Eq. 4, its norm read as the mean squared error."""
-    return image_l2(x, reference, weight)
-
-
-def hdr(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
-    """Compare linear radiance: the last term of Eq. 4, its norm read as the mean absolute error.
-
-    Squared, this term is 1e5 times the logarithmic ones on a map with a sun.
-    """
-    return image_l1(x, reference, weight)
-
-
-def luminance(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
-    r"""Compare total luminance, ``|Lum(E) - Lum(E')|`` (Eq. 8).
+def luminance(x: Tensor, reference: Tensor) -> DrArray:
+    r"""Compare total luminance, ``|Lum(E) - Lum(E')|`` (Eq. 8) of RGB images; InputError for others.
 
     ``Lum(E) = sum of 0.2126 R + 0.7152 G + 0.0722 B`` over texels (Eq. 7), not weighted by solid angle, as
-    in the paper; a ``weight`` multiplies the terms of both sums. The subgradient where the sums are equal is
-    0. Both sums and their difference are taken in double precision.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ or the images are not RGB.
+    in the paper. The subgradient where the sums are equal is 0. Both sums and their difference are taken in
+    double precision.
     """
     check_pair(x, reference)
     if x.shape[2] != 3:
         raise InputError(f"luminance needs RGB images (H, W, 3), got {tuple(x.shape)}.")
-    difference = _luminance_sum(x, weight) - _luminance_sum(reference, weight)
+    difference = _luminance_sum(x) - _luminance_sum(reference)
     return type(x.array)(dr.abs(difference))
 
 
-def _luminance_sum(x, weight):
-    values = x.array if weight is None else x.array * expand(weight, x.shape)
-    wide = dr.float64_array_t(type(values))  # 0.2126 in single precision is itself off by 1e-8
+def _luminance_sum(x):
+    wide = dr.float64_array_t(type(x.array))  # 0.2126 in single precision is itself off by 1e-8
     channel = dr.arange(dr.uint32_array_t(wide), math.prod(x.shape)) % 3
     red, green, blue = LUMINANCE
     factor = dr.select(channel == 0, wide(red), dr.select(channel == 1, wide(green), wide(blue)))
-    return dr.sum(wide(values) * factor)
+    return dr.sum(wide(x.array) * factor)
 
 
-def l1(x: Tensor, reference: Tensor | None = None, weight: Tensor | None = None) -> DrArray:
+def l1(x: Tensor, reference: Tensor | None = None) -> DrArray:
     """Sum ``|E|`` over texels and channels (Eq. 9): a sum, not a mean; ``reference`` is not used.
 
-    A ``weight`` multiplies the terms. The subgradient at 0 is 0.
+    The subgradient at 0 is 0.
     """
     check_image(x, "image")
-    return _sum(dr.abs(x.array), x.shape, weight)
+    return type(x.array)(total(dr.abs(x.array)))
 
 
-def tv(x: Tensor, reference: Tensor | None = None, weight: Tensor | None = None) -> DrArray:
+def tv(x: Tensor, reference: Tensor | None = None) -> DrArray:
     """Compute the anisotropic total variation of a lat-long image, as a mean; ``reference`` is not used.
 
     The sum of ``|x[i, j+1] - x[i, j]| + |x[i+1, j] - x[i, j]|``, columns periodic, rows not, divided by the
-    number of texels and channels. A weight belongs to the texel ``(i, j)`` of each pair.
+    number of texels and channels.
     """
     check_image(x, "image")
     height, width, channels = x.shape
@@ -112,10 +91,10 @@ def tv(x: Tensor, reference: Tensor | None = None, weight: Tensor | None = None)
     below = dr.select(index < (height - 1) * row, index + row, column)
     across = dr.abs(dr.gather(type(values), values, right) - values)
     down = dr.abs(dr.gather(type(values), values, below) - values)
-    return _mean(across + dr.select(index < (height - 1) * row, down, 0), x.shape, weight)
+    return _mean(across + dr.select(index < (height - 1) * row, down, 0), x.shape)
 
 
-def change(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
+def change(x: Tensor, reference: Tensor) -> DrArray:
     """Compare the logarithms of two maps: mean of sqrt(d^2 + s^2) - s, d = log((x + e) / (reference + e)).
 
     About the mean factor by which texels were changed: a sun that moves counts as a few texels, a sky that
@@ -127,14 +106,10 @@ def change(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArra
     floor = CHANGE_FLOOR * total(dr.detach(reference.array)) / math.prod(x.shape)
     floor = values(dr.maximum(floor, 1e-12))
     distance = dr.log((x.array + floor) / (reference.array + floor))
-    return _mean(dr.sqrt(dr.square(distance) + CHANGE_SOFT**2) - CHANGE_SOFT, x.shape, weight)
+    return _mean(dr.sqrt(dr.square(distance) + CHANGE_SOFT**2) - CHANGE_SOFT, x.shape)
 
 
-def _sum(values, shape, weight):
-    return type(values)(total(values if weight is None else values * expand(weight, shape)))
-
-
-def _mean(values, shape, weight):
+def _mean(values, shape, weight=None):
     if weight is None:
         return type(values)(total(values) / math.prod(shape))
     weight = expand(weight, shape)
@@ -143,16 +118,12 @@ def _mean(values, shape, weight):
     return type(values)(total(values * weight) / dr.select(mass == 0, 1, mass))
 
 
-LOSSES = {
-    "ssim": ssim_loss,
-    "log_ssim": ssim_loss,
+LOSSES: dict[str, Callable[..., DrArray]] = {
     "luminance": luminance,
     "l1": l1,
     "tv": tv,
     "change": change,
     "image_l1": image_l1,
     "image_l2": image_l2,
-    "log_mse": log_mse,
-    "hdr": hdr,
 }
-"""Name in the configuration -> loss."""
+"""Name in the configuration -> loss; ``ssim`` is a class of its own."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
-from envedit.core.errors import ConfigError, InputError, place_of
+from envedit.core.errors import InputError, place_of
 from envedit.core.types import Views
 
 if TYPE_CHECKING:
@@ -69,35 +69,21 @@ def mse(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def psnr(a: np.ndarray, b: np.ndarray, data_range: float = 1.0) -> float:
-    """Compute the peak signal-to-noise ratio ``10 log10(data_range^2 / MSE)`` in dB, at most `PSNR_CAP`.
-
-    Raises
-    ------
-    ConfigError
-        If ``data_range`` is not a positive number.
-    """
-    if not (math.isfinite(data_range) and data_range > 0):
-        raise ConfigError(f"PSNR: data_range must be a positive number, got {data_range}.")
+    """Compute the peak signal-to-noise ratio ``10 log10(data_range^2 / MSE)`` in dB, at most `PSNR_CAP`."""
     error = mse(a, b)
     if error == 0:
         return PSNR_CAP
     return min(PSNR_CAP, 20 * math.log10(data_range) - 10 * math.log10(error))
 
 
-def ssim(a: np.ndarray, b: np.ndarray, data_range: float = 1.0) -> float:
-    """Compute the mean structural similarity of ``envedit.losses.ssim.Ssim``, in double precision.
-
-    Raises
-    ------
-    ConfigError
-        If ``data_range`` is not a positive number.
-    """
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Compute the mean structural similarity of ``envedit.losses.ssim.Ssim``, in double precision."""
     import mitsuba as mi  # here: the variant, once selected, provides the tensor type
 
-    from envedit.losses.ssim import ssim_index
+    from envedit.losses.ssim import Ssim
 
     a, b = _pair(a, b)
-    return float(ssim_index(mi.TensorXd(a), mi.TensorXd(b), data_range=data_range)[0])
+    return float((1 - Ssim(mi.TensorXd(b))(mi.TensorXd(a)))[0])
 
 
 def compare(
@@ -128,13 +114,7 @@ def compare(
     -------
     dict
         ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1, and ``lpips``, None without one, or where the
-        image is too small for its network. Of the radiance itself: `log_rmse`, and ``beyond_display``, the
         share of the samples that differ of which a display shows nothing: both black, or both white.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such tonemap.
     """
     radiance = _pair(a, b)
     a, b = (apply_tonemap(image, tonemap) for image in radiance)

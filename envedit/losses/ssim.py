@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import InputError
 from envedit.core.types import DrArray, Shape, Tensor, Views
 
 # ---- Shapes and sums, shared with the other losses ---------------------------------------------------------
@@ -50,6 +50,8 @@ def total(values: DrArray) -> DrArray:
 
 WINDOW = 11
 """Texels along a side of the Gaussian window."""
+C1, C2 = 0.01**2, 0.03**2
+"""Constants of the two factors, for a data range of 1."""
 
 
 class Ssim:
@@ -66,12 +68,13 @@ class Ssim:
     with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``. In an image smaller than 11 along
     an axis the window shrinks along that axis to the largest odd size that fits, down to one texel.
 
-    With ``d = x - y`` the map is ``(1 - a)(1 - b)``, ``a = mu_d^2 / (mu_x^2 + mu_y^2 + C1)``,
-    ``b = var_d / (var_x + var_y + C2)``, and the loss the mean of ``a + b - ab``: identical images give
-    exactly 0 and near ones keep their digits. Variances are merged from columns of squared deviations, never
-    ``E[x^2] - E[x]^2``: they are not negative and carry a relative error of some 1e-6 in single precision,
-    whatever the offset of the image; the gradient's is as much times ``|x|`` over the local contrast. Squares
-    must be representable: ``|x|`` up to 1e18 in single precision, NaN beyond.
+    Images are display values, whose data range is 1. With ``d = x - y`` the map is ``(1 - a)(1 - b)``,
+    ``a = mu_d^2 / (mu_x^2 + mu_y^2 + C1)``, ``b = var_d / (var_x + var_y + C2)``, and the loss the mean of
+    ``a + b - ab``: identical images give exactly 0 and near ones keep their digits. Variances are merged from
+    columns of squared deviations, never ``E[x^2] - E[x]^2``: they are not negative and carry a relative error
+    of some 1e-6 in single precision, whatever the offset of the image; the gradient's is as much times
+    ``|x|`` over the local contrast. Squares must be representable: ``|x|`` up to 1e18 in single precision,
+    NaN beyond.
 
     Parameters
     ----------
@@ -79,22 +82,15 @@ class Ssim:
         The image y; not differentiated.
     weight : tensor (H, W, 1) or (H, W, C), optional
         Weight of the window centred there, not negative; windows that cross an edge do not exist.
-    data_range : float
-        Difference between the largest and the smallest value that the images may take.
 
     Raises
     ------
     InputError
-        If a shape does not fit, or a weight is negative or not finite.
-    ConfigError
-        If ``data_range`` is not a positive number.
+        If a shape does not fit.
     """
 
-    def __init__(self, reference: Tensor, weight: Tensor | None = None, data_range: float = 1.0):
+    def __init__(self, reference: Tensor, weight: Tensor | None = None):
         check_image(reference, "reference")
-        if not (math.isfinite(data_range) and data_range > 0):
-            raise ConfigError(f"SSIM: data_range must be a positive number, got {data_range}.")
-        self.c1, self.c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
         self.shape = height, width, channels = tuple(reference.shape)
         self._rows, self._columns = _gaussian(height), _gaussian(width)
         self.map_shape = height - len(self._rows) + 1, width - len(self._columns) + 1, channels
@@ -107,26 +103,15 @@ class Ssim:
 
     def __call__(self, x: Tensor) -> DrArray:
         """Return ``1 - mean SSIM`` of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
-        self._check(x)
+        if tuple(x.shape) != self.shape:
+            raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
         if not dr.grad_enabled(x):
             return self._evaluate(x.array, False)[0]
         return dr.custom(KnownGradient, x.array, self)
 
-    def map(self, x: Tensor) -> Tensor:
-        """Return the SSIM of every window, ``(H - 10, W - 10, C)`` from 11 x 11 texels on; no gradient."""
-        self._check(x)
-        a, b = self._terms(dr.detach(x.array))[:2]
-        return type(x)((1 - a) * (1 - b), self.map_shape)
-
-    def _check(self, x):
-        if tuple(x.shape) != self.shape:
-            raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
-
     def _normalised(self, weight):
         """Crop the weights to the window centres and let them sum to one (or all be zero)."""
         values = expand(weight, self.shape)
-        if not dr.all(dr.isfinite(values) & (values >= 0))[0]:
-            raise InputError("SSIM: the weight holds negative or non-finite values.")
         crop = self._row_start(len(self._columns) // 2) + len(self._rows) // 2 * self.shape[1] * self.shape[2]
         values = dr.gather(type(values), values, crop)
         mass = total(values)
@@ -165,8 +150,8 @@ class Ssim:
 
     def _terms(self, x):
         mean_x, variance_x, mean_d, variance_d = self._window(self._moments(x, self._y))
-        scale_a = 1 / (dr.square(mean_x) + dr.square(self._mean_y) + self.c1)
-        scale_b = 1 / (variance_x + self._variance_y + self.c2)
+        scale_a = 1 / (dr.square(mean_x) + dr.square(self._mean_y) + C1)
+        scale_b = 1 / (variance_x + self._variance_y + C2)
         return dr.square(mean_d) * scale_a, variance_d * scale_b, scale_a, scale_b, mean_x, mean_d
 
     def _evaluate(self, x, with_gradient):
@@ -285,9 +270,9 @@ class KnownGradient(dr.CustomOp):
         return "measure"
 
 
-def _gaussian(length, size=WINDOW, sigma=1.5):
-    """Gaussian window of the largest odd size up to ``size`` that fits, with sum one."""
-    radius = (min(size, length) - 1) // 2
+def _gaussian(length, sigma=1.5):
+    """Gaussian window of the largest odd size up to :data:`WINDOW` that fits, with sum one."""
+    radius = (min(WINDOW, length) - 1) // 2
     taps = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
     return [tap / sum(taps) for tap in taps]
 
@@ -307,31 +292,3 @@ def _scatter_filter(taps, fields, position, base, step, length):
         index = dr.uint32_array_t(F)(source + base)
         sums = [s + tap * dr.gather(F, field, index, inside) for s, field in zip(sums, fields, strict=True)]
     return sums
-
-
-def ssim_loss(x: Tensor, reference: Tensor, weight: Tensor | None = None, data_range: float = 1.0) -> DrArray:
-    """Compute ``1 - mean SSIM`` of two images ``(H, W, C)``; see `Ssim`, which keeps the reference's share.
-
-    Differentiable in ``x`` only.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ, or gradients are expected of the reference.
-    """
-    if dr.grad_enabled(reference):
-        raise InputError("SSIM: gradients of the reference are not available: swap the two, or detach it.")
-    check_pair(x, reference)
-    return Ssim(reference, weight, data_range)(x)
-
-
-def ssim_index(
-    x: Tensor, reference: Tensor, weight: Tensor | None = None, data_range: float = 1.0
-) -> DrArray:
-    """Compute the mean SSIM of two images ``(H, W, C)`` as a size-1 array; see `Ssim`."""
-    return 1 - ssim_loss(x, reference, weight, data_range)
-
-
-def ssim_map(x: Tensor, reference: Tensor, data_range: float = 1.0) -> Tensor:
-    """Compute the SSIM of every window that lies inside the image; see `Ssim.map`."""
-    return Ssim(reference, None, data_range).map(x)

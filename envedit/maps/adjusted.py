@@ -17,46 +17,24 @@ _ROWS = 256  # of a map that are worked on at a time
 
 @dataclass(frozen=True)
 class Adjustments:
-    """What is changed of a map; the defaults change nothing.
+    """What is changed of a map; the defaults change nothing."""
 
-    Attributes
-    ----------
-    turn, tilt, horizon : float
-        Degrees, as of :func:`.sphere.rotation`.
-    exposure : float
-        Stops.
-    white_balance : float
-        Kelvin of the light that becomes neutral; 0: as it is.
-    saturation : float
-        Factor on the distance of a colour from grey of its luminance.
-    soften : float
-        Radius in degrees over which each texel of a light is spread.
-    max_radiance : float
-        Bound that lights are spread to keep to, in the units of the file; 0: none.
-    blur : float
-        Standard deviation in degrees, of all of the map.
-    """
-
+    # turn, tilt, horizon: degrees, as of :func:`.sphere.rotation`
     turn: float = 0.0
     tilt: float = 0.0
     horizon: float = 0.0
-    exposure: float = 0.0
-    white_balance: float = 0.0
-    saturation: float = 1.0
-    soften: float = 0.0
-    max_radiance: float = 0.0
-    blur: float = 0.0
+    exposure: float = 0.0  # stops
+    white_balance: float = 0.0  # kelvin of the light that becomes neutral; 0: as it is
+    saturation: float = 1.0  # factor on the distance of a colour from grey of its luminance
+    soften: float = 0.0  # radius in degrees over which each texel of a light is spread
+    max_radiance: float = 0.0  # bound that lights are spread to keep to, in the units of the file; 0: none
+    blur: float = 0.0  # standard deviation in degrees, of all of the map
 
 
 def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[str]]:
     """Adjust a map; returns one that is not negative, and what was done, with the errors of :func:`.adjust`.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3) float32
-        Linear radiance in Rec. 709.
-    how : Adjustments
-        What is changed.
+    ``radiance`` (H, W, 3) float32 is linear, in Rec. 709.
     """
     # ---- Orientation
     notes = []

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.rotations import rotated, rotation_between, rotation_vector
+from envedit.core.rotations import rotated, rotation_between, rotation_matrix, rotation_vector
 from envedit.export import file_lights, light_list
 from envedit.maps import sphere
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
@@ -39,23 +39,21 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
     first, second : ndarray (H, W, 3) float32
         Linear radiance in Rec. 709. Both are overwritten: two maps of 8192 x 4096 texels are 0.8 GB.
     amount : float
-        0: the first; 1: the second.
+        0: the first; 1: the second, which is returned.
 
     Returns
     -------
     blended : ndarray (H, W, 3) float32
         It is ``first``, overwritten, where the amount is between.
     lights : list of dict
-        ``direction`` and ``flux`` of each light of the result; empty where it is one of the maps.
+        ``direction`` and ``flux`` of each light of the result; empty where it is the second.
     """
-    if amount <= 0:
-        return first, []
     if amount >= 1:
         return second, []
 
     # ---- Lights, matched, and the skies without them
     maps = first, second
-    lights = [file_lights.lights_of(envmap).lights for envmap in maps]
+    lights = [file_lights.lights_of(envmap) for envmap in maps]
     moves = _moves(lights, first.shape[:2], amount)
     for envmap, own_lights in zip(maps, lights, strict=True):
         file_lights.take_out(envmap, own_lights)
@@ -82,7 +80,7 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
     # ---- Lights
     for move in moves:
         for light, flux in move.parts:
-            matrix = _matrix(rotation_vector(light.direction, move.direction))
+            matrix = rotation_matrix(rotation_vector(light.direction, move.direction))
             sphere.add_rotated(first, light, matrix, flux)
     return first, [
         {
@@ -119,8 +117,3 @@ def _moves(lights, shape, amount):
 
 def _log_glow(light):
     return np.zeros((len(GLOW_DEGREES), 3)) if light.glow is None else np.log1p(light.glow)
-
-
-def _matrix(vector):
-    """Return the matrix (3, 3) of a rotation vector."""
-    return np.stack([rotated(axis, vector) for axis in np.eye(3)], axis=1)

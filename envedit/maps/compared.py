@@ -57,7 +57,7 @@ def lights(first: np.ndarray, second: np.ndarray) -> dict:
         ``before`` and ``after`` of :func:`.light_list.matched`, the latter with ``stops_of_flux`` over that
         of the light of the first map; None for one that is new.
     """
-    separated = [file_lights.lights_of(envmap).lights for envmap in (first, second)]
+    separated = [file_lights.lights_of(envmap) for envmap in (first, second)]
     tables = [light_list.listed(own, first.shape[:2], np.eye(3)) for own in separated]
     matched = light_list.matched(tables[0], tables[1])
     flux = {light["id"]: float(luminance(light["flux"])) for light in matched["before"]}

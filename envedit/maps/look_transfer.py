@@ -56,24 +56,12 @@ class Placed:
 
 @dataclass(frozen=True)
 class Change:
-    """What is done to one map.
+    """What is done to one map."""
 
-    Attributes
-    ----------
-    lights : dict of int to Placed
-        By the light's index in the map's layers; spare ones come last.
-    gain : ndarray (9,)
-        As of :class:`.Look`.
-    log_saturation : float
-        Logarithm of the exponent of chroma.
-    white_balance : ndarray (3,)
-        Stops.
-    """
-
-    lights: dict[int, Placed]
-    gain: np.ndarray
-    log_saturation: float
-    white_balance: np.ndarray
+    lights: dict[int, Placed]  # by the light's index in the map's layers; spare ones come last
+    gain: np.ndarray  # (9,), as of :class:`.Look`
+    log_saturation: float  # logarithm of the exponent of chroma
+    white_balance: np.ndarray  # (3,), stops
 
 
 def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | None = None) -> np.ndarray:
@@ -83,17 +71,10 @@ def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | Non
     ----------
     envmap : ndarray (H, W, 3) float32
         Linear radiance, finite and not negative.
-    look : Look
-        What is done.
+    look, start : Look
+        What is done at amount 1, and at amount 0; without the latter that is nothing.
     amount : float
-        0: nothing, or ``start``; 1: the look. Lights move on great circles, fluxes and gains change in
-        proportion.
-    start : Look, optional
-        The look at amount 0.
-
-    Returns
-    -------
-    ndarray (H, W, 3) float32
+        Between 0 and 1 lights move on great circles, fluxes and gains change in proportion.
 
     Raises
     ------
@@ -126,16 +107,10 @@ def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | Non
 
 
 def of_edit(initial: np.ndarray, edited: np.ndarray, turn: float = 0.0) -> Look:
-    """Measure the look of an edit.
+    """Measure the look of an edit from the map (H, W, 3) float32 before and after, linear radiance.
 
     The lights are those of the edited map; the sky's change is that from the map before with these lights.
-
-    Parameters
-    ----------
-    initial, edited : ndarray (H, W, 3) float32
-        The map before and after, linear radiance.
-    turn : float
-        Degrees by which the whole map was turned before it was edited.
+    ``turn`` is by how many degrees the whole map was turned before it was edited.
     """
     after = looks.layers_of(edited)
     irradiance = looks.sky_irradiance(after, after.base)

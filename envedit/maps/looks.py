@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from envedit.config.toml import quote
+from envedit.config.validators import Check, Number, Numbers, named
 from envedit.core import atomic_files, latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import ConfigError, InputError
@@ -46,50 +47,27 @@ _VARIES = 1e-4  # least variance of log chroma from which its slope is known
 
 @dataclass(frozen=True)
 class RoleLight:
-    """A light of a look.
+    """A light of a look."""
 
-    Attributes
-    ----------
-    azimuth, elevation : float
-        Degrees in the map; of fill and rim, over the key's.
-    flux : float
-        Stops over the sky's irradiance.
-    radius : float
-        Degrees within which 97 % of its flux lie; 0: at most :func:`.smallest`, as a sun.
-    tint : (float, float, float)
-        Its colour, of luminance 1.
-    """
-
+    # azimuth, elevation: degrees in the map; of fill and rim, over the key's
     azimuth: float
     elevation: float
-    flux: float
-    radius: float
-    tint: tuple[float, float, float]
+    flux: float  # stops over the sky's irradiance
+    radius: float  # degrees within which 97 % of its flux lie; 0: at most :func:`.smallest`, as a sun
+    tint: tuple[float, float, float]  # its colour, of luminance 1
 
 
 @dataclass(frozen=True)
 class Look:
-    """What an edit did to the light.
+    """What an edit did to the light."""
 
-    Attributes
-    ----------
-    turn : float
-        Degrees by which the whole map was turned (:func:`.latlong.rotate`); 0: it stood.
-    gain : ndarray (9,)
-        Coefficients of :func:`harmonics`: stops of the sky's luminance.
-    saturation : float
-        Exponent of the sky's chroma, as of :mod:`.saturation`.
-    white_balance : (float, float, float)
-        Stops of the sky's red, green and blue beside those of its luminance.
-    lights : dict of str to RoleLight
-        By role; without a key light there is none.
-    """
-
-    turn: float = 0.0
+    turn: float = 0.0  # degrees by which the whole map was turned (:func:`.latlong.rotate`); 0: it stood
+    # (9,), coefficients of :func:`harmonics`: stops of the sky's luminance
     gain: np.ndarray = field(default_factory=lambda: np.zeros(9))
-    saturation: float = 1.0
+    saturation: float = 1.0  # exponent of the sky's chroma, as of :mod:`.saturation`
+    # stops of the sky's red, green and blue beside those of its luminance
     white_balance: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    lights: dict[str, RoleLight] = field(default_factory=dict)
+    lights: dict[str, RoleLight] = field(default_factory=dict)  # by role; without a key light there is none
 
     def toward(self, role: str) -> np.ndarray:
         """Return the direction (3,) of a light in the map."""
@@ -109,14 +87,7 @@ def harmonics(d: np.ndarray) -> np.ndarray:
     Y_0, then y, z, x, then xz, xy, yz, 3 y^2 - 1 and x^2 - z^2, orthonormal on the sphere. Below the horizon
     they have their value at the mirrored direction: ground goes with the sky above it.
 
-    Parameters
-    ----------
-    d : ndarray (..., 3)
-        Unit vectors, +y up.
-
-    Returns
-    -------
-    ndarray (..., 9)
+    ``d`` (..., 3) are unit vectors, +y up; returns (..., 9).
     """
     x, y, z = d[..., 0], np.abs(d[..., 1]), d[..., 2]
     first = 0.5 * math.sqrt(3 / math.pi)
@@ -242,20 +213,21 @@ def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total:
 
 # ---- Files -------------------------------------------------------------------------------------------------
 
-_NUMBERS = {
-    "turn": (1, -360.0, 360.0),
-    "saturation": (1, 0.0, 4.0),
-    "white_balance": (3, -MOST_STOPS, MOST_STOPS),
-    "gain": (9, -MOST_COEFFICIENT, MOST_COEFFICIENT),
+_STOPS = Number(-MOST_STOPS, MOST_STOPS)
+_NUMBERS: dict[str, Check] = {
+    "turn": Number(-360, 360),
+    "saturation": Number(0, 4),
+    "white_balance": Numbers(*3 * [_STOPS]),
+    "gain": Numbers(*9 * [Number(-MOST_COEFFICIENT, MOST_COEFFICIENT)]),
 }
-_LIGHT = {
-    "azimuth": (1, -360.0, 360.0),
-    "elevation": (1, -180.0, 180.0),
-    "flux": (1, -MOST_STOPS, MOST_STOPS),
-    "radius": (1, 0.0, 90.0),
-    "tint": (3, 0.0, 1000.0),
+_LIGHT: dict[str, Check] = {
+    "azimuth": Number(-360, 360),
+    "elevation": Number(-180, 180),
+    "flux": _STOPS,
+    "radius": Number(0, 90),
+    "tint": Numbers(*3 * [Number(0, 1000)]),
 }
-"""Of each key: how many numbers it has, their least and their largest."""
+"""What each key may be."""
 
 
 def to_toml(look: Look) -> str:
@@ -286,12 +258,8 @@ def write(path: FilePath, look: Look) -> None:
 def read(path: FilePath) -> Look:
     """Read a look.
 
-    Raises
-    ------
-    ConfigError
-        A key is missing, unknown or out of range: names the file and the key.
-    InputError
-        The file cannot be read.
+    ConfigError names the file and the key that is missing, unknown or out of range; InputError if the file
+    cannot be read.
     """
     try:
         with open(path, "rb") as file:
@@ -319,21 +287,12 @@ def read(path: FilePath) -> Look:
 
 
 def _numbers(path, prefix, table, expected):
-    """Check that a table has the expected keys, with so many numbers in range."""
+    """Check that a table has the expected keys, with such numbers."""
     for name in table:
         if name not in expected:
             raise ConfigError(f"{path}: {prefix}{name}: unknown key, expected {', '.join(expected)}")
-    values = {}
-    for name, (count, low, high) in expected.items():
+    for name in expected:
         if name not in table:
             raise ConfigError(f"{path}: {prefix}{name}: missing")
-        value = table[name]
-        numbers = value if isinstance(value, list) else [value]
-        right = len(numbers) == count and isinstance(value, list) == (count > 1)
-        right = right and all(type(number) in (int, float) and low <= number <= high for number in numbers)
-        if not right:
-            what = "a number" if count == 1 else f"{count} numbers"
-            wrong = f"{path}: {prefix}{name}: got {value!r}"
-            raise ConfigError(f"{wrong}, expected {what} from {low:g} to {high:g}")
-        values[name] = tuple(map(float, numbers)) if count > 1 else float(value)
-    return values
+    values = {name: named(f"{path}: {prefix}{name}", expected[name], table[name]) for name in expected}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

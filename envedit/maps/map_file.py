@@ -24,18 +24,9 @@ _ROWS = 256  # that are converted at a time
 def read(path: FilePath, repair: bool = False) -> InputMap:
     """Read a map at the resolution of its file; errors as of :func:`.images.load_envmap`.
 
-    Parameters
-    ----------
-    path : path-like
-        OpenEXR or Radiance; PNG and JPEG are read as well.
-    repair : bool
-        Replace texels that are not finite instead of refusing them.
-
-    Returns
-    -------
-    InputMap
-        Its ``radiance`` is (H, W, 3) float32 in Rec. 709; ``as_stored`` turns edited radiance into the file's
-        colours.
+    OpenEXR or Radiance; PNG and JPEG are read as well. ``repair`` replaces texels that are not finite instead
+    of refusing them. Of the result ``radiance`` is (H, W, 3) float32 in Rec. 709, and ``as_stored`` turns
+    edited radiance into the file's colours.
     """
     return inputs.read_file(os.fsdecode(path), None, config.Input(repair=repair), 1.0)
 
@@ -106,7 +97,7 @@ def output_path(
 
 
 def write(path: FilePath, values: np.ndarray, like: InputMap | None = None) -> list[str]:
-    """Write a map, by the ending of its name as OpenEXR or Radiance.
+    """Write a map, by the ending of its name as OpenEXR or Radiance; returns warnings: what half cannot hold.
 
     Parameters
     ----------
@@ -117,11 +108,6 @@ def write(path: FilePath, values: np.ndarray, like: InputMap | None = None) -> l
     like : InputMap, optional
         The map that was read: OpenEXR is half where its file is, and its chromaticities are those of the
         result. None: float, Rec. 709.
-
-    Returns
-    -------
-    list of str
-        Warnings: what half could not hold.
 
     Raises
     ------

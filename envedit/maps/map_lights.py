@@ -23,20 +23,9 @@ AXES = {
 def listed(lights: list[Light], shape: tuple[int, int], sky: np.ndarray) -> list[dict]:
     """List lights as of :func:`.light_list.listed`, with their ``stops`` over the sky.
 
-    Parameters
-    ----------
-    lights : list of separation.Light
-        Of a map.
-    shape : (int, int)
-        Its rows and columns.
-    sky : ndarray (H, W, 3)
-        The map without its lights, linear radiance.
-
-    Returns
-    -------
-    list of dict
-        ``stops``: log2 of the luminance of the light's irradiance over that of the sky, on a surface that
-        faces the light; None under a black sky.
+    ``shape`` is that of the map, ``sky`` (H, W, 3) the map without its lights, linear radiance. ``stops``:
+    log2 of the luminance of the light's irradiance over that of the sky, on a surface that faces the light;
+    None under a black sky.
     """
     rows = light_list.listed(lights, shape, np.eye(3))
     if rows:
@@ -49,17 +38,8 @@ def listed(lights: list[Light], shape: tuple[int, int], sky: np.ndarray) -> list
 def irradiance(envmap: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Integrate a map over the hemisphere of each normal: E = sum of L max(n . w, 0) dw.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3)
-        Linear radiance.
-    normals : ndarray (n, 3)
-        Unit vectors in the frame of the map.
-
-    Returns
-    -------
-    ndarray (n, 3)
-        Radiance times steradian.
+    ``envmap`` (H, W, 3) is linear radiance, ``normals`` (n, 3) are unit vectors in its frame. Returns (n, 3),
+    radiance times steradian.
     """
     height, width = envmap.shape[:2]
     if width > IRRADIANCE_WIDTH:
@@ -80,19 +60,8 @@ def stops(value: float, reference: float) -> float | None:
 def split(stored: np.ndarray, cores: list[np.ndarray], lights: list[Light]) -> tuple[np.ndarray, np.ndarray]:
     """Split the values of a file into sky and lights, whose sum in float32 is the file's, bit for bit.
 
-    Parameters
-    ----------
-    stored : ndarray (H, W, 3) float32
-        Values in the colours of the file; they become the sky.
-    cores : list of ndarray (n, 3)
-        Radiance of each light in the colours of the file.
-    lights : list of separation.Light
-        The lights.
-
-    Returns
-    -------
-    sky, lights : ndarray (H, W, 3) float32
-        As of :func:`.light_list.split`; the first is ``stored``.
+    ``stored`` (H, W, 3) float32 are values in the colours of the file; they become the sky. ``cores`` (n, 3)
+    are the radiance of each light in these colours. Sky and lights are as of :func:`.light_list.split`.
     """
     alone = np.zeros_like(stored)
     for core, light in zip(cores, lights, strict=True):

@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import flat
-from envedit.core.rotations import rotated
+from envedit.core.rotations import rotation_matrix
 from envedit.export import adjustments, file_lights
 from envedit.representations.layers.separation import Light
 
@@ -38,42 +38,23 @@ BAND_TEXELS = 1 << 20
 def rotation(turn: float = 0.0, tilt: float = 0.0, horizon: float = 0.0) -> np.ndarray:
     """Return the matrix (3, 3) that takes directions of a map to those of the rotated map.
 
-    In the map's frame (+y up, the middle column towards +z): first ``horizon`` and then ``tilt``, both as
-    seen in the map as it is, then ``turn``.
-
-    Parameters
-    ----------
-    turn : float
-        Degrees about the vertical, as of :func:`.latlong.rotate`: positive moves the picture to the left.
-    tilt : float
-        Degrees clockwise about the middle of the map.
-    horizon : float
-        Degrees by which the middle of the map is raised.
+    In the map's frame (+y up, the middle column towards +z): first ``horizon`` raises the middle of the map,
+    then ``tilt`` rotates clockwise about it, both as seen in the map as it is, then ``turn`` about the
+    vertical moves the picture to the left (:func:`.latlong.rotate`). All in degrees.
     """
     matrix = np.eye(3)
     for vector in ((-horizon, 0.0, 0.0), (0.0, 0.0, tilt), (0.0, turn, 0.0)):
-        step = [rotated(axis, np.radians(vector)) for axis in np.eye(3)]
-        matrix = np.stack(step, axis=1) @ matrix
+        matrix = rotation_matrix(np.radians(vector)) @ matrix
     return matrix
 
 
 def rotate(radiance: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Rotate a map on the sphere, resampled once; lights keep their flux.
+    """Rotate a map (H, W, 3) float32 on the sphere by :func:`rotation`; lights keep their flux.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3) float32
-        Linear radiance in Rec. 709.
-    matrix : ndarray (3, 3)
-        Of :func:`rotation`.
-
-    Returns
-    -------
-    ndarray (H, W, 3) float32
-        Flux is radiance times :func:`.latlong.lookup_solid_angles`.
+    The sky is resampled once. Flux is radiance times :func:`.latlong.lookup_solid_angles`.
     """
     shape = radiance.shape[:2]
-    lights = file_lights.lights_of(radiance).lights
+    lights = file_lights.lights_of(radiance)
     result = resampled(
         file_lights.without(radiance, lights), matrix, (0, shape[0]), (0, shape[0]), SKY_SAMPLES
     )
@@ -83,18 +64,9 @@ def rotate(radiance: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def add_rotated(envmap: np.ndarray, light: Light, matrix: np.ndarray, flux: np.ndarray | None = None) -> None:
-    """Add a light to a map (H, W, 3) float32 in place, rotated.
+    """Add a light, of a map of the same size, to a map (H, W, 3) float32 in place, rotated.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3)
-        The map.
-    light : separation.Light
-        Of a map of the same size.
-    matrix : ndarray (3, 3)
-        Of :func:`rotation`.
-    flux : ndarray (3,), optional
-        That it will have; None: that it has.
+    ``matrix`` is of :func:`rotation`; ``flux`` (3,) is that it will have, by default that it has.
     """
     height, width = envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
@@ -125,7 +97,7 @@ def resampled(
     """Average the rotated interpolant of a map over texels of the same grid.
 
     Each texel is divided into ``samples`` x ``samples`` parts, weighted by their solid angles, and the map is
-    interpolated at their middles as of :func:`.latlong.lookup`.
+    interpolated at their middles as Mitsuba interpolates it.
 
     Parameters
     ----------
@@ -187,7 +159,7 @@ def resampled(
 
 
 def _lookup(source, d, rows, height, width):
-    """Interpolate rows of a map at directions as :func:`.latlong.lookup`; black where they are not."""
+    """Interpolate rows of a map at directions as Mitsuba does (:mod:`.latlong`); black where they are not."""
     first, count = rows
     across = dr.atan2(d.x, -d.z) * (width / (2 * math.pi)) - 0.5
     down = dr.atan2(dr.sqrt(d.x * d.x + d.z * d.z), d.y) * ((height - 1) / math.pi)
@@ -212,19 +184,11 @@ def _lookup(source, d, rows, height, width):
 
 
 def blur(radiance: np.ndarray, degrees: float) -> np.ndarray:
-    """Blur a map on the sphere by exp((cos g - 1) / s^2) of the angle g, a Gaussian where s is small.
+    """Blur a map (H, W, 3) on the sphere by exp((cos g - 1) / s^2) of the angle g.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3) float32
-        The map.
-    degrees : float
-        Standard deviation s; of less than a fifth of a texel the map is returned as it is.
-
-    Returns
-    -------
-    ndarray (H, W, 3) float32
-        Flux, radiance times :func:`.latlong.lookup_solid_angles`, is kept.
+    That is a Gaussian where s, the standard deviation in ``degrees``, is small. With less than a fifth of a
+    texel the map is returned as it is.
+    Flux, radiance times :func:`.latlong.lookup_solid_angles`, is kept.
     """
     height, width = radiance.shape[:2]
     if degrees < 0.2 * 360 / width:

@@ -21,17 +21,10 @@ PARALLAX_DEGREES = 8.794 / 3600
 
 @dataclass(frozen=True)
 class SunPosition:
-    """Where the sun is seen.
+    """Where the sun is seen."""
 
-    Attributes
-    ----------
-    azimuth : float
-        Degrees from north by east, in [0, 360).
-    elevation : float
-        Degrees above the horizon, raised by refraction (10 degrees Celsius, 1010 hPa) down to -1 degree.
-    """
-
-    azimuth: float
+    azimuth: float  # degrees from north by east, in [0, 360)
+    # Degrees above the horizon, raised by refraction (10 degrees Celsius, 1010 hPa) down to -1 degree
     elevation: float
 
 
@@ -56,15 +49,7 @@ def moment(text: str) -> datetime.datetime:
 
 
 def sun_position(latitude: float, longitude: float, time: datetime.datetime) -> SunPosition:
-    """Compute where the sun is seen.
-
-    Parameters
-    ----------
-    latitude, longitude : float
-        Degrees; north and east are positive.
-    time : datetime
-        With its offset from UTC.
-    """
+    """Compute where the sun is seen at a latitude and longitude in degrees, north and east positive."""
     j2000 = datetime.datetime(2000, 1, 1, 12, tzinfo=datetime.UTC)
     days = (time - j2000) / datetime.timedelta(days=1)
     t = days / 36525

@@ -109,14 +109,8 @@ def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dic
     A weight that rises during a run lets the loss rise while the rendering improves: values of different
     iterations can be compared only under the same weights.
 
-    Parameters
-    ----------
-    rows : list of dict
-        A row an iteration: ``iteration``, ``loss``, and the weighted terms that it is the sum of.
-    ramps : dict of str to (float, float)
-        First and last weight of the terms.
-    iterations : int
-        That the weights take to change.
+    A row of an iteration has ``iteration``, ``loss``, and the weighted terms that it is the sum of;
+    ``ramps`` has the first and last weight of each, which change over so many iterations.
     """
     names = columns(rows)
     if {"sigma", "residual"} <= set(names):

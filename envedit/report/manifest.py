@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 import envedit
-from envedit.core import atomic_files
+from envedit.core import atomic_files, processor
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
 
@@ -57,17 +57,8 @@ def plain(value: Any, where: str, lost: list[str]) -> Any:
 def write_json(path: FilePath, value: Any) -> list[str]:
     """Write ``metrics.json``, ``manifest.json`` or ``lights.json``; numbers are finite or null.
 
-    Returns
-    -------
-    list of str
-        Where a NaN or Inf became null, as ``"render.psnr"``, so that the caller can warn.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    TypeError
-        If a value is neither number, text, list, dict, path nor NumPy scalar or array.
+    Returns where a NaN or Inf became null, as ``"render.psnr"``, so that the caller can warn. InputError if
+    the file cannot be written; TypeError for what is neither number, text, list, dict, path nor NumPy's.
     """
     lost: list[str] = []
     text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
@@ -75,29 +66,17 @@ def write_json(path: FilePath, value: Any) -> list[str]:
     return lost
 
 
-def write_history(path: FilePath, rows: list[dict]) -> list[str]:
-    """Write ``history.csv``, a row an iteration.
+def write_history(path: FilePath, rows: list[dict]) -> None:
+    """Write ``history.csv``, a row an iteration; InputError if it cannot be written.
 
     The columns are the union of the rows' keys in the order first seen. A value that is missing, None, NaN
     or Inf is an empty cell.
-
-    Returns
-    -------
-    list of str
-        Where a NaN or Inf became an empty cell, as ``"[17].loss"`` (index of the row, column).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
     """
-    lost: list[str] = []
     text = io.StringIO()
     writer = csv.DictWriter(text, columns(rows) or ["iteration"], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(plain(rows, "", lost))
+    writer.writerows(plain(rows, "", []))
     write_atomically(path, text.getvalue().encode("utf-8", "backslashreplace"))
-    return lost
 
 
 def columns(rows: Iterable[dict]) -> list[str]:
@@ -112,6 +91,8 @@ def columns(rows: Iterable[dict]) -> list[str]:
 def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
     """Collect what it takes to explain a run later: versions, machine, seeds, and the digests of its inputs.
 
+    ``commit`` is None unless the package runs from its own git checkout.
+
     Parameters
     ----------
     config_summary : dict
@@ -120,11 +101,7 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
         Files read, by role. None is left out; a file that cannot be read any more is listed with the reason.
     variant : str
         Mitsuba variant.
-
-    Returns
-    -------
-    dict
-        Ready for :func:`write_json`. ``commit`` is None unless the package runs from its own git checkout.
+        Mitsuba variant.
     """
     versions: dict[str, str | None] = {"envedit": envedit.__version__, "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy", "OpenEXR"):
@@ -132,7 +109,6 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "time_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": versions,
@@ -140,7 +116,7 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
         "variant": variant,
         "llvm": _llvm() if variant.startswith("llvm") else None,
         "platform": platform.platform(),
-        "cores": {"usable": usable, "machine": os.cpu_count()},
+        "cores": {"usable": processor.cores(), "machine": os.cpu_count()},
         "seeds": {key: value for key, value in config_summary.items() if "seed" in str(key)},
         "inputs": {role: _digest(path) for role, path in inputs.items() if path is not None},
         "config": config_summary,

@@ -25,23 +25,10 @@ if TYPE_CHECKING:
 def write_map(
     settings: config.Output, path: Path, envmap: np.ndarray, input_map: inputs.InputMap
 ) -> list[str]:
-    """Write a map in the format asked for.
+    """Write a map in the format asked for; returns warnings: what half could not hold.
 
-    Parameters
-    ----------
-    settings : config.Output
-        Format, and whether half.
-    path : Path
-        File without its ending.
-    envmap : ndarray (H, W, 3)
-        Linear values, in the units and colours of the file that was edited.
-    input_map : inputs.InputMap
-        That file.
-
-    Returns
-    -------
-    list of str
-        Warnings: what half could not hold.
+    ``path`` is the file without its ending; ``envmap`` (H, W, 3) has linear values in the units and colours
+    of the file that was edited, ``input_map``.
     """
     source = {"source": input_map.source}
     space = input_map.chromaticities
@@ -87,10 +74,7 @@ def write_scene(
 ) -> list[str]:
     """Write ``edited.xml``, the scene lit by the edited map, which lies beside it, and ``edited.usda``.
 
-    Returns
-    -------
-    list of str
-        A warning, if it cannot be written.
+    Returns a warning, if it cannot be written.
     """
     edited = f"edited.{settings.output.format}"
     lights = result.lights["after"]
@@ -101,14 +85,7 @@ def write_scene(
             below = os.path.relpath(chosen.file, folder), conversion.kept(chosen.file).stage
         stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale, below)
         atomic_files.write_atomically(folder / "edited.usda", stage.encode())
-        text = scene.relit(
-            chosen.file,
-            edited,
-            dict(chosen.parameters),
-            base,
-            chosen.up,
-            chosen.scale,
-        )
+        text = scene.relit(chosen.file, edited, dict(chosen.parameters), base, chosen.up, chosen.scale)
     except InputError as error:  # the scene's files may be gone by now
         return [f"edited.xml or edited.usda is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())

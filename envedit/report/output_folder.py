@@ -92,10 +92,7 @@ def _runs(process):
 def alone(folder: Path) -> Iterator[None]:
     """Make a folder for results, and let no other process of this machine work in it meanwhile.
 
-    Raises
-    ------
-    InputError
-        It cannot be made, or another process works in it.
+    InputError if it cannot be made, or another process works in it.
     """
     try:
         if folder.exists() and not folder.is_dir():
@@ -124,6 +121,8 @@ def prepare_folder(
 ) -> None:
     """Move what an earlier run left in a folder to ``earlier-N`` in it.
 
+    InputError if an input lies where a result would go, or the folder cannot be used.
+
     Parameters
     ----------
     folder : Path
@@ -137,11 +136,6 @@ def prepare_folder(
         Leave what is there, if it is complete or there is a checkpoint: it is to be continued.
     spare : sequence of path
         What is copied and not moved, if it is among the results: the run will be asked for by it again.
-
-    Raises
-    ------
-    InputError
-        An input lies where a result would go, or the folder cannot be used.
     """
     try:
         # ---- What lies there, and whether an input is among it

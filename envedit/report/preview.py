@@ -92,7 +92,7 @@ def preview(
     tonemap: str = "gamma",
     views: Views = (),
 ) -> None:
-    """Write ``preview.png``: what :func:`sheet` draws; errors as there, or that it cannot be written."""
+    """Write ``preview.png``: what :func:`sheet` draws; InputError if it cannot be written."""
     write_atomically(path, sheet(renders, maps, tonemap, views))
 
 
@@ -119,11 +119,6 @@ def sheet(
     -------
     bytes
         A PNG file, whose text ``Description`` names the columns and the exposures.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such tonemap.
     """
     names = list(dict.fromkeys([*renders, *maps]))
     renders = known(renders)
@@ -273,13 +268,7 @@ def photograph(photo: Photo, rendering: np.ndarray, outliers: np.ndarray) -> lis
 
 
 def influence(path: FilePath, values: np.ndarray, frozen: np.ndarray | None = None) -> None:
-    """Draw ``influence.png``: :func:`influence_image`, every texel a square of pixels.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Draw ``influence.png``: :func:`influence_image`, every texel a square of pixels."""
     pixels = influence_image(values, frozen)
     factor = -(-INFLUENCE_WIDTH // pixels.shape[1])
     low, high = INFLUENCE_RANGE

@@ -26,25 +26,11 @@ if TYPE_CHECKING:
 def write(
     settings: config.Config, folder: Path, result: results.Result, import_s: float, base: Path | None = None
 ) -> list[str]:
-    """Write a result; the checkpoint goes last of all.
+    """Write the result of settings that were carried out; the checkpoint goes last of all.
 
-    Parameters
-    ----------
-    settings : config.Config
-        What was carried out.
-    folder : Path
-        Where to; files of the same names are replaced.
-    result : results.Result
-        What was found; the timing of its metrics is completed.
-    import_s : float
-        Seconds that imports took.
-    base : Path, optional
-        Folder that file names in scene parameters are relative to.
-
-    Returns
-    -------
-    list of str
-        Warnings: the result's, and numbers that were not finite.
+    Files of the same names are replaced, and the timing of the result's metrics is completed, with the
+    seconds ``import_s`` that imports took. ``base`` is the folder that file names in scene parameters are
+    relative to. Returns warnings: the result's, and numbers that were not finite.
     """
     # ---- Maps and renderings
     start = time.perf_counter()
@@ -158,13 +144,9 @@ def _write_renderings(settings, folder, result):
     views = [view.rows for view in result.views]
     for name, picture in result.renders.items():
         for file, rows in output_folder.of_views(f"render_{name}.exr", views):
-            images.write_exr(
-                folder / file,
-                picture[rows],
-                {"source": settings.scene.file},
-                panorama=False,
-                alpha=None if result.alpha is None else result.alpha[rows],
-            )
+            alpha = None if result.alpha is None else result.alpha[rows]
+            source = {"source": settings.scene.file}
+            images.write_exr(folder / file, picture[rows], source, panorama=False, alpha=alpha)
 
 
 def _write_full_resolution(settings, folder, result):

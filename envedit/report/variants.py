@@ -29,31 +29,17 @@ SPP = 64
 
 @dataclass(frozen=True)
 class Variant:
-    """An explanation of paint, as it is after the few steps by which explanations are compared.
+    """An explanation of paint, as it is after the few steps by which explanations are compared."""
 
-    Attributes
-    ----------
-    name : str
-        What was done to the map's lights.
-    evidence : float
-        -2 log evidence, but for a constant that all explanations of a run have: lower is likelier.
-    envmap : ndarray (H, W, 3)
-        Its map, in the units of the file that was edited.
-    render : ndarray (h, w, 3)
-        Mitsuba's rendering of it, linear radiance.
-    towards, elsewhere : float or None
-        How far the paint is followed, and the rest changed, as of :func:`.metrics.painted`.
-    run : gauss_newton.Run
-        Where an edit goes on from it.
-    """
-
-    name: str
+    name: str  # what was done to the map's lights
+    # -2 log evidence, but for a constant that all explanations of a run have: lower is likelier
     evidence: float
-    envmap: np.ndarray
-    render: np.ndarray
+    envmap: np.ndarray  # (H, W, 3), its map, in the units of the file that was edited
+    render: np.ndarray  # (h, w, 3), mitsuba's rendering of it, linear radiance
+    # towards, elsewhere: how far the paint is followed, and the rest changed, as of :func:`.metrics.painted`
     towards: float | None
     elsewhere: float | None
-    run: gauss_newton.Run
+    run: gauss_newton.Run  # where an edit goes on from it
 
     @property
     def summary(self) -> str:
@@ -106,12 +92,8 @@ def write(
 ) -> list[str]:
     """Write the map and the solution of each, numbered from 1, and a sheet; returns warnings.
 
-    ``optimizer.start`` takes a solution, ``1.npz``: an edit then goes on from it.
-
-    Raises
-    ------
-    InputError
-        A file cannot be written.
+    ``optimizer.start`` takes a solution, ``1.npz``: an edit then goes on from it. InputError if a file cannot
+    be written.
     """
     if not variants:
         return []

@@ -16,10 +16,11 @@ from typing import TextIO
 
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.processor import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job
-from .process import DONE, ERROR_LENGTH, LOG, Outcome, cores, run_job
+from .process import DONE, ERROR_LENGTH, LOG, Outcome, run_job
 
 CORES_PER_JOB = 4
 """A run is parallel kernels with serial stretches between: two jobs on eight cores beat one."""
@@ -207,15 +208,7 @@ def _outcome(job, future):
 
 
 class Progress:
-    """Lines on how far a sweep has come, and when it will end at the rate so far.
-
-    Parameters
-    ----------
-    total : int
-        Jobs that are to run.
-    stream : file or None
-        Where to; None: nowhere.
-    """
+    """Lines to a stream, if there is one, on how far a sweep has come, and when it will end at that rate."""
 
     def __init__(self, total: int, stream: TextIO | None):
         self._total = total

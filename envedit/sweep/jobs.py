@@ -25,27 +25,14 @@ from envedit.losses.perceptual import installed
 
 @dataclass(frozen=True)
 class Job:
-    """One run to be made; by :func:`job` or :func:`read_jobs`.
+    """One run to be made; by :func:`job` or :func:`read_jobs`."""
 
-    Attributes
-    ----------
-    name : str
-        What the table calls it.
-    toml : str
-        The configuration, every key spelled out, paths absolute, without an output folder.
-    key : str
-        32 hexadecimal digits of the SHA-256 of the configuration, of the files it names and of the program.
-    program : str
-        :func:`program` where the job was made.
-    command : tuple of str
-        What carries it out, as :data:`.process.COMMAND`; empty: that.
-    """
-
-    name: str
-    toml: str
+    name: str  # what the table calls it
+    toml: str  # the configuration, every key spelled out, paths absolute, without an output folder
+    # 32 hexadecimal digits of the SHA-256 of the configuration, of the files it names and of the program
     key: str
-    program: str
-    command: tuple[str, ...] = ()
+    program: str  # :func:`program` where the job was made
+    command: tuple[str, ...] = ()  # what carries it out, as :data:`.process.COMMAND`; empty: that
 
     def folder(self, out: FilePath) -> Path:
         """Return the job's folder under ``out``."""
@@ -124,10 +111,7 @@ def job(
 def read_jobs(path: FilePath) -> list[Job]:
     """Read a TOML file of jobs, or the configurations in a folder; see the package's text.
 
-    Raises
-    ------
-    ConfigError, InputError
-        A file cannot be read, or holds no jobs, or one that is not usable.
+    ConfigError or InputError if a file cannot be read, or holds no jobs, or one that is not usable.
     """
     path = Path(path)
     if path.is_dir():

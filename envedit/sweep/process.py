@@ -19,6 +19,7 @@ import envedit
 from envedit.core import file_locks
 from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import InputError
+from envedit.core.processor import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job, program
@@ -66,28 +67,15 @@ _GUARD = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
-
-    Attributes
-    ----------
-    state : str
-        "done"; "skipped": it was done before; "failed"; "held": another call carries it out; "stopped": by
-        the user; "lost": the scheduler went away.
-    seconds : float
-        What it took, this time.
-    error : str
-        Of a failed job: exit code and last line of its output. Of one that is held: who holds it.
-    """
+    """What became of a job."""
 
     job: Job
+    # "done"; "skipped": it was done before; "failed"; "held": another call carries it out; "stopped": by the
+    # user; "lost": the scheduler went away
     state: str
-    seconds: float = 0.0
+    seconds: float = 0.0  # what it took, this time
+    # Of a failed job: exit code and last line of its output. Of one that is held: who holds it.
     error: str = ""
-
-
-def cores() -> int:
-    """Count the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_job(

@@ -14,6 +14,7 @@ import numpy as np
 import OpenEXR
 
 from envedit import config
+from envedit.config import presets
 from envedit.images import images
 from envedit.scene import scene
 from envedit.solve import checkpoint
@@ -197,7 +198,7 @@ def toml_files() -> dict[str, bytes]:
     """Return whole configurations: two by hand, and presets and kinds with every key spelled out."""
     files = {"painted.toml": PAINTED.encode()}
     files["image.toml"] = '[target]\nkind = "image"\nfile = "é/paint.png"\n'.encode()
-    for preset, kind in itertools.product(config.preset_names(), ("layers", "siren", "pixels")):
+    for preset, kind in itertools.product(presets.PRESETS, ("layers", "siren", "pixels")):
         chosen = config.loads(f'representation.kind = "{kind}"', "/maps", "a.toml", preset)
         files[f"{preset}-{kind}.toml"] = config.to_toml(chosen).encode()
     return files

@@ -68,18 +68,6 @@ def test_a_configuration_that_cannot_be_understood(text, says, tmp_path, capsys)
     assert all(words in said for words in says), said
 
 
-@pytest.mark.parametrize(
-    ("override", "says"),
-    [
-        ("fit.epoch=3", ["--set", "did you mean epochs"]),
-        ("fit.epochs", ["--set", "table.key=value"]),
-    ],
-)
-def test_an_override_that_cannot_be_understood(override, says, path, capsys):
-    said = fails(2, capsys, path, "--set", override)
-    assert all(words in said for words in says), said
-
-
 def test_a_configuration_that_is_not_there(tmp_path, capsys):
     assert "none.toml: no such configuration file" in fails(2, capsys, tmp_path / "none.toml")
     assert "a folder" in fails(2, capsys, tmp_path)
@@ -133,14 +121,6 @@ def test_a_map_that_is_not_there(path, capsys):
     assert str(path.parent / "none.exr") in said  # relative to the configuration
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.99])
-def test_a_truncated_map(share, path, capsys, tmp_path, rng):
-    images.write_exr(tmp_path / "map.exr", sky(rng, 64, 128))
-    data = (tmp_path / "map.exr").read_bytes()
-    (tmp_path / "map.exr").write_bytes(data[: int(share * len(data))])
-    assert "map.exr" in fails(3, capsys, path)
-
-
 @pytest.mark.parametrize("data", [b"hello, world\n" * 40, b"\0" * 4096])
 def test_a_map_that_is_no_image(data, path, capsys, tmp_path):
     (tmp_path / "map.exr").write_bytes(data)
@@ -155,13 +135,6 @@ def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
     (said,) = [line for line in err.splitlines() if "no effect: needs" not in line]
     assert out == "" and said.startswith("envedit: warning: ") and "not HDR" in said
     assert "not HDR" in (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("height, width", [(8, 14), (16, 16), (1, 2), (1, 1)])
-def test_a_map_that_is_not_two_to_one_or_too_small(height, width, path, capsys, tmp_path, rng):
-    images.write_exr(tmp_path / "map.exr", sky(rng, height, width))
-    said = fails(3, capsys, path)
-    assert "map.exr" in said and f"{width} x {height}" in said
 
 
 @pytest.mark.slow

@@ -127,21 +127,6 @@ def test_lights_are_where_and_as_strong_as_in_the_map():
     np.testing.assert_allclose(np.pi * np.array(picture).ravel(), found["irradiance"], rtol=0.02)
 
 
-def test_a_map_without_lights_is_all_sky(rng):
-    even = (1 + 0.1 * rng.random((16, 32, 3))).astype(np.float32)
-    whole, none = light_list.split(even, separate(even).core)
-    assert (
-        whole.tobytes() == even.tobytes()
-        and not none.any()
-        and light_list.listed(separate(even).lights, even.shape[:2], np.eye(3)) == []
-    )
-    black = np.zeros((16, 32, 3), np.float32)
-    assert (
-        not any(part.any() for part in light_list.split(black, separate(black).core))
-        and light_list.listed(separate(black).lights, black.shape[:2], np.eye(3)) == []
-    )
-
-
 # ---- formats -------------------------------------------------------------------------------------------
 
 
@@ -213,18 +198,3 @@ def test_texels_are_where_the_documentation_says_that_other_programs_have_them()
     for name, (s, t) in found.items():
         assert np.abs((s - u + 0.5) % 1 - 0.5).max() < 1e-6, name
         np.testing.assert_allclose(t, v, atol=1e-6, err_msg=name)
-
-
-@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (90, 30), (200, 60), (350, 85)])
-def test_the_rotation_of_a_sun_lamp_in_blender(azimuth, elevation):
-    """As ``docs/blender.md`` says: a lamp shines along its -z; Euler angles XYZ turn about x first."""
-    a, e = np.radians([azimuth, elevation])
-    x, y, z = latlong.on_sphere(np.pi / 2 - e, a)
-    told = -np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)
-    np.testing.assert_allclose(told, (z, x, y), atol=1e-12)
-    about_x, about_z = np.pi / 2 - e, -np.pi / 2 - a
-    cos, sin = np.cos(about_x), np.sin(about_x)
-    shines = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ [0, 0, -1]
-    cos, sin = np.cos(about_z), np.sin(about_z)
-    shines = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ shines
-    np.testing.assert_allclose(-shines, told, atol=1e-12)

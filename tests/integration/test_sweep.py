@@ -20,7 +20,7 @@ from envedit import config
 from envedit.cli.sweep import main
 from envedit.core.errors import ConfigError, InputError
 from envedit.solve import adam_loop, checkpoint
-from envedit.sweep import COMMAND, Outcome, drive, job, process, program, read_jobs, run_job, sweep, table
+from envedit.sweep import COMMAND, Outcome, drive, job, process, program, read_jobs, run_job, sweep
 from tests.oracles import ROOT
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 
@@ -217,7 +217,6 @@ def test_a_driver_that_is_killed_loses_only_what_was_in_flight(stub, held):
     assert files(jobs[1].folder(stub.out)) == ["done.json", "job.toml", "log.txt", "result"]
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
     stub.block("hold", 0)
@@ -549,24 +548,6 @@ def test_lines_tell_how_far_it_has_come_and_when_it_ends(tmp_path, clock):
     assert "log.txt); 1 failed, about 13 min left" in lines[1]  # 4 jobs, 200 s each
     assert lines[2].startswith("[3/6] j2: skipped; 1 failed, about 7 min left")
     assert lines[5] == "[6/6] j5: done, 8 s; 1 failed"
-
-
-def test_that_the_scheduler_is_gone_is_said_once(tmp_path):
-    said = io.StringIO()
-    progress = drive.Progress(3, said)
-    for i in range(3):
-        outcome = Outcome(job(f"j{i}", f"seed = {i}"), "lost", error="the scheduler went away")
-        progress.report(outcome, tmp_path)
-    assert said.getvalue() == "the scheduler went away: run again to complete the table\n"
-
-
-def test_the_table_has_a_line_for_each_job():
-    outcomes = [Outcome(job("long name", ""), "done", 3.25), Outcome(job("x", "seed=1"), "lost", 0, "why")]
-    lines = table(outcomes).splitlines()
-    assert lines[0] == f"long name  done          3.2 s  {outcomes[0].job.key}"
-    assert lines[1].startswith("x          lost   ") and lines[1].endswith("  why")
-    assert lines[2] == "2 jobs: 1 done, 1 lost"
-    assert table([]) == "0 jobs: "
 
 
 # ---- the real run ------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core import latlong
 from envedit.scene import camera_paths, scene
+from tests.oracles.plain import lookup
 from tests.oracles.statistics import disagreement, normal_square, student
 
 # ---- statistics (also used by the tests of the renderers) --------------------------------------------------
@@ -189,7 +189,7 @@ def test_pixels_see_the_sky_through_the_filter_of_the_film(rng, name):
 
     def ours(seed):
         seen = next(iter(camera_paths.trace(s.mi, every_pixel(s), count, 0, seed)))
-        radiance = latlong.lookup(sky, np.array(seen.direction).T.astype(np.float64))
+        radiance = lookup(sky, np.array(seen.direction).T.astype(np.float64))
         radiance *= np.array(seen.throughput).T * np.array(seen.active)[:, None]
         return radiance.reshape(s.height, s.width, count, 3).mean(axis=2)
 

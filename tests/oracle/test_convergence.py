@@ -12,6 +12,7 @@ import pytest
 
 from envedit.core import latlong
 from envedit.scene import camera_paths, scene
+from tests.oracles.plain import lookup
 from tests.oracles.scenes import ball, build, one_hot, picture, references, stage
 from tests.oracles.statistics import disagreement
 
@@ -230,7 +231,7 @@ def test_error_of_the_grid_falls_with_the_square_of_its_width(how):
         image = np.repeat(image, 3, axis=2).astype(np.float32)
         transports = (build(plane, *grid, spp=512, max_depth=2, seed=seed) for seed in range(4))
         traced.append(np.mean([picture(t, image).mean(dtype=np.float64) for t in transports]) / exact - 1)
-        told = 0.5 / np.pi * irradiance(lambda d, image=image: latlong.lookup(image, d), 400)
+        told = 0.5 / np.pi * irradiance(lambda d, image=image: lookup(image, d), 400)
         integrated.append(told / exact - 1)
     # What is traced is what the interpolated map gives; measured: within 0.15 %, which is noise.
     np.testing.assert_allclose(traced, integrated, atol=3e-3)
@@ -248,7 +249,7 @@ def test_error_of_the_radiance_falls_with_the_square_of_the_width(how):
         image = lobe(latlong.directions(width // 2, width), 10)
         if how == "averaged":
             image = latlong.resize(lobe(latlong.directions(256, 512), 10), width // 2, width)
-        square = np.square(latlong.lookup(image, d) - lobe(d, 10))[..., 0]
+        square = np.square(lookup(image, d) - lobe(d, 10))[..., 0]
         errors.append(np.sqrt((square * omega).sum() / (180 * omega.sum())))
     assert -2.05 < slope(widths, errors) < -1.85
 

@@ -1,14 +1,12 @@
 """Adam and the schedules against trajectories recorded from PyTorch, and against closed forms."""
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core.errors import ConfigError, InputError
-from envedit.losses.optimizer import Adam, constant, cosine, cosine_warm_restarts, ramp
+from envedit.core.errors import InputError
+from envedit.losses.optimizer import Adam, cosine, cosine_warm_restarts, ramp
 from tests.oracles import ROOT
 
 # python experiments/references/make_adam_reference.py tests/data/adam_reference.npz      (PyTorch 2.13.0)
@@ -71,28 +69,6 @@ def test_adam_finds_a_minimum_through_its_leaves():
     np.testing.assert_allclose(np.array(adam.params["x"]), [1.0, 0.5], atol=1e-4)
 
 
-@pytest.mark.parametrize("g", [0.0, 1e-45, 1e-30, 1e-20, 1e-6, 1.0, 65504.0, 1e6, 1.8e19])
-def test_any_gradient_that_squares_gives_a_bounded_step(g):
-    adam = Adam({"p": own([1.0])}, lr=0.01)
-    for _ in range(3):
-        assert adam.step({"p": own([g])})
-    assert abs(np.array(adam.params["p"])[0] - 1) <= 0.0301
-    assert all(np.isfinite(value).all() for value in adam.state_dict().values())
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
-def test_a_bad_gradient_is_refused_as_a_whole(bad, rng):
-    adam = Adam({"a": own(rng.random((5, 4))), "b": own(rng.random(4))}, lr=0.01)
-    good = {"a": own(rng.random((5, 4))), "b": own(rng.random(4))}
-    assert adam.step(good)
-    before = adam.state_dict()
-    g = np.ones((5, 4))
-    g[4, 3] = bad
-    assert adam.step({"a": own(g), "b": own(np.ones(4))}) is False
-    assert same(adam.state_dict(), before)
-    assert adam.step(good) and not same(adam.state_dict(), before)
-
-
 def test_kernels_are_compiled_once():
     shapes = {"a": (32, 8), "b": (32, 8), "c": (8,), "d": (8,)}
     adam = Adam({name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}, lr=0.01)
@@ -137,21 +113,9 @@ def test_a_checkpoint_continues_exactly(tmp_path, rng):
     assert whole["step"] == 10
 
 
-def test_adam_refuses():
+def test_a_state_of_other_parameters_is_refused():
     x = own([1.0, 2.0])
-    with pytest.raises(ConfigError, match="learning rate must be a number >= 0, got nan"):
-        Adam({"x": x}, lr=math.nan)
-    with pytest.raises(ConfigError, match=r"both betas must lie in \[0, 1\), got \(0.9, 1.0\)"):
-        Adam({"x": x}, lr=1, betas=(0.9, 1.0))
-    with pytest.raises(ConfigError, match="eps must be a number >= 1e-30, got 0"):
-        Adam({"x": x}, lr=1, eps=0)
     adam = Adam({"x": x}, lr=1)
-    with pytest.raises(ConfigError, match="got -1"):
-        adam.step({"x": x}, lr=-1)
-    with pytest.raises(InputError, match="differ in x, y"):
-        adam.step({"y": x})
-    with pytest.raises(InputError, match=r"gradient of x has shape \(1,\), not \(2,\)"):
-        adam.step({"x": own([1.0])})
     with pytest.raises(
         InputError, match="entries and the parameters differ in before/x, m/x, params/x, step"
     ):
@@ -174,17 +138,8 @@ def test_warm_restarts_follow_pytorch(reference):
 
 def test_cosine_follows_pytorch(reference):
     # PyTorch's is a recurrence that gathers rounding; the closed form does not.
-    rates = [cosine(2e-3, step, 60, final=1e-5) for step in range(61)]
+    rates = [1e-5 + cosine(2e-3 - 1e-5, step, 60) for step in range(61)]
     np.testing.assert_allclose(rates, reference["cosine"], rtol=1e-9)
-
-
-def test_tables_of_the_docstrings():
-    assert [constant(1, step) for step in (0, 10, 100)] == [1, 1, 1]
-    np.testing.assert_allclose([cosine(1, s, 4) for s in range(6)], [1, 0.854, 0.5, 0.146, 0, 0], atol=5e-4)
-    rates = [cosine_warm_restarts(1, s, 4) for s in range(6)]
-    np.testing.assert_allclose(rates, [1, 0.854, 0.5, 0.146, 1, 0.854], atol=5e-4)
-    values = [ramp(1, 1e4, s, 5) for s in range(6)]
-    np.testing.assert_allclose(values, [1, 10, 100, 1e3, 1e4, 1e4], rtol=1e-12)
 
 
 def test_ramp_ends_exactly_and_is_geometric():
@@ -198,15 +153,3 @@ def test_ramp_ends_exactly_and_is_geometric():
 def test_one_step_runs():
     assert cosine(0.1, 0, 1) == cosine_warm_restarts(0.1, 0, 1) == cosine_warm_restarts(0.1, 5, 1) == 0.1
     assert ramp(2, 3, 0, 1) == 2
-
-
-@pytest.mark.parametrize("schedule, ends", [(cosine, [1]), (cosine_warm_restarts, [1]), (ramp, [1, 2])])
-def test_schedules_refuse_an_empty_run(schedule, ends):
-    with pytest.raises(ConfigError, match="must be at least 1 step, got 0"):
-        schedule(*ends, 0, 0)
-
-
-@pytest.mark.parametrize("ends", [(0, 1), (1, 0), (-1, 1), (1, math.inf), (math.nan, 1)])
-def test_ramp_refuses_ends_that_have_no_logarithm(ends):
-    with pytest.raises(ConfigError, match="both ends must be positive numbers"):
-        ramp(*ends, 0, 10)

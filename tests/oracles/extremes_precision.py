@@ -11,12 +11,21 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import color, latlong, radiance
+from envedit.core import color, latlong
 from envedit.losses import losses, metrics, optimizer, ssim
 from envedit.representations.layers import lights
 from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
-from tests.oracles.extremes_stages import LUMINANCE, dense, loss_and_gradient, plain, single, sky, transport
+from tests.oracles.extremes_stages import (
+    LOSSES,
+    LUMINANCE,
+    dense,
+    loss_and_gradient,
+    plain,
+    single,
+    sky,
+    transport,
+)
 from tests.oracles.plain import IDENTICAL, plain_ssim
 
 SCALES = [10.0**k for k in range(-5, 6)]
@@ -120,15 +129,6 @@ def _resize():
     return worst
 
 
-def _health():
-    worst = 0.0
-    for m in wild():
-        found, y = radiance.health(m), m.astype(np.float64) @ LUMINANCE
-        for got, wanted in ((found.median, np.median(y)), (found.dynamic_range, y.max() / y.min())):
-            worst = max(worst, error(got, wanted))
-    return worst
-
-
 def _transport(adjoint):
     def measure():
         traced, matrix, worst = transport(16, 32), dense(16, 32), 0.0
@@ -179,7 +179,7 @@ def _constant_ssim():
         for b in (a, 2 * a, 0.0):
             x, y = (np.full((16, 32, 3), v, np.float32) for v in (a, b))
             p, q = float(x[0, 0, 0]), float(y[0, 0, 0])
-            got = ssim.ssim_loss(single(x), single(y))[0]
+            got = ssim.Ssim(single(y))(single(x))[0]
             wanted = (p - q) ** 2 / (p * p + q * q + c1)
             if a == b and got:
                 return math.inf  # equal images are equal
@@ -322,10 +322,10 @@ _GRADIENTS = {
     "tv": (3e-7, "sums of signs"),
 }
 
-CHECKS = {f"loss `{name}`": Check(_value(name), *_VALUES[name]) for name in losses.LOSSES}
+CHECKS = {f"loss `{name}`": Check(_value(name), *_VALUES[name]) for name in LOSSES}
 CHECKS |= {
     f"gradient of `{name}`": Check(_gradient(name), *_GRADIENTS.get(name, (3e-7, "a few roundings")))
-    for name in losses.LOSSES
+    for name in LOSSES
 }
 CHECKS |= {
     "luminance of a sun of 1e6 over a sky of 1e-3": Check(
@@ -338,7 +338,6 @@ CHECKS |= {
     "light kept by resizing": Check(
         _resize, 1e-6, "sums in double, texels rounded", "1e-5 to 1e5 in one map"
     ),
-    "median and dynamic range": Check(_health, 1e-12, _WIDE, "1e-5 to 1e5 in one map"),
     "T E": Check(_transport(False), 3e-6, "sums of some 300 positive terms in single precision", RANGE),
     "T' y": Check(_transport(True), 3e-6, "sums of some 50 positive terms in single precision", RANGE),
     "sum over 65536 points in the network's gradient": Check(

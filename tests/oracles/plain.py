@@ -4,6 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core import latlong
+
 
 def waves(height=40, width=56):
     """Two images by formula, so that another program can make the same ones."""
@@ -83,3 +85,18 @@ IDENTICAL = {
     "psnr": 200.0, "ssim": 1.0, "mse": 0.0, "lpips": None, "log_rmse": 0.0, "beyond_display": 0.0,
 }  # fmt: skip
 """What `metrics.compare` says of an image and itself."""
+
+
+def lookup(image, d):
+    """Interpolate a map (H, W, C) at directions (..., 3) as Mitsuba's ``envmap`` does, in float64."""
+    image = np.asarray(image)
+    height, width = image.shape[:2]
+    row, column = latlong.texel_position(d, height, width)
+    r0 = np.clip(np.floor(row).astype(np.int64), 0, max(height - 2, 0))
+    c0 = np.floor(column).astype(np.int64)
+    fr, fc = (row - r0)[..., None], (column - c0)[..., None]
+    r1 = np.minimum(r0 + 1, height - 1)
+    c0, c1 = c0 % width, (c0 + 1) % width
+    upper = (1 - fc) * image[r0, c0] + fc * image[r0, c1]
+    lower = (1 - fc) * image[r1, c0] + fc * image[r1, c1]
+    return (1 - fr) * upper + fr * lower

@@ -86,15 +86,6 @@ def test_libraries_are_heard_and_kept_quiet(capfd):
     assert capfd.readouterr() == ("", "after\n")
 
 
-def test_what_libraries_print_to_either_descriptor_is_kept_off(capfd):
-    with quiet_libraries() as said:
-        os.write(1, b"to one")
-        os.write(2, b"to two")
-        print("to python")
-    assert all(text in said[0] for text in ("to one", "to two", "to python"))
-    assert capfd.readouterr() == ("", "")
-
-
 def test_a_folder_is_worked_in_by_one_at_a_time(tmp_path):
     folder = tmp_path / "new" / "results"
     with output_folder.alone(folder):

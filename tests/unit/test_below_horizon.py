@@ -61,7 +61,7 @@ def test_public_maps_are_told_apart(width, data):
             assert kind_of(images.load_envmap(str(file), width)[0]) == kind, file.name
 
 
-@pytest.mark.parametrize("kind", below_horizon.KINDS)
+@pytest.mark.parametrize("kind", ("mirror", "keep"))
 @pytest.mark.parametrize("height", [3, 8, 31, 32])
 def test_the_same_sky_changes_nothing_to_the_bit(kind, height, rng):
     low, sky = halves(mirror((height, 2 * height)))
@@ -105,7 +105,7 @@ def test_the_width_is_that_under_which_the_original_mirrors_itself():
     assert Below(low, sky, "keep").widest in below_horizon.BLUR_MOST_DEGREES
 
 
-@pytest.mark.parametrize("kind", below_horizon.KINDS)
+@pytest.mark.parametrize("kind", ("mirror", "keep"))
 def test_gradient_is_that_of_finite_differences(kind, rng):
     low, sky = halves(mirror((8, 16)))
     below, weight = Below(low, sky, kind), tensor(rng.normal(0, 1, low.shape))

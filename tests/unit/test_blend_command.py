@@ -23,7 +23,7 @@ def sky(at, peak, level):
 
 
 def lights_of(envmap):
-    return light_list.listed(file_lights.lights_of(envmap).lights, envmap.shape[:2], np.eye(3))
+    return light_list.listed(file_lights.lights_of(envmap), envmap.shape[:2], np.eye(3))
 
 
 @pytest.mark.parametrize("amount", [0.25, 0.5, 0.9])

@@ -41,17 +41,6 @@ def test_the_help_of_a_command_has_an_example(command, capsys):
     assert re.search(rf"(?m)^(example: |  )envedit {command}\b", said)
 
 
-def test_the_help_of_run_names_what_it_takes_without_a_path(capsys):
-    said = help_of(capsys, "run")
-    assert all(name in said for name in (*shipped.configurations(), *shipped.scenes()))
-    assert f"{{{','.join(config.preset_names())}}}" in said
-
-
-def test_the_help_of_init_names_the_shipped_scenes(capsys):
-    said = help_of(capsys, "init")
-    assert all(name in said for name in shipped.scenes())
-
-
 def test_every_example_names_a_command_and_things_that_exist(capsys):
     said = "".join(help_of(capsys, *command) for command in ([], *([name] for name in cli.COMMANDS)))
     examples = re.findall(r"(?m)^(?:example: |  )(envedit .+)", said)

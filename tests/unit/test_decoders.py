@@ -447,8 +447,6 @@ def test_odd_exposures_are_told_and_not_damage(tmp_path, value, told):
 
 
 def test_a_jpeg_whose_table_breaks_off_is_damaged(tmp_path):
-    import mitsuba as mi
-
     mi.Bitmap(np.full((16, 32, 3), 188, np.uint8)).write(str(tmp_path / "a.jpg"))
     raw = (tmp_path / "a.jpg").read_bytes()
     at = raw.index(b"\xff\xdb")

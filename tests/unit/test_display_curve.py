@@ -17,11 +17,6 @@ def slope(x):
     return display_curve.slope(np.reshape(x, (1, 1, -1))).ravel()
 
 
-def test_display_values_are_the_metrics_tonemap_in_its_middle():
-    x = np.geomspace(1e-3, 1, 200)
-    np.testing.assert_allclose(shown(x), x ** (1 / 2.2), rtol=2e-6)
-
-
 def test_display_values_by_formula():
     x = np.float32([-1, 0, 1e-30, 5e-4, 1e-3, 0.18, 1, 2, 65504, 1e6, 1e30, 3e38])
     found = shown(x)

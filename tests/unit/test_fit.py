@@ -10,7 +10,7 @@ import pytest
 
 from envedit import config
 from envedit.core.errors import InputError, NumericalError
-from envedit.losses import metrics, optimizer, ssim
+from envedit.losses import metrics, ssim
 from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
 from tests.oracles.kernels import launched
@@ -107,18 +107,6 @@ def test_headroom_is_left_free_at_either_end(headroom, rng):
         np.testing.assert_allclose(decoded, np.maximum(ends, 0), rtol=1e-4, atol=1e-6)
 
 
-def test_no_headroom_is_equation_1(rng):
-    image = sky(rng)
-    assert fit.Normalisation.of(image, 0.0) == fit.Normalisation.of(image) != fit.Normalisation.of(image, 0.1)
-
-
-@pytest.mark.parametrize("headroom", [0.0, 0.05, 0.45])
-@pytest.mark.parametrize("value", [0.0, 0.3, 1e38])
-def test_a_constant_map_needs_no_headroom(value, headroom):
-    image = np.full((2, 4, 3), value, np.float32)
-    assert fit.Normalisation.of(image, headroom) == fit.Normalisation.of(image)
-
-
 # ---- objective (Eq. 4) -----------------------------------------------------------------------------------
 
 
@@ -185,14 +173,6 @@ def test_objective_of_the_perturbation_is_the_ssim_alone(rng):
     np.testing.assert_allclose(loss[0], expected, rtol=1e-5)
 
 
-def test_objective_does_not_touch_the_callers_graph(rng):
-    image = sky(rng, 12, 16)
-    objective = fit.Objective(image, fit.Normalisation.of(image), config.Fit())
-    y = mi.TensorXf(rng.random((192, 3)).astype(np.float32))
-    objective.gradient(y)
-    assert not dr.grad_enabled(y)
-
-
 # ---- adversarial weight perturbation (Eq. 5) -------------------------------------------------------------
 
 
@@ -227,12 +207,6 @@ def test_perturbation_makes_the_ssim_worse(rng):
     assert after > before
     _, _, _, further = step_of_perturbation(rng, gamma=2e-3)
     assert further > after
-
-
-def test_perturbation_does_not_depend_on_the_proxys_rate(rng):
-    a, b = (step_of_perturbation(np.random.default_rng(0), lr=lr)[1] for lr in (1e-4, 1e-2))
-    for name in a:
-        np.testing.assert_allclose(a[name].numpy(), b[name].numpy(), rtol=1e-4, atol=1e-6)
 
 
 def test_perturbation_of_a_zero_layer_or_by_a_zero_gradient_changes_nothing(rng):
@@ -366,40 +340,7 @@ def test_progress_ends_with_the_last_epoch(rng):
     assert all(math.isfinite(now[2]) for now in seen)
 
 
-def test_progress_counts_perturbed_and_polishing_epochs_alike(rng):
-    seen = []
-    settings = dataclasses.replace(QUICK, epochs=43, awp_gamma=0.01, awp_until=0.4)
-    fit.fit(sky(rng), NETWORK, settings, progress=lambda *now: seen.append(now))
-    assert [now[:2] for now in seen] == [(1, 43), (21, 43), (41, 43), (43, 43)]
-
-
 # ---- perturbation for a while, grids, Adam ---------------------------------------------------------------
-
-
-def test_perturbation_that_never_starts_is_none(rng):
-    image = sky(rng)
-    none = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.0))
-    never = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.05, awp_until=0.0))
-    always = fit.fit(image, NETWORK, dataclasses.replace(QUICK, awp_gamma=0.05, awp_until=1.0))
-    assert same(never.params, none.params) and not same(always.params, none.params)
-
-
-@pytest.mark.parametrize(("until", "every", "updates", "applied"), [
-    (0.7, 2, 4, 7), (1.0, 1, 10, 10), (0.1, 3, 1, 1), (0.75, 3, 3, 8), (0.0, 1, 0, 0),
-])  # fmt: skip
-def test_epochs_are_perturbed_up_to_a_share_of_them(until, every, updates, applied, rng, monkeypatch):
-    calls = []
-    for name in ("update", "apply"):
-        plain = getattr(fit.Perturbation, name)
-
-        def counted(self, *args, name=name, plain=plain):
-            calls.append(name)
-            return plain(self, *args)
-
-        monkeypatch.setattr(fit.Perturbation, name, counted)
-    settings = dataclasses.replace(QUICK, epochs=10, awp_gamma=0.01, awp_until=until, awp_every=every)
-    fit.fit(sky(rng), NETWORK, settings)
-    assert (calls.count("update"), calls.count("apply")) == (updates, applied)
 
 
 GRIDS = [  # height, width, stride, grids
@@ -437,38 +378,6 @@ def test_every_texel_belongs_to_one_grid_with_its_point(height, width, stride, c
         np.testing.assert_array_equal(objective.logs.numpy(), expected)
         seen += texels.ravel().tolist()
     assert sorted(seen) == list(range(height * width))
-
-
-@pytest.mark.slow
-def test_grids_take_turns_at_random(rng, monkeypatch):
-    image, used, plain = sky(rng, 23, 31), [], fit.Objective.gradient
-
-    def noted(self, y, only_ssim=False):
-        used.append(float(self.radiance.numpy()[0, 0, 0]))
-        return plain(self, y, only_ssim)
-
-    monkeypatch.setattr(fit.Objective, "gradient", noted)
-    corners = image[:2, :2, 0].ravel().tolist()
-    for seed in (0, 0, 1):
-        fit.fit(image, NETWORK, dataclasses.replace(QUICK, epochs=16), seed)
-    turns = [used[start : start + 4] for start in range(0, 48, 4)]
-    assert len(used) == 48 and all(sorted(turn) == sorted(corners) for turn in turns)
-    assert turns[:4] == turns[4:8] != turns[8:]
-    assert any(turn != turns[0] for turn in turns[:4])
-
-
-@pytest.mark.slow
-def test_adam_decays_squared_gradients_as_told(rng, monkeypatch):
-    betas, plain = [], optimizer.Adam.__init__
-
-    def noted(self, params, lr, betas_=(0.9, 0.999), *args):
-        betas.append(betas_)
-        plain(self, params, lr, betas_, *args)
-
-    monkeypatch.setattr(optimizer.Adam, "__init__", noted)
-    image = sky(rng)
-    a, b = (fit.fit(image, NETWORK, dataclasses.replace(QUICK, beta2=beta2)) for beta2 in (0.99, 0.9))
-    assert betas == [(0.9, 0.99), (0.9, 0.9)] and not same(a.params, b.params)
 
 
 # ---- schedules -------------------------------------------------------------------------------------------
@@ -569,25 +478,6 @@ def test_other_settings_are_another_fit(tmp_path, rng):
         assert fit.fit(image, NETWORK, quick, 0, rows, folder=tmp_path).cached
 
 
-def test_the_same_texels_elsewhere_in_a_map_are_another_picture(rng):
-    image = sky(rng)
-    top, equator, whole, told = (
-        fit.fit(image, NETWORK, QUICK, rows=rows) for rows in ((0, 32), (8, 32), None, (0, 16))
-    )
-    assert same(whole.params, told.params) and not same(top.params, equator.params)
-    assert not same(top.params, whole.params)
-    # In the plane a crop is stretched to a whole, wherever it lies.
-    plane = dataclasses.replace(NETWORK, coordinates="plane")
-    top, equator = (fit.fit(image, plane, QUICK, rows=rows) for rows in ((0, 32), (8, 32)))
-    assert same(top.params, equator.params)
-
-
-def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path, rng):
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    assert not fit.fit(sky(rng), NETWORK, QUICK, folder=blocked / "fits").cached
-
-
 class Killed(Exception):
     pass
 
@@ -638,14 +528,6 @@ def test_seconds_of_a_killed_fit_count(tmp_path, monkeypatch, rng):
         fit.fit(image, NETWORK, settings, folder=tmp_path / "two", progress=killed_at(21))
     continued = fit.fit(image, NETWORK, settings, folder=tmp_path / "two")
     assert undisturbed.seconds > 40 * 100 and abs(continued.seconds - undisturbed.seconds) <= 400
-
-
-def test_default_folder_follows_the_desktop_standard(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert fit.default_folder() == tmp_path / "envedit" / "fits"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert fit.default_folder() == tmp_path / ".cache" / "envedit" / "fits"
 
 
 def test_a_fit_that_ends_in_nan_is_refused_as_what_it_is(rng):

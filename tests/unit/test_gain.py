@@ -77,14 +77,6 @@ def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
 
 @pytest.mark.parametrize("cycles, share", GAINS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_gain_starts_at_exactly_nothing(cycles, share, shape):
-    g = gain.GridGain(cycles, share)
-    assert {n: v.shape for n, v in g.init().items()} == {f"gain.{i}": (*s, 3) for i, s in enumerate(g.sizes)}
-    np.testing.assert_array_equal(field(g, g.init(), shape), np.zeros((*shape, 3)))
-
-
-@pytest.mark.parametrize("cycles, share", GAINS)
-@pytest.mark.parametrize("shape", SHAPES)
 def test_hats_are_a_partition_of_unity(cycles, share, shape):
     g = gain.GridGain(cycles, share)
     for level in levels(g):
@@ -116,56 +108,6 @@ def test_field_is_the_interpolation_of_its_grids(cycles, share, shape, rng):
         nodes = grid.reshape(-1, 3).astype(np.float64)
         by_hats = by_hats + sum(nodes[node] * weight[:, None] for node, weight in g.hats(level, shape))
     np.testing.assert_allclose(by_hats.reshape(*shape, 3), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("width", [64, 61, 9])
-def test_seam_is_like_any_other_place(width, rng):
-    """From a column to the next, no node's step is exceeded, nor from the last to the first."""
-    g = gain.GridGain(4, 1.0)
-    for level in levels(g):
-        name, columns = f"gain.{level}", g.sizes[level][1]
-        params = {n: v * (n == name) for n, v in random(g, rng).items()}
-        nodes = params[name]
-        values = field(g, params, (16, width))
-        step = np.abs(np.roll(nodes, -1, axis=1) - nodes).max()
-        jump = np.abs(values - np.roll(values, 1, axis=1))
-        assert jump.max() <= step * columns / width + 1e-5
-        assert columns == 2 or jump[:, 0].max() > 0  # of two columns the seam is an axis of symmetry
-
-
-def test_field_turns_with_its_nodes(rng):
-    g = gain.GridGain(4, 1.0)
-    params = random(g, rng)
-    for nodes in params.values():
-        nodes[[0, -1]] = nodes[[0, -1], :1]  # of a pole's nodes only the first counts
-    width = 40  # 5 columns for one of 8 nodes
-    still = field(g, params, (9, width))
-    for turns in (1, 3):  # nodes of the coarsest grid, of which there are 2
-        turned = {n: np.roll(v, turns * v.shape[1] // 2, axis=1) for n, v in params.items()}
-        np.testing.assert_allclose(
-            field(g, turned, (9, width)), np.roll(still, width // 2, axis=1), atol=2e-6
-        )
-    one = {"gain.2": np.roll(params["gain.2"], 1, axis=1)}
-    zero = g.init()
-    a, b = field(g, zero | {"gain.2": params["gain.2"]}, (9, width)), field(g, zero | one, (9, width))
-    np.testing.assert_allclose(b, np.roll(a, 5, axis=1), atol=2e-6)
-    assert np.abs(b - a).max() > 0.1
-
-
-@pytest.mark.parametrize("cycles", [4, 6, 16])
-def test_spectrum_around_the_horizon_ends_at_the_stated_cycles(cycles, rng):
-    """Random nodes of a bilinear grid: sinc^4 of their energy, 93 % of it below the highest of their own."""
-    g = gain.GridGain(cycles, 1.0)
-    shape = (64, 256)
-    share = []
-    for _ in range(8):
-        energy = np.abs(np.fft.rfft(field(g, random(g, rng), shape), axis=1)) ** 2
-        energy[:, 1:-1] *= 2
-        share.append(energy[:, : cycles + 1].sum() / energy.sum())
-    assert min(share) >= 0.9
-    finest = {n: v * (n == "gain.2") for n, v in random(g, rng).items()}
-    energy = np.abs(np.fft.rfft(field(g, finest, shape), axis=1)).sum(axis=(0, 2))
-    assert energy[cycles // 2 + 1 : cycles + 1].sum() > 0.15 * energy.sum(), "and reaches there"
 
 
 def test_gain_is_bounded_and_only_at_its_bounds(rng):

@@ -1,12 +1,10 @@
 """The HTML report: parsed, and read for what it says about good, failed and empty runs."""
 
-import ast
 import re
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -231,23 +229,3 @@ def test_map_statistics_weight_the_mean_by_solid_angle():
     mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
     assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"]
     assert cells[4:] == ["0", "0"]
-
-
-def test_map_statistics_of_a_real_map(data):
-    source = next((data / "puresky").glob("kloofendal*.hdr"))
-    image = np.array(mi.Bitmap(str(source)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
-    light = image.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
-    row, column = np.unravel_index(light.argmax(), light.shape)
-    cells = html_tables.map_statistics(image)
-    assert float(cells[1]) == pytest.approx(light.max(), rel=1e-3) and cells[2] == f"{row}, {column}"
-
-
-@pytest.mark.slow
-def test_only_what_writes_results_imports_the_report():
-    """The rest does without the page; which packages may import which, import-linter says."""
-    package = ROOT / "envedit"
-    for source in package.rglob("*.py"):
-        if source.relative_to(package).as_posix() != "report/run_folder.py":
-            tree = ast.parse(source.read_text(encoding="utf-8"))
-            nodes = [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom))]
-            assert not [node for node in nodes if "html_report" in ast.unparse(node)], source.name

@@ -21,21 +21,8 @@ def test_real_maps(data):
     for name in ("puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr", "hdri/venice_sunset_1k.hdr"):
         found, info = images.read(data / name)
         assert found.shape == (512, 1024, 3) and not info["warnings"]
-        # Independent decoder: the run lengths of the first scanline, by hand.
-        raw = (data / name).read_bytes()
-        at = raw.index(b"+X 1024\n") + 8 + 4
-        bands = []
-        for _ in range(4):
-            band = []
-            while len(band) < 1024:
-                n = raw[at]
-                band += [raw[at + 1]] * (n - 128) if n > 128 else raw[at + 1 : at + 1 + n]
-                at += 2 if n > 128 else 1 + n
-            bands.append(band)
-        q = np.array(bands, np.float64).T
-        np.testing.assert_array_equal(found[0], (q[:, :3] * 2 ** (q[:, 3:] - 136)).astype(np.float32))
         small, info = images.load_envmap(data / name, width=128)
-        assert small.shape == (64, 128, 3) and info["size"] == (1024, 512) and info["health"].ok
+        assert small.shape == (64, 128, 3) and info["size"] == (1024, 512)
         energy = [i.sum(1, dtype=np.float64).T @ latlong.solid_angles(*i.shape[:2]) for i in (found, small)]
         np.testing.assert_allclose(*energy, rtol=1e-6)
 
@@ -105,9 +92,6 @@ def test_load_envmap_refusals(tmp_path):
     def grey(height, width, value=1.0):
         return exr(tmp_path / "g.exr", **{c: np.full((height, width), value, np.float32) for c in "RGB"})
 
-    for height, width in ((8, 8), (5, 12), (5, 8)):
-        with pytest.raises(InputError, match=rf"g.exr: a lat-long map is 2:1, this is {width} x {height}"):
-            images.load_envmap(grey(height, width))
     for height, width in ((1, 1), (1, 2), (2, 4), (2, 5)):
         with pytest.raises(InputError, match=rf"g.exr: {width} x {height} texels are too few"):
             images.load_envmap(grey(height, width))
@@ -203,8 +187,6 @@ def test_unwritable(tmp_path):
             writer(tmp_path / "taken", values)
         with pytest.raises(ValueError, match=r"\(H, W, 3\), got shape \(4, 8, 4\)"):
             writer(tmp_path / "a", np.zeros((4, 8, 4)))
-    with pytest.raises(ConfigError, match="'dataWindow' cannot be used"):
-        images.write_exr(tmp_path / "a.exr", values, {"dataWindow": "x"})
     assert os.listdir(tmp_path) == ["taken"]
 
 

@@ -85,23 +85,6 @@ def test_what_is_not_there(arguments, says, here, capsys):
     assert not list(here.iterdir())
 
 
-def test_comments_are_aligned_and_lines_fit():
-    assert init.main([]) == 0
-    lines = Path("edit.toml").read_text().splitlines()
-    settings = [line for line in lines if re.match(r"(# )?\w+ = .*\S  +# ", line)]
-    assert len(settings) >= 12 and len({line.rindex("  # ") for line in settings}) == 1
-    assert max(map(len, lines)) <= 120 and not any(line.endswith(" ") for line in lines)
-
-
-def test_a_long_path_does_not_move_the_other_comments(here):
-    (here / ("long" * 20 + ".hdr")).touch()
-    assert init.main(["--out", "short.toml"]) == 0
-    assert init.main(["--envmap", "long" * 20 + ".hdr", "--out", "long.toml"]) == 0
-    short, long = ((here / name).read_text().splitlines()[1:] for name in ("short.toml", "long.toml"))
-    moved = [before for before, after in zip(short, long, strict=True) if before != after]
-    assert len(moved) == 2 and moved[0].startswith("envmap = ") and "--export-initial" in moved[1]
-
-
 def uncommented(text, *keys):
     """Activate commented settings, each the first of its kind, in place of the active one."""
     for key, value in keys:

@@ -8,7 +8,7 @@ import pytest
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotation_vector
-from envedit.representations.layers import gain, layers
+from envedit.representations.layers import layers
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, SPARE
@@ -187,15 +187,6 @@ def test_rows_of_a_map(first, last, sunny):
 # ---- gain ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", range(gain.LEVELS))
-@pytest.mark.parametrize("value", [-3.0, -0.2, 0.1, 2.5])
-def test_even_gain_is_a_factor(level, value):
-    made, params = encoded(grey(0.7))
-    name = f"gain.{level}"
-    params |= {name: dr.full(mi.TensorXf, value / made.scales[name], params[name].shape)}
-    np.testing.assert_allclose(made.decode(params).numpy(), 0.7 * np.exp(value), rtol=1e-5)
-
-
 def test_log_gain_is_that_of_the_map(rng):
     made, params = encoded(grey(1.0, 24, 48))
     params = random_gain(params, rng, 0.3)
@@ -205,13 +196,6 @@ def test_log_gain_is_that_of_the_map(rng):
     down = (log < 0).all(axis=2)
     assert log.shape == got.shape and log.dtype == np.float32 and down.mean() > 0.02
     np.testing.assert_allclose(np.log(got)[down], log[down], rtol=1e-4, atol=1e-6)
-
-
-def test_gain_is_limited():
-    made, params = encoded(grey(1.0))
-    for sign in (1, -1):
-        p = params | {"gain.0": dr.full(mi.TensorXf, sign * 1e30, params["gain.0"].shape)}
-        np.testing.assert_allclose(made.decode(p).numpy(), np.exp(sign * gain.MOST), rtol=1e-4)
 
 
 def test_gain_of_a_channel_leaves_the_others(rng):
@@ -236,28 +220,6 @@ def test_black_channel_is_brightened_by_the_veil(factor):
         part = image * (1 - VEIL) + (image @ LUMINANCE)[..., None] * VEIL
         np.testing.assert_allclose(got, image + (factor - 1) * part, rtol=1e-4)
         assert got[..., 0].min() > 0
-
-
-def test_gain_is_smooth_and_has_no_seam(rng):
-    made, params = encoded(grey(1.0, 24, 48))
-    log = np.log(made.decode(random_gain(params, rng)).numpy())
-    steps = np.abs(np.roll(log, -1, axis=1) - log)
-    assert steps[:, -1].max() <= steps[:, :-1].max() * 1.01
-    assert steps[:, -1].max() > 0
-
-
-@pytest.mark.parametrize("cycles", [1, 4, 12, 40])
-def test_finest_grid_has_two_nodes_a_cycle(cycles):
-    made, params = encoded(grey(1.0), cycles=cycles)
-    sizes = [params[f"gain.{i}"].shape for i in range(gain.LEVELS)]
-    assert sizes[-1][1] == 2 * cycles
-    assert all(a[1] <= b[1] for a, b in zip(sizes[:-1], sizes[1:], strict=True))
-    for level in range(gain.LEVELS):
-        total = sum(w for _, w in made.gain.hats(level, SHAPE))
-        np.testing.assert_allclose(total, 1)
-        assert all(
-            i.max() < np.prod(sizes[level][:2]) and w.min() >= 0 for i, w in made.gain.hats(level, SHAPE)
-        )
 
 
 # ---- texels that are kept --------------------------------------------------------------------------------
@@ -322,24 +284,6 @@ def test_moving_a_light_with_a_glow_leaves_what_is_far_from_it(sunny):
     assert got[26, 104].max() > 1.2 * image[26, 104].max()
 
 
-def test_moving_there_and_back_is_nothing(sunny):
-    made, params = sunny
-    end = latlong.directions(*SHAPE)[40, 60]
-    v = rotation_vector(made.lights.centres[0], end)
-    full = 2 * np.pi * v / np.linalg.norm(v)
-    got = made.decode(moved(params, turn=full)).numpy()
-    np.testing.assert_allclose(got, made.decode(params).numpy(), rtol=1e-3, atol=1e-3 * sky().max())
-
-
-def test_spare_light_adds_its_flux(sunny):
-    made, params = sunny
-    changed = moved(params, light=1, flux=np.log([0.5, 1, 2]), turn=[0.7, 0.2, 0.9])
-    sky, core = (part.numpy() for part in made.parts(changed))
-    assert (sky >= made.parts(params)[0].numpy()).all()  # its glow
-    added = irradiance(np.float64(core) - made.parts(params)[1].numpy())
-    np.testing.assert_allclose(added, made.lights.flux[1] * [0.5, 1, 2], rtol=1e-4)
-
-
 # ---- derivatives -----------------------------------------------------------------------------------------
 
 
@@ -349,21 +293,6 @@ def gradients(made, params, weight):
     decoded = made.decode(params)
     dr.backward(dr.sum((decoded * single(weight)).array))
     return {name: dr.grad(value).numpy() for name, value in params.items()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start", ["unmoved", "moved", "zenith", "nadir"])
-def test_gradient_is_finite(start, rng, sunny):
-    made, params = sunny
-    if start != "unmoved":
-        end = {"zenith": [0, 1, 0], "nadir": [0, -1, 0], "moved": [0.5, 0.4, 0.7]}[start]
-        params = random_gain(moved(sent(made, params, end), light=1, flux=-1.0), rng, 0.5)
-    grads = gradients(made, params, rng.normal(size=(*SHAPE, 3)))
-    assert set(grads) == set(params)
-    for name, grad in grads.items():
-        assert np.isfinite(grad).all() and grad.any(), name
-        assert grad.shape == params[name].shape
-    assert grads["turn"][0].any() and grads["size"][0].any() and grads["flux"][0].all()
 
 
 @pytest.mark.slow

@@ -129,9 +129,9 @@ def test_a_file_holds_the_look_and_a_bad_one_names_its_key(tmp_path):
     np.testing.assert_array_equal(again.gain, EVENING.gain)
     text = path.read_text()
     for old, new, message in (
-        ("saturation = 1.3", "saturation = nan", r"look.toml: saturation: got nan, expected a number from 0"),
-        ("flux = 2.5", "flux = true", r"look.toml: key.flux: got True, expected a number from -16 to 16"),
-        ("tint = [1.6, 0.89, 0.2]", "tint = [1, 2]", r"key.tint: got \[1, 2\], expected 3 numbers"),
+        ("saturation = 1.3", "saturation = nan", r"look.toml: saturation: got nan, expected a finite number"),
+        ("flux = 2.5", "flux = true", r"look.toml: key.flux: got true, expected a number of at least -16"),
+        ("tint = [1.6, 0.89, 0.2]", "tint = [1, 2]", r"key.tint: got \[1, 2\], expected a list of 3 numbers"),
         ("tint = [1.6, 0.89, 0.2]", "tint = [0, 0, 0]", "key.tint: got black"),
         ("[key]", "[rim]", r"rim: needs a key light beside it: add the table \[key\]"),
         ("turn", "torn", "look.toml: torn: unknown key"),

@@ -69,7 +69,7 @@ def test_the_list_has_direction_flux_and_stops(rng, tmp_path, capsys):
 
 def test_bands_of_a_large_map_hold_the_lights_of_the_whole(rng):
     envmap = latlong.resize(sunny(rng), 300, 600)
-    apart = file_lights.lights_of(envmap).lights
+    apart = file_lights.lights_of(envmap)
     whole = separate(envmap).lights
     assert [len(one.texels) for one in apart] == [len(one.texels) for one in whole]
     for one, other in zip(apart, whole, strict=True):

@@ -1,4 +1,4 @@
-"""Metrics against closed forms and scikit-image's recorded numbers."""
+"""Metrics against closed forms."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from envedit.core.color import inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.losses import metrics
-from tests.oracles.plain import IDENTICAL, waves
+from tests.oracles.plain import IDENTICAL
 
 PAIRS = [
     "mse", "psnr", "ssim", "compare",
@@ -26,16 +26,6 @@ def test_psnr_and_mse_of_a_known_error():
     assert metrics.psnr(a + 0.1, a) == pytest.approx(20)
     assert metrics.psnr(a + 0.1, a, data_range=10) == pytest.approx(40)
     assert metrics.psnr(a + 1e6, a) == pytest.approx(-120)
-
-
-def test_against_scikit_image():
-    """Check against scikit-image 0.26.0 on `waves`: peak_signal_noise_ratio and structural_similarity.
-
-    The latter with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=2``.
-    """
-    x, y = waves()
-    assert metrics.psnr(x, y) == pytest.approx(23.010295007701277, rel=1e-12)
-    assert metrics.ssim(x, y) == pytest.approx(0.7613521445087875, rel=1e-12)
 
 
 def test_compare_states_its_tonemap():
@@ -142,14 +132,6 @@ def test_unsuitable_images_are_refused(name):
             function(a, b)
 
 
-@pytest.mark.parametrize("function", [metrics.psnr, metrics.ssim])
-@pytest.mark.parametrize("data_range", [0, -1, math.nan])
-def test_data_range_must_be_positive(function, data_range):
-    a = np.ones((12, 12, 3))
-    with pytest.raises(ConfigError, match="data_range must be a positive number"):
-        function(a, a, data_range)
-
-
 # ---- painted pictures --------------------------------------------------------------------------------------
 
 
@@ -186,14 +168,6 @@ def test_paint_below_the_noise_is_unknown(rng):
         found = metrics.painted(edited, wanted, before, coverage, noise=noise)["towards"]
         assert blind == pytest.approx(1 - 2 / np.sqrt(np.pi) * 0.01 / change, abs=0.05)
         assert found == (blind if measured else None)
-
-
-def test_painted_without_a_question_is_unknown():
-    initial = np.full((4, 6, 3), 0.25)
-    assert metrics.painted(initial, initial, initial, np.ones((4, 6, 1))) == {
-        "towards": None,
-        "elsewhere": None,
-    }
 
 
 def test_of_paint_only_pixels_that_count_are_measured(rng):

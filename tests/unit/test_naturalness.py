@@ -50,15 +50,6 @@ def test_a_dark_bump_is_a_patch_of_its_size(width, rng):
         assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_a_square_has_the_root_of_its_share():
-    """RMS of a change of -1 in a square of a share f of the half: sqrt(f), less what is smooth of it."""
-    square = np.zeros(GRID)
-    square[16:20, 40:56] = -1
-    share = float((OMEGA * square[:HALF] ** 2).sum() / OMEGA.sum())
-    found = naturalness.patches(grey(square), grey(0 * square))
-    assert np.sqrt(share) * (1 - 3 * share) < found < np.sqrt(share)
-
-
 def test_a_gradient_over_the_whole_sky_is_less_than_patches_of_the_same_size():
     east, d = DIRECTIONS[..., 0], DIRECTIONS.reshape(-1, 3)
     patchy = np.cos(np.radians(360 / 40) * np.degrees(np.arctan2(d[:, 0], -d[:, 2]))).reshape(GRID)

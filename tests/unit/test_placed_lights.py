@@ -70,15 +70,6 @@ def test_lights_are_placed_as_without_any_gain(horizon, sky):
     assert np.array_equal(found, with_gain) and not np.array_equal(found, sky)
 
 
-@pytest.mark.parametrize("size", [0.01, 3.0, 40.0])
-@pytest.mark.parametrize("elevation", [-90.0, 0.0, 33.0, 90.0])
-def test_an_added_light_has_its_flux_at_any_size_resolution_and_place(size, elevation):
-    light = {"azimuth": 0.0, "elevation": elevation, "flux": [1.0, 2.0, 1e6], "size": size}
-    for height in (3, 32, 100):
-        found = add(np.zeros((height, 2 * height, 3), np.float32), [light])
-        assert np.allclose(flux(found), [1, 2, 1e6], rtol=1e-4)
-
-
 A = np.radians(6)
 AREA = {
     "disc": 0.5 * np.pi * A**2,

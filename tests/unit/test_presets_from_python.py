@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 
 from envedit import config
-from envedit.config import Config, Fit, Input, Loss, Optimizer, Output, Representation, Scene, Target
+from envedit.config import Config, Input, Optimizer, Output, Representation, Scene, Target
 
-PRESETS = config.preset_names()
+PRESETS = config.presets.PRESETS
 KINDS = ("layers", "siren", "pixels", "log-pixels")
 STROKE = {"type": "shadow", "ellipse": [0.5, 0.5, 0.1, 0.1]}
 TARGETS = {
@@ -38,21 +38,6 @@ def test_a_preset_names_the_kind_where_none_is_given(preset, target):
     made = Config(preset=preset, output=Output(**OUT), target=Target(**TARGETS[target]))
     assert made == config.from_dict({"preset": preset, "output": OUT, "target": TARGETS[target]})
     assert made.representation.kind == ("siren" if preset == "paper" else "layers")
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_what_is_given_goes_before_the_preset(preset):
-    made = Config(
-        preset=preset,
-        input=Input(width=40),
-        scene=Scene(width=9),
-        representation=Representation("siren", hidden=17),
-        fit=Fit(epochs=3),
-        loss=Loss(ssim=0.25),
-        optimizer=Optimizer(iterations=5),
-    )
-    given = (made.input.width, made.scene.width, made.representation.hidden, made.fit.epochs)
-    assert given == (40, 9, 17, 3) and (made.loss.ssim, made.optimizer.iterations) == (0.25, 5)
 
 
 def test_what_is_given_and_equal_to_the_default_goes_before_the_preset_too():
@@ -88,12 +73,6 @@ def test_replacing_one_key_of_a_table_keeps_all_others(preset):
     other = replace(made, optimizer=replace(made.optimizer, lr=0.25))
     assert replace(other, optimizer=made.optimizer) == made and other.optimizer.lr == 0.25
     assert other.optimizer.iterations == made.optimizer.iterations
-
-
-def test_replacing_what_no_preset_knows_changes_nothing_else():
-    made = Config(preset="draft", representation=Representation("siren"))
-    other = replace(made, seed=9)
-    assert other.seed == 9 and replace(other, seed=0) == made and other.optimizer.iterations == 150
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -1,5 +1,6 @@
 """Progress: lines in a log, a bar on a terminal, nothing when asked to be quiet."""
 
+import contextlib
 import io
 import re
 
@@ -25,7 +26,7 @@ def clock(monkeypatch):
 
 def test_a_log_gets_a_line_a_stage_and_one_now_and_then(clock):
     stream = io.StringIO()
-    with Progress(stream=stream) as shown:
+    with contextlib.redirect_stderr(stream), Progress() as shown:
         shown.stage("fitting")
         for done in range(1, 101):
             clock[0] += 0.25
@@ -39,7 +40,7 @@ def test_a_log_gets_a_line_a_stage_and_one_now_and_then(clock):
 
 def test_a_line_in_a_log_holds_no_control_characters_or_blanks_at_its_end(clock):
     stream = io.StringIO()
-    with Progress(stream=stream) as shown:
+    with contextlib.redirect_stderr(stream), Progress() as shown:
         shown.stage("tracing")
         clock[0] += 6
         shown.update(3, 7)
@@ -52,7 +53,7 @@ def test_a_line_in_a_log_holds_no_control_characters_or_blanks_at_its_end(clock)
 def test_what_was_done_before_is_not_taken_for_speed(kind, clock, monkeypatch):
     stream, begun = kind(), []
     monkeypatch.setattr(progress, "tqdm", lambda **given: begun.append(given) or tqdm(**given))
-    with Progress(stream=stream) as shown:
+    with contextlib.redirect_stderr(stream), Progress() as shown:
         shown.stage("fitting")
         shown.update(500, 1000)
         clock[0] += 6
@@ -66,7 +67,7 @@ def test_what_was_done_before_is_not_taken_for_speed(kind, clock, monkeypatch):
 def test_an_update_at_once_does_not_divide_by_zero(clock, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     stream = io.StringIO()
-    with Progress(stream=stream) as shown:
+    with contextlib.redirect_stderr(stream), Progress() as shown:
         shown.update(0, 0)
         shown.stage("editing")
         shown.update(0, 0)
@@ -76,7 +77,7 @@ def test_an_update_at_once_does_not_divide_by_zero(clock, monkeypatch):
 @pytest.mark.parametrize("kind", [io.StringIO, Terminal])
 def test_quiet_says_nothing(kind, clock):
     stream = kind()
-    with Progress(quiet=True, stream=stream) as shown:
+    with contextlib.redirect_stderr(stream), Progress(quiet=True) as shown:
         for text in ("fitting", "editing"):
             shown.stage(text)
             for done in range(10):
@@ -87,7 +88,7 @@ def test_quiet_says_nothing(kind, clock):
 
 def test_a_terminal_gets_a_bar_for_each_stage():
     stream = Terminal()
-    with Progress(stream=stream) as shown:
+    with contextlib.redirect_stderr(stream), Progress() as shown:
         shown.stage("fitting")
         shown.update(1, 4, "loss 0.5")
         shown.update(4, 4, "loss 0.25")
@@ -101,7 +102,7 @@ def test_a_terminal_gets_a_bar_for_each_stage():
 
 
 def test_a_bar_is_closed_when_the_run_fails():
-    with pytest.raises(KeyError), Progress(stream=Terminal()) as shown:
+    with pytest.raises(KeyError), contextlib.redirect_stderr(Terminal()), Progress() as shown:
         shown.stage("fitting")
         shown.update(1, 4)
         raise KeyError

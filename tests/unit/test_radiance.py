@@ -7,37 +7,6 @@ from envedit.core import radiance
 from envedit.core.errors import InputError
 
 
-def test_health():
-    values = np.ones((4, 8, 3), np.float32)
-    values[1, 2, 0] = values[3, 0, 1] = np.nan
-    values[2, 3] = np.inf
-    values[0, 7, 2] = -0.5
-    values[3, 7] = 65504
-    h = radiance.health(values)
-    assert (h.texels, h.nan, h.inf, h.negative, h.saturated) == (32, 2, 1, 1, 1)
-    first = (h.first_nan, h.first_inf, h.first_negative, h.first_saturated)
-    assert first == ((1, 2), (2, 3), (0, 7), (3, 7))
-    assert (h.minimum, h.maximum, h.median) == (-0.5, 65504, pytest.approx(1))
-    assert h.dynamic_range == pytest.approx(65504 / (1 - 1.5 * 0.0722)) and not h.ok
-    assert "2 NaN (first at row 1, column 2)" in h.summary() and "\n" not in h.summary()
-
-
-def test_a_texel_that_is_repaired_does_not_count_as_negative():
-    values = np.ones((4, 8, 3), np.float32)
-    values[1, 2] = -np.inf
-    values[2, 3] = (np.nan, -1, 2)
-    values[3, 4] = (1, -1, 2)
-    h = radiance.health(values)
-    assert (h.inf, h.nan, h.negative, h.first_negative) == (1, 1, 1, (3, 4))
-
-
-@pytest.mark.parametrize("value", [0.0, 1e-30, 1e6, 3e38, np.nan, -np.inf])
-def test_health_is_finite(value):
-    h = radiance.health(np.full((1, 1, 3), value, np.float32))
-    assert np.isfinite([h.minimum, h.maximum, h.median, h.dynamic_range]).all()
-    assert h.ok == np.isfinite(value) and h.summary()
-
-
 def test_repair(rng):
     values = rng.random((6, 8, 3)).astype(np.float32)
     broken = values.copy()

@@ -58,7 +58,7 @@ def checked(m, rows=None):
     glow, core = np.ones_like(s.glow), np.zeros_like(s.core).reshape(-1, 3)
     for light in s.lights:
         assert abs(np.linalg.norm(light.direction) - 1) < 1e-12
-        assert 0 < light.share <= 1 + 1e-12 and len(light.texels)
+        assert len(light.texels)
         assert not core[light.texels].any(), "a texel belongs to one light"
         core[light.texels] = light.radiance
         if light.glow is not None:
@@ -67,7 +67,6 @@ def checked(m, rows=None):
             glow *= 1 + separation.glow_at(light.glow, d @ light.direction)
     np.testing.assert_allclose(s.glow, glow, rtol=1e-12)
     np.testing.assert_array_equal(s.core, core.reshape(s.core.shape))
-    assert [x.share for x in s.lights] == sorted((x.share for x in s.lights), reverse=True)
     if not s.lights:
         assert s.background.tobytes() == np.asarray(m, np.float64).tobytes()
         assert (s.glow == 1).all() and not s.core.any()
@@ -86,18 +85,7 @@ def test_a_sun_of_one_texel_is_one_light(where):
     (light,) = s.lights
     assert angle(latlong.directions(HEIGHT, WIDTH)[row, column], light.direction) < 180 / (HEIGHT - 1)
     assert row * WIDTH + column in light.texels and len(light.texels) <= 9
-    irradiance = latlong.solid_angles(HEIGHT, WIDTH)[row] * (5e4 - truth @ LUMINANCE)
-    total = (latlong.solid_angles(HEIGHT, WIDTH) @ (m @ LUMINANCE)).sum()
-    assert light.share == pytest.approx(irradiance / total, rel=1e-3)
     np.testing.assert_allclose((s.background * s.glow)[row, column], truth, rtol=0.05)
-
-
-def test_a_sun_between_the_columns_of_the_seam_is_in_its_middle():
-    m = sky()
-    m[20, [0, -1]] = 5e4
-    (light,) = checked(m).lights
-    assert {20 * WIDTH, 21 * WIDTH - 1} <= set(light.texels.tolist())
-    assert abs(light.direction[0]) < 1e-9 and light.direction[2] < 0
 
 
 def test_a_sun_in_the_pole_is_one_light():
@@ -105,14 +93,6 @@ def test_a_sun_in_the_pole_is_one_light():
     m[0] = 5e4
     (light,) = checked(m).lights
     assert angle(np.array([0, 1, 0]), light.direction) < 0.1
-
-
-def test_two_lamps_are_two_lights_the_stronger_first():
-    a, b = toward(30, 50), toward(-20, 200)
-    lights = checked(discs((a, 2.5, 1000), (b, 2.5, 2000))).lights
-    assert len(lights) == 2
-    assert angle(lights[0].direction, b) < 1.5 and angle(lights[1].direction, a) < 1.5
-    assert lights[0].share > 1.5 * lights[1].share > 0.1
 
 
 @pytest.mark.parametrize("azimuth", [0, 77])
@@ -154,7 +134,7 @@ def test_one_bright_texel_in_the_dark_is_all_there_is(exposure):
     m[20, -1] = exposure * np.array([3, 2, 1])
     s = checked(m)
     (light,) = s.lights
-    assert light.share == pytest.approx(1) and light.texels.tolist() == [21 * WIDTH - 1]
+    assert light.texels.tolist() == [21 * WIDTH - 1]
     assert not s.background.any() and light.glow is None
     np.testing.assert_array_equal(light.radiance, m[20, -1:])
 
@@ -244,21 +224,6 @@ def test_a_crop_has_the_light_where_the_map_has_it(rows, scale):
     )
 
 
-@pytest.mark.parametrize("rows", [(0, 350), (51, 280), (99, 350)])
-def test_the_copy_in_which_lights_are_looked_for_lies_where_the_crop_does(rows):
-    height, width = 350, 701
-    d = latlong.directions(height, width)[slice(*rows)]
-    small = separation._reduced(d - d.min() + 1, rows[0], height)
-    places = separation._Places(small.rows, small.image.shape[1], rows[0], height)
-    theta = places.upsampled(np.arccos(small.directions[..., 1:2]), *d.shape[:2])[2:-2, :, 0]
-    np.testing.assert_allclose(theta, np.arccos(d[2:-2, :, 1]), atol=1e-7)
-    upsampled = places.upsampled(small.directions, *d.shape[:2])[2:-2]
-    assert np.degrees(np.linalg.norm(upsampled - d[2:-2], axis=-1)).max() < 0.1 * 360 / small.image.shape[1]
-    nearest = places.at(small.directions, *d.shape[:2])[2:-2]
-    assert np.degrees(np.linalg.norm(nearest - d[2:-2], axis=-1)).max() < 0.75 * 360 / small.image.shape[1]
-    np.testing.assert_allclose(small.image + d.min() - 1, small.directions, atol=0.005)
-
-
 @pytest.mark.parametrize("factor", [1000, 1e-6])
 def test_lights_do_not_depend_on_the_exposure(factor):
     d = latlong.directions(HEIGHT, WIDTH)
@@ -268,7 +233,6 @@ def test_lights_do_not_depend_on_the_exposure(factor):
     assert len(one.lights) == len(other.lights) == 2 and one.lights[0].glow is not None
     for a, b in zip(one.lights, other.lights, strict=True):
         np.testing.assert_allclose(b.direction, a.direction, atol=1e-9)
-        assert b.share == pytest.approx(a.share, rel=1e-9)
         if a.glow is not None:
             np.testing.assert_allclose(b.glow, a.glow, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(other.background, one.background * factor, rtol=1e-6)
@@ -284,7 +248,6 @@ def test_lights_do_not_depend_on_the_resolution():
     assert len(a) == len(b) == 3
     for one, other, v in zip(a, b, where, strict=True):
         assert angle(one.direction, other.direction) < 1 and angle(one.direction, v) < 1
-        assert other.share == pytest.approx(one.share, rel=0.05)
         assert (one.glow is None) == (other.glow is None)
     assert a[0].glow is not None
 
@@ -350,15 +313,6 @@ def hole(height, width, column, radius):
 
 
 SIZES = [(3, 6), (9, 18), (33, 67), (50, 100), (63, 125), (64, 128), (65, 130)]
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("value", [1e-30, 3.7, 65504])
-def test_a_constant_stays_constant_under_a_hole(size, value):
-    mask = hole(*size, 0, max(1, size[0] // 5))
-    m = np.full((*size, 3), value)
-    m[mask] = 1e9
-    np.testing.assert_allclose(separation.filled(m, mask), value, rtol=1e-9)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -448,7 +402,7 @@ def test_a_sunny_sky_has_its_sun_and_no_ghost_of_it(name, data):
     m = real(data, name)
     s = checked(m)
     (light,) = s.lights
-    assert light.share > 0.4 and light.glow is not None
+    assert light.glow is not None
     brightest = np.unravel_index(np.argmax(m @ LUMINANCE), m.shape[:2])
     away = angle(latlong.directions(*m.shape[:2]), light.direction)
     assert away[brightest] < 2
@@ -465,19 +419,3 @@ def test_a_sunny_sky_has_its_sun_and_no_ghost_of_it(name, data):
 @pytest.mark.parametrize("name", OVERCAST)
 def test_an_overcast_sky_has_no_light(name, data):
     assert checked(real(data, name)).lights == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name, least", [("studio_small_03", 2), ("dikhololo_night", 1), ("venice_sunset", 1)]
-)
-def test_lamps_of_a_studio_a_night_and_a_town(name, least, data):
-    lights = checked(real(data, name)).lights
-    assert least <= len(lights) <= separation.MOST_LIGHTS
-    assert lights[0].share > 0.01
-
-
-@pytest.mark.slow
-def test_a_real_map_has_the_same_sun_at_another_resolution(data):
-    (a,), (b,) = (checked(real(data, "sunflowers", w)).lights for w in (1024, 256))
-    assert angle(a.direction, b.direction) < 1 and b.share == pytest.approx(a.share, rel=0.05)

@@ -22,24 +22,11 @@ _TORCH = pickle.dumps(0x1950A86A20F9469CFC6C, 2)
 
 
 def read(data: bytes, name: str) -> dict[str, Any]:
-    """Read a checkpoint.
+    """Read a checkpoint: nested dicts of float32 arrays.
 
-    Parameters
-    ----------
-    data : bytes
-        A pickle of nested dicts of numpy arrays, or a state dict as ``torch.save`` wrote it before 1.6.
-    name : str
-        What errors call it.
-
-    Returns
-    -------
-    dict
-        Nested dicts of float32 arrays.
-
-    Raises
-    ------
-    InputError
-        If it is damaged, or asks for anything but arrays of float32.
+    ``data`` is a pickle of nested dicts of numpy arrays, or a state dict as ``torch.save`` wrote it before
+    1.6; ``name`` is what errors call it. InputError if it is damaged, or asks for anything but arrays of
+    float32.
     """
     stream = io.BytesIO(data)
     try:

@@ -10,13 +10,11 @@ that the matrix of patches stays below :data:`MOST_PATCHES`.
 Kernels take sizes as data: one kernel serves all layers and all image sizes. Divisions by sizes, which
 processors do slowly, are products with their inverses in double precision (:class:`Divisor`).
 
-A layer has ``forward(x) -> (output, kept)`` and ``backward(x, output, kept, gradient) -> gradient of x``, all
-flat arrays without derivatives attached.
+A layer has ``forward(x) -> output``, and those of VGG16 with Hanning pooling, DISTS's network, also
+``backward(x, output, gradient) -> gradient of x``: all flat arrays without derivatives attached.
 """
 
 from __future__ import annotations
-
-from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -128,18 +126,6 @@ class _Windows:
         return place * self._c.value + c
 
 
-class Step(Protocol):
-    """A layer: what it makes of its input, and what its backward pass needs beside that."""
-
-    def forward(self, x: DrArray) -> tuple[DrArray, Any]:
-        """Return the output, and what to keep."""
-        ...
-
-    def backward(self, x: DrArray, y: DrArray, kept: Any, gradient: DrArray, /) -> DrArray:
-        """Pull a gradient of the output back to the input."""
-        ...
-
-
 class Convolution:
     """Convolution with zeros around the image, and ReLU."""
 
@@ -158,15 +144,16 @@ class Convolution:
         self._before = before
         self._after = after
         self._outputs = after[2]
-        self._kernel, self._stride, self._padding = kernel, stride, padding
+        self._kernel = kernel
+        self._padding = padding
         self._columns = kernel * kernel * before[2]
         self._windows = _Windows(before, after, kernel, stride, padding)
         self._by_outputs = Divisor(after[2])
         self._rows = max(MOST_PATCHES // (after[1] * self._columns), 1)
         self._pointwise = kernel == 1 and self._rows >= after[0]
 
-    def forward(self, x: DrArray) -> tuple[DrArray, None]:
-        """Return max(W patches + bias, 0), and nothing to keep."""
+    def forward(self, x: DrArray) -> DrArray:
+        """Return max(W patches + bias, 0)."""
         height = self._after[0]
         parts = []
         for first in range(0, height, self._rows):
@@ -177,19 +164,18 @@ class Convolution:
             product += type(x)(dr.gather(mi.Float, self._bias, mi.UInt32(channel)))
             parts.append(dr.select(product < 0, 0, product))  # maximum may drop NaN
             dr.eval(parts[-1])
-        return _joined(parts), None
+        return _joined(parts)
 
-    def backward(self, x: DrArray, y: DrArray, _: None, gradient: DrArray) -> DrArray:
-        """Pull a gradient back; where the ReLU gave 0, its slope is 0."""
+    def backward(self, x: DrArray, y: DrArray, gradient: DrArray) -> DrArray:
+        """Pull a gradient back, of a stride of 1; where the ReLU gave 0, its slope is 0."""
         gradient = dr.select(y <= 0, 0, gradient)
         dr.eval(gradient)
         height = self._before[0]
-        rows = self._rows * self._stride
         parts = []
-        for first in range(0, height, rows):
-            stop = min(first + rows, height)
-            low = max(-(-(first + self._padding - self._kernel + 1) // self._stride), 0)
-            high = min((stop - 1 + self._padding) // self._stride + 1, self._after[0])
+        for first in range(0, height, self._rows):
+            stop = min(first + self._rows, height)
+            low = max(first + self._padding - self._kernel + 1, 0)
+            high = min(stop + self._padding, self._after[0])
             parts.append(self._pull(gradient, first, stop, low, high))
             dr.eval(parts[-1])
         return _joined(parts)
@@ -209,15 +195,11 @@ class Convolution:
         F = type(gradient)
         windows = self._windows
         i, row, column, c = windows.inputs(first, stop - first)
-        if low >= high:  # rows at the end that no window reaches
-            return dr.zeros(F, len(i) * windows.together)
         if (low, high) != (0, self._after[0]):
             row_length = self._after[1] * self._outputs
             part = dr.arange(mi.UInt32, (high - low) * row_length) + dr.opaque(mi.UInt32, low * row_length)
             gradient = dr.gather(F, gradient, part)
         patches = dr.matmul(_rows_of(gradient, self._outputs), self._weights(F)).array
-        if self._pointwise:
-            return patches
         total = 0
         low = dr.opaque(mi.Int32, low)
         for y, x, tap_y, tap_x, inside in windows.over(row, column):
@@ -226,40 +208,23 @@ class Convolution:
 
 
 class MaxPool:
-    """Max pooling; where several are largest, the first has the gradient, as in PyTorch."""
+    """Max pooling."""
 
     def __init__(self, kernel: int, stride: int, before: Shape, after: Shape):
         self._kernel = kernel
         self._windows = _Windows(before, after, kernel, stride, 0, together=1)
 
-    def forward(self, x: DrArray) -> tuple[DrArray, DrArray]:
-        """Return the largest of every window, and under which tap it is."""
+    def forward(self, x: DrArray) -> DrArray:
+        """Return the largest of every window, NaN where it has one."""
         windows = self._windows
-        best = winner = None
         _, row, column, c = windows.outputs()
-        for tap in range(self._kernel**2):
+        best = windows.read(x, *windows.under(row, column, 0, 0, c))  # windows begin inside
+        for tap in range(1, self._kernel**2):
             index, inside = windows.under(row, column, *divmod(tap, self._kernel), c)
             value = windows.read(x, index, inside)
-            if best is None:  # windows begin inside
-                best, winner = value, mi.Int32(0)
-            else:
-                better = inside & ((value > best) | dr.isnan(value))
-                best, winner = dr.select(better, value, best), dr.select(better, tap, winner)
-        dr.eval(best, winner)
-        return best, winner
-
-    def backward(self, x: DrArray, y: DrArray, winner: DrArray, gradient: DrArray) -> DrArray:
-        """Give the gradient of a window to its largest."""
-        windows = self._windows
-        total = 0
-        dr.eval(gradient)
-        _, row, column, c = windows.inputs(0, windows.before[0])
-        for y_, x_, tap_y, tap_x, inside in windows.over(row, column):
-            index = windows.output(y_, x_, c)
-            won = windows.read(winner, index, inside) == tap_y * self._kernel + tap_x
-            total += windows.read(gradient, index, inside & won)
-        dr.eval(total)
-        return total
+            best = dr.select(inside & ((value > best) | dr.isnan(value)), value, best)
+        dr.eval(best)
+        return best
 
 
 class HanningPool:
@@ -268,8 +233,8 @@ class HanningPool:
     def __init__(self, before: Shape, after: Shape):
         self._windows = _Windows(before, after, 3, 2, 1)
 
-    def forward(self, x: DrArray) -> tuple[DrArray, None]:
-        """Return the root of every window, and nothing to keep."""
+    def forward(self, x: DrArray) -> DrArray:
+        """Return the root of every window."""
         windows = self._windows
         total = 0
         i, row, column, c = windows.outputs()
@@ -279,9 +244,9 @@ class HanningPool:
             total += _hanning(tap_y) * _hanning(tap_x) * value * value
         pooled = windows.write(type(x), dr.sqrt(total + 1e-12), i)
         dr.eval(pooled)
-        return pooled, None
+        return pooled
 
-    def backward(self, x: DrArray, y: DrArray, _: None, gradient: DrArray) -> DrArray:
+    def backward(self, x: DrArray, y: DrArray, gradient: DrArray) -> DrArray:
         """Pull a gradient back: w x / root, summed over the windows."""
         windows = self._windows
         total = 0

@@ -1,31 +1,31 @@
-"""Perceptual measures on feature stacks, natively in Dr.Jit: DISTS and LPIPS v0.1, with their gradients.
+"""Perceptual measures on feature stacks, natively in Dr.Jit: DISTS, with its gradient, and LPIPS v0.1.
 
 Both compare display images ``(H, W, 3)``, nominally in [0, 1]; values beyond are taken as they
 are. Identical images give exactly 0, and NaN gives NaN. Both are evaluated as sums of squared differences,
-so that near images keep their digits; sums over pixels run in double precision. Each measure is one node
-of the AD graph, in forward and reverse mode, whose gradient is computed by hand together with its value.
+so that near images keep their digits; sums over pixels run in double precision. DISTS is one node of the AD
+graph, in forward and reverse mode, whose gradient is computed by hand together with its value.
 
 A step of DISTS, forward and back, makes 20 GFLOP of matrix products at 256 x 64 pixels, growing with their
 number, and takes about 1.2 times as long as these; it holds some 140 MB beside the weights.
 
-Weights are not part of the package: see `features.Backbone.load`, `DISTS_SOURCE` and `LPIPS_SOURCE`.
+Weights are not part of the package: see `Backbone.load`, `DISTS_SOURCE` and `LPIPS_SOURCE`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import InputError, place_of
 from envedit.core.types import DrArray, FilePath, Shape, Tensor
 from envedit.losses.perceptual import weights
-from envedit.losses.perceptual.backbones import Backbone, title
+from envedit.losses.perceptual.backbones import Backbone
 from envedit.losses.perceptual.convolution import Divisor
-from envedit.losses.perceptual.measure import DEVIATION, Measure, by_channel, normalised, single
+from envedit.losses.ssim import KnownGradient, check_image
 
 DISTS_SOURCE = "https://github.com/dingkeyan93/DISTS, DISTS_pytorch/weights.pt"
 LPIPS_SOURCE = "https://github.com/richzhang/PerceptualSimilarity, lpips/weights/v0.1/{}.pth"
@@ -34,6 +34,43 @@ C1 = C2 = 1e-6
 """Constants of DISTS, of its texture and of its structure."""
 NORM_EPS = 1e-10
 """What LPIPS adds to the length of a feature before it divides by it."""
+
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of the images that the networks were trained on, in [0, 1]; LPIPS says the same of images in [-1, 1]."""
+
+
+# ---- Images ------------------------------------------------------------------------------------------------
+
+
+def _check(image: Tensor, name: str) -> None:
+    """Refuse what is not an image ``(H, W, 3)``."""
+    check_image(image, name)
+    if image.shape[2] != 3:
+        raise InputError(f"{name}: expected an image of shape (H, W, 3), got {tuple(image.shape)}.")
+
+
+def _single(image: Any, name: str) -> mi.TensorXf:
+    """Return an image, array or tensor, in single precision, refusing what is not finite."""
+    image = np.ascontiguousarray(image, np.float32)
+    _check(image, name)
+    bad = ~np.isfinite(image).all(axis=2)
+    if bad.any():
+        where = f"the first at {place_of(bad)}"
+        raise InputError(f"{name}: {bad.sum()} pixel(s) are not finite, {where}; repair the image first.")
+    return mi.TensorXf(image)
+
+
+def _normalised(x: DrArray) -> DrArray:
+    """Return a flat image as the networks take it."""
+    F = type(x)
+    return (x - _by_channel(F, len(x), MEAN)) / _by_channel(F, len(x), DEVIATION)
+
+
+def _by_channel(F: type[DrArray], length: int, values: Sequence[float]) -> DrArray:
+    """Repeat three constants along an image."""
+    channel = dr.arange(mi.UInt32, length) % 3
+    red, green, blue = (F(value) for value in values)
+    return dr.select(channel == 0, red, dr.select(channel == 1, green, blue))
 
 
 # ---- DISTS -------------------------------------------------------------------------------------------------
@@ -68,15 +105,11 @@ class Dists:
 
     Raises
     ------
-    ConfigError
-        If the network is another.
     InputError
         If the file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
     """
 
     def __init__(self, backbone: Backbone, weights_file: FilePath):
-        if backbone.kind != "vgg":
-            raise ConfigError(f"DISTS needs the features of VGG16, not those of {backbone.title}")
         self.backbone = backbone
         channels = [3, *backbone.channels]
         shape = (1, sum(channels), 1, 1)
@@ -94,29 +127,28 @@ class Dists:
         ]
 
     def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
-        """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``.
+        """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``, differentiable.
 
-        Raises
-        ------
-        InputError
-            If it is no image, or gradients are expected of it.
+        InputError if it is no image, or gradients are expected of it.
         """
         return _DistsTo(self, reference)
 
     def __call__(self, x: Tensor, reference: Tensor) -> DrArray:
-        """Return the distance of two images ``(H, W, 3)`` as a size-1 array, differentiable in ``x``.
-
-        Raises
-        ------
-        InputError
-            If the shapes differ, or gradients are expected of the reference.
-        """
+        """Return the distance of two images as a size-1 array; as of :meth:`against`."""
         return self.against(reference)(x)
 
 
-class _DistsTo(Measure):
+class _DistsTo:
+    """The distance to a fixed image: value, and gradient by hand."""
+
     def __init__(self, dists, reference):
-        super().__init__(dists.backbone, reference, "hanning", "DISTS")
+        _check(reference, "DISTS: reference")
+        if dr.grad_enabled(reference):
+            raise InputError(
+                "DISTS: gradients of the reference are not available: swap the two, or detach it."
+            )
+        self.shape = tuple(reference.shape)
+        self._stack = dists.backbone.stack(self.shape[0], self.shape[1], "hanning")
         self._weights = dists.weights
         self._reference = []
         for y, pixels, channels in self._features(dr.detach(reference.array))[0]:
@@ -126,8 +158,15 @@ class _DistsTo(Measure):
             dr.eval(mean, variance)
             self._reference.append((y, mean, variance))
 
+    def __call__(self, x: Tensor) -> DrArray:
+        if tuple(x.shape) != self.shape:
+            raise InputError(f"DISTS: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
+        if not dr.grad_enabled(x):
+            return self._evaluate(dr.detach(x.array), False)[0]
+        return dr.custom(KnownGradient, x.array, self)
+
     def _features(self, x):
-        tape = self._stack.forward(normalised(x))
+        tape = self._stack.forward(_normalised(x))
         dr.eval(x)
         return [(x, self.shape[0] * self.shape[1], 3), *self._stack.taps(tape)], tape
 
@@ -156,7 +195,7 @@ class _DistsTo(Measure):
         score = type(x)(score)
         if not with_gradient:
             return score, None
-        gradient = self._stack.backward(tape, gradients[1:]) / by_channel(type(x), len(x), DEVIATION)
+        gradient = self._stack.backward(tape, gradients[1:]) / _by_channel(type(x), len(x), DEVIATION)
         gradient += gradients[0]
         dr.eval(score, gradient)
         return score, gradient
@@ -224,7 +263,6 @@ class Lpips:
 
        lpips = Lpips("alex", "alexnet.safetensors", "lpips_v0.1_alex.npz")
        lpips(a, b)                                # a float
-       lpips.against(b)(x)                        # a size-1 array, differentiable in x
 
     Zhang et al. 2018 ("The unreasonable effectiveness of deep features as a perceptual metric",
     Eq. 1), as in the authors' PyTorch code, version 0.1: features of every tapped layer, divided by
@@ -235,36 +273,25 @@ class Lpips:
     ----------
     kind : str
         "alex", "vgg" or "squeeze".
-    backbone_file : path-like or Backbone
-        Weights of the network; see `features.Backbone.load`.
+    backbone : path-like or Backbone
+        Weights of the network, or their file; see `Backbone.load`.
     heads_file : path-like
         ``safetensors`` or ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer.
 
     Raises
     ------
-    ConfigError
-        If there is no such network here, or the backbone is another one.
     InputError
         If a file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
     """
 
-    def __init__(self, kind: str, backbone_file: FilePath | Backbone, heads_file: FilePath):
-        words = title(kind)
+    def __init__(self, kind: str, backbone: FilePath | Backbone, heads_file: FilePath):
         self.kind = kind
-        self.backbone = _backbone(kind, backbone_file)
-        if self.backbone.kind != kind:
-            raise ConfigError(
-                f"LPIPS '{kind}' needs the features of {words}, not those of {self.backbone.title}"
-            )
+        self.backbone = backbone if isinstance(backbone, Backbone) else Backbone.load(kind, backbone)
         shapes: dict[str, Shape] = {
             f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)
         }
         read = weights.read(heads_file, shapes, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
         self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in shapes]
-
-    def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
-        """Return the distance to an image as :meth:`.Dists.against`; InputError also of one too small."""
-        return _LpipsTo(self, reference)
 
     def __call__(self, a: Any, b: Any) -> float:
         """Compare two images ``(H, W, 3)``, arrays or tensors, in single precision.
@@ -275,63 +302,37 @@ class Lpips:
             If they differ in shape, are too small for the network, or hold values that are not finite or so
             large that their features are not.
         """
-        a, b = (single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
-        distance = float(self.against(b)(a)[0])
+        a, b = (_single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
+        distance = float(self.distance(a, b)[0])
         if not np.isfinite(distance):
             raise InputError("LPIPS: the images hold values too large to compare; give display values.")
         return distance
 
-
-def _backbone(kind: str, backbone: FilePath | Backbone) -> Backbone:
-    return backbone if isinstance(backbone, Backbone) else Backbone.load(kind, backbone)
-
-
-class _LpipsTo(Measure):
-    def __init__(self, lpips, reference):
-        super().__init__(lpips.backbone, reference, "max", "LPIPS")
-        self._heads = lpips.heads
-        tape = self._stack.forward(normalised(dr.detach(reference.array)))
-        self._reference = [_unit(*tap)[0] for tap in self._stack.taps(tape)]
-        dr.eval(self._reference)
-
-    def _evaluate(self, x, with_gradient):
-        F = type(x)
-        score = 0
-        gradients = []
-        tape = self._stack.forward(normalised(x))
-        for (value, pixels, channels), y, head in zip(
-            self._stack.taps(tape), self._reference, self._heads, strict=True
-        ):
-            unit, norm, pixel, channel = _unit(value, pixels, channels)
-            difference = unit - y
-            head = F(head)
+    def distance(self, a: Tensor, b: Tensor) -> DrArray:
+        """Return the distance of two images ``(H, W, 3)`` in their precision, as a size-1 array."""
+        if a.shape != b.shape:
+            raise InputError(f"LPIPS: images {tuple(a.shape)} and {tuple(b.shape)} differ in shape.")
+        stack = self.backbone.stack(a.shape[0], a.shape[1], "max")
+        features = [stack.taps(stack.forward(_normalised(image.array))) for image in (a, b)]
+        score = mi.Float64(0)
+        for (x, pixels, channels), (y, _, _), head in zip(*features, self.heads, strict=True):
+            difference = _unit(x, pixels, channels) - _unit(y, pixels, channels)
+            head = type(x)(head)
             score += dr.sum(mi.Float64(_rowwise(dr.square(difference), head, channels))) / pixels
-            if with_gradient:
-                slope = 2 / pixels * dr.gather(F, head, channel) * difference
-                along = _rowwise(value * slope, dr.ones(F, channels), channels) / (norm + NORM_EPS)
-                along = dr.select(norm == 0, 0, along / norm)  # features of 0, or whose squares are
-                length = dr.gather(F, norm, pixel) + NORM_EPS
-                gradients.append((slope - value * dr.gather(F, along, pixel)) / length)
-                dr.eval(gradients[-1])
-        score = F(score)
-        if not with_gradient:
-            return score, None
-        gradient = self._stack.backward(tape, gradients) / by_channel(F, len(x), DEVIATION)
-        dr.eval(score, gradient)
-        return score, gradient
+        return type(a.array)(score)
 
 
 def _unit(value, pixels, channels):
-    """Divide features by their length at each pixel; also return lengths, and pixel and channel of each."""
+    """Divide features by their length at each pixel."""
     F = type(value)
     norm = dr.sqrt(_rowwise(dr.square(value), dr.ones(F, channels), channels))
     dr.eval(norm)
-    pixel, channel = (mi.UInt32(i) for i in Divisor(channels).split(dr.arange(mi.Int32, pixels * channels)))
+    pixel, _ = Divisor(channels).split(dr.arange(mi.Int32, pixels * channels))
     # A length beyond the largest number would leave a direction of zeros.
     length = dr.select(dr.isinf(norm), np.nan, norm + NORM_EPS)
-    unit = value / dr.gather(F, length, pixel)
+    unit = value / dr.gather(F, length, mi.UInt32(pixel))
     dr.eval(unit)
-    return unit, norm, pixel, channel
+    return unit
 
 
 def _rowwise(values, factors, channels):

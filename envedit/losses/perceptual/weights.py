@@ -34,6 +34,10 @@ _SAFETENSORS: dict[str, np.dtype] = {
 def read(file: FilePath, shapes: dict[str, tuple[int, ...]], what: str, source: str) -> dict[str, np.ndarray]:
     """Read named tensors, and nothing else, from a ``safetensors`` or ``npz`` file.
 
+    Returns float32 arrays by name, of half, bfloat16, single or double precision. InputError if the file
+    cannot be read, is damaged or of another format, or a tensor is missing, has another shape or type, or
+    holds values that are not finite.
+
     Parameters
     ----------
     file : path-like
@@ -44,17 +48,6 @@ def read(file: FilePath, shapes: dict[str, tuple[int, ...]], what: str, source: 
         What the tensors are, for messages: "VGG16".
     source : str
         Where a user gets them, for messages.
-
-    Returns
-    -------
-    dict
-        Name -> float32 array of the wanted shape. Half, bfloat16, single and double precision are accepted.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is damaged or of another format, or a tensor is missing, has another
-        shape or type, or holds values that are not finite.
     """
     # ---- Read, by the format that the first bytes show
     name = os.fsdecode(file)

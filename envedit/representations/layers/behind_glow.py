@@ -35,19 +35,12 @@ LEAST_VARIANCE = 1e-12
 
 @dataclass(frozen=True)
 class BehindGlow:
-    """log R - b = offset + slope log(B + faint), which holds at any resolution of B.
+    """log R - b = offset + slope log(B + faint), which holds at any resolution of B."""
 
-    Attributes
-    ----------
-    offset, slope : ndarray (rows, W, 3) float32
-        Smooth; slope is c - 1.
-    faint : float
-        Added before logarithms, 1e-6 of the mean radiance.
-    """
-
+    # offset, slope: (rows, W, 3), smooth; slope is c - 1
     offset: np.ndarray
     slope: np.ndarray
-    faint: float
+    faint: float  # added before logarithms, 1e-6 of the mean radiance
 
     def log_change(self, background: np.ndarray) -> np.ndarray:
         """Return log R - b of a background (rows, W, 3)."""
@@ -86,14 +79,9 @@ def behind_glow(
 ) -> BehindGlow:
     """Predict the sky where the glow has gone.
 
-    Parameters
-    ----------
-    background, glow : ndarray (rows, W, 3)
-        Linear radiance without lights; the factor by which they brightened it, at least 1.
-    away : ndarray (rows, W)
-        Degrees to the core of the nearest light that has a glow.
-    rows : (int, int)
-        First row in the map, and the rows of the map.
+    ``background`` (rows, W, 3) is linear radiance without lights, ``glow`` the factor by which they
+    brightened it, at least 1, ``away`` (rows, W) degrees to the core of the nearest light that has a glow.
+    ``rows`` are the first row in the map, and the rows of the map.
     """
     faint = float(max(1e-6 * background.mean(), 1e-30))
     shape = background.shape[:2]

@@ -34,7 +34,6 @@ from envedit.representations.layers.ground_light import GroundLight, with_lumina
 
 Horizon = Literal["mirror", "keep", "free"]
 
-KINDS = "mirror", "keep"
 MIRROR_MOST_DETAIL = 0.0125
 """Most detail below the horizon of a mirror: median of |log luminance less its mean over a square of
 :data:`DETAIL_DEGREES`|. Above it is photographed ground. Measured: 0.001 to 0.007 on 13 PureSky maps, 0.03 to
@@ -107,21 +106,12 @@ def kind_of(envmap: np.ndarray) -> str:
 class Below:
     """The rows below the horizon of one map.
 
-    Parameters
-    ----------
-    radiance : ndarray (rows, W, 3)
-        The original's rows below the horizon.
-    sky : ndarray (sky_rows, W, 3)
-        The original's rows above, without cores of lights.
-    kind : str
-        "mirror" or "keep".
-    above : ndarray (sky_rows, W, 3), optional
-        The original's rows above, with cores; the ground is lit by them. None: it keeps its brightness.
+    ``radiance`` (rows, W, 3) are the original's rows below the horizon, ``sky`` (sky_rows, W, 3) its rows
+    above, without cores of lights, and ``above`` these with cores: ground is lit by them, or keeps its
+    brightness without. ``kind`` is "mirror" or "keep".
 
     Attributes
     ----------
-    image : ndarray (rows, W, 3)
-        The radiance as given.
     light : GroundLight or None
         What falls on ground that it lights; None of a mirror, and of ground that keeps its brightness.
     mirrored : ndarray of int64 (rows,)
@@ -207,12 +197,9 @@ class Below:
         The change grows from nothing at the horizon, which follows the sky's own, to all of it at
         :data:`BLEND_DEGREES`. The mirror image of a core goes with its glow, all of it and at any elevation.
 
-        Parameters
-        ----------
-        log_change : ndarray (rows, W, 3)
-            Of :meth:`.BehindGlow.log_change`, beside what follows from the sky.
-        gone, near : ndarray (rows, W, 1)
-            Share of the light that is gone where every glow is, and :func:`.near_core`.
+        ``log_change`` (rows, W, 3) is of :meth:`.BehindGlow.log_change`, beside what follows from the sky;
+        ``gone`` and ``near`` (rows, W, 1) are the share of the light that is gone where every glow is, and
+        :func:`.near_core`.
         """
         share = 1 - near + near / np.maximum(gone, LEAST_GONE)
         visible = 1 - (1 - self._blend[:, None, None]) * (1 - near)
@@ -266,17 +253,7 @@ class Below:
 
 
 class _Blur:
-    """K of a sky (rows, W, 3), on a grid of its own.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the sky.
-    total : int
-        Rows of its map.
-    columns : int
-        Of the grid, at most.
-    """
+    """K of a sky (rows, W), in a map of ``total`` rows, on a grid of at most so many ``columns``."""
 
     def __init__(self, shape, total, columns):
         up, width = shape

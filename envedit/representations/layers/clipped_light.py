@@ -49,36 +49,18 @@ LEAST_TEXELS = 2
 
 @dataclass(frozen=True)
 class ClippedLight:
-    """A clipped region of a map.
+    """A clipped region of a map."""
 
-    Attributes
-    ----------
-    kind : str
-        "sun", "lamp" or "cloud".
-    reason : str
-        Why, a clause.
-    direction : ndarray (3,)
-        Unit vector to its middle, in the map's frame.
-    radius : float
-        Of a disc of its solid angle, degrees.
-    level : float
-        The map's largest channel value.
-    rings : ndarray (15, 3)
-        Median radiance at :data:`RING_DEGREES` from its middle, above the horizon; NaN where most is clipped.
-    sky_irradiance : ndarray (3,)
-        Of the map without its core, on a horizontal surface.
-    core_flux : float
-        What the clipped map has within :data:`CORE_DEGREES` over its surroundings, luminance.
-    """
-
-    kind: str
-    reason: str
-    direction: np.ndarray
-    radius: float
-    level: float
+    kind: str  # "sun", "lamp" or "cloud"
+    reason: str  # why, a clause
+    direction: np.ndarray  # (3,), unit vector to its middle, in the map's frame
+    radius: float  # of a disc of its solid angle, degrees
+    level: float  # the map's largest channel value
+    # (15, 3), median radiance at :data:`RING_DEGREES` from its middle, above the horizon; NaN where most is
+    # clipped
     rings: np.ndarray
-    sky_irradiance: np.ndarray
-    core_flux: float
+    sky_irradiance: np.ndarray  # (3,), of the map without its core, on a horizontal surface
+    core_flux: float  # what the clipped map has within :data:`CORE_DEGREES` over its surroundings, luminance
 
     @property
     def elevation(self) -> float:
@@ -127,17 +109,10 @@ class ClippedLight:
 
 
 def find(radiance: np.ndarray) -> ClippedLight | None:
-    """Find the clipped region of a map that is most like a sun, and say what it is.
+    """Find the clipped region of a map (H, W, 3) that is most like a sun, and say what it is.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3)
-        Linear radiance, finite and not negative.
-
-    Returns
-    -------
-    ClippedLight or None
-        None where less than :data:`LEAST_TEXELS` above the horizon are on the plateau, or all is black.
+    None where less than :data:`LEAST_TEXELS` above the horizon are on the plateau, or all is black. Radiance
+    is linear, finite and not negative.
     """
     height, width, _ = radiance.shape
     level = float(radiance.max(initial=0))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from envedit.core.arrays import settled
 from envedit.representations.layers.behind_glow import gone_of
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.lights import Lights
@@ -28,56 +29,30 @@ from envedit.representations.layers.saturation import saturated
 
 @dataclass(frozen=True)
 class Glows:
-    """The glows of lights, and what they hide, at the texels of a map.
+    """The glows of lights, and what they hide, at the texels of a map."""
 
-    Attributes
-    ----------
-    lights : Lights
-        The lights of the map.
-    turn, log_flux : TensorXf (count, 3)
-        Where they are placed, as of :meth:`.Lights.core`.
-    before : Color3f
-        Product of 1 + G over the unmoved lights (:meth:`.Lights.glow_before`).
-    offset, slope : Color3f
-        Of :class:`.BehindGlow`.
-    faint : Float
-        Likewise.
-    """
-
-    lights: Lights
+    lights: Lights  # the lights of the map
+    # turn, log_flux: (count, 3), where they are placed, as of :meth:`.Lights.core`
     turn: mi.TensorXf
     log_flux: mi.TensorXf
-    before: mi.Color3f
+    before: mi.Color3f  # product of 1 + G over the unmoved lights (:meth:`.Lights.glow_before`)
+    # offset, slope: of :class:`.BehindGlow`
     offset: mi.Color3f
     slope: mi.Color3f
-    faint: mi.Float
+    faint: mi.Float  # likewise
 
 
 @dataclass(frozen=True)
 class Fields:
-    """What an edit does at the texels of a map; None: nothing.
+    """What an edit does at the texels of a map; None: nothing."""
 
-    Attributes
-    ----------
-    glows : Glows or None
-        How the glows of lights change.
-    log_followed : Color3f or None
-        Log factor, by what lights do, of rows that follow those above the horizon.
-    follows : Bool or None
-        Texels of such rows; None: all where there are no :attr:`glows`.
-    log_saturation : Float or None
-        Logarithm of k.
-    log_gain : Color3f or None
-        The gain g.
-    share : Float or None
-        Share of the saturation and of the gain that acts on a texel, 0 to 1; None: all.
-    """
-
-    glows: Glows | None = None
+    glows: Glows | None = None  # how the glows of lights change
+    # Log factor, by what lights do, of rows that follow those above the horizon
     log_followed: mi.Color3f | None = None
-    follows: mi.Bool | None = None
-    log_saturation: mi.Float | None = None
-    log_gain: mi.Color3f | None = None
+    follows: mi.Bool | None = None  # texels of such rows; None: all where there are no :attr:`glows`
+    log_saturation: mi.Float | None = None  # logarithm of k
+    log_gain: mi.Color3f | None = None  # the gain g
+    # Share of the saturation and of the gain that acts on a texel, 0 to 1; None: all
     share: mi.Float | None = None
 
 
@@ -110,7 +85,8 @@ def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) ->
     factor, gone = None, None
     if fields.glows is not None:
         glows = fields.glows
-        factor = glows.lights.glow_ratio(glows.turn, glows.log_flux, directions, glows.before)
+        glow = glows.lights.glow(glows.turn, glows.log_flux, directions)
+        factor = settled(glow / glows.before, 1)  # exactly 1 where nothing moved
         gone = gone_of(factor)
         hidden = glows.offset + glows.slope * dr.log(base / glows.before + glows.faint)
         factor = factor * dr.exp(gone * hidden)

@@ -73,21 +73,11 @@ def _spline(t):
 
 @dataclass(frozen=True)
 class Octave:
-    """One grid of detail.
+    """One grid of detail."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        Its rows and columns of nodes.
-    known : ndarray (rows, columns)
-        How well the picture determines it at each node, in [0, 1).
-    share : float
-        Share of the active rows' solid angle in which it is identifiable, in [0, 1].
-    """
-
-    size: tuple[int, int]
-    known: np.ndarray
-    share: float
+    size: tuple[int, int]  # its rows and columns of nodes
+    known: np.ndarray  # (rows, columns), how well the picture determines it at each node, in [0, 1)
+    share: float  # share of the active rows' solid angle in which it is identifiable, in [0, 1]
 
     @property
     def cycles(self) -> int:
@@ -163,8 +153,8 @@ class GridGain:
                 taps.append((node.ravel(), weight.ravel()))
         return taps
 
-    def prepare(self, shape: tuple[int, int], rows: object = None) -> list:
-        """Make the matrices of :meth:`evaluate` for an image (rows, W); ``rows`` is not used."""
+    def prepare(self, shape: tuple[int, int]) -> list:
+        """Make the matrices of :meth:`evaluate` for an image (rows, W)."""
         matrices = []
         for size in self.sizes:
             down, across = splines(size, shape)

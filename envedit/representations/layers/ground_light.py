@@ -27,14 +27,9 @@ LEAST_IRRADIANCE = 1e-30
 
 
 class GroundLight:
-    """Irradiance of a horizontal plane under the rows above the horizon.
+    """Irradiance of a horizontal plane under rows ``above`` the horizon (rows, W, 3), with cores of lights.
 
-    Parameters
-    ----------
-    above : ndarray (rows, W, 3)
-        Those rows of the original, with the cores of lights.
-    ground : ndarray (low, W, 3)
-        The rows below.
+    ``ground`` (low, W, 3) are the rows below.
 
     Attributes
     ----------
@@ -73,12 +68,8 @@ class GroundLight:
     def log_change(self, sky: mi.TensorXf, core: mi.TensorXf) -> mi.TensorXf:
         """Return log H / H_0, (1, 3), differentiably.
 
-        Parameters
-        ----------
-        sky : TensorXf (rows, W, 3)
-            The rows above the horizon, without cores of lights.
-        core : TensorXf (rows or more, W, 3)
-            The cores; rows beyond those of the sky do not count.
+        ``sky`` (rows, W, 3) are the rows above the horizon, without cores of lights, ``core`` (rows or more,
+        W, 3) the cores; rows beyond those of the sky do not count.
         """
         core = dr.gather(mi.Float, core.array, dr.arange(mi.UInt32, self._size))
         return self._log_light(mi.TensorXf(sky.array + core, sky.shape)) - self._before

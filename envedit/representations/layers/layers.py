@@ -45,14 +45,9 @@ tangent: ``docs/decisions/slope_of_the_saturation.md``."""
 
 
 def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
-    """Return the luminance of the irradiance of level ground by a sky without lights.
+    """Return the luminance of the irradiance of level ground by a sky (n, W, 3) without lights.
 
-    Parameters
-    ----------
-    sky : ndarray (n, W, 3)
-        Linear radiance.
-    rows : (int, int)
-        Its first row in the map, and the rows of the map; those below the horizon light nothing.
+    ``rows`` are its first row in the map, and the rows of the map; those below the horizon light nothing.
     """
     first, total = rows
     polar = np.pi * np.arange(first, first + len(sky)) / max(total - 1, 1)
@@ -63,21 +58,13 @@ def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
 
 @dataclass(frozen=True)
 class TexelFields:
-    """What parameters do to every texel of a working map, (rows, W, 3) float32 each.
+    """What parameters do to every texel of a working map, (rows, W, 3) float32 each."""
 
-    Attributes
-    ----------
-    log_gain : ndarray
-        Log gain, also of texels that :meth:`Layers.keeping` excepts from it; of rows that follow, the log
-        factor that is beside :attr:`log_followed`.
-    log_followed : ndarray
-        Log factor, by what lights do, of rows that follow; 0 of others.
-    offset, slope : ndarray
-        Of :class:`.BehindGlow`; 0 of rows that follow, and without glows.
-    """
-
+    # Log gain, also of texels that :meth:`Layers.keeping` excepts from it; of rows that follow, the log
+    # factor that is beside :attr:`log_followed`
     log_gain: np.ndarray
-    log_followed: np.ndarray
+    log_followed: np.ndarray  # log factor, by what lights do, of rows that follow; 0 of others
+    # offset, slope: of :class:`.BehindGlow`; 0 of rows that follow, and without glows
     offset: np.ndarray
     slope: np.ndarray
 
@@ -337,7 +324,7 @@ class Layers:
 
     @functools.cached_property
     def _grids(self):
-        return self.gain.prepare(self.shape, self.rows)
+        return self.gain.prepare(self.shape)
 
     # ---- fields and derivatives ----------------------------------------------------------------------------
 

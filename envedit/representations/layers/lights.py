@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import settled, tensor
+from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.types import ArrayLike
 from envedit.representations.layers.separation import GLOW_DEGREES, Light
@@ -189,16 +189,13 @@ class Lights:
 
         Parameters
         ----------
-        turn : TensorXf (count, 3)
-            Rotation vectors: axis times angle in radians, from where the light was.
-        log_flux : TensorXf (count, 3)
-            Logarithm of the flux over that of :attr:`flux`.
+        turn, log_flux : TensorXf (count, 3)
+            Rotation vectors, axis times angle in radians, from where the light was; logarithm of the flux
+            over that of :attr:`flux`.
         log_size : TensorXf (count, 1)
             Logarithm of the size over what it was.
-        shape : (int, int)
-            Rows and columns wanted.
-        rows : (int, int)
-            First row in the map, and the rows of the map, at that resolution.
+        shape, rows : (int, int)
+            Rows and columns wanted; first row in the map, and the rows of the map, at that resolution.
 
         Returns
         -------
@@ -218,21 +215,11 @@ class Lights:
     def cores_of(
         self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], shape: tuple[int, int]
     ) -> np.ndarray:
-        """Render the core of light ``i`` alone as it is placed in one way and another.
+        """Render the core of light ``i`` alone as it is placed in one way and another, (k, rows, W, 3).
 
-        Parameters
-        ----------
-        i : int
-            Which light.
-        placements : sequence of (ndarray (3,), ndarray (3,), float)
-            Turn, log flux and log size, as of :meth:`core`.
-        shape : (int, int)
-            Rows and columns wanted, from the first row that the lights were given for, at their resolution.
-
-        Returns
-        -------
-        ndarray (k, rows, W, 3)
-            Linear radiance; not differentiable.
+        ``placements`` are turn, log flux and log size, as of :meth:`core`; ``shape`` has the rows and columns
+        wanted, from the first row that the lights were given for, at their resolution. Linear radiance; not
+        differentiable.
         """
         # ---- Every point of the light once for each placement
         first, count = self._points_of[i]
@@ -272,12 +259,6 @@ class Lights:
         log_flux = np.zeros((self.count, 3), np.float32)
         log_flux[self.own :] = DARK
         return self.glow(tensor(np.zeros_like(log_flux)), tensor(log_flux), d)
-
-    def glow_ratio(
-        self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f, before: mi.Color3f
-    ) -> mi.Color3f:
-        """Evaluate :meth:`glow` over ``before``, of :meth:`glow_before`: exactly 1 where nothing moved."""
-        return settled(self.glow(turn, log_flux, d) / before, 1)
 
     def glow_of(self, i: int, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
         """Evaluate 1 + s_i G_i of light ``i`` alone; 1 if it has no glow."""

@@ -33,12 +33,8 @@ ROWS = 128
 class PlacedLights:
     """A map whose lights can be placed anew.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3) float32
-        Linear radiance, finite and not negative.
-    horizon : str
-        What rows below the horizon do, as of :class:`.Layers`, or "auto".
+    ``envmap`` (H, W, 3) float32 is linear radiance, finite and not negative; ``horizon`` what rows below the
+    horizon do, as of :class:`.Layers`, or "auto".
 
     Attributes
     ----------
@@ -78,10 +74,7 @@ class PlacedLights:
     def place(self, placed: Sequence[dict]) -> np.ndarray:
         """Return the map with its lights placed, (H, W, 3) float32.
 
-        Raises
-        ------
-        InputError
-            A texel becomes brighter than :data:`.radiance.BRIGHTEST`.
+        InputError where a texel becomes brighter than :data:`.radiance.BRIGHTEST`.
         """
         envmap = self.envmap
         if any("light" in light for light in placed):
@@ -152,22 +145,15 @@ def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
     where c is the largest d. A "rectangle" is the product of such g across both pairs of sides, a "gradient"
     the rectangle times a ramp along y, a "gaussian" exp(-(x/a)^2 / 2 - (y/b)^2 / 2).
 
-    Parameters
-    ----------
-    light : dict
-        Without ``light``, as of :func:`.light_schema.LightList`.
-    toward : ndarray (..., 3)
-        Unit vectors in the frame of the map.
-    texel : float
-        Spacing of the texels in radians: the least width of a border, and about the least of a light.
+    ``light`` is without the key ``light``, as of :func:`.light_schema.LightList`; ``toward`` are unit vectors
+    in the frame of the map, and ``texel`` is the spacing of the texels in radians: the least width of a
+    border, and about the least of a light.
     """
     shape = light.get("shape", "gaussian")
     aspect = light.get("aspect", light_schema.SHAPES[shape])
 
     # ---- Coordinates in radians along the sides
-    azimuth, elevation, rotation = np.radians(
-        [light["azimuth"], light["elevation"], light.get("rotation", 0)]
-    )
+    azimuth, rotation = np.radians([light["azimuth"], light.get("rotation", 0)])
     centre = direction(light["azimuth"], light["elevation"])
     east = np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
     up = np.cross(east, centre)

@@ -64,72 +64,39 @@ RELAXATIONS = 30
 
 @dataclass(frozen=True)
 class Light:
-    """One light of a map.
+    """One light of a map."""
 
-    Attributes
-    ----------
-    direction : ndarray (3,)
-        Unit vector to the centre of its flux, in the emitter's frame.
-    texels : ndarray of int64 (n,)
-        Its texels, row * W + column.
-    radiance : ndarray (n, 3)
-        Radiance of the core in them.
-    glow : ndarray (len(GLOW_DEGREES), 3) or None
-        Factor by which it brightens the sky, less 1, at :data:`GLOW_DEGREES` from its centre.
-    share : float
-        Its share of the map's luminance, integrated over solid angle.
-    """
-
-    direction: np.ndarray
-    texels: np.ndarray
-    radiance: np.ndarray
+    direction: np.ndarray  # (3,), unit vector to the centre of its flux, in the emitter's frame
+    texels: np.ndarray  # (n,), its texels, row * W + column
+    radiance: np.ndarray  # (n, 3), radiance of the core in them
+    # (len(GLOW_DEGREES), 3), factor by which it brightens the sky, less 1, at these angles from its centre
     glow: np.ndarray | None
-    share: float
 
 
 @dataclass(frozen=True)
 class Separation:
-    """A separated map; ``background * glow + core`` is the map to float precision.
+    """A separated map; ``background * glow + core`` is the map to float precision."""
 
-    Attributes
-    ----------
-    background, glow, core : ndarray (rows, W, 3) float64
-        B, the product of 1 + G over all lights, and the sum of all cores.
-    lights : list of Light
-        Those with most flux first.
-    survey : Survey or None
-        Where the lights were found, to find the same lights in another resolution of the map; None without.
-    """
-
+    # background, glow, core: (rows, W, 3): B, the product of 1 + G over all lights, and the sum of all cores
     background: np.ndarray
     glow: np.ndarray
     core: np.ndarray
-    lights: list[Light] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)  # those with most flux first
+    # Where the lights were found, to find the same lights in another resolution of the map; None without
     survey: Survey | None = None
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the small copy of a map gives of its lights: all that does not depend on the map's resolution.
+    """What the small copy of a map gives of its lights: all that does not depend on the map's resolution."""
 
-    Attributes
-    ----------
-    label : ndarray of int64 (h, w)
-        Index in :attr:`Separation.lights` of the light that a texel of the copy belongs to, or -1.
-    below : ndarray (h, w, 3)
-        The background of the copy, filled in under the lights.
-    rows : (int, int)
-        First row of the copy in its map, and the rows of that map.
-    centres, glows, shares : lists
-        Direction, :attr:`Light.glow` and :attr:`Light.share` of each light.
-    """
-
+    # (h, w), index in :attr:`Separation.lights` of the light that a texel of the copy belongs to, or -1
     label: np.ndarray
-    below: np.ndarray
-    rows: tuple[int, int]
+    below: np.ndarray  # (h, w, 3), the background of the copy, filled in under the lights
+    rows: tuple[int, int]  # first row of the copy in its map, and the rows of that map
+    # centres, glows: direction and :attr:`Light.glow` of each light
     centres: list[np.ndarray]
     glows: list[np.ndarray | None]
-    shares: list[float]
 
 
 def survey_of(
@@ -191,14 +158,12 @@ def separate(
             continue
         number[i] = len(lights)
         kept.append(i)
-        radiance = core.reshape(-1, 3)[texels]
-        lights.append(Light(centre, texels, radiance, survey.glows[i], float(survey.shares[i])))
+        lights.append(Light(centre, texels, core.reshape(-1, 3)[texels], survey.glows[i]))
     survey = replace(
         survey,
         label=number[survey.label],
         centres=[survey.centres[i] for i in kept],
         glows=[survey.glows[i] for i in kept],
-        shares=[survey.shares[i] for i in kept],
     )
     return Separation(background, glow, core, lights, survey)
 
@@ -214,7 +179,7 @@ def glow_of(survey: Survey, directions: np.ndarray) -> np.ndarray:
 
 def _survey(small: _Small, most: int) -> Survey | None:
     """Find lights, the background under them and the glow of each on the small copy; None without lights."""
-    label, count, shares = _find(small, most)
+    label, count = _find(small, most)
     if not count:
         return None
     cores = label >= 0
@@ -227,7 +192,7 @@ def _survey(small: _Small, most: int) -> Survey | None:
             free = free / (1 + glow_at(table, small.directions @ centre))
         glows.append(table)
         centres.append(centre)
-    return Survey(label, filled(free, cores), small.rows, centres, glows, shares)
+    return Survey(label, filled(free, cores), small.rows, centres, glows)
 
 
 # ---- Finding -----------------------------------------------------------------------------------------------
@@ -319,13 +284,13 @@ def _reduced(image, first, total):
     return _Small(small, toward, omega, first, total, (start, h))
 
 
-def _find(small: _Small, most: int) -> tuple[np.ndarray, int, list[float]]:
-    """Label the texels of each light: (label or -1, count, shares), the light with most flux first."""
+def _find(small: _Small, most: int) -> tuple[np.ndarray, int]:
+    """Label the texels of each light: (label or -1, count), the light with most flux first."""
     lum = small.image @ LUMINANCE
     total = (lum * small.omega).sum()
-    nothing: tuple[np.ndarray, int, list[float]] = np.full(lum.shape, -1), 0, []
+    label = np.full(lum.shape, -1)
     if not total > 0:
-        return nothing
+        return label, 0
     base = _local_median(lum, *small.rows)
 
     # ---- Connected parts that stand out, and their shares of the map's light
@@ -338,12 +303,11 @@ def _find(small: _Small, most: int) -> tuple[np.ndarray, int, list[float]]:
     strongest = np.argsort(-share, kind="stable")
     lights = [i for i in strongest if numbers[i] >= 0 and share[i] >= LEAST_SHARE]
     lights = [i for i in lights if not _cut_off(parts == numbers[i], lum, small.omega)][:most]
-    label = nothing[0]
     for i, part in enumerate(lights):
         # One texel more to every side: a lens and a resampling spread light.
         mask = _grown(parts == numbers[part])
         label = np.where(mask & (label < 0), i, label)
-    return label, len(lights), [share[i] for i in lights]
+    return label, len(lights)
 
 
 def _cut_off(part, lum, omega):
@@ -522,12 +486,7 @@ def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     Coarse to fine: unknown texels start from the mean of known ones at the next coarser level, and are then
     relaxed towards the mean of their neighbours. Columns are periodic.
 
-    Parameters
-    ----------
-    image : ndarray (rows, W, 3)
-        Linear radiance, not negative.
-    mask : ndarray of bool (rows, W)
-        Texels to replace.
+    ``image`` (rows, W, 3) is linear radiance, not negative; ``mask`` (rows, W) are the texels to replace.
     """
     if not mask.any():
         return image

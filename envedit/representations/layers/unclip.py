@@ -60,18 +60,10 @@ LEAST_ELEVATION = 0.5
 
 @dataclass(frozen=True)
 class Estimate:
-    """Flux of a sun.
+    """Flux of a sun."""
 
-    Attributes
-    ----------
-    flux : ndarray (3,)
-        Irradiance on a surface that faces it, linear RGB.
-    stops : float
-        Standard deviation of log2 of it.
-    """
-
-    flux: np.ndarray
-    stops: float
+    flux: np.ndarray  # (3,), irradiance on a surface that faces it, linear RGB
+    stops: float  # standard deviation of log2 of it
 
 
 def air_mass(elevation: float) -> float:
@@ -92,13 +84,7 @@ def analytic_fluxes(elevation: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def estimate(light: ClippedLight) -> Estimate:
-    """Estimate the flux of a clipped sun.
-
-    Parameters
-    ----------
-    light : ClippedLight
-        Any with a ring that is measured.
-    """
+    """Estimate the flux of a clipped sun, of which a ring is measured."""
     first = min(light.first or 0, len(AUREOLE) - 1)
     near = RING_DEGREES[first] <= NEAR_DEGREES
     haze = _haze(light.elevation)
@@ -186,19 +172,8 @@ def restored(radiance: np.ndarray, light: ClippedLight, flux: np.ndarray) -> np.
     light has an aureole.
     The disc, 0.54 degrees across, has the flux that the core lacks.
 
-    Parameters
-    ----------
-    radiance : ndarray (H, W, 3)
-        The map in which the light has been found.
-    light : ClippedLight
-        Of :func:`.clipped_light.find`.
-    flux : ndarray (3,)
-        Of the sun, irradiance on a surface that faces it.
-
-    Returns
-    -------
-    ndarray (H, W, 3) float32
-        All other texels have their bits.
+    ``radiance`` (H, W, 3) is the map in which the light has been found, ``flux`` (3,) the irradiance of the
+    sun on a surface that faces it. Returns (H, W, 3) float32: all other texels have their bits.
     """
     image = np.array(radiance, np.float32)
     if light.has_aureole and light.radius > CORE_DEGREES:

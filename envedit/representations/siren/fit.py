@@ -105,14 +105,8 @@ def fit(
     """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
 
     Parameters are those of :func:`envedit.fit`. The fit is read from ``folder`` if the same was made before,
-    and continued if it was begun.
-
-    Raises
-    ------
-    InputError
-        If a texel is not finite or is negative.
-    NumericalError
-        If too many steps were not finite.
+    and continued if it was begun. InputError if a texel is not finite or is negative, NumericalError if too
+    many steps were not finite.
     """
     network, settings = network or config.Representation(), settings or config.Fit()
     settings = unpolished(settings) if settings.polish == "never" else settings
@@ -193,11 +187,12 @@ class Objective:
             else:
                 loss = dr.opaque(mi.Float, 0)
                 if self.settings.log_mse:
-                    loss += self.settings.log_mse * losses.log_mse(values, self.logs)
+                    loss += self.settings.log_mse * losses.image_l2(values, self.logs)
                 if self.settings.log_ssim:
                     loss += self.settings.log_ssim * self.ssim(values)
                 if self.settings.hdr:
-                    loss += self.settings.hdr * losses.hdr(self.normalisation.decode(values), self.radiance)
+                    radiance = self.normalisation.decode(values)
+                    loss += self.settings.hdr * losses.image_l1(radiance, self.radiance)
             dr.backward(loss)
         return dr.detach(loss), dr.grad(y)
 
@@ -242,7 +237,7 @@ def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
         return optimizer.cosine(base, epoch, settings.epochs)
     if settings.schedule == "warm-restarts":
         return optimizer.cosine_warm_restarts(base, epoch, settings.restart_period)
-    return optimizer.constant(base, epoch)
+    return base
 
 
 def _train(image, normalisation, x, network, settings, seed, begun, progress):

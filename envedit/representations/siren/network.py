@@ -38,21 +38,9 @@ def init(
     First layer U(-1/in, 1/in), later ones U(-sqrt(6/in)/omega, sqrt(6/in)/omega) (Sitzmann et al. 2020,
     Sec. 3.2), biases U(-1/sqrt(in), 1/sqrt(in)) as in the authors' code.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the draw; the same seed gives the same weights on every machine.
-    hidden, depth : int
-        Width, and number of hidden sine layers after the first.
-    omega : float
-        Angular frequency of the sine layers.
-    inputs, outputs : int
-        Size of a coordinate and of a value.
-
-    Returns
-    -------
-    dict
-        ``"i.weight"`` (out, in) and ``"i.bias"`` (out,) for i = 0 ... depth + 1.
+    ``hidden`` is the width, ``depth`` the number of hidden sine layers after the first, ``omega`` the angular
+    frequency of the sine layers, and ``inputs`` and ``outputs`` are the sizes of a coordinate and of a value.
+    The same seed gives the same weights on every machine.
     """
     rng = np.random.default_rng(seed)
     sizes = [inputs] + [hidden] * (depth + 1) + [outputs]
@@ -92,29 +80,14 @@ def directions(height: int, width: int, first: int = 0, total: int | None = None
     """Directions through texel centres as network coordinates (H * W, 3), scaled by :data:`SPHERE_SCALE`.
 
     On the sphere a map has no seam, its zenith is a point, and a step of a texel is as long across as down.
-
-    Parameters
-    ----------
-    height, width : int
-        Rows and columns wanted.
-    first, total : int
-        The rows are ``first`` ... ``first + height - 1`` of a map of ``total`` rows; all of them by default.
+    The rows are ``first`` ... ``first + height - 1`` of a map of ``total`` rows; all of them by default.
     """
     d = latlong.directions(total or height, width)[first : first + height]
     return mi.TensorXf((SPHERE_SCALE * d).astype(np.float32).reshape(-1, 3))
 
 
 def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, list]:
-    """Evaluate the network.
-
-    Parameters
-    ----------
-    params : dict
-        Weights (see :func:`init`).
-    x : TensorXf
-        Coordinates (N, inputs).
-    omega : float
-        Angular frequency.
+    """Evaluate the network at coordinates ``x`` (N, inputs).
 
     Returns
     -------
@@ -139,21 +112,9 @@ def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, 
 
 
 def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
-    """Pull a gradient of the output back to the parameters.
+    """Pull ``grad`` (N, outputs), of a scalar by y, back to the parameters that made the ``tape``.
 
-    Parameters
-    ----------
-    params : dict
-        The weights :func:`forward` was called with.
-    tape : list
-        What it kept.
-    grad : TensorXf
-        Gradient of a scalar with respect to y, (N, outputs).
-
-    Returns
-    -------
-    dict
-        Gradient with respect to every parameter, same names and shapes.
+    Returns the gradient of every parameter, same names and shapes.
     """
     last = layers(params) - 1
     grads: Params = {}

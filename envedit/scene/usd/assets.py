@@ -15,17 +15,8 @@ from envedit.scene.usd.description import Description
 def texture_file(scene: Description, path: Any, asset: Any) -> str:
     """Return the name of a texture's file as the XML has it: an absolute path, or a copy out of a package.
 
-    Parameters
-    ----------
-    path : pxr.Sdf.Path
-        The prim that names it.
-    asset : pxr.Sdf.AssetPath
-        Its value.
-
-    Raises
-    ------
-    InputError
-        There is no such file.
+    ``path`` (pxr.Sdf.Path) is the prim that names it, ``asset`` (pxr.Sdf.AssetPath) its value. InputError if
+    there is no such file.
     """
     resolved = asset.resolvedPath
     if not resolved:

@@ -22,12 +22,7 @@ _TENTH = 0.1  # focal length and apertures are in tenths of the scene's unit
 def choose(file: str, cameras: Sequence[tuple[Any, np.ndarray]], path: str) -> list[tuple[Any, np.ndarray]]:
     """Return the cameras (prim, transform) of a path: "" is for the only one, "all" for every one.
 
-    Raises
-    ------
-    ConfigError
-        There are several, or none of that path.
-    InputError
-        There is none.
+    ConfigError if there are several, or none of that path; InputError if there is none.
     """
     if not cameras:
         raise InputError(f"{file}: no camera that is visible; add one to the stage")
@@ -46,12 +41,8 @@ def add_camera(scene: Description, prim: Any, to_world: np.ndarray) -> None:
     """Add a sensor whose id is the path of a camera.
 
     USD looks along -z with +x to the right, Mitsuba along +z with +x to the left. The horizontal field of
-    view is 2 atan(horizontalAperture / (2 focalLength)).
-
-    Parameters
-    ----------
-    to_world : array (4, 4)
-        From the camera to the stage; a scale in it does not count.
+    view is 2 atan(horizontalAperture / (2 focalLength)). ``to_world`` (4, 4) is from the camera to the stage;
+    a scale in it does not count.
     """
     camera = UsdGeom.Camera(prim)
     focal, wide, high, right, up = (

@@ -36,24 +36,12 @@ _ENVIRONMENT = {
 
 
 class Converted(NamedTuple):
-    """A Mitsuba scene that was made of a USD file.
+    """A Mitsuba scene that was made of a USD file."""
 
-    Attributes
-    ----------
-    xml : Path
-        The scene.
-    notes : tuple of str
-        What of the file is not used.
-    sources : tuple of str
-        Files that it was made of: layers and textures.
-    stage : dict
-        ``upAxis`` and ``metersPerUnit`` of the USD file, and the paths of its ``domes``.
-    """
-
-    xml: Path
-    notes: tuple[str, ...]
-    sources: tuple[str, ...]
-    stage: dict
+    xml: Path  # the scene
+    notes: tuple[str, ...]  # what of the file is not used
+    sources: tuple[str, ...]  # files that it was made of: layers and textures
+    stage: dict  # ``upAxis`` and ``metersPerUnit`` of the USD file, and the paths of its ``domes``
 
 
 def is_usd(file: object) -> bool:
@@ -129,10 +117,7 @@ def _answer(file, request):
 def kept(file: FilePath) -> Converted:
     """Return the scene of a USD file in the folder of caches, made anew where one of its sources has changed.
 
-    Raises
-    ------
-    ConfigError, InputError, MachineError
-        As of :func:`convert`, which is asked for all cameras.
+    Errors are those of :func:`convert`, which is asked for all cameras.
     """
     file = Path(file).absolute()
     root = cache_folder("usd")

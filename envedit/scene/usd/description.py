@@ -17,35 +17,16 @@ _POINTS = {"center": "point", "position": "point", "direction": "vector"}
 
 @dataclass
 class Description:
-    """A scene that is being written.
+    """A scene that is being written."""
 
-    Attributes
-    ----------
-    file : str
-        What errors call the USD file.
-    folder : Path
-        Folder of the XML file.
-    files : str
-        Name of the folder in it where meshes and textures go.
-    stage : pxr.Usd.Stage
-        What is read.
-    time : pxr.Usd.TimeCode
-        When animated values are taken.
-    root : Element
-        ``<scene>``.
-    textures : set of str
-        Absolute paths of the textures that it names.
-    unused : dict
-        What is not used, and the paths of the first prims with it.
-    """
-
-    file: str
-    folder: Path
-    files: str
-    stage: Any
-    time: Any
-    root: ET.Element = field(default_factory=lambda: ET.Element("scene", version="3.0.0"))
-    textures: set[str] = field(default_factory=set)
+    file: str  # what errors call the USD file
+    folder: Path  # folder of the XML file
+    files: str  # name of the folder in it where meshes and textures go
+    stage: Any  # what is read
+    time: Any  # when animated values are taken
+    root: ET.Element = field(default_factory=lambda: ET.Element("scene", version="3.0.0"))  # ``<scene>``
+    textures: set[str] = field(default_factory=set)  # absolute paths of the textures that it names
+    # What is not used, and the paths of the first prims with it
     unused: dict[str, list[str]] = field(default_factory=dict)
 
     def leave_out(self, what: str, path: Any) -> None:

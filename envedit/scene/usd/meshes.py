@@ -19,12 +19,8 @@ FIRST_UV = ("st", "UVMap", "map1")
 def triangles(scene: Description, prim: Any, uv_name: str, faces: np.ndarray | None) -> dict[str, np.ndarray]:
     """Return a mesh as triangles; polygons are cut into fans.
 
-    Parameters
-    ----------
-    uv_name : str
-        Primvar of the texture coordinates; "": one of :data:`FIRST_UV`.
-    faces : array (n,) of int, or None
-        Which faces; None: all.
+    ``uv_name`` is the primvar of the texture coordinates; "": one of :data:`FIRST_UV`. ``faces`` (n,) says
+    which faces; None: all.
 
     Returns
     -------
@@ -142,14 +138,9 @@ def _texture_coordinates(scene, prim, name):
 
 
 def write_ply(path: Path, mesh: dict[str, np.ndarray], mirrored: bool) -> None:
-    """Write triangles as a PLY file.
+    """Write triangles, as of :func:`triangles`, as a PLY file.
 
-    Parameters
-    ----------
-    mesh : dict
-        As of :func:`triangles`.
-    mirrored : bool
-        Its transform mirrors: corners go the other way round, so that the outside stays outside.
+    If its transform is ``mirrored`` corners go the other way round, so that the outside stays outside.
     """
     names = [("vertices", "xyz"), ("normals", ("nx", "ny", "nz")), ("uv", "uv")]
     properties = [name for key, keys in names if key in mesh for name in keys]

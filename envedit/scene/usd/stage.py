@@ -78,23 +78,10 @@ def main(request: dict, seconds: int) -> None:
 
 
 def convert(file: str, xml: str, camera: str = "", time: float | None = None) -> dict[str, Any]:
-    """Write a USD file as a Mitsuba scene.
+    """Write a USD file as a Mitsuba scene; arguments and errors as of :func:`.conversion.convert`.
 
-    Parameters
-    ----------
-    file, xml, camera, time
-        As of :func:`.conversion.convert`; meshes go to ``NAME_files``.
-
-    Returns
-    -------
-    dict
-        ``notes``: what is not used; ``sources``: absolute paths of the layers and textures; ``stage``: its
-        ``upAxis`` and ``metersPerUnit``, and the paths of its ``domes``.
-
-    Raises
-    ------
-    ConfigError, InputError
-        The file cannot be read, or has no camera, several, or nothing to light.
+    Returns ``notes``: what is not used; ``sources``: absolute paths of the layers and textures; ``stage``:
+    its ``upAxis`` and ``metersPerUnit``, and the paths of its ``domes``.
     """
     try:
         stage = Usd.Stage.Open(file)
@@ -151,19 +138,8 @@ class _Walk:
     def visit(self, prim: Any, to_world: np.ndarray, purpose: str, depth: int) -> None:
         """Visit a prim and those inside it.
 
-        Parameters
-        ----------
-        to_world : array (4, 4)
-            Of its parent.
-        purpose : str
-            That it has without an own one.
-        depth : int
-            Number of prims around it.
-
-        Raises
-        ------
-        InputError
-            There are more prims or shapes than can be read.
+        ``to_world`` (4, 4) is of its parent, ``purpose`` that it has without an own one, ``depth`` the number
+        of prims around it. InputError if there are more prims or shapes than can be read.
         """
         self._prims += 1
         if self._prims > MOST_PRIMS or depth > _DEEPEST:

@@ -25,6 +25,16 @@ SHOWN = 0.02, 0.98
 """Display values between which a plate says how a map is exposed."""
 
 
+def composed(
+    plate: np.ndarray, outline: np.ndarray, with_object: np.ndarray, without: np.ndarray
+) -> np.ndarray:
+    """Return the plate with the object: its own pixels, and around it what it changes, as a factor.
+
+    All are radiance (h, w, 3); the outline (h, w, 1) is 1 where the object is.
+    """
+    return outline * with_object + (1 - outline) * plate * with_object / np.maximum(without, 1e-6)
+
+
 class Plate:
     """A photograph without noise, and the scene with and without the ball.
 
@@ -60,15 +70,13 @@ class Plate:
     def inserted(self, envmap: np.ndarray, curve: str) -> dict:
         """Put the ball in under a map, exposed for each channel as the plate is in the median.
 
-        Outside of the ball, the plate is multiplied by what the ball changes in the rendering. Returns RMSE
-        and SSIM of the display values, against the ball under the photograph's map.
+        Returns RMSE and SSIM of the display values, against the ball under the photograph's map.
         """
         without, with_ball = (self._render(name, envmap) for name in ("without", "with"))
         plate = Camera(curve).radiance(np.minimum(self.values, SHOWN[1]))
-        shown = (self.values > SHOWN[0]) & (self.values < SHOWN[1]) & (without > 0) & (plate > 0)
-        ratio = np.where(shown, plate, np.nan) / np.where(shown, without, 1)
+        told = (self.values > SHOWN[0]) & (self.values < SHOWN[1]) & (without > 0) & (plate > 0)
+        ratio = np.where(told, plate, np.nan) / np.where(told, without, 1)
         camera = Camera(curve, np.log(np.nanmedian(ratio, axis=(0, 1))))
-        changed = camera.radiance(self.values) * with_ball / np.maximum(without, 1e-6)
-        composed = camera.shown(self.outline * with_ball + (1 - self.outline) * changed)
-        error = float(np.sqrt(np.mean((composed - self.true) ** 2)))
-        return {"insertion RMSE": error, "insertion SSIM": metrics.ssim(composed, self.true)}
+        shown = camera.shown(composed(camera.radiance(self.values), self.outline, with_ball, without))
+        error = float(np.sqrt(np.mean((shown - self.true) ** 2)))
+        return {"insertion RMSE": error, "insertion SSIM": metrics.ssim(shown, self.true)}

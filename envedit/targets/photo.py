@@ -215,7 +215,8 @@ class Photo:
     def displayed(self, radiance: np.ndarray) -> np.ndarray:
         """Return the light of a display, white at 1, on which the camera shows radiance (h, w, 3)."""
         shown = self.camera.shown(radiance)
-        return np.float32(shown if self.camera.curve == "linear" else srgb_to_linear(shown))
+        light = shown if self.camera.curve == "linear" else srgb_to_linear(shown)
+        return np.asarray(light, np.float32)
 
     def exposed_by(self, log_factor: np.ndarray) -> Photo:
         """Return it with a camera whose log factor is larger by (3,)."""

@@ -1,4 +1,4 @@
-"""Two real photographs, with a rough scene each, and a ball put into one: ``python -m experiments.photograph.real``.
+"""Two real photographs, a rough scene of each, and a ball put into one: ``-m experiments.photograph.real``.
 
 The photographs are of scikit-image's wheel, which pip fetches: ``coffee.png`` (Rachel Michetti, CC0) and
 ``astronaut.png`` (NASA, public domain). They and all results go to a folder.

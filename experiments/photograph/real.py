@@ -29,8 +29,10 @@ SCENES = Path(__file__).parent / "scenes"
 STUDIO = "hdri/studio_small_03_1k.hdr"
 SIZES = {"coffee": (150, 100), "astronaut": (96, 96)}
 """Width and height of the renderings."""
-LEFT_OUT = {"coffee": [], "astronaut": [(0, 512, 0, 75), (0, 270, 350, 480), (270, 345, 360, 512)]}
+LEFT_OUT = {"coffee": [], "astronaut": [(0, 512, 0, 75), (0, 270, 350, 480), (270, 512, 360, 512)]}
 """Rows and columns of what the scene lacks, pixels of the photograph: flag, model, table."""
+VISOR = 452, 393, 100
+"""Row, column and radius of what counts although it is in them, pixels: the black of the helmet."""
 SIDES = 48
 PROFILES = {
     "ball": [(np.cos(v), np.sin(v)) for v in np.linspace(-1.57, 1.57, 24)],
@@ -62,18 +64,30 @@ def main() -> None:
     """Fetch the photographs, edit a studio's light towards each, insert the ball, draw ``sheet.jpg``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="for photographs, scenes and results")
-    folder = parser.parse_args().folder
-    folder.mkdir(parents=True, exist_ok=True)
-    prepare(folder)
-    found = {name: edited(name, folder) for name in SIZES}
-    rows = [panels(result) for result in found.values()]
-    rows[0].append(with_ball(found["coffee"], folder))
-    rows[1].append(np.zeros((1, 1, 3)))
-    height = [np.concatenate([scaled(one) for one in row], axis=1) for row in rows]
-    width = max(row.shape[1] for row in height)
-    sheet = np.concatenate([np.pad(row, ((0, 3), (0, width - row.shape[1]), (0, 0))) for row in height])
+    parser.add_argument("--only", choices=SIZES, help="edit this one; the other's results are in the folder")
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    prepare(given.folder)
+    for name in [given.only] if given.only else SIZES:
+        result = edited(name, given.folder)
+        if name == "coffee":
+            insert_ball(result, given.folder)
+
+    # ---- A row a photograph, of its folder's files
+    rows = []
+    for name in SIZES:
+        maps = [
+            images.read(given.folder / name / "edited.exr")[0],
+            images.read(puresky.data(STUDIO) / STUDIO)[0],
+        ]
+        pictures = [images.read_stored(given.folder / name / "photograph.png")[0]]
+        pictures += [tonemap(one / 4, "gamma") for one in maps[::-1]]
+        pictures += [images.read_stored(given.folder / "inserted.png")[0]] if name == "coffee" else []
+        rows.append(np.concatenate([scaled(one) for one in pictures], axis=1))
+    width = max(row.shape[1] for row in rows)
+    sheet = np.concatenate([np.pad(row, ((0, 3), (0, width - row.shape[1]), (0, 0))) for row in rows])
     pixels = np.rint(255 * np.clip(sheet, 0, 1)).astype(np.uint8)
-    mi.Bitmap(pixels).write(str(folder / "sheet.jpg"), quality=85)
+    mi.Bitmap(pixels).write(str(given.folder / "sheet.jpg"), quality=85)
 
 
 def prepare(folder: Path) -> None:
@@ -87,6 +101,9 @@ def prepare(folder: Path) -> None:
             mask = np.ones_like(images.read_stored(folder / f"{name}.png")[0][..., :3])
             for top, bottom, left, right in LEFT_OUT[name]:
                 mask[top:bottom, left:right] = 0
+            if name == "astronaut":
+                row, column = np.mgrid[: len(mask), : len(mask)]
+                mask[np.hypot(row - VISOR[0], column - VISOR[1]) < VISOR[2]] = 1
             images.write_png(folder / f"{name}_mask.png", mask)
     angles = 2 * np.pi * np.arange(SIDES) / SIDES
     for name, profile in PROFILES.items():
@@ -120,14 +137,8 @@ def edited(name: str, folder: Path) -> Result:
     return result
 
 
-def panels(result: Result) -> list[np.ndarray]:
-    """Return the rendering under the map as it was, the photograph, the edited rendering, and both maps."""
-    pictures = [tonemap(result.shown[name], "srgb") for name in ("initial", "target", "edited")]
-    return pictures + [tonemap(result.maps[name] / 4, "gamma") for name in ("initial", "edited")]
-
-
-def with_ball(result: Result, folder: Path) -> np.ndarray:
-    """Return the coffee with the ball, twice as large as the rendering."""
+def insert_ball(result: Result, folder: Path) -> None:
+    """Write ``inserted.png``: the coffee with the ball, twice as large as the rendering."""
     width, height = 2 * SIZES["coffee"][0], 2 * SIZES["coffee"][1]
     scene = (folder / "coffee.xml").read_text()
     stage = scene.split('<bsdf type="roughplastic" id="wood">')[0]
@@ -147,7 +158,6 @@ def with_ball(result: Result, folder: Path) -> np.ndarray:
     outline = scenes["alone"].alpha[..., None]
     shown = photo.camera.shown(insertion.composed(photo.picture, outline, with_object, without))
     images.write_png(folder / "inserted.png", shown)
-    return shown
 
 
 def scaled(picture: np.ndarray) -> np.ndarray:

@@ -72,22 +72,24 @@ def main() -> None:
         result = edited(name, given.folder)
         if name == "coffee":
             insert_ball(result, given.folder)
+    draw(given.folder)
 
-    # ---- A row a photograph, of its folder's files
+
+def draw(folder: Path) -> None:
+    """Write ``sheet.jpg``, of files: photograph, rendering, outliers, the map before and after, the ball."""
+    studio = images.read(puresky.data(STUDIO) / STUDIO)[0]
     rows = []
     for name in SIZES:
-        maps = [
-            images.read(given.folder / name / "edited.exr")[0],
-            images.read(puresky.data(STUDIO) / STUDIO)[0],
+        pictures = [images.read_stored(folder / name / "photograph.png")[0] / 255]
+        pictures += [
+            tonemap(one / 4, "gamma") for one in (studio, images.read(folder / name / "edited.exr")[0])
         ]
-        pictures = [images.read_stored(given.folder / name / "photograph.png")[0]]
-        pictures += [tonemap(one / 4, "gamma") for one in maps[::-1]]
-        pictures += [images.read_stored(given.folder / "inserted.png")[0]] if name == "coffee" else []
+        pictures += [images.read_stored(folder / "inserted.png")[0] / 255] if name == "coffee" else []
         rows.append(np.concatenate([scaled(one) for one in pictures], axis=1))
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 3), (0, width - row.shape[1]), (0, 0))) for row in rows])
     pixels = np.rint(255 * np.clip(sheet, 0, 1)).astype(np.uint8)
-    mi.Bitmap(pixels).write(str(given.folder / "sheet.jpg"), quality=85)
+    mi.Bitmap(pixels).write(str(folder / "sheet.jpg"), quality=85)
 
 
 def prepare(folder: Path) -> None:

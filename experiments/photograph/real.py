@@ -125,7 +125,7 @@ def edited(name: str, folder: Path) -> Result:
     """Edit a studio's light towards a photograph, and save the result."""
     width, height = SIZES[name]
     settings = {
-        "input": {"envmap": str(puresky.data(STUDIO) / STUDIO), "width": 128},
+        "input": {"envmap": str(puresky.data(STUDIO) / STUDIO), "width": 128, "horizon": "free"},
         "scene": {"file": str(folder / f"{name}.xml"), "width": width, "height": height},
         "target": {
             "kind": "photo",

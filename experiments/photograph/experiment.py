@@ -185,7 +185,7 @@ SUMMARY = Summary(
             f"{name}: si-RMSE, angle": f"{{{name} si-RMSE.mean:.3f}}, {{{name} angle.mean:.1f}}"
             for name in protocol.SPHERES
         },
-        "insertion: RMSE, SSIM": "{insertion RMSE.mean:.3f}, {insertion SSIM.mean:.3f}",
+        "insertion: RMSE, SSIM": "{insertion RMSE.mean:.4f}, {insertion SSIM.mean:.4f}",
         "seconds": "{seconds.mean:.0f}",
     },
 )
@@ -210,7 +210,7 @@ EXPERIMENT = Experiment(
         "sun, degrees": "{sun:.1f}",
         "brightness, stops": "{brightness:+.2f}",
         "irradiance, stops": "{irradiance:.2f}",
-        "insertion RMSE": "{insertion RMSE:.3f}",
+        "insertion RMSE": "{insertion RMSE:.4f}",
         "worse than unedited": "{worse}",
     },
     summary=SUMMARY,
